@@ -1,6 +1,6 @@
-"""Everything a user can get wrong has an error of its own here; a program bug is any other exception.
+"""Errors that a user can cause or fix; any other exception is a bug of the program.
 
-Messages say what was found, what was expected and what to do. The commands print them without a traceback and exit
+Messages state what was found, what was expected and what to do. The commands print them without a traceback and exit
 with code 2.
 """
 
@@ -11,34 +11,34 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 _MOST_PROBLEMS = 5
-"""Problems named in a message; a damaged table would be reported number by number."""
+"""Largest number of problems in a message; a damaged table would have one for each number."""
 
 _MOST_LISTED = 1000
-"""Problems that are looked at: a list of a million would take a gigabyte."""
+"""Largest number of problems that are examined: a list of a million would take a gigabyte."""
 
 _LONGEST_PROBLEM = 300
 _LONGEST = 5000
 
 
 class Error(Exception):
-    """Base of all errors caused by input, files or the machine rather than by a bug; long messages are cut."""
+    """Base of all errors caused by input, files or the machine rather than by a bug; long messages are shortened."""
 
     def __str__(self) -> str:
-        """The message, of at most about 5000 characters: some quote what was found in a file."""
+        """Return the message, shortened to about 5000 characters: some quote the content of a file."""
         text = super().__str__()
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1000]} ... {text[-1000:]}"
 
 
 class DescriptionError(Error):
-    """A sensor, scene or target description cannot be read: unknown key, wrong type, unknown name."""
+    """A description of a sensor, scene or target cannot be read: unknown key, wrong type, unknown name."""
 
 
 class DesignError(Error):
-    """A description is readable but the sensor it describes cannot work."""
+    """A description is readable but its sensor cannot work."""
 
 
 class RangeError(Error):
-    """A value lies outside the range for which a formula or table holds."""
+    """A value is outside the range of validity of a formula or table."""
 
 
 class CaptureError(Error):
@@ -50,7 +50,7 @@ class OutputError(Error):
 
 
 class ImageError(Error):
-    """An image has the wrong size, type or content for what is asked of it."""
+    """An image has the wrong size, type or content for its purpose."""
 
 
 class TargetError(Error):
@@ -62,7 +62,7 @@ class CalibrationError(Error):
 
 
 class EvaluationError(Error):
-    """A cloud does not hold what the evaluation needs."""
+    """A cloud lacks what the evaluation needs."""
 
 
 class SetupError(Error):
@@ -74,7 +74,7 @@ class HardwareError(Error):
 
 
 class CommandFailed(Error):
-    """A command that a function ran has failed, and has printed why; ``returncode`` is its exit code."""
+    """A command run by a function has failed and printed the reason; ``returncode`` is its exit code."""
 
     def __init__(self, line: str, returncode: int):
         super().__init__(f"{line} ended with exit code {returncode}")
@@ -82,12 +82,12 @@ class CommandFailed(Error):
 
 
 def first_problems(error: "ValidationError", most: int) -> "list[ErrorDetails]":
-    """The first problems that a validation found; none where there are too many to list them."""
+    """Return the first problems found by a validation; empty if there are too many to list them."""
     return error.errors(include_url=False)[:most] if error.error_count() <= _MOST_LISTED else []
 
 
 def problems_of(error: "ValidationError") -> str:
-    """The first problems that a validation found, each with the place where it is."""
+    """Describe the first problems found by a validation, each with its location."""
     problems = (
         f"{'.'.join(map(str, p['loc']))}: {p['msg']}"[:_LONGEST_PROBLEM] for p in first_problems(error, _MOST_PROBLEMS)
     )

@@ -25,7 +25,7 @@ from uwlts.cli import app as uwlts_app
 from uwlts.model.library import library_folder
 
 _SIZE_PX = {"width_px": 640, "height_px": 512, "pixel_size_um": 10.6}
-"""Half the thesis's pixels along each side, of the same view: the smallest in which its targets are found."""
+"""Half of the thesis's pixels along each side, with the same view: the smallest for which its targets are found."""
 _PRINCIPAL_POINT_PX = [323.1, 252.95]
 """Half of that of `thesis-as-built`."""
 _MOST_PLACES = {"target": 5, "target-through-window": 5, "step": 3}
@@ -37,7 +37,7 @@ _SAMPLES = "2"
 
 @dataclass(frozen=True)
 class Page:
-    """How a page is run: files that it takes for granted, and what differs from the page."""
+    """How to run a page: required files, and differences from the page."""
 
     given: dict[str, str] = field(default_factory=dict)
     """File in the page's folder: file of the shared campaign."""
@@ -46,9 +46,9 @@ class Page:
     small_python: bool = False
     """Whether Python blocks take the smaller descriptions too; tutorials are fast enough, and check their figures."""
     before: str = ""
-    """Command lines that make what else the page takes for granted."""
+    """Command lines that make the other required files."""
     instead: dict[str, str] = field(default_factory=dict)
-    """Words of the page: shorter or existing ones, with the same options."""
+    """Words of the page: their replacements, shorter or existing ones, with the same options."""
     not_run: dict[str, str] = field(default_factory=dict)
     """Beginning of a command or Python block: why it is not run."""
     again: tuple[str, ...] = ()
@@ -56,9 +56,9 @@ class Page:
     tables: dict[str, int] = field(default_factory=dict)
     """File in the page's folder: number of the TOML block of the page that is written to it, from 0."""
     prepare: dict[str, Callable[["Runner"], None]] = field(default_factory=dict)
-    """Beginning of a command: what is made before it runs."""
+    """Beginning of a command: preparation before it runs."""
     ready: dict[str, str] = field(default_factory=dict)
-    """Beginning of a command that goes on until Ctrl-C: words that it prints when it is ready."""
+    """Beginning of a command that runs until Ctrl-C: words that it prints when it is ready."""
 
 
 def write_small_descriptions(folder: Path) -> None:
@@ -102,7 +102,7 @@ class Runner:
         """Run a command line, or start it until it has printed `ready`; return what it printed."""
         words = [name for word in words_of(command) for name in self._expanded(word)]
         if words[0] == "cd":
-            # A copy: what the commands there write does not belong into the project.
+            # A copy: files written by the commands there do not belong in the project.
             shutil.copytree(ROOT / words[1], self.folder / words[1])
             self.folder = self.folder / words[1]
             return ""
@@ -118,7 +118,7 @@ class Runner:
             done = subprocess.run(
                 _called(words), cwd=self.folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=600
             )
-        # The doctor judges the machine, of which no test knows.
+        # The doctor examines the machine, which tests do not know.
         expected = (0, 1) if words[:2] == ["uwlts", "doctor"] else (0,)
         assert done.returncode in expected, (
             f"{shlex.join(words)}: {done.returncode}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
@@ -134,7 +134,7 @@ class Runner:
             exec(compile("\n" * (block.line - 1) + text, block.page, "exec"), self.names)
 
     def end(self) -> None:
-        """End what goes on, as Ctrl-C does."""
+        """End running commands, as by Ctrl-C."""
         for process in reversed(self._going):
             process.send_signal(signal.SIGINT)
             said, errors = process.communicate(timeout=60)
@@ -186,7 +186,7 @@ def run_page(page: Path, how: Page, *, shared: Path | None, folder: Path, small:
     for name, number in how.tables.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(_instead(tables[number], how.instead, set()), encoding="utf-8")
-    # What is listed for a table was looked for above.
+    # Entries for a table were searched for above.
     beginnings = {*how.not_run, *how.again, *how.prepare, *how.ready}
     unused = set(beginnings)
     unused |= {word for word in how.instead if not any(word in tables[number] for number in how.tables.values())}

@@ -14,7 +14,7 @@ STAGE = {100: 1 / RESOLUTION_MM, 130: TRAVEL_MM}
 """Settings of the controller."""
 START_MM = 5.0
 PX_PER_MM = 3.0
-"""How far a stripe moves in the image where the stage moves by a millimetre."""
+"""Motion of a stripe in the image per millimetre of the stage."""
 
 
 class DrawnCamera(GigeCamera):

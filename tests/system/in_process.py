@@ -15,12 +15,12 @@ from uwlts.runtime.workers import Workers, open_workers
 
 
 def uwlts(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """How ``uwlts`` with these arguments ended, and what it said."""
+    """Exit code and output of ``uwlts`` with these arguments."""
     return run_program(cli.app, "uwlts", *arguments)
 
 
 def run_program(app: App, program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """How a program with these arguments ended, and what it said."""
+    """Exit code and output of a program with these arguments."""
     words, said, errors = [program, *map(str, arguments)], StringIO(), StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(errors):
         patch.setattr(sys, "argv", words)

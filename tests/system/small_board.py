@@ -1,4 +1,4 @@
-"""Descriptions of a coarse sensor and a turned board, as tests of scans have the twin serve them."""
+"""Descriptions of a coarse sensor and a rotated board, which the twin serves in tests of scans."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What formulas say of a design against what rendering and the sensor's software find, and how that is kept."""
+"""Agreement between a design's formulas and the results of rendering and software, and its storage."""
 
 from pathlib import Path
 
@@ -91,7 +91,7 @@ def test_what_was_rendered_is_not_rendered_again(study, thesis, tmp_path, monkey
             (row,) = render(study, folder, candidates, pool, variant=CPU)
             assert (row.label, row.ratio) == (label, 1.25)
     assert len(list(folder.iterdir())) == 1
-    # The worker would have said another ratio the second time.
+    # The second time the worker would have returned another ratio.
     with open_workers(workers=1) as pool:
         (other,) = render(
             study, folder, [candidate("x", -1, altered(thesis, {"laser": {"power_mw": 8.0}}))], pool, variant=CPU

@@ -118,7 +118,7 @@ def started(*words: object) -> subprocess.Popen[str]:
 
 
 def dark(controller: GrblController) -> bool:
-    """Whether the laser goes off within a second."""
+    """Return whether the laser goes off within a second."""
     return within(1.0, lambda: not controller.state().laser_on)
 
 
@@ -137,7 +137,7 @@ def wait_for(part: Path, count: int) -> None:
 
 
 def check_camera(path: Path, sensor: Sensor) -> None:
-    """Against the description by which the twin was built."""
+    """Compare with the description from which the twin was built."""
     calibration = read_calibration(path)
     figures = calibration.residuals["camera"]
     # Circles are found to some 0.05 px in small images with noise.
@@ -188,7 +188,7 @@ def test_an_interrupted_one_is_dark_keeps_the_accepted_and_can_be_gone_on_from(s
     assert done.returncode == 0, done.stderr
     with Capture(tmp_path / "c-target.h5") as capture:
         assert len(capture) == 2 * COUNT and (np.diff(capture.time_s) > 0).all()
-    # What was recorded was not taken again.
+    # Recorded poses were not taken again.
     assert len(re.findall(r"mm: \d+ points", done.stdout)) == COUNT - kept // 2
 
 
@@ -221,7 +221,7 @@ def test_positions_beyond_the_travel_are_refused_before_anything_moves(served, p
 
 
 class Tank:
-    """A target held by hand before a camera, and a laser switched by a controller: what is seen at any moment."""
+    """A target held by hand before a camera, and a laser switched by a controller: the image at any moment."""
 
     def __init__(self, sensor: Sensor, controller: GrblController):
         self._sensor, self._controller = sensor, controller
@@ -245,7 +245,7 @@ class Tank:
 
 
 def hand_poses() -> Iterator[np.ndarray]:
-    """Poses as an operator brings them about, over and over: all sides farther, near and far, all over the image."""
+    """Poses of an operator, repeatedly: all sides tilted away, near and far, all over the image."""
     rng = np.random.default_rng(4)
     while True:
         for angle in rng.permutation(8) * np.pi / 4:
@@ -255,7 +255,7 @@ def hand_poses() -> Iterator[np.ndarray]:
 
 
 def _hold(tank: Tank, going: subprocess.Popen[str], said: list[str]) -> None:
-    """Hold the target still until it was taken, then bring it elsewhere, until the guide has enough."""
+    """Hold the target still until it was taken, then move it, until the guide has enough."""
     poses, deadline, taken, asked = hand_poses(), time.monotonic() + 60, 0, False
     until = deadline
     while going.poll() is None:

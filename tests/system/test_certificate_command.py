@@ -50,7 +50,7 @@ def test_a_certificate_is_written_and_checked(folder: Path):
     assert content["lengths"] and content["cannot_tell"] and content["next_shots"]
     checked = run("certificate", "calibration.json", "--check", "calibration.certificate.json", folder=folder)
     assert (checked.returncode, checked.stderr) == (0, "")
-    assert "is as it was issued, and is about calibration.json" in checked.stdout
+    assert "is unchanged, and belongs to calibration.json" in checked.stdout
 
 
 def test_changes_are_found(folder: Path):

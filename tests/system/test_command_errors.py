@@ -1,4 +1,4 @@
-"""What the commands say and return when the user errs: a message on standard error, exit code 2, no traceback.
+"""Messages and exit codes for user errors: a message on standard error, exit code 2, no traceback.
 
 Most cases run inside this process, as the commands' own entry points; some as processes of their own.
 """
@@ -59,7 +59,7 @@ SUBCOMMANDS = [
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended."""
+    """Result of a command."""
 
     code: int
     out: str
@@ -88,7 +88,7 @@ def command(capsys) -> Callable[..., Ended]:
 
 @pytest.fixture
 def fails(command) -> Callable[..., str]:
-    """Runs a command that the user got wrong; returns the message."""
+    """Run a wrong command and return its message."""
 
     def run(program: str, *arguments: object, says: str) -> str:
         ended = command(program, *arguments)
@@ -286,7 +286,7 @@ def test_reader_that_leaves_early_is_no_error(tmp_path: Path):
 
 # --- missing files and files of another kind
 
-# Every place where a command takes a file, with the files that belong there.
+# Every input file of a command, with the kinds of files that it accepts.
 PLACES = {
     "reconstruct, capture": ("uwlts reconstruct {} --calibration calibration.json --out x.ply", {"scan.h5"}),
     "reconstruct, calibration": ("uwlts reconstruct scan.h5 --calibration {} --out x.ply", {"calibration.json"}),

@@ -15,6 +15,7 @@ from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
 from uwlts.files.inputs import OUTPUTS
 from uwlts.pages.toolkit import json_beside
+from uwlts.runtime.command_line import PathText
 
 ROOT = Path(__file__).resolve().parents[2]
 APPS = {"uwlts": uwlts_app, "twin": twin_app}
@@ -43,7 +44,7 @@ def _values(kind: Any) -> list[tuple[list[str], object]]:
     """Two values of a kind: their words on the command line, and what they mean."""
     if get_origin(kind) is Literal:
         return [([word], word) for word in get_args(kind)[1:3]]
-    if kind in (str, Path):
+    if kind in (str, PathText, Path):
         return [(["one"], kind("one")), (["two"], kind("two"))]
     assert set(get_args(kind)) == {float}, f"no example of {kind}: add one"
     numbers = [[float(start + number) for number in range(len(get_args(kind)))] for start in (-1, 5)]
@@ -102,7 +103,7 @@ def test_distortion_is_auto_or_each_coefficient_once(command, tmp_path, monkeypa
         assert ended.returncode == 2
         assert f"--distortion {wrong}: expected only auto" in ended.stderr
     assert _parsed(uwlts_app, command, "--distortion", ["--distortion", "auto"]) == ("auto",)
-    # The coefficients are taken: something else is missed next.
+    # The coefficients are accepted: something else is missing next.
     ended = uwlts(command, *required, "--distortion", "k1", "k2")
     assert ended.returncode == 2 and "distortion" not in ended.stderr
 
@@ -115,7 +116,7 @@ FOLDERS = {
     "twin demo --out",
     "twin sweep --out",
 }
-"""Outputs that are folders, whose names have no ending."""
+"""Outputs that are folders, whose names need no ending."""
 
 
 def _outputs() -> Iterator[Any]:
@@ -132,7 +133,7 @@ ENDINGS = {"align": "x.csv", "compare": "x.html", "evaluate": "x.json", "inspect
 
 
 def test_what_is_described_as_written_counts_as_an_output():
-    # Else it would be refused as an input where it is to be replaced.
+    # Otherwise it would be refused as an input that is to be replaced.
     described = {
         argument.name.lower().removeprefix("--").replace("-", "_")
         for program, command, app in _commands()
@@ -154,7 +155,7 @@ def test_an_ending_that_names_no_format_is_refused_before_the_work(
 ):
     monkeypatch.chdir(tmp_path)
     words = [ENDINGS.get(command, "x.h5") if word == "x.h5" else word for word in _required(app, command, option)]
-    # No input exists: whatever looks at one first complains of that.
+    # No input exists: reading one first would be reported.
     words = ["x.ply" if word == "x" and command == "export" else word for word in words]
     ended = run_program(app, program, command, *words, option, "wrong.ending")
     assert ended.returncode == 2
@@ -179,7 +180,7 @@ def _blocks() -> Iterator[Any]:
 
 
 def _written(line: str) -> list[str]:
-    """Names of the files that a command line writes anew, with those beside them."""
+    """Return the names of the files that a command line writes, including those beside them."""
     program, *words = shlex.split(line)
     command, bound, _ = APPS[program].parse_args(words, exit_on_error=False, print_error=False)
     given = bound.arguments

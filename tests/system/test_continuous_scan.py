@@ -1,4 +1,4 @@
-"""Scans without stops over real protocols: where frames are placed, what the latency is, and what is refused."""
+"""Scans without stops over real protocols: positions of frames, latency, and refusals."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +24,7 @@ ENCODER_MM = 1 / STEPS_PER_MM
 
 
 def surface(position_mm: float) -> np.ndarray:
-    """Where the stripe of each line lies, px: a hill 30 mm wide."""
+    """Stripe position of each line in px: a hill 30 mm wide."""
     away = (position_mm - 150.0 - 0.05 * np.arange(WIDTH_PX)) / 12.0
     return 250.0 + 120.0 * np.exp(-(away**2))
 
@@ -76,14 +76,14 @@ def plan(folder: Path, hill: Hill, moving: str, *, count: int = COUNT) -> Path:
 
 
 def true_places(capture: Capture, hill: Hill) -> np.ndarray:
-    """True positions of the frames: those of the exposures that were nearest in time, all being one offset off.
+    """True positions of the frames: those of the nearest exposures in time, with a common offset.
 
-    Where exposures come evenly, offsets by whole frames fit alike: of these the one counts that is nearest to where the
-    capture has its frames, as no error looked for is a whole frame.
+    For regular exposures, offsets by whole frames fit equally well. The offset closest to the capture's own positions
+    counts, because no error in question is a whole frame.
     """
     times = np.array([state.time_s for state in hill.states])
     places = np.array([state.position_mm for state in hill.states])
-    # The capture counts time from its beginning by the host's clock, to which the camera's was compared.
+    # The capture counts time from its beginning on the host's clock, with which the camera's was compared.
     offsets = times[:, None] - capture.time_s
     candidates = np.sort(offsets.ravel())
     off = np.array([np.abs(offsets - by).min(axis=0).max() for by in candidates])
@@ -112,7 +112,7 @@ def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_
         assert "measured" in said[-1]
         error_s = (capture.stage_mm - true_places(capture, hill)) / capture.speed_mm_per_s
         scatter_s = float(said[-1].split("scatter by ")[1].split(" ms")[0]) * 1e-3
-        # 0.2 ms; on a busy machine five standard errors of a pass's place by its reports, of which four or more count.
+        # 0.2 ms; on a busy machine five standard errors of a pass's position from its reports, at least four.
         allowed_s = max(2e-4, 5 * scatter_s / np.sqrt(4))
         assert np.abs(error_s).max() < allowed_s
 
@@ -138,7 +138,7 @@ def test_a_way_alone_says_that_its_latency_is_not_known(hill, tmp_path):
     warned = []
     moving = f"speed_mm_per_s = {SPEED}, both_ways = false"
     uwlts.scan(plan(tmp_path, hill, moving), tmp_path / "a.h5", home=True, warn=warned.append)
-    assert any("latency of the stage is not known" in text for text in warned)
+    assert any("latency of the stage is unknown" in text for text in warned)
 
 
 @pytest.mark.slow
@@ -167,7 +167,7 @@ def test_a_way_too_long_for_its_ramps_and_a_dark_laser_are_errors(hill, tmp_path
 
 def test_the_latency_of_drawn_passes_and_what_does_not_show_it():
     rng, speed, latency = np.random.default_rng(8), 80.0, -0.0123
-    # The hill stands amid flat ground, which fits itself at any shift.
+    # The hill is surrounded by flat ground, which matches itself at any shift.
     places = np.concatenate([np.arange(90, 211.0), np.arange(210.4, 89, -1.0)])
     signed = np.where(np.arange(len(places)) < 121, speed, -speed)
     truth = places + signed * latency
@@ -181,5 +181,5 @@ def test_the_latency_of_drawn_passes_and_what_does_not_show_it():
         measure_latency(np.full_like(centres, 200.0), places, signed)
     # A busy camera takes every fourth frame: the stripe moves by 10 px and more a frame, and bends by 13 at the top.
     coarse = measure_latency(centres[::4], places[::4], signed[::4])
-    # Hermite's cubic through central differences, wrong by 0.2 px/mm at most at 4 mm, errs by some 0.1 px.
+    # The error of Hermite's cubic through central differences, at most 0.2 px/mm wrong at 4 mm, is about 0.1 px.
     assert coarse.std_s < 2e-5 and abs(coarse.latency_s - latency) < 2e-4

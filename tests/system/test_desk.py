@@ -1,4 +1,4 @@
-"""The operator's page in a real browser, with the twin as the hardware: the whole way, faults, viewers.
+"""The operator's page in a real browser, with the twin as the hardware: all steps, faults, viewers.
 
 Screenshots of the first way through are kept in the folder that UWLTS_SCREENSHOTS names.
 """
@@ -82,7 +82,7 @@ def desk(tmp_path: Path, folder: Path, served: ServedTwin) -> Iterator[Desk]:
 
 @pytest.fixture
 def page(desk: Desk, chromium: "Browser") -> "Iterator[Page]":
-    """The operator's page; it asks for nothing beyond this machine, and its scripts fail nowhere."""
+    """The operator's page, without requests to other machines or script errors."""
     with watched(chromium.new_page(viewport={"width": 1400, "height": 850})) as opened:
         opened.set_default_timeout(SLOW_MS)
         opened.goto(desk.operator_address)
@@ -120,12 +120,12 @@ def tab(page: "Page", name: str) -> None:
 
 
 def says(page: "Page", text: str) -> None:
-    """Wait until the log says something, a regular expression."""
+    """Wait until the log matches a regular expression."""
     page.locator(".log").get_by_text(re.compile(text)).first.wait_for()
 
 
 def shows(page: "Page", text: str) -> None:
-    """Wait until the header says something."""
+    """Wait until the header matches."""
     page.locator("header").get_by_text(text).first.wait_for()
 
 
@@ -235,7 +235,7 @@ def test_a_scan_is_paused_stopped_and_continued(desk, page, served):
     done = re.findall(r"(\d+) of 60", page.locator("header").inner_text())
     page.wait_for_timeout(1500)
     assert done and re.findall(r"(\d+) of 60", page.locator("header").inner_text()) == done
-    press(page, "go on")
+    press(page, "resume")
     page.wait_for_timeout(500)
     press(page, "stop")
     says(page, "stopped")
@@ -285,7 +285,7 @@ def test_laser_off_works_while_the_stage_moves_and_in_the_live_image(desk, page,
     tab(page, "Stage")
     press(page, "unlock")
     says(page, "unlocking done")
-    # The light is not shown again by itself.
+    # The light is not switched on again automatically.
     page.wait_for_timeout(1000)
     assert not served.controller.state().laser_on
 
@@ -323,7 +323,7 @@ class LaserOff:
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
         shown = self.page.evaluate("([x, y]) => document.elementFromPoint(x, y).id", [x, y])
         (self.page.touchscreen.tap if self._tap else self.page.mouse.click)(x, y)
-        # Judged by the light alone: it is off within 1 s on a machine at rest.
+        # Judged by the light only: it is off within 1 s on an idle machine.
         assert within(5.0, lambda: not self.controller.state().laser_on), state
         assert shown == "laser-off", state
         kept(self.page, f"off-{self.page.viewport_size['width']}-{state}")
@@ -356,7 +356,7 @@ def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
     assert page.get_by_role("dialog").is_visible()
     page.evaluate("scrollTo(0, document.body.scrollHeight)")
     off.works("about-scrolled")
-    # The listener repeats Ctrl-X until the server has answered the last press: light that stays shows that it has.
+    # The listener repeats Ctrl-X until the server has answered the last press: steady light shows that it has.
     light(served.controller)
     os.kill(desk.process.pid, signal.SIGSTOP)
     try:
@@ -365,7 +365,7 @@ def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
         os.kill(desk.process.pid, signal.SIGCONT)
     press(page, "close")
     off.works("dialog-closed")
-    # Before the page's scripts are there.
+    # Before the page's scripts are loaded.
     page.route(re.compile("nicegui.js"), lambda route: held.append(route))
     held: list[Route] = []
     page.reload(wait_until="commit")
@@ -444,7 +444,7 @@ def test_viewers_look_and_have_no_control(desk, page, chromium, served):
     with watched(chromium.new_page()) as other:
         other.set_default_timeout(SLOW_MS)
         other.goto(desk.address)
-        # Who joins late has a picture within 2 s of the page.
+        # A late viewer has a picture within 2 s of the page.
         other.locator('img[src^="picture.jpg"]').wait_for(timeout=2000)
         assert other.get_by_role("button", name="Laser off").count() == 0
         assert [each.inner_text() for each in other.get_by_role("button").all()] == ["FIT"]
@@ -471,7 +471,7 @@ def test_mistakes_are_said_and_cost_nothing(desk, page, served):
     (desk.folder / "taken.h5").write_bytes(b"a capture")
     connected(page)
     tab(page, "Scan")
-    for name, words in (("taken", "taken.h5 exists"), ("../away", "is no name for a file"), ("", "is no name")):
+    for name, words in (("taken", "taken.h5 exists"), ("../away", "is not a name for a file"), ("", "is not a name")):
         page.get_by_label("name of the capture").fill(name)
         press(page, "start")
         says(page, words)

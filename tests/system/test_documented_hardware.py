@@ -41,7 +41,7 @@ def without_capture(runner: Runner) -> None:
 PAGES_RUN = {
     "docs/how-to/served-twin.md": Page(ready={"twin serve plane": "serving"}),
     "docs/how-to/hardware-camera.md": Page(
-        # A frame of the twin comes when it is rendered.
+        # The twin delivers a frame when it is rendered.
         instead={"gige:192.168.1.20": CAMERA, "timeout_s=1.0": "timeout_s=60.0"}
     ),
     "docs/how-to/scan.md": Page(

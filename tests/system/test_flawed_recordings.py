@@ -1,4 +1,4 @@
-"""Images with the flaws of real ones: lens and pixels of a camera are found, and the stripe is where it truly is."""
+"""Images with the flaws of real ones: correct parameters of lens and pixels, and correct stripes."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ its peak is 0.02 px lower, its centre of mass where it was, as for a stripe draw
 
 
 class Tripod(Studio):
-    """A studio in which the sensor is turned before the board instead of being moved by a stage."""
+    """A studio that rotates the sensor before the board instead of moving it by a stage."""
 
     def pose(self, shot: Shot) -> np.ndarray:
         rotation, place = VIEWS[round(shot.stage_mm)]
@@ -84,7 +84,7 @@ def test_pixels_and_tangential_distortion_are_found_in_flawed_photographs(thesis
     true = {"fx": fx, "fy": fy, "cx": cx, "cy": cy} | camera.distortion.model_dump()
     off = {name: (values[name] - true[name]) / std[name] for name in values}
     assert max(np.abs([*off.values()])) < 4, off
-    # The uncertainties are small enough to tell the flaws from none.
+    # The uncertainties are small enough to distinguish the flaws from zero.
     assert abs(values["p1"]) > 4 * std["p1"]
     aspect = found.lens.solution.model.fy_px / found.lens.solution.model.fx_px
     assert abs(aspect - 1.002) < 2e-4
@@ -100,8 +100,8 @@ def test_the_stripe_is_found_in_flawed_images_where_it_truly_is(thesis):
     assert np.isfinite(true).all() and np.ptp(true) > 20
     off = stripe.centre_px - true
     assert np.isfinite(off).mean() >= 0.95
-    # Speckle and compression err alike in neighbouring lines, but not from block to block of 16: the mean of 40 blocks
-    # lies beyond four of its standard errors once in 4,000 times (Student's t).
+    # Errors due to speckle and compression are correlated between neighbouring lines, but not between blocks of 16: the
+    # mean of 40 blocks exceeds four of its standard errors once in 4,000 times (Student's t).
     blocks = np.nanmean(off.reshape(-1, BLOCK_LINES), axis=1)
     assert abs(blocks.mean() - COLOUR_SHIFT_PX) < 4 * blocks.std(ddof=1) / np.sqrt(len(blocks))
     # Speckle leaves 0.11 px, filters and compression 0.17; no line follows the plate's light or the edge of a block.

@@ -1,5 +1,6 @@
-"""Images and captures that are truncated, of wrong size, black, white, turned, or without a stripe: what the commands
-say. One line that names the cause, exit code 2, and nothing is written. All images are drawn here."""
+"""Truncated, wrongly sized, black, white or rotated images and captures, and those without a stripe: messages.
+
+One line names the cause, the exit code is 2, and nothing is written. All images are drawn here."""
 
 import re
 from collections.abc import Callable
@@ -85,7 +86,7 @@ def turned(image: np.ndarray) -> np.ndarray:
 
 
 def turned_square(image: np.ndarray) -> np.ndarray:
-    """Without telling by its size."""
+    """Turn the image without a change of its size."""
     return np.rot90(image[:, 64:576])
 
 
@@ -119,7 +120,7 @@ def captured(path: Path, frames: list[Frame], **rest: object) -> Path:
 
 @pytest.fixture
 def says(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
-    """Runs a command line; it must fail with one line on standard error that matches, and write nothing."""
+    """Run a command line, which must fail with one matching line on standard error and write nothing."""
 
     def check(line: str, words: str) -> None:
         arguments = line.split()
@@ -149,7 +150,7 @@ def folder_of(place: Path, frames: list[np.ndarray], suffix: str = ".png", size:
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".jpg"])
 def test_truncated_images(says, scan_images, tmp_path: Path, suffix: str):
-    """However much is missing, and nothing but the message is said, by no library either."""
+    """However much is missing, only the message is printed, also by libraries."""
     folder = folder_of(tmp_path / "images", scan_images[:3], suffix)
     victim = folder / f"laser1{suffix}"
     whole = victim.read_bytes()
@@ -161,7 +162,7 @@ def test_truncated_images(says, scan_images, tmp_path: Path, suffix: str):
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg"])
 def test_images_with_a_hole(says, scan_images, tmp_path: Path, suffix: str):
-    """What a decoder makes up for missing bytes is no image; BMP has nothing that would tell."""
+    """Pixels that a decoder substitutes for missing bytes are not an image; BMP has no means to detect that."""
     folder = folder_of(tmp_path / "images", scan_images[:3], suffix)
     victim = folder / f"laser1{suffix}"
     content = bytearray(victim.read_bytes())
@@ -177,7 +178,7 @@ def test_images_with_a_hole(says, scan_images, tmp_path: Path, suffix: str):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (turned, "512 x 640 pixels; expected 640 x 512 .* turned by a quarter turn: turn them back"),
+        (turned, "512 x 640 pixels; expected 640 x 512 .* rotated by 90 deg: rotate them back"),
         (lambda image: cv2.resize(image, (320, 256)), "320 x 256 pixels; expected 640 x 512"),
         (black, "all 5 laser images are black, no pixel reaches 2 % of full scale: is the laser on"),
         (white, "laser0.png is white: 100 % of its pixels are saturated"),
@@ -246,7 +247,7 @@ def test_captures_of_the_target(says, target_frames, tmp_path: Path, name: str):
 
 
 def test_the_target_as_it_should_be_calibrates(target_frames, tmp_path: Path, monkeypatch, capfd):
-    """The same images undamaged: what the refusals rest on."""
+    """The same images undamaged, as a control for the refusals."""
     path = captured(tmp_path / "x.h5", target_frames, target=PLATE)
     monkeypatch.setattr("sys.argv", ["uwlts", "calibrate", "--air", str(path), "--out", str(tmp_path / "x.json")])
     with pytest.raises(SystemExit) as ended:
@@ -342,12 +343,12 @@ def test_truncated_captures(says, scan_images, calibration, tmp_path: Path, shar
     scan = write(tmp_path / "scan.h5", scan_images, stage_mm=STAGE_MM)
     whole = scan.read_bytes()
     scan.write_bytes(whole[: int(share * len(whole))])
-    words = "no HDF5 file" if share == 0 else f"truncated: {int(share * len(whole)):,} of its {len(whole):,} bytes"
+    words = "not an HDF5 file" if share == 0 else f"truncated: {int(share * len(whole)):,} of its {len(whole):,} bytes"
     says(f"reconstruct {scan} --calibration {calibration} --out {tmp_path / 'x.ply'}", words)
 
 
 def test_captures_with_a_hole(says, scan_images, calibration, tmp_path: Path):
-    """The checksum of an image tells which one is damaged."""
+    """The checksum of an image identifies the damaged one."""
     scan = write(tmp_path / "scan.h5", scan_images, stage_mm=STAGE_MM)
     with Capture(scan) as capture:
         place = capture.file["frames"].id.get_chunk_info(4).byte_offset

@@ -1,6 +1,6 @@
 """The served GigE Vision camera, read by the real driver over the loopback interface.
 
-Both sides run Aravis in one process. Where it is not installed these tests fail and say how to install it.
+Both sides run Aravis in one process. If it is not installed, these tests fail and state how to install it.
 """
 
 import threading
@@ -25,7 +25,7 @@ WAIT_S = 3.0
 
 
 class Scene:
-    """Images that tell when and how they were taken: stage position and exposure in the corner, noise elsewhere."""
+    """Images that contain stage position and exposure in the corner, and noise elsewhere."""
 
     def __init__(self):
         self.stage_mm = 0
@@ -74,7 +74,7 @@ def test_the_camera_says_who_it_is_and_what_it_set(camera):
 def test_what_the_camera_cannot_do_is_an_error(camera):
     with pytest.raises(HardwareError, match="no setting for gain"):
         camera.configure(gain_db=6)
-    with pytest.raises(HardwareError, match="does not give Mono12, only .*Mono8"):
+    with pytest.raises(HardwareError, match="does not offer Mono12, only .*Mono8"):
         camera.configure(bits=12)
     with pytest.raises(HardwareError, match="not within the image sensor of 1280 x 1024"):
         camera.configure(region=Region(1000, 0, 281, 10))
@@ -110,7 +110,7 @@ def test_every_trigger_gives_one_frame_of_its_moment(scene, camera):
     for position in range(1, 6):
         scene.stage_mm = position
         camera.trigger()
-        # Seen only if the image were made later than the trigger's answer.
+        # Visible only if the image were made later than the trigger's answer.
         frame = camera.grab(WAIT_S)
         scene.stage_mm = 99
         assert (frame.image[0, 0], frame.image[0, 1], frame.frame_id) == (position, 7, position)
@@ -138,17 +138,17 @@ def test_free_running_frames_follow_each_other_past_the_end_of_the_counter(scene
         frames = [camera.grab(WAIT_S) for _ in range(20)]
     assert [frame.frame_id for frame in frames] == [*range(2**16 - 10, 2**16), *range(1, 11)]
     assert camera.counts.dropped == camera.counts.short == camera.counts.duplicated == 0
-    # Between the frames lie at least their periods, but for the camera's clock, which ticks in whole milliseconds.
+    # At least one period separates the frames, apart from the camera's clock, which ticks in whole milliseconds.
     assert frames[-1].time_s - frames[0].time_s > 19 / 50 - 2e-3 - 0.1
 
 
 @pytest.mark.parametrize(
     ("inject", "status", "message"),
     [
-        (lambda served: served.inject("drop", 2), "dropped", "before it were dropped"),
-        (lambda served: served.inject("repeat"), "duplicated", "the previous frame once more"),
-        (lambda served: served.inject("cut"), "short", "lost on the way"),
-        (lambda served: served.inject("delay", delay_s=0.3), "late", "more than a frame's period"),
+        (lambda served: served.inject("drop", 2), "dropped", "preceded by dropped frames"),
+        (lambda served: served.inject("repeat"), "duplicated", "it repeats the previous frame"),
+        (lambda served: served.inject("cut"), "short", "incomplete: packets were lost"),
+        (lambda served: served.inject("delay", delay_s=0.3), "late", "more than one frame period"),
     ],
 )
 def test_each_fault_of_a_free_running_camera_is_named(served, camera, inject, status, message):
@@ -161,7 +161,7 @@ def test_each_fault_of_a_free_running_camera_is_named(served, camera, inject, st
         for _ in range(5):
             camera.grab(WAIT_S)
     assert getattr(camera.counts, status) == (2 if status == "dropped" else 1)
-    # It can go on.
+    # It can continue.
     camera.stop()
     camera.start()
     camera.grab(WAIT_S)

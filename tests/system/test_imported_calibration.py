@@ -64,7 +64,7 @@ def poses(target) -> list[tuple[np.ndarray, np.ndarray]]:
 def photographs(target, rotation, translation, rng) -> tuple[np.ndarray, np.ndarray]:
     """The board in lamp light, without and with the laser on it: each (H, W) uint8."""
     board, corner = printed(target)
-    # From the board's pixels to mm, to the camera, to pixels FINER times as fine, whose first centre lies at 1/2.
+    # From the board's pixels to mm, to the camera, to pixels FINER times as fine, with the first centre at 1/2.
     to_mm = np.array([[1 / PX_PER_MM, 0, corner[0] + 0.5 / PX_PER_MM], [0, 1 / PX_PER_MM, corner[1] + 0.5 / PX_PER_MM]])
     to_camera = np.column_stack([rotation[:, :2], translation]) @ np.vstack([to_mm, [0, 0, 1]])
     shift = (FINER - 1) / 2

@@ -24,6 +24,7 @@ from uwlts.errors import OutputError
 from uwlts.files.inputs import OUTPUTS, inputs_kept
 from uwlts.files.reading import read_text
 from uwlts.files.writing import one_writer, refuse_unsuitable, written_aside
+from uwlts.runtime.command_line import PathText
 from uwlts.storage.cloud import PointCloud
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,10 +32,10 @@ APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
 
 
 def _takes_text(hint: Any) -> bool:
-    """Whether a parameter's value can be the name of a file."""
+    """Return whether a parameter's value can be the name of a file."""
     if get_origin(hint) is Literal:
         return False
-    return hint in (Path, str) or any(_takes_text(part) for part in get_args(hint) if part is not Ellipsis)
+    return hint in (Path, PathText, str) or any(_takes_text(part) for part in get_args(hint) if part is not Ellipsis)
 
 
 def _pairs() -> Iterator[tuple[str, str, str, str]]:
@@ -99,7 +100,7 @@ def test_an_output_that_is_an_argument_is_refused(tmp_path, program, name, outpu
     if same != "name":
         other = tmp_path / "other.h5"
         (os.link if same == "hard link" else os.symlink)(existing, other)
-    # Where it is a pair of arguments that goes on one option, all values are of the same parameter.
+    # If a pair of arguments becomes one option, all values are of the same parameter.
     ended = run_program(APPS[program], program, *_arguments(program, name, {source: existing, output: other}))
     assert ended.returncode == 2, ended
     assert f"cannot write {other}: it is an input of this command" in ended.stderr, ended.stderr
@@ -136,7 +137,7 @@ def _contents(folder: Path) -> dict[Path, bytes]:
 @pytest.mark.parametrize("named", ["laser1.png", "sensor.toml", "base.toml", "import.toml"])
 def test_what_a_folder_or_a_description_leads_to_is_an_input(tmp_path, named):
     folder = _photographs(tmp_path / "photographs")
-    # By another name: one that ends otherwise is refused as that.
+    # Another name, because a file with another ending is refused for that.
     os.link(folder / named, tmp_path / "out.h5")
     before = _contents(tmp_path)
     ended = run_program(APPS["uwlts"], "uwlts", "import", folder, "--out", tmp_path / "out.h5", "--overwrite")
@@ -182,7 +183,7 @@ def test_functions_keep_their_inputs_too(tmp_path, nominal):
     with pytest.raises(OutputError, match="is an input"):
         uwlts.export(cloud, cloud, overwrite=True)
     assert cloud.read_bytes() == before
-    # Who reads and writes in steps of his own knows what he does.
+    # A program that reads and writes in its own steps is responsible for itself.
     uwlts.read(cloud).save(cloud, overwrite=True)
 
 
@@ -267,7 +268,7 @@ def test_a_killed_writer_holds_nothing(tmp_path, holder):
 
 
 def test_a_command_claims_its_output_before_the_work(tmp_path, holder, nominal):
-    """The first is still at work when the second is started; nothing is computed in vain."""
+    """The first is still running when the second starts; no work is wasted."""
     command = ["certificate", nominal, "--out", tmp_path / "a.html"]
     begun = time.monotonic()
     ended = run_program(APPS["uwlts"], "uwlts", *command)
@@ -283,7 +284,7 @@ def test_without_a_command_asking_claims_nothing(tmp_path):
 
 
 def test_a_locked_hdf5_output_can_be_written(tmp_path):
-    """HDF5 locks what it writes itself; the lock lies on another file."""
+    """HDF5 locks its own output; this lock is on another file."""
     with written_aside(tmp_path / "a.h5") as aside, h5py.File(aside, "w") as file:
         file["a"] = 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
@@ -308,14 +309,15 @@ def test_the_works_of_a_program_that_goes_on_are_apart(tmp_path):
 
     with inputs_kept(), ThreadPoolExecutor(1) as thread:
         thread.submit(read_and_replace).result()
-        # What one work has read another may replace, and it holds what it writes until its own end only.
+        # A file that one task has read may be replaced by another, and outputs are held until the end of their task
+        # only.
         thread.submit(replace).result()
         assert writer_elsewhere(path) == "none"
     assert path.read_text(encoding="utf-8") == "new"
 
 
 def writer_elsewhere(path: Path) -> str:
-    """What another process finds that wants to write a path."""
+    """Result of another process's attempt to write a path."""
     program = (
         "import sys\nfrom pathlib import Path\nfrom uwlts.errors import OutputError\n"
         "from uwlts.files.writing import one_writer\n"

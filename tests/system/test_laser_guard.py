@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EXPOSURE_S = 0.5
 ALLOWED_S = EXPOSURE_S + 1.0
 LOAD_S = 0.5
-"""For machines so busy that a process which is ready does not run at once. The guard itself needs some ms."""
+"""Allowance for busy machines, where a ready process does not run at once. The guard itself needs some ms."""
 COUNT = 4
 
 PROGRAM = """
@@ -113,7 +113,7 @@ class Scanning:
     def dark_after_s(self, *, at_most_s: float = ALLOWED_S) -> float:
         """Time in s until the controller's laser pin is off.
 
-        What this process is kept from running is allowed on top, as the machine keeps the others from it as well.
+        Delays of this process are added as an allowance, because the machine delays the others as well.
         """
         began = before = time.monotonic()
         late_s = 0.0
@@ -184,7 +184,7 @@ def test_a_suspended_scan_is_dark_and_ends_when_it_is_continued(start, stop):
     # The controller has ended the light; the guard waits for 0.8 s beyond the exposure.
     time.sleep(EXPOSURE_S + 0.8)
     os.killpg(scan.program.pid, signal.SIGCONT)
-    scan.ended(2, "switched off by its guard.*suspended")
+    scan.ended(2, "guard switched the laser off.*suspended")
     assert not scan.controller.state().laser_on
     with Capture(part_path(scan.out)) as capture:
         kept = len(capture)
@@ -206,7 +206,7 @@ def test_a_scan_that_is_suspended_in_the_dark_goes_on(start):
         scan.program.send_signal(signal.SIGSTOP)
         if not scan.controller.state().laser_on:
             break
-        # The next image has begun before the signal came: go on before its guard finds the program late.
+        # The next image has begun before the signal came: continue before its guard finds the program late.
         scan.program.send_signal(signal.SIGCONT)
     else:
         raise AssertionError("every signal came during an image")
@@ -239,7 +239,7 @@ def test_a_frame_that_does_not_come_leaves_no_laser_on(start):
     scan.lit()
     scan.lit()
     scan.program.stdout.read()
-    scan.ended(2, "did not answer a trigger.*asked for 3 times")
+    scan.ended(2, "did not answer a trigger.*tried 3 times")
 
 
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])
@@ -249,11 +249,11 @@ def test_without_its_guard_a_scan_is_dark_and_ends(start, ending):
     os.kill(guard, ending)
     print(f"dark after {scan.dark_after_s(at_most_s=1.0):.3f} s")
     scan.program.stdout.read()
-    scan.ended(2, "the process that switches the laser off .* is gone")
+    scan.ended(2, "guard process, which switches the laser off .* is gone")
 
 
 def test_without_any_process_the_controller_switches_the_laser_off(start):
-    """By the line that it was sent with the one that lit the laser."""
+    """By the line that was sent together with the one that switched the laser on."""
     scan = start()
     guard = scan.lit()
     os.kill(guard, signal.SIGKILL)

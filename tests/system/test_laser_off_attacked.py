@@ -30,7 +30,7 @@ from uwlts.desk.request_limits import HEAD_BYTES, HEAD_S
 from uwlts.hardware.grbl import GrblStage
 
 OFF_S = 2.0
-"""Bound of a press on a busy machine; at rest it takes some ms. Before there were limits: 7 s, or for ever."""
+"""Time limit of a press on a busy machine; on an idle one it takes some ms. Without limits it took 7 s or more."""
 HALF = 1300
 LONG_LINE_BYTES = 120 * 2**20
 USUAL_FILES = 1024
@@ -58,9 +58,9 @@ print(*(line.text for line in board.lines()), sep="\\n", flush=True)
 
 
 def light(controller: GrblController, *, steady_s: float = 0.5) -> None:
-    """Light the laser as another program at the controller would: nothing but a reset ends it.
+    """Switch the laser on as another program at the controller would: only a reset ends the light.
 
-    Both processes send one for each press; on a busy machine the second comes late. So the light has to be steady.
+    Both processes send one for each press; on a busy machine the second is late. Therefore the light must be steady.
     """
 
     def lit() -> bool:
@@ -102,7 +102,7 @@ class Operated(Place):
         return time.monotonic() - began if within(OFF_S, lambda: not self.controller.state().laser_on) else None
 
     def go_on(self) -> str:
-        """Let the program go on to its next output."""
+        """Let the program continue to its next output."""
         self.program.stdin.write("\n")
         self.program.stdin.flush()
         return self.program.stdout.readline()
@@ -133,7 +133,7 @@ def operated() -> Iterator[Operated]:
 
 
 def closed(line: socket.socket) -> bool:
-    """Whether the other side has ended a connection on which it sends nothing."""
+    """Return whether the other side has closed a connection that it sends nothing on."""
     try:
         return line.recv(1, socket.MSG_DONTWAIT) == b""
     except BlockingIOError:
@@ -144,7 +144,7 @@ def closed(line: socket.socket) -> bool:
 
 @pytest.fixture
 def half_requests() -> Iterator[Callable[[int], list[socket.socket]]]:
-    """Opens many connections to a port, each with a request that has no end."""
+    """Open many connections to a port, each with an incomplete request."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (limits[1], limits[1]))
     with ExitStack() as lines:
@@ -190,12 +190,12 @@ def test_laser_off_does_not_need_the_program(operated):
     try:
         assert operated.press() == 204
         assert operated.dark_after_s() is not None
-        # What the program had sent before may light it again; resets are repeated.
+        # Earlier commands of the program may switch it on again; resets are repeated.
         light(controller, steady_s=0.0)
         assert operated.dark_after_s() is not None
     finally:
         os.kill(operated.program.pid, signal.SIGCONT)
-    # When the program has answered, nothing is sent any more.
+    # After the program's answer nothing more is sent.
     light(controller, steady_s=2.0)
 
 
@@ -268,7 +268,7 @@ def test_a_long_header_line_is_refused_and_holds_up_no_press(operated):
                 light(operated.controller)
             print(f"dark after {directly_s} s, by the page's server {by_the_server_s} s")
             assert directly_s is not None and by_the_server_s is not None
-            # What the line's buffers hold is sent before the end of the connection comes back.
+            # The contents of the line's buffers are sent before the end of the connection arrives.
             assert line.sent < LONG_LINE_BYTES / 4
     for port in (operated.page_port, operated.port):
         with socket.create_connection(("127.0.0.1", port), timeout=20) as long:
@@ -287,7 +287,7 @@ def test_half_requests_end_and_lock_nobody_out(operated, half_requests):
         browser.click(browser.buttons()["Laser off"])
         assert operated.dark_after_s() is not None
         assert sum(map(closed, held)) >= 2 * (HALF - 256)
-    # A request that is sent little by little has no more time than one that stops.
+    # A request that is sent slowly has no more time than one that stops.
     for _ in range(50):
         with suppress(OSError):
             held[-1].sendall(b"X: y\r\n")

@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EXPOSURE_MS = 0.09
 ALLOWED_S = 1e-3 * EXPOSURE_MS + 1.0
 FAULTY_LIGHT = 4
-"""The light in which a fault comes."""
+"""Number of the light with a fault."""
 PATIENCE_S = 120.0
 """Start of a scan on a busy machine."""
 LONGEST_S = 14.0
@@ -38,7 +38,7 @@ LONGEST_S = 14.0
 
 
 class FaultyCamera(DrawnCamera):
-    """Calls ``fault`` in the light of that number, before the image is sent; then it may make no image any more."""
+    """Calls ``fault`` in the light of that number, before the image is sent; afterwards it may make no more images."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -72,7 +72,7 @@ class Lit:
         )
 
     def signal(self, number: int, *, guard: bool = False) -> None:
-        """Send a signal to the program, after its guard, the only child, where that shall get it too."""
+        """Send a signal to the program, after its guard, the only child, if that is to receive it, too."""
         program = self.program.pid
         if guard:
             (child,) = map(int, Path(f"/proc/{program}/task/{program}/children").read_text().split())
@@ -134,13 +134,13 @@ CAMERA_FAULTS: dict[str, tuple[Callable[[FaultyCamera], object], str]] = {
         lambda camera: camera.inject("delay", 100, delay_s=2.0),
         "it may have been exposed in the dark .* 3 times",
     ),
-    # Its thread waits for the one in which this is called.
+    # Its thread waits for the thread of this call.
     "unplug": (
         lambda camera: (threading.Thread(target=camera.disconnect).start(), setattr(camera, "hangs", True)),
         "check power and cable",
     ),
 }
-"""What fails at the camera, and what the error names."""
+"""Faults of the camera, and the words of their errors."""
 
 
 @pytest.mark.parametrize("fault", CAMERA_FAULTS)
@@ -167,7 +167,7 @@ def test_a_broken_line_leaves_no_light(scan, fault):
     assert scan.program.returncode == 2 and re.search("hangs|does not answer|silence", errors), errors
 
 
-# Light on the way
+# Light in motion
 
 
 SPEED, STEP_MM, TRAVEL_MM = 40.0, 0.5, 300.0
@@ -199,7 +199,7 @@ class FreeCamera(GigeCamera):
 
 @contextmanager
 def passing(tmp_path: Path) -> Iterator[Scan]:
-    """A scan on its way."""
+    """A continuous scan in motion."""
     settings = {24: 600, 25: 7200, 100: 100, 110: 7200, 120: 2000, 130: TRAVEL_MM}
     with GrblController(settings=settings, boot_s=0.2) as controller, FreeCamera(controller) as camera:
         path = write_plan(tmp_path, camera, controller, count=481, step_mm=STEP_MM, laser_ms=f"{EXPOSURE_MS}")
@@ -229,12 +229,12 @@ PASS_FAULTS: dict[str, Callable[[Scan], object]] = {
 
 
 NOTICED = {"drop": 3, "unplug": 3}
-"""Tries of a fault that the program has to notice, which a busy machine delays. The controller ends other light."""
+"""Attempts for a fault that the program must notice, which a busy machine delays. The controller ends other light."""
 
 
 @pytest.mark.parametrize("fault", PASS_FAULTS)
 def test_the_laser_goes_off_on_the_way(tmp_path, fault):
-    """The image after the one of the fault should have been taken a period later."""
+    """The image after the fault should have been taken a period later."""
     dark_s = []
     while len(dark_s) < NOTICED.get(fault, 1) and min(dark_s, default=LONGEST_S) > PERIOD_S + ALLOWED_S:
         folder = tmp_path / str(len(dark_s))

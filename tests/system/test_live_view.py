@@ -1,4 +1,4 @@
-"""The page of a growing recording: what is seen of each image, and the command that serves it."""
+"""The page of a recording in progress: display of each image, and the command that serves it."""
 
 import signal
 import socket
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from uwlts.desk.board import Board
-from uwlts.desk.recording_view import RecordingView, frames_of
+from uwlts.desk.recording_view import RecordingView, follow_frames
 from uwlts.errors import CaptureError
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
@@ -52,7 +52,7 @@ def seen(path: Path, number: int, calibration: AnyCalibration | None) -> Board:
     """A board that shows one image of a recording."""
     board = Board("live")
     with Capture(path) as capture:
-        RecordingView(board, capture.header, calibration).see(capture[number], number)
+        RecordingView(board, capture.header, calibration).show(capture[number], number)
     return board
 
 
@@ -69,7 +69,7 @@ def test_an_image_shows_its_stripe_points_and_faults(thesis, tmp_path):
     good, faint, bright, empty, lamp = (seen(tmp_path / "live.h5", number, calibration) for number in range(5))
     assert "image 1, laser" in good.picture.caption and "stripe on 1,280 of 1,280 profile lines" in good.picture.caption
     assert warnings(good) == "" and good.picture.saturated == 0.0
-    # On a row near the image's middle the stripe lies near the stand-off, all along one depth.
+    # On a row near the image's middle the stripe is near the stand-off, at one depth.
     points = good.cloud.points()
     assert len(points) == 1280 and np.abs(points[:, 2]).max() < 20
     assert points[:, 3] == pytest.approx(150, abs=20)
@@ -80,7 +80,7 @@ def test_an_image_shows_its_stripe_points_and_faults(thesis, tmp_path):
     assert red.any(axis=0).mean() > 0.99
     assert "image 2: faint" in warnings(faint)
     assert "image 3: saturated" in warnings(bright) and bright.picture.saturated > 0.9
-    assert "image 4: faint" in warnings(empty) and "image 4: hardly any stripe" in warnings(empty)
+    assert "image 4: faint" in warnings(empty) and "image 4: almost no stripe" in warnings(empty)
     assert empty.cloud.total == 0
     assert "lamp" in lamp.picture.caption and "stripe" not in lamp.picture.caption and warnings(lamp) == ""
     assert lamp.position_mm == 4.0 and lamp.cloud.total == 0
@@ -94,14 +94,14 @@ def test_a_warning_is_said_once_and_a_cloud_grows(thesis, tmp_path):
         view = RecordingView(board, capture.header, nominal_calibration(thesis, thesis.medium("water")), name="wall.h5")
         totals = []
         for number in range(4):
-            view.see(capture[number], number)
+            view.show(capture[number], number)
             totals.append(board.cloud.total)
     assert [line.text.split(":")[0] for line in board.lines()] == ["image 1"]
     assert np.diff([0, *totals])[[1, 3]].tolist() == [1280, 1280] and board.pictures == 4
     # The stage moves by 1 mm from image to image.
     last = board.cloud.points()[-1280:, 0] - board.cloud.points()[totals[0] : totals[0] + 1280, 0]
     np.testing.assert_allclose(last, 2.0, atol=0.01)
-    # The next recording begins anew.
+    # The next recording starts from the beginning.
     RecordingView(board, header(thesis), None)
     assert (board.cloud.total, board.cloud_name) == (0, "live")
 
@@ -125,7 +125,7 @@ def test_a_recording_is_followed_while_it_grows(thesis, tmp_path):
     recorder = threading.Thread(target=record)
     recorder.start()
     shown, pauses = [], 0
-    for following in frames_of(path):
+    for following in follow_frames(path):
         if following is None:
             pauses += 1
             time.sleep(0.05)
@@ -142,7 +142,7 @@ def test_a_recording_is_followed_while_it_grows(thesis, tmp_path):
 def test_a_damaged_file_is_no_recording_to_wait_for(tmp_path):
     (tmp_path / "live.h5").write_bytes(b"no capture")
     with pytest.raises(CaptureError):
-        list(frames_of(tmp_path / "live.h5"))
+        list(follow_frames(tmp_path / "live.h5"))
 
 
 def test_the_page_is_served_to_this_machine_until_it_is_closed(thesis, tmp_path):

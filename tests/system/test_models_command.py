@@ -1,4 +1,4 @@
-"""What the command that compares models refuses before it works, in one line and without a traceback."""
+"""Refusals of the command that compares models, before the work, in one line and without a traceback."""
 
 from pathlib import Path
 

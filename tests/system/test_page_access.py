@@ -1,4 +1,4 @@
-"""Requests to a page as browsers, other sites and bystanders send them: what is refused, whose clicks count."""
+"""Requests to a page from browsers, other sites and bystanders: refusals, and whose clicks count."""
 
 import html
 import http.client
@@ -36,7 +36,7 @@ PROTECTION = {"X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer", "X-Co
 
 @dataclass(frozen=True)
 class Place:
-    """Where a page is found, and where its operator finds it."""
+    """Addresses of a page for viewers and for its operator."""
 
     address: str
     operator_address: str
@@ -100,7 +100,7 @@ def asked(page: Place, path: str = "/", *, method: str = "GET", **headers: str) 
 
 
 def opened(page: Place, *, client: str = "", **headers: str) -> AbstractContextManager[ClientConnection]:
-    """The connection, opened by a with, by which a browser's page sends its clicks, that of a ``client`` if given."""
+    """Connection, as a context, by which a browser's page sends its clicks, or that of a ``client`` if given."""
     place, origin = urlsplit(page.address), headers.pop("Origin", None)
     query = {"EIO": 4, "transport": "websocket"}
     if client:
@@ -143,7 +143,7 @@ class Browser:
             for number, element in self.elements.items()
             if element["tag"] == "q-btn"
         }
-        # It is no element of NiceGUI's; its event comes from the whole page.
+        # It is not a NiceGUI element; its event comes from the whole page.
         for event in self.elements["0"]["events"]:
             if event["type"] == "laser_off":
                 found["Laser off"] = (0, event["listener_id"])
@@ -175,12 +175,12 @@ class Browser:
 
 
 def pressed(page: Page) -> bool:
-    """Whether a button was pressed on a machine however busy."""
+    """Return whether a button was pressed, even on a busy machine."""
     return within(20.0, lambda: page.screen.answer() == "take")
 
 
 def ever_pressed(page: Page) -> bool:
-    """Whether a button was pressed where none must be: what is obeyed is obeyed within some ms."""
+    """Return whether a button was pressed that must not be: presses are obeyed within some ms."""
     return within(1.0, lambda: page.screen.answer() is not None)
 
 
@@ -271,7 +271,7 @@ def test_the_operators_clicks_are_obeyed_and_no_bystanders_are(page):
     operator = Browser(page, Cookie=cookie(page))
     take, off = (operator.buttons()[label] for label in ("take", "Laser off"))
     with Browser(page) as bystander:
-        # As if he knew the buttons: in his own page, and in one that he made up.
+        # With known buttons: in the viewer's own page, and in a made-up one.
         for button in (take, off):
             bystander.click(button)
             bystander.click(button, client=str(uuid.uuid4()))

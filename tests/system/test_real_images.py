@@ -1,4 +1,4 @@
-"""Import, target detection and stripe extraction on real images that others took (tests/data/README.md)."""
+"""Import, target detection and stripe extraction on real images of others (tests/data/README.md)."""
 
 import re
 from collections.abc import Iterator
@@ -227,7 +227,7 @@ def test_no_reflection_on_the_machine_beside_the_board_is_taken(etna: Capture):
 
 @pytest.mark.slow
 def test_a_folder_of_photographs_calibrates_camera_and_sheet(etna: Capture):
-    """Poses free: all of it, and halves that agree within what is stated."""
+    """Poses free: all images, and halves that agree within the stated uncertainty."""
     evidence = gather([etna], [], options=ETNA_OPTIONS)
     air = evidence.air
     assert len(air.images) == 16 and min(map(len, air.stripes)) > 700
@@ -252,7 +252,7 @@ def _mount_agrees_with_the_board(capture: Capture, calibration: Calibration, air
     seen = cloud.points_mm - np.outer(capture.stage_mm[cloud.frame], capture.header.stage_direction)
     mount = uwlts.calibrate_mount([seen[cloud.frame == n] for n in np.unique(cloud.frame)], poses, artefact="plane")
     assert all(pose.reason is None for pose in mount.poses)
-    # The plate is bent by some tenths of a millimetre and lies on a level table.
+    # The plate is bent by some tenths of a millimetre and stands on a level table.
     assert mount.rms_mm < 0.5 and mount.held_out_rms_mm < 0.8
     assert isinstance(mount.artefact, PlaneFound) and abs(mount.artefact.normal[2]) > np.cos(np.radians(3))
 

@@ -55,5 +55,5 @@ def test_circles_out_of_focus_are_found_where_they_are():
         by_model, off = (each - of_pose @ (of_pose.T @ each) for each in (by_all[good, 6:], off[good]))
         products += by_model.T @ off
         squares += (by_model**2).sum(axis=0)
-    # What a camera would be taken for whose p1 or focal length alone is estimated, every image with a pose of its own.
+    # Apparent change of a camera if p1 or the focal length alone is estimated, every image with its own pose.
     assert np.all(np.abs(products / squares) < (P1, FOCAL_PX))

@@ -1,4 +1,4 @@
-"""Campaigns recorded by several processes: gone on with after a stop, never mixed, and nothing left behind.
+"""Campaigns recorded by several processes: continued after a stop, never mixed, and without leftovers.
 
 The campaign is a small one of the tests' own, with a sensor of few pixels.
 """
@@ -117,7 +117,7 @@ def record(described: Path, folder: Path, *, name: str = "small", **how) -> Prog
 
 @pytest.fixture(scope="module")
 def rendered(described: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Progress]:
-    """A folder with the whole small campaign, and how its rendering went on."""
+    """A folder with the whole small campaign, and the progress of its rendering."""
     folder = tmp_path_factory.mktemp("rendered") / "deep" / "runs"
     return folder, record(described, folder)
 
@@ -153,7 +153,7 @@ def assert_same_images(first: Path, second: Path) -> None:
     assert np.array_equal(truths[0].centre_px, truths[1].centre_px, equal_nan=True)
 
 
-# --- what is recorded
+# --- recorded files
 
 
 def test_a_campaign_is_recorded(rendered: tuple[Path, Progress], described: Path):
@@ -212,7 +212,7 @@ def test_interrupted_takes_are_completed_and_another_seed_adds_a_campaign(
     shutil.copy(truth_path(whole), copied / "campaign-1")
     before = contents(place)
     progress = record(described, copied, seeds=range(2))
-    # Of what is not complete, all images are waited for.
+    # For incomplete recordings, all images are waited for.
     assert progress == [(done, 2 * IMAGES) for done in range(3, 2 * IMAGES + 1)]
     names = contents(rendered[0]).keys()
     assert contents(copied).keys() == names | {name.replace("campaign-0", "campaign-1") for name in names}
@@ -239,7 +239,7 @@ def test_overwriting_renders_anew(copied: Path, rendered: tuple[Path, Progress],
         assert_same_images(copied / "campaign-0" / f"{name}.h5", rendered[0] / "campaign-0" / f"{name}.h5")
 
 
-# --- what is not mixed
+# --- campaigns that are not mixed
 
 
 @pytest.mark.parametrize(
@@ -296,7 +296,7 @@ def test_wrong_descriptions_leave_nothing(described: Path, tmp_path: Path, how: 
 
 @pytest.fixture
 def reproduce(capfd, monkeypatch) -> Callable[..., tuple[int, str]]:
-    """Runs ``twin reproduce`` in this process; returns exit code and what is said, that of its own processes too."""
+    """Run ``twin reproduce`` in this process; return exit code and output, including that of its own processes."""
 
     def run(*arguments: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["twin", "reproduce", *map(str, arguments)])
@@ -310,7 +310,7 @@ def reproduce(capfd, monkeypatch) -> Callable[..., tuple[int, str]]:
 
 
 def test_a_complete_campaign_goes_on_to_its_evaluation(reproduce, rendered: tuple[Path, Progress], described: Path):
-    """Which needs the thesis's recordings, and these are none."""
+    """It needs the thesis's recordings, which these are not."""
     before = contents(rendered[0])
     arguments = ["--out", rendered[0], "--campaigns", 1, "--spp", 4]
     code, said = reproduce(described / "small.toml", *arguments)

@@ -65,7 +65,7 @@ def test_calibrated_coordinates_are_refused():
 
 
 ROWS, STAMP_NS = 8, 3_000_000
-"""Profiles in a frame, and time between them."""
+"""Number of profiles in a frame, and time between them."""
 
 
 class Counting:
@@ -81,7 +81,7 @@ class Counting:
 
     def image(self, number: int) -> np.ndarray:
         image = np.zeros((64, 96), np.uint8)
-        # Two rows as bright: half-way between them.
+        # Two equally bright rows: the position is half-way between them.
         image[10 + number % 40 : 12 + number % 40] = 200
         return image
 
@@ -116,7 +116,7 @@ def test_each_profile_of_a_frame_has_its_own_count_and_time(counting):
         camera.stop()
     numbers = np.array([(5 - frame.encoder) // 3 for frame in grabbed])
     steps = np.diff(numbers)
-    # Of the frame that was lost all profiles are.
+    # All profiles of the lost frame are missing.
     assert set(steps) == {1, 1 + ROWS} and np.flatnonzero(steps > 1) % ROWS == ROWS - 1
     for number, frame in zip(numbers, grabbed, strict=True):
         assert (frame.seen.centre_px == 10.5 + number % 40).all()
@@ -158,7 +158,7 @@ def test_a_scan_holds_the_centre_lines_that_the_twin_simulates(served, folder, b
         assert abs(np.nanmedian(apart)) <= 1 / 16 and np.nanquantile(np.abs(apart), 0.9) < 0.5
         calibration = uwlts.nominal(sensor, medium="air")
         cloud = uwlts.reconstruct(scan, calibration)
-        # But for two lines at each end of the stripe.
+        # Except for two lines at each end of the stripe.
         assert 0.9 * np.count_nonzero(lit) < len(cloud) <= np.count_nonzero(lit) and np.isnan(cloud.intensity).all()
     with ReplayCamera(tmp_path / "scan.h5") as camera, Capture(tmp_path / "scan.h5") as scan:
         camera.configure()

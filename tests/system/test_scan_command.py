@@ -60,7 +60,7 @@ def run(plan: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 
 def dark(served: ServedTwin) -> bool:
-    """Whether the laser goes off within a second."""
+    """Return whether the laser goes off within a second."""
     return within(1.0, lambda: not served.controller.state().laser_on)
 
 
@@ -97,7 +97,7 @@ def test_a_scan_of_the_served_twin_is_the_simulated_one(served, folder, board, s
             judged = subprocess.run([sys.executable, "-m", "uwlts", *line.split()], capture_output=True, text=True)
             assert judged.returncode == 0, judged.stderr
         clouds.append((tmp_path / f"{name}.evaluation.json").read_text())
-    # The served images' noise is of another draw than the simulated ones', so that the spreads differ by chance.
+    # The served images have other noise than the simulated ones, so that the spreads differ randomly.
     spreads = [float(re.search(r'"STD": ([0-9.e-]+)', text)[1]) for text in clouds]
     assert spreads[0] == pytest.approx(spreads[1], rel=0.25)
 
@@ -122,7 +122,7 @@ def test_background_is_subtracted_and_lamp_images_are_kept(served, folder, tmp_p
         _, lamp = next(iter(scan.frames()))
         laser = scan[1].image
         assert lamp.max() < 256
-        # Away from the stripe the difference is noise about 256, which stands for none.
+        # Away from the stripe the difference is noise about 256, which represents zero.
         assert np.median(laser) == pytest.approx(256, abs=1) and laser.max() > 300
 
 

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 COUNT, STEP_MM = 6, 2.0
 MANY = 55
-"""Images of a scan that cannot end by itself before it is ended."""
+"""Images of a scan that is always ended from outside first."""
 LAST_MM = START_MM + STEP_MM * (COUNT - 1)
 
 
@@ -86,7 +86,7 @@ class Bench:
         return program
 
     def wait(self, program: "subprocess.Popen[str]", lights: int) -> None:
-        """Until a running scan has had so many images with laser from now on."""
+        """Wait until a running scan has taken this many further images with laser."""
         wanted = self.camera.lit + lights
         assert within(30.0, lambda: self.camera.lit >= wanted or program.poll() is not None)
 
@@ -97,18 +97,18 @@ class Bench:
         return self.controller.state().moving
 
     def going_back(self) -> bool:
-        """Whether the stage has been at the last position for an image and has left it again."""
+        """Return whether the stage has left the last position after an image there."""
         position = self.controller.state().position_mm
         if self.camera.lit:
             self._farthest_mm = max(self._farthest_mm, position)
         return self._farthest_mm > LAST_MM - 0.01 and self.camera.lit >= COUNT and position < LAST_MM - 0.1
 
     def dark(self) -> bool:
-        """Whether the laser goes off within a second of its exposure."""
+        """Return whether the laser goes off within a second of its exposure."""
         return within(1.0, lambda: not self.lit())
 
     def kept(self) -> int | None:
-        """Images that an interrupted scan has left, every one readable; None if there is no file of it."""
+        """Return the images left by an interrupted scan, all of them readable; None without a file."""
         if not part_path(self.out).exists():
             return None
         return self._complete(part_path(self.out))
@@ -123,7 +123,7 @@ class Bench:
             return len(capture)
 
     def completed(self, count: int = COUNT, **plan: str) -> None:
-        """What is left is taken, and the capture is whole."""
+        """Resume the scan with the remaining images, and check that the capture is complete."""
         if not self.out.exists():
             done = uwlts(*self.words(self.plan(count=count, **plan)))
             assert done.returncode == 0, done.stderr
@@ -138,7 +138,7 @@ def bench(camera: DrawnCamera, tmp_path: Path) -> Iterator[Bench]:
 
 
 def test_a_scan_killed_at_twelve_moments_loses_nothing(bench):
-    """Each run is killed so many ms after the laser's first, second or fourth light: in it or after it."""
+    """Each run is killed some ms after the laser's first, second or fourth light: in it or after it."""
     kept, plan = 0, bench.plan(count=MANY)
     moments = [(light, after_ms) for after_ms in (0, 3, 10, 30) for light in (1, 2, 4)]
     for light, after_ms in moments:
@@ -149,7 +149,7 @@ def test_a_scan_killed_at_twelve_moments_loses_nothing(bench):
         assert program.wait() == -signal.SIGKILL
         assert bench.dark(), (light, after_ms)
         found = bench.kept()
-        # An image that is being taken is lost, and no other.
+        # Only an image in progress is lost.
         assert found is None or found >= kept
         kept = found or kept
     assert kept > len(moments)
@@ -176,7 +176,7 @@ PHASES: dict[str, Callable[[Bench], bool]] = {
     "exposing": lambda bench: bench.camera.lit >= 2 and bench.lit(),
     "checking": lambda bench: bench.going_back(),
 }
-"""Phases of a scan and how each is noticed from outside."""
+"""Phases of a scan, and how each is detected from outside."""
 FAULTS = {
     "camera": "check power and cable",
     "stage": "gone|connection|lost",
@@ -185,7 +185,7 @@ FAULTS = {
     "restart": "restarted by itself",
     "break-laser": "no laser light|the laser has failed|shows no stripe",
 }
-"""What fails, and what the message names."""
+"""Faults, and the words of the message."""
 
 
 @pytest.mark.parametrize("fault", FAULTS)

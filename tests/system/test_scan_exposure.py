@@ -30,7 +30,7 @@ travel_mm = 400.0
 resolution_mm = 0.01
 settling_s = 0.0
 """
-# A board, and between the positions that are looked at beforehand a bar 60 mm nearer.
+# A board, and a bar 60 mm nearer between the positions of the automatic exposure.
 BAR = """
 title = "Board and bar"
 medium = "air"
@@ -84,14 +84,14 @@ def test_it_agrees_with_the_twin(folder, sensor, tmp_path, name, placement):
     way = (motion.count - 1) * motion.step_mm
     scene = scene.model_copy(update={"motion": motion.model_copy(update={"count": 3, "step_mm": way / 2})})
     with serve(scene, sensor=sensor, spp=16, speed_up=50.0) as served:
-        # A sphere that just touches the sheet, at the last position, is faint, and this is said.
+        # A sphere that just touches the sheet, at the last position, is faint, as a warning states.
         assert "saturated" not in scanned(scene, served, folder, tmp_path / "scan.h5")
         expected = served.exposure_ms
     with Capture(tmp_path / "scan.h5") as scan:
         for laser_on, light in ((True, "laser"), (False, "lamp")):
             used = set(scan.exposure_ms[scan.laser_on == laser_on].round(4).tolist())
-            # One exposure for each light. Both bring all but 2 % of the lit lines to 80 % of the full scale; here with
-            # shot noise, of whose values on the pixels at the peak the highest counts, and read to within 10 %.
+            # One exposure for each light. Both bring all but 2 % of the lit lines to 80 % of full scale. Here the
+            # maximum of several pixels with shot noise counts at each peak; accuracy 10 %.
             assert len(used) == (light in scene.motion.lights)
             for exposure_ms in used:
                 assert exposure_ms == pytest.approx(expected[light], rel=0.25)
@@ -117,7 +117,10 @@ def test_what_comes_nearer_later_is_taken_again_with_a_shorter_exposure(folder, 
     # The dim board behind the bar is faint from there on, which is said at the end.
     assert said.count("saturated on many lines: exposed by") == said.count("from here on") == 1
     # A machine that has other work may lose images on their way, which are taken again and mentioned.
-    assert said.count("warning:") - said.count("lost on their way") == 2 and "laser images are faint" in said
+    assert (
+        said.count("warning:") - said.count("lost between camera and computer") == 2
+        and "laser images are faint" in said
+    )
 
 
 def watched(folder: Path, served: ServedTwin, out: Path, *, count: int) -> subprocess.Popen[str]:
@@ -138,7 +141,7 @@ def watched(folder: Path, served: ServedTwin, out: Path, *, count: int) -> subpr
 
 
 def refused(address: str) -> bool:
-    """Whether the page goes within five seconds."""
+    """Return whether the page ends within five seconds."""
     deadline = time.monotonic() + 5
     while time.monotonic() < deadline:
         try:
@@ -182,7 +185,7 @@ def test_the_page_is_there_while_the_scan_runs_and_ends_with_it(folder, sensor, 
 
 
 def test_a_bracket_multiplies_the_exposure_that_was_found(folder, sensor, tmp_path):
-    """Long exposures of a bright board are saturated on purpose: nothing is shortened, and nothing warned of."""
+    """Long exposures of a bright board are saturated on purpose: no exposure is shortened, and there is no warning."""
     scene = load_scene("plane", placement="near")
     motion = {"count": 3, "bracket": (1.0, 4.0, 16.0), "lights": ("lamp", "laser")}
     scene = scene.model_copy(update={"motion": scene.motion.model_copy(update=motion)})

@@ -1,4 +1,4 @@
-"""Everything that can go wrong with camera, stage and laser happens to real runs of ``uwlts scan`` at a served twin."""
+"""All faults of camera, stage and laser in real runs of ``uwlts scan`` at a served twin."""
 
 import re
 import subprocess
@@ -24,13 +24,13 @@ MOTION = ("start_mm = -20.0", "step_mm = 2.0", "count = 21")
 DESCRIPTIONS = {
     "sensor": small_sensor("travel_mm = 160.0", "resolution_mm = 0.01", "settling_s = 0.0"),
     "board": turned_board(*MOTION),
-    # Half of the scan passes a narrow board: the stripe is rightly absent at first and at last.
+    # Half of the scan passes a narrow board: the stripe is correctly absent at both ends.
     "narrow": turned_board(*MOTION, width_mm=20.0),
 }
 
 STAGE_FAULTS = {
-    "stall": "stall: the stage has stood at",
-    "stop-short:200": "missed steps: .* read back where",
+    "stall": "stall: the stage has been at",
+    "stop-short:200": "missed steps: the position is .* where",
     "alarm:1": "ALARM:1",
     "hold": "feed hold|is held",
     "restart": "restarted by itself",
@@ -39,9 +39,9 @@ STAGE_FAULTS = {
     "cut-line": "the controller hangs|does not answer",
     "break-laser": "the laser has failed: at .*, where its stripe was seen before",
 }
-"""Faults that end a scan, and what the message names."""
+"""Faults that end a scan, and the words of the message."""
 LOST_FRAMES = {"drop": 1, "cut": 2, "repeat": 1, "delay:4": 1}
-"""Faults after which the image is asked for again, and how many of them come here."""
+"""Faults after which the image is requested again, and their number here."""
 
 
 @contextmanager
@@ -68,12 +68,12 @@ def scan(plan: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 
 def dark(served: ServedTwin) -> bool:
-    """Whether the laser goes off within a second."""
+    """Return whether the laser goes off within a second."""
     return within(1.0, lambda: not served.controller.state().laser_on)
 
 
 def ended(done: subprocess.CompletedProcess[str], says: str) -> None:
-    """The user is told in one line what happened."""
+    """One line informs the user."""
     errors = [line for line in done.stderr.splitlines() if line.strip()]
     assert done.returncode == 2, done.stderr
     assert len(errors) == 1 and errors[0].startswith("error:"), done.stderr
@@ -93,7 +93,7 @@ def planned(served: ServedTwin, count: int) -> np.ndarray:
 
 
 def test_a_scan_meets_one_fault_after_the_other_and_goes_on_after_each(board, sensor, folder, tmp_path):
-    """Each run confirms its first image by one without laser, takes the next one, at which the fault comes."""
+    """Each run confirms its first image by one without laser, and takes the next one, where the fault occurs."""
     names, out = list(STAGE_FAULTS), tmp_path / "scan.h5"
     count = 2 * len(names) + 1
     faults = [f"{name}@{3 * (k + 1)}" for k, name in enumerate(names)]
@@ -107,7 +107,7 @@ def test_a_scan_meets_one_fault_after_the_other_and_goes_on_after_each(board, se
             assert dark(served), name
             assert not out.exists()
             found = positions(part_path(out))
-            # A fault that comes with the image that is being taken may cost this image, but no other.
+            # A fault during an image may cost this image, but no other.
             assert kept < len(found) <= kept + 2, name
             np.testing.assert_allclose(found, planned(served, len(found)), atol=0.011)
             kept = len(found)
@@ -140,7 +140,7 @@ def test_frames_lost_on_their_way_are_taken_again(board, sensor, folder, tmp_pat
 def test_a_camera_that_loses_every_frame_ends_the_scan(board, sensor, folder, tmp_path):
     with serving(board, sensor, "cut:3@3") as served:
         plan, out = written(folder, served, count=4), tmp_path / "scan.h5"
-        ended(scan(plan, out), "short: parts of it were lost .* 3 times")
+        ended(scan(plan, out), "incomplete: packets were lost.* 3 times")
         assert dark(served)
         np.testing.assert_allclose(positions(part_path(out)), planned(served, 1), atol=0.011)
         assert scan(plan, out, "--resume").returncode == 0
@@ -193,14 +193,14 @@ def test_an_object_out_of_view_is_no_broken_laser(folder, sensor, tmp_path):
 
 @pytest.mark.parametrize("steps", [20, -20])
 def test_steps_that_the_motor_loses_show_at_the_end(board, sensor, folder, tmp_path, steps):
-    """The controller cannot know, but the board leans, so that the stripe tells where the stage is."""
+    """The controller cannot detect it, but the board is tilted, so that the stripe shows the stage's position."""
     out = tmp_path / "scan.h5"
     with serving(board, sensor, f"lose-steps:{steps}@5") as served:
         plan = written(folder, served, count=6)
         done = scan(plan, out)
         ended(done, "the stage has lost steps")
-        # The third image, which tells how the stripe moves, came before the slip. Noise of 0.2 px on 96 lines, on which
-        # the stripe moves by 3 px/mm, is 0.02 mm with what neighbouring lines share.
+        # The third image, which shows the stripe's motion, was taken before the slip. Noise of 0.2 px on 96 lines with
+        # a motion of 3 px/mm is 0.02 mm, including the correlation of neighbouring lines.
         stood_mm, error_mm = map(float, re.search(r"stood (\S+) mm \(std (\S+) mm\)", done.stderr).groups())
         assert stood_mm == pytest.approx(steps * sensor.stage.resolution_mm, abs=0.04) and error_mm < 0.03
         assert dark(served)

@@ -1,4 +1,4 @@
-"""The served twin through the real drivers: what stage, laser and exposure do to the picture, and its faults."""
+"""The served twin through the real drivers: effects of stage, laser and exposure on the image, and faults."""
 
 import re
 import signal
@@ -81,16 +81,16 @@ def grab_lit(camera: CameraDevice, stage: GrblStage, *, power: float = 1.0) -> n
 
 
 def centres(image: np.ndarray) -> np.ndarray:
-    """Stripe centres (96,) in px, nan where there is none."""
+    """Stripe centres (96,) in px, nan without a stripe."""
     return extract_stripe(image, stripe_along="width").centre_px
 
 
-# What a frame shows
+# Content of a frame
 
 
 @pytest.mark.slow
 def test_a_scan_shows_what_simulate_shows(served, stage, camera, board, sensor, tmp_path):
-    """Same places, errors of the stage included: same stripe, but for the noise."""
+    """Same positions, including errors of the stage: same stripe, apart from the noise."""
     record_scene(board, sensor, tmp_path / "board.h5", options=Options(spp=4))
     with Capture(tmp_path / "board.h5") as capture:
         expected = [image for _, image in capture.frames()]
@@ -105,8 +105,8 @@ def test_a_scan_shows_what_simulate_shows(served, stage, camera, board, sensor, 
         apart = np.abs(centres(one) - centres(other))
         assert np.isfinite(apart).mean() > 0.9
         assert np.nanmedian(apart) < 0.1
-        # Both have the same speckle and fixed pattern. What differs is the readout's noise, 22 electrons of 0.0253 DN,
-        # and rounding, 1 / sqrt(12) DN, of both images: 0.89 DN; the stripe's few pixels add some shot noise.
+        # Both have the same speckle and fixed pattern. They differ by the readout's noise, 22 electrons of 0.0253 DN,
+        # and by rounding, 1 / sqrt(12) DN, of both images: 0.89 DN; the stripe's few pixels add some shot noise.
         assert 0.8 < np.std(one.astype(float) - other) < 1.0
     # The stripe moves from place to place by far more than that.
     assert all(abs(np.nanmedian(centres(b) - centres(a))) > 1 for a, b in pairwise(seen))
@@ -169,7 +169,7 @@ def test_a_laser_that_breaks_leaves_the_dark(served, stage, camera):
         served.controller.inject("break-laser", 0)
 
 
-# Where the scene lies
+# Position of the scene
 
 
 def test_the_motion_lies_in_the_middle_of_the_travel_or_where_it_is_wanted(served, board, sensor):

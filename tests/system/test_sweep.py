@@ -1,6 +1,6 @@
-"""Whole sweeps by the command: stopped and gone on with, shared, on a Dask cluster that loses a worker, and their end.
+"""Whole sweeps by the command: stopped and continued, shared, on a Dask cluster that loses a worker, and their end.
 
-Only formulas are asked here; what rendering says of designs is tested with the verification.
+Only formulas are used here; the rendering of designs is tested with the verification.
 """
 
 import json
@@ -65,7 +65,7 @@ def workers() -> Iterator[Workers]:
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory: pytest.TempPathFactory, workers: Workers) -> dict[str, np.ndarray]:
-    """All designs of the study, judged in one go."""
+    """All designs of the study, evaluated in one run."""
     folder = tmp_path_factory.mktemp("expected")
     (folder / "study.toml").write_text(STUDY, encoding="utf-8")
     screen(load_study(folder / "study.toml"), folder / "out", workers)
@@ -140,7 +140,7 @@ def test_a_finished_sweep_has_page_table_summary_and_a_sensor_that_works(study, 
     assert sensor.laser.baseline_mm == pytest.approx(winner["laser.baseline_mm"])
     assert len((out / "designs.csv").read_text().splitlines()) == 8001
     assert "<html" in (out / "report.html").read_text(encoding="utf-8")
-    # Run again there is nothing left to judge.
+    # When run again, there is nothing left to evaluate.
     before = contents(out)
     assert run(study, out).returncode == 0
     assert contents(out) == before
@@ -198,8 +198,8 @@ def test_an_optimiser_beats_chance_and_goes_on_where_it_was(study, tmp_path):
         assert len(read_parts(out / "screen")["design"]) == count
     columns = read_parts(out / "screen")
     meets = columns["violation"] == 0
-    # By chance 0.39 of all designs meet the constraint, 0.035 more or less of 200. The optimiser looks where it holds;
-    # what it proposes depends on which designs are judged when it does, so that 0.53 to 0.69 were seen.
+    # A fraction of 0.39 of all designs meets the constraint, 0.035 more or less of 200. The optimiser searches there;
+    # its proposals depend on the designs evaluated before them, so that 0.53 to 0.69 were seen.
     assert meets[-200:].mean() > 0.45
 
 

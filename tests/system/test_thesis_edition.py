@@ -179,10 +179,10 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
     # a single one does (Szekely and Bakirov 2003, Probab. Theory Relat. Fields 126:184): 6.3e-5 beyond 4 sigma.
     assert np.mean((errors[JOINT] / stated) ** 2) < 4.0**2
 
-    # The stated uncertainty hardly depends on the noise that was drawn: its level follows from some ten thousand stripe
-    # centres and circles, to a few percent, and from descriptions. 30 % are far beyond a probability of 1e-4. It may
-    # neither shrink to half or a third (too sure) nor grow (an advantage lost); that it is right is shown by the
-    # simulated campaigns of tests/uwlts/calibration/joint/test_coverage.py.
+    # The stated uncertainty depends little on the drawn noise: its level follows from some ten thousand stripe centres
+    # and circles, to a few percent, and from descriptions. 30 % are far beyond a probability of 1e-4. It may neither
+    # shrink to half or a third (overconfident) nor grow (an advantage lost); the simulated campaigns of
+    # tests/uwlts/calibration/joint/test_coverage.py show that it is correct.
     assert 0.0204 / 1.3 < root_mean_square(stated) < 0.0204 * 1.3
 
     # Factors of 7.7 and 8.7 are expected, and 3 is required: a joint estimate whose errors are 2.6 times larger fails.

@@ -48,12 +48,12 @@ def design(request: pytest.FixtureRequest, thesis: Sensor) -> Sensor:
 
 @pytest.fixture(params=[name for name in DESIGNS if name != "distorted"])
 def pinhole(request: pytest.FixtureRequest, thesis: Sensor) -> Sensor:
-    """One of the sensors without distortion, which the oracle knows nothing of."""
+    """One of the sensors without distortion, which the oracle does not model."""
     return altered(thesis, DESIGNS[request.param])
 
 
 def origins(scene: Scene) -> np.ndarray:
-    """Z (K,) in the OCS at which the sensor sees the scene's origin at each of its places."""
+    """Z (K,) in the OCS of the scene's origin at each position of the sensor."""
     motion = scene.motion
     return -(motion.start_mm + motion.step_mm * np.arange(motion.count))
 
@@ -222,14 +222,14 @@ def test_a_cloud_with_too_few_points_everywhere_is_refused():
 
 
 def test_the_thesiss_sensor_measures_a_plane_in_water(thesis, tmp_path):
-    """Loose physical bounds; what matters is that twin and software, which share no mathematics, agree."""
+    """Loose physical bounds; the point is that twin and software, which share no mathematics, agree."""
     found = verify(thesis, "water", tmp_path, seed=3)
     assert len(found.z_mm) == STANDARD_DEPTHS and (np.diff(found.z_mm) > 0).all()
     assert (found.points > 0.95 * thesis.camera.lines()).all()
     # Speckle of contrast 0.5 to 0.7 over a stripe of some 0.3 mm moves its centre by 0.02 to 0.03 mm along Z.
     assert ((found.scatter_mm > 0.01) & (found.scatter_mm < 0.06)).all()
     assert (np.abs(found.error_mm) < 0.1).all()
-    # The line's length grows with the distance, and lies between the designer's figures for 640 and 1280 columns.
+    # The line's length grows with the distance, and is between the designer's figures for 640 and 1280 columns.
     assert (np.diff(found.line_mm) > 0).all()
     assert ((found.line_mm > 100) & (found.line_mm < 220)).all()
     # Seven step images give the window's distance with a standard deviation of 0.07 mm; seven of them.

@@ -2,7 +2,7 @@
 
 import sys
 
-# Importing them adds their commands.
+# Their import registers the commands.
 from uwlts.cli import calibration, describing, findings, measuring, recording
 from uwlts.cli.options import app
 from uwlts.runtime.console import run
@@ -11,5 +11,5 @@ __all__ = ["app", "calibration", "describing", "findings", "main", "measuring", 
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the command line of this process."""
     sys.exit(run(app))

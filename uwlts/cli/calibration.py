@@ -1,4 +1,4 @@
-"""Commands that calibrate, and about the quality of a calibration: model comparison, certificate and verification."""
+"""Commands for calibration and its quality: model comparison, certificate and verification."""
 
 import sys
 from pathlib import Path
@@ -23,7 +23,7 @@ def calibrate(
     live: Annotated[
         Path | None,
         Parameter(
-            help="Plan (TOML, docs/how-to/calibrate-live.md) of a guided calibration with camera and stage, in place "
+            help="Plan (TOML, docs/how-to/calibrate-live.md) of a guided calibration with camera and stage, instead "
             "of captures: leads through the images, rejects bad ones with the reason, and records the good ones beside "
             "the calibration."
         ),
@@ -79,8 +79,8 @@ def camera(
         Path,
         a_file(".yaml", ".yml", beside=".html"),
         Parameter(
-            help="ROS CameraInfo to write (YAML), which uwlts import reads as intrinsics, and a page with all images "
-            "beside it, those left out with the reason."
+            help="ROS CameraInfo to write (YAML), which uwlts import reads as intrinsics; a page beside it shows all "
+            "images, rejected ones with the reason."
         ),
     ],
     overwrite: Overwrite = False,
@@ -114,7 +114,7 @@ def refresh(
     call: Call,
     *,
     out: Annotated[
-        Path | None, a_file(".json"), Parameter(help="Calibration to write; CALIBRATION.refreshed.json unless given.")
+        Path | None, a_file(".json"), Parameter(help="Calibration to write; by default CALIBRATION.refreshed.json.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -164,7 +164,7 @@ def certificate(
     check: Annotated[
         Path | None,
         Parameter(
-            help="Certificate (JSON) to verify against the calibration, in place of writing one: exit code 1 if it was "
+            help="Certificate (JSON) to verify against the calibration, instead of writing one: exit code 1 if it was "
             "changed or belongs to another calibration."
         ),
     ] = None,
@@ -180,7 +180,7 @@ def certificate(
         if call.given.keys() & {"out", "before"}:
             raise DescriptionError("`check` verifies and writes nothing: give it without `out` and `before`")
         against = uwlts.report.check_certificate(check, calibration)
-        print("\n".join(against) or f"{check} is as it was issued, and is about {calibration}")
+        print("\n".join(against) or f"{check} is unchanged, and belongs to {calibration}")
         if against:
             sys.exit(1)
         return
@@ -191,7 +191,7 @@ def certificate(
 
 @derived(app, uwlts, "verify")
 def verify(call: Call) -> None:
-    """Answers pass or fail: exit code 0 or 1.
+    """Answer pass or fail: exit code 0 or 1.
 
     Example: uwlts verify step.h5 --calibration calibration.json --limit-mm 0.05
     """

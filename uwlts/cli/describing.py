@@ -1,4 +1,4 @@
-"""Commands about sensors and files: what a design can do, what a file holds, and other formats."""
+"""Commands about sensors and files: properties of a design, content of a file, and other formats."""
 
 from pathlib import Path
 

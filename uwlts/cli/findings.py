@@ -1,4 +1,4 @@
-"""Commands that judge measured objects: what changed, features, the gauge, and reports."""
+"""Commands that evaluate measured objects: changes, features, gauge studies, and reports."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from uwlts.cli.options import (
 from uwlts.runtime.command_line import Call, derived, show
 
 _INSPECTIONS = [(uwlts, f"inspect_{kind}") for kind in ("pipe", "weld", "flange")]
-"""Functions whose options an inspection has."""
+"""Functions that provide the options of an inspection."""
 
 
 @derived(app, uwlts, "evaluate")
@@ -52,7 +52,7 @@ def compare(
         Path | None,
         a_file(".ply", ".laz", ".las"),
         Parameter(
-            help="Also write the places in the colours of the map, with distance, level of detection and significance, "
+            help="Also write the points in the colours of the map, with distance, level of detection and significance, "
             "to this PLY, LAZ or LAS file."
         ),
     ] = None,
@@ -136,7 +136,7 @@ def findings_report(
 
 @derived(app, uwlts.report, "write_campaign")
 def report(call: Call) -> None:
-    """Prints a table.
+    """Print a table.
 
     Example: uwlts report runs/demo --reference thesis
     """

@@ -18,8 +18,8 @@ def reconstruct(
         Path,
         Before(a_cloud),
         Parameter(
-            help="Cloud to write, by its ending PLY, HDF5 (.h5) or another format of uwlts export, with intensity, "
-            "frame and line of every point, and from a joint calibration its uncertainty."
+            help="Cloud to write: PLY, HDF5 (.h5) or another format of uwlts export, by its ending; with intensity, "
+            "frame and line of every point, and its uncertainty if the calibration is a joint one."
         ),
     ],
     overwrite: Overwrite = False,
@@ -52,13 +52,13 @@ def register(
     out: Annotated[
         Path,
         Before(a_cloud),
-        Parameter(help="Merged cloud to write, in the format that its ending names, as for uwlts export."),
+        Parameter(help="Merged cloud to write, in the format of its ending, as for uwlts export."),
     ],
     page: Annotated[
         Path | None,
         a_page("registration"),
         Parameter(
-            help="Page to write, with all figures, poses and their covariance as JSON beside it: of pipe.html, "
+            help="Page to write, with all figures, poses and their covariance as JSON beside it: for pipe.html, "
             "pipe.registration.json."
         ),
     ] = None,

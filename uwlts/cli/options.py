@@ -1,4 +1,4 @@
-"""The ``uwlts`` command line itself, and the options that several commands have beside their functions' own."""
+"""The ``uwlts`` command line, and options that several commands have in addition to their functions'."""
 
 import pkgutil
 from collections.abc import Callable, Iterable
@@ -25,7 +25,7 @@ app = App(
 if TYPE_CHECKING:
     MethodName = str
 else:
-    # The names of the modules in uwlts.stripe.methods, which are not imported for a command's help.
+    # Names of the modules in uwlts.stripe.methods, which are not imported for a command's help.
     _METHODS = Path(__file__).parents[1] / "stripe" / "methods"
     _NAMES = sorted(m.name.replace("_", "-") for m in pkgutil.iter_modules([str(_METHODS)]))
     MethodName = Literal[(*_NAMES, "learned")]
@@ -36,12 +36,14 @@ STRIPE = Shortcuts(
         "method": Annotated[
             MethodName | None,
             Parameter(
-                help="How the stripe's centre is found; learned needs --stripe model=FILE.onnx (docs: learned_stripe)."
+                help="Method for the stripe's centre; learned needs --stripe model=FILE.onnx (docs: learned_stripe)."
             ),
         ],
         "peak": Annotated[
             Literal["direct", "strongest", "first", "last"] | None,
-            Parameter(help="Which of several stripes on a line counts; the direct one, or as the sensor's table says."),
+            Parameter(
+                help="Which of several stripes on a line counts; by default that of the sensor's table, or direct."
+            ),
         ],
     },
 )
@@ -49,14 +51,14 @@ STRIPE = Shortcuts(
 
 
 def a_cloud(path: Path, *, overwrite: bool, coloured: bool = False) -> None:
-    """Refuse a cloud that cannot be written; imported when it is needed, as the commands' help needs no NumPy."""
+    """Refuse a cloud that cannot be written; imports its module on use, because the help needs no NumPy."""
     from uwlts.storage import cloud_files
 
     cloud_files.refuse_unsuitable_cloud(path, overwrite=overwrite, coloured=coloured)
 
 
 def a_page(kind: str = "") -> Before:
-    """Check of a page, and of the JSON beside it."""
+    """Return the check of a page, and of the JSON beside it."""
 
     def check(path: Path, *, overwrite: bool) -> None:
         from uwlts.pages.toolkit import refuse_unsuitable_page
@@ -67,7 +69,7 @@ def a_page(kind: str = "") -> Before:
 
 
 def a_file(*endings: str, beside: str = "") -> Before:
-    """Check of a file whose name has one of some endings, and of one that gets another ending beside it."""
+    """Return the check of a file with one of some endings, and of the file with another ending beside it."""
 
     def check(path: Path, *, overwrite: bool) -> None:
         refuse_unsuitable(path, overwrite=overwrite, endings=endings)
@@ -83,14 +85,14 @@ ColouredOut = Annotated[
     Path | None,
     Before(partial(a_cloud, coloured=True)),
     Parameter(
-        help="Also write the cloud coloured by the deviation of every point from the surface, with these in mm, to "
-        "this PLY, LAZ, LAS, E57 or HDF5 file."
+        help="Also write the cloud coloured by the deviation of every point from the surface, with deviations in mm, "
+        "to this PLY, LAZ, LAS, E57 or HDF5 file."
     ),
 ]
 
 
 def write_coloured(path: Path, cloud: "PointCloud", limit_mm: Callable[..., float], *, overwrite: bool) -> None:
-    """Write a cloud with its deviations in the colours of the pages, which end at a limit."""
+    """Write a cloud with its deviations in the colours of the pages, limited to a range."""
     import numpy as np
 
     from uwlts.report.plot import deviation_colours
@@ -102,17 +104,17 @@ def write_coloured(path: Path, cloud: "PointCloud", limit_mm: Callable[..., floa
 
 
 def wrote(lines: Iterable[str], warnings: Iterable[str], *paths: Path | None) -> None:
-    """Print a result, warnings about it, and the files it was written to."""
+    """Print a result, its warnings, and the files written."""
     show(lines)
     warn(*warnings)
     wrote_files(*paths)
 
 
 def wrote_files(*paths: Path | None) -> None:
-    """Print the files that a result was written to."""
+    """Print the files written for a result."""
     print(f"wrote {', '.join(str(path) for path in paths if path is not None)}")
 
 
 def wrote_page(page: Path) -> None:
-    """Print a page and the JSON beside it that a result was written to."""
+    """Print the page written for a result, and the JSON beside it."""
     print(f"wrote {page} and {page.with_suffix('.json').name}")

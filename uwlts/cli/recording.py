@@ -31,7 +31,7 @@ def desk(call: Call) -> None:
 
 @derived(app, uwlts, "examine")
 def doctor(call: Call) -> None:
-    """Ends with exit code 1 if something required, or something named here, is missing or does not work.
+    """End with exit code 1 if something required, or something named here, is missing or does not work.
 
     Example: uwlts doctor --camera gige: --stage /dev/ttyACM0
     """

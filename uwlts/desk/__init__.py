@@ -1,1 +1,1 @@
-"""The operator's page: scan, calibrate, look and measure in a browser."""
+"""Operator's page: scan, calibrate, view and measure in a browser."""

@@ -1,7 +1,7 @@
-"""Access control of the page: requests of other sites are refused, and only the operator's clicks count.
+"""Access control of the page: requests of other sites are refused, and only the operator can control anything.
 
-The rules stand in front of the whole application (ASGI), so that they hold for pages, files and the connection by which
-browsers send clicks. Who only looks gets a page without a single control, so there is nothing of his to obey.
+The rules apply in front of the whole application (ASGI): to pages, files and the connection for the browsers' events.
+Viewers get a page without controls, so that they cannot send events.
 """
 
 import hmac
@@ -25,14 +25,14 @@ _PROTECTION = (
     (b"referrer-policy", b"no-referrer"),
     (b"x-content-type-options", b"nosniff"),
 )
-"""Headers of every answer: no other site shows the page in a frame of its own, or learns its address."""
+"""Headers of every response: no other site can show the page in a frame, or learn its address."""
 
 _MOST_VIEWED = 100
-"""Every window of a viewer holds one connection, and some requests for a moment; a process may open 1024 files."""
+"""Each window of a viewer has one connection, and briefly some requests; a process may open 1024 files."""
 
 
 def is_local(host: str) -> bool:
-    """Whether an address to serve at can be reached from this machine only."""
+    """Return whether a host is reachable from this machine only."""
     return host == "localhost" or _is_loopback(host)
 
 
@@ -50,10 +50,10 @@ def _is_loopback(name: str) -> bool:
 
 @dataclass(frozen=True)
 class PageAccess:
-    """Rules of a page that is served at ``host``.
+    """Access rules of a page that is served at ``host``.
 
-    Everybody who reaches it may look. The operator opens it with the ``token`` in the address, which the browser keeps
-    in a ``cookie`` of this name: cookies are shared by all ports of a machine.
+    Everybody who can reach it may view it. The operator opens it with the ``token`` in the address. The browser then
+    keeps the token in the ``cookie``, which has a unique name because all ports of a machine share cookies.
     """
 
     host: str
@@ -61,9 +61,9 @@ class PageAccess:
     cookie: str = field(default_factory=lambda: f"uwlts-operator-{secrets.token_hex(4)}")
 
     def refusal(self, headers: Headers, *, page_port: int | None = None) -> str | None:
-        """Why a request is refused: its Host is not this machine's, as after DNS rebinding, or another site sent it.
+        """Return why a request is refused: a foreign Host, as after DNS rebinding, or a request from another site.
 
-        ``page_port`` is the port of the page whose requests are accepted, if it is another port than the request's.
+        ``page_port`` is the port of the page whose requests are accepted, if it differs from the request's port.
         """
         hosts, origins = headers.getlist("Host"), headers.getlist("Origin")
         if len(hosts) != 1 or not self._is_own(hosts[0]):
@@ -71,7 +71,7 @@ class PageAccess:
         own, foreign = [hosts[0].lower()], {"cross-site", "same-site"}
         if page_port is not None:
             name = _HOST.sub(r"\1", own[0])
-            # Browsers leave out port 80, and count another port of one machine to the same site.
+            # Browsers omit port 80, and treat another port of the same machine as the same site.
             own, foreign = [f"{name}:{page_port}", *[name] * (page_port == 80)], {"cross-site"}
         for origin in origins:
             parts = urlsplit(origin)
@@ -83,7 +83,7 @@ class PageAccess:
         return None
 
     def _is_own(self, host: str) -> bool:
-        """Whether a Host, with or without port, is this page's. Port forwarding may change the port."""
+        """Return whether a Host, with or without port, is this page's; port forwarding may change the port."""
         found = _HOST.fullmatch(host)
         if not found:
             return False
@@ -94,13 +94,13 @@ class PageAccess:
         if is_local(self.host):
             return False
         if bound is not None and bound.is_unspecified:
-            # A page that was rebound to this machine still has its own name, never a number.
+            # After DNS rebinding the Host is still the attacker's name, never an IP address.
             own = socket.gethostname().lower()
             return _address(name) is not None or name in (own, f"{own}.local")
         return name == self.host.lower() or (bound is not None and _address(name) == bound)
 
     def is_operator(self, headers: Headers) -> bool:
-        """Whether a request has the token's cookie."""
+        """Return whether a request has the token's cookie."""
         for line in headers.getlist("Cookie"):
             try:
                 kept = SimpleCookie(line).get(self.cookie)
@@ -114,7 +114,7 @@ class PageAccess:
         return hmac.compare_digest(text.encode(), self.token.encode())
 
     def answer(self, scope: Scope) -> Response | None:
-        """Answer to a request that is refused or has the token in its address; None for the application's own."""
+        """Return the response to a refused request, or to one with the token; None if the application responds."""
         headers = Headers(scope=scope)
         if (why := self.refusal(headers)) is not None:
             return PlainTextResponse(f"{why}\n", http.HTTPStatus.FORBIDDEN)
@@ -124,14 +124,14 @@ class PageAccess:
         if len(given) != 1 or not self._is_token(given[0]):
             why = "this token is not the page's: open the address that it printed"
             return PlainTextResponse(f"{why}\n", http.HTTPStatus.FORBIDDEN)
-        # A path that begins with two slashes would lead to another site.
+        # A path that begins with two slashes would redirect to another site.
         moved = RedirectResponse(f"/{scope['path'].lstrip('/')}", http.HTTPStatus.SEE_OTHER)
         moved.set_cookie(self.cookie, self.token, httponly=True, samesite="strict")
         return moved
 
 
 class GuardedApp:
-    """An ASGI application behind the rules, whose answers are framed by no other site and tell none its address.
+    """An ASGI application behind the access rules, with protective headers in all responses.
 
     It serves a limited number of viewers' requests and connections at once, and any number of the operator's.
     """
@@ -149,7 +149,7 @@ class GuardedApp:
             why = f"{_MOST_VIEWED} requests of viewers are being served: close other windows of this page"
             answer, viewer = PlainTextResponse(f"{why}\n", http.HTTPStatus.SERVICE_UNAVAILABLE), False
         if answer is not None and scope["type"] == "websocket":
-            # Before it is accepted: the browser sees status 403.
+            # Closed before it is accepted: the browser sees status 403.
             await WebSocketClose()(scope, receive, send)
             return
 

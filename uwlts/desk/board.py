@@ -1,4 +1,4 @@
-"""State shown on the page: written by worker threads, read by the page of every browser."""
+"""State shown on the page, written by worker threads and read by the page of every browser."""
 
 import threading
 import time
@@ -15,7 +15,7 @@ from uwlts.desk.thinned_cloud import ThinnedCloud
 
 Kind = Literal["note", "warning", "error"]
 LaserState = Literal["none", "off", "flashing", "on", "unknown"]
-"""None is connected; off; lit while images are exposed; lit; its controller cannot be reached."""
+"""No laser connected; off; on while images are exposed; on; controller unreachable."""
 _LONGEST_SIDE_PX = 1000
 _BINS = 64
 KEPT_LINES = 1000
@@ -24,10 +24,10 @@ _FOUND, _STRIPE = (0, 140, 0), (40, 60, 255)
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image (H, W) to be shown, with the pixels (N, 2) of the stripe and (M, 2) of a target's points marked in it.
+    """An image (H, W) to be shown, with the pixels (N, 2) of the stripe and the points (M, 2) of a target.
 
-    ``full_dn`` is the full scale, ``saturated`` the share of profile lines there, where that is known. What is shown is
-    made when somebody looks at it first: a recording has more images than a page shows.
+    ``full_dn`` is full scale, and ``saturated`` the fraction of saturated profile lines, if known. The encoded image is
+    made on first use, because a recording has more images than a page shows.
     """
 
     image: np.ndarray
@@ -39,7 +39,7 @@ class Picture:
 
     @cached_property
     def jpeg(self) -> bytes:
-        """The image as a JPEG with its dark parts raised."""
+        """The image as a JPEG with its dark parts brightened."""
         grey = np.minimum(255 * np.sqrt(self.image.astype(np.float32) / self.full_dn), 255).astype(np.uint8)
         scale = min(1.0, _LONGEST_SIDE_PX / max(grey.shape))
         size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
@@ -49,20 +49,20 @@ class Picture:
             shown[row, column] = _STRIPE
         for u, v in np.rint((np.empty((0, 2)) if self.points is None else self.points) * scale).astype(int).tolist():
             cv2.circle(shown, (u, v), 3, _FOUND, 2, cv2.LINE_AA)
-        return _encoded(shown, ".jpg")
+        return _encode(shown, ".jpg")
 
     @cached_property
     def histogram(self) -> np.ndarray:
-        """Shares of the pixels in equal steps of grey value."""
+        """Fractions of the pixels in equal intervals of grey value."""
         return np.histogram(self.image, _BINS, (0, self.full_dn + 1))[0] / self.image.size
 
 
-def png_of(picture: np.ndarray) -> bytes:
-    """A picture (H, W, 3) of uint8 in red, green, blue as a PNG file."""
-    return _encoded(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), ".png")
+def encode_png(picture: np.ndarray) -> bytes:
+    """Encode a picture (H, W, 3) of uint8 in red, green, blue as PNG."""
+    return _encode(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), ".png")
 
 
-def _encoded(picture: np.ndarray, suffix: str) -> bytes:
+def _encode(picture: np.ndarray, suffix: str) -> bytes:
     done, data = cv2.imencode(suffix, picture)
     if not done:
         raise ValueError(f"a picture of the shape {picture.shape} cannot be encoded as {suffix}")
@@ -81,9 +81,9 @@ class Line:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far the work is: ``phase`` in words, images ``done`` of a ``total``, and the time left in s.
+    """Progress of the work: name of the ``phase``, images ``done`` of a ``total``, and remaining time in s.
 
-    ``busy`` is whether something is being done.
+    ``busy``: work is in progress.
     """
 
     phase: str = "not connected"
@@ -95,11 +95,11 @@ class Progress:
 
 @dataclass
 class Board:
-    """The content of the page. Its attributes are replaced as wholes, never changed in place; the log is kept by `say`.
+    """Content of the page; attributes are replaced, never changed in place, and `say` appends to the log.
 
-    ``request`` is what the operator is asked to do, and
-    ``answers`` what the buttons for it are called. ``coverage`` is a PNG of what a guided calibration has seen.
-    ``detail`` gives, of a cloud of more points than are shown, those in a box from low to high (3,), mm, as `table_of`.
+    ``request`` is what the operator should do, and ``answers`` are the labels of its buttons. ``coverage`` is a PNG of
+    the image area covered in a guided calibration. ``detail`` returns, for a cloud that is shown thinned, the points in
+    a box from low to high (3,) in mm, in the form of `point_table`.
     """
 
     title: str
@@ -126,17 +126,17 @@ class Board:
             self._lines.append(Line(number, time.time(), kind, text))
 
     def lines(self, after: int = -1) -> list[Line]:
-        """The log's lines with higher numbers."""
+        """Return the log's lines with higher numbers."""
         with self._lock:
             return [line for line in self._lines if line.number > after]
 
     def phase(self, name: str, *, busy: bool = True) -> None:
-        """Begin another phase of the work, or of waiting for the operator."""
+        """Begin another phase of work, or of waiting for the operator."""
         self._began_s = time.monotonic()
         self.progress = Progress(name, busy=busy)
 
     def count(self, done: int, total: int, *, before: int = 0) -> None:
-        """So much of the phase is done, ``before`` of it when it began; the time left follows."""
+        """Set the progress of the phase and the remaining time; ``before`` was done when the phase began."""
         taken, since = done - before, time.monotonic() - self._began_s
         left_s = since / taken * (total - done) if taken > 0 else None
         self.progress = replace(self.progress, done=done, total=total, left_s=left_s)

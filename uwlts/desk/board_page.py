@@ -1,4 +1,4 @@
-"""The page of the board: state, live image, cloud and log; the desk's controls come beside them."""
+"""Page of the board: state, live image, cloud and log; the desk adds its controls."""
 
 import math
 import time
@@ -55,17 +55,17 @@ _STYLE = """
 
 
 class BoardView:
-    """The parts of the page that show a board; `refresh` brings them up to date. Made for every browser anew."""
+    """Parts of the page that show a board, in one browser; `refresh` updates them."""
 
     def __init__(self, board: Board, *, picked: Callable[[np.ndarray], None] | None = None):
         self._board, self._picked = board, picked
         self._pictures, self._coverage, self._line = -1, b"", -1
-        # The parts that not every page has.
+        # Parts that some pages lack.
         self._cloud: CloudView | None = None
         self._map: ui.element | None = None
 
     def header(self) -> AbstractContextManager[object]:
-        """The bar on top, to which controls may be added."""
+        """Build the top bar and return it, so that controls can be added."""
         ui.add_css(_STYLE)
         ui.query(".nicegui-content").classes("p-2")
         bar = ui.header().classes("items-center py-2 gap-4 bg-slate-800")
@@ -78,7 +78,7 @@ class BoardView:
         return bar
 
     def image(self) -> None:
-        """The latest image, its histogram and what is known of it."""
+        """Build the latest image with its caption and histogram."""
         with ui.element("section").classes("image").props('aria-label="latest image"'):
             self._image = ui.element("img").props('alt="latest image"')
             self._image.set_visibility(False)
@@ -86,14 +86,14 @@ class BoardView:
             self._histogram = ui.html("", sanitize=False)
 
     def coverage(self) -> None:
-        """What a guided calibration has seen of the image."""
+        """Build the map of the image area covered in a guided calibration."""
         with ui.column().classes("p-3") as self._seen:
-            ui.label("parts of the image that the target was seen in")
+            ui.label("parts of the image in which the target was seen")
             self._map = ui.element("img").props('alt="coverage of the image"').style("max-height: 40vh")
         self._seen.set_visibility(False)
 
     def cloud(self) -> None:
-        """The cloud, and how it is coloured."""
+        """Build the cloud, with a choice of colours."""
         with ui.element("section").classes("cloud").props('aria-label="cloud"'):
             shown = self._cloud = CloudView(self._picked)
             with ui.row().classes("items-center px-2 py-1 gap-3"):
@@ -103,7 +103,7 @@ class BoardView:
                 self._count = ui.label().classes("text-sm")
 
     def log(self) -> None:
-        """All that was said, the latest first."""
+        """Build the log, the latest line first."""
         self._log = ui.element("section").classes("log").props('aria-label="log" role="log" tabindex="0"')
 
     def mark(self, places_mm: Sequence[np.ndarray]) -> None:
@@ -162,7 +162,7 @@ def _line_text(line: Line) -> str:
 
 
 def _histogram(picture: Picture) -> str:
-    """Bars of the grey values, on a logarithmic scale from a hundred-thousandth of all pixels."""
+    """Return bars of the grey values as HTML, on a logarithmic scale from 1e-5 of all pixels."""
     heights = np.clip(1 + np.log10(np.maximum(picture.histogram, 1e-5)) / 5, 0.0, 1.0)
     bars = "".join(
         f'<rect x="{4 * k}" y="{40 - 40 * height:.1f}" width="3.4" height="{40 * height:.1f}"/>'
@@ -178,7 +178,7 @@ def _histogram(picture: Picture) -> str:
 
 
 def build_board(board: Board, operator: bool) -> None:
-    """The page of those who only look."""
+    """Build the page for viewers."""
     view = BoardView(board)
     view.header()
     with ui.element("main").classes("desk looking"):
@@ -189,6 +189,6 @@ def build_board(board: Board, operator: bool) -> None:
 
 
 def timed(refresh: Callable[[], object]) -> None:
-    """Bring a browser's page up to date several times a second, and at once."""
+    """Update a browser's page now, and then several times a second."""
     refresh()
     ui.timer(_REFRESH_S, refresh)

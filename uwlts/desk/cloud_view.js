@@ -1,6 +1,6 @@
-// A point cloud of bounded size: fitted to the view, turned with the mouse or by touch, coloured by a field, with a
-// scale bar, axes and a legend. A click on a point emits its place. Points come from /cloud as float32 (see
-// `packed` in thinned_cloud.py); of larger clouds those in view are fetched from /cloud/detail when the view rests.
+// A point cloud of bounded size: fitted to the view, rotated with the mouse or by touch, coloured by a field, with a
+// scale bar, axes and a legend. A click on a point emits its position. Points come from /cloud as float32 (see `pack`
+// in thinned_cloud.py); for larger clouds the points in view are fetched from /cloud/detail when the view is at rest.
 import { OrbitControls, THREE } from "nicegui-scene";
 
 const COLUMNS = 6;
@@ -14,7 +14,7 @@ const TURBO = [
 const turbo = (x) =>
   TURBO.map((p) => Math.min(1, Math.max(0, p.reduceRight((sum, factor) => sum * x + factor, 0))));
 
-// Without its darkest end, which does not show on a dark ground.
+// Without its darkest end, which is invisible on a dark background.
 const shade = (share) => turbo(0.05 + 0.95 * Math.min(1, Math.max(0, share)));
 
 export default {
@@ -36,7 +36,7 @@ export default {
       this.problem = "this browser draws no WebGL: the cloud cannot be shown";
       return;
     }
-    // Colours are shown as they are given.
+    // Colours are shown without conversion.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     const steps = Array.from({ length: 11 }, (_, k) => `rgb(${shade(k / 10).map((c) => 255 * c)})`);
     this.$el.querySelector(".ramp").style.background = `linear-gradient(to top, ${steps})`;
@@ -91,7 +91,7 @@ export default {
   methods: {
     async load() {
       if (!this.renderer) return;
-      // One at a time; what came meanwhile is fetched afterwards.
+      // One request at a time; a newer version is fetched afterwards.
       if (this.loading) { this.again = true; return; }
       this.loading = true;
       try {
@@ -99,7 +99,7 @@ export default {
         this.count = this.whole.count;
         this.clearNear();
         this.colour();
-        // Follows while it grows, until the user turns or zooms.
+        // Fit the growing cloud until the user rotates or zooms.
         if (!this.touched && this.count > 1.2 * this.fitted) this.fitAll();
         this.draw();
         this.rest();
@@ -139,14 +139,14 @@ export default {
       }
       const asked = (this.asked = box.map((value) => value.toFixed(4)).join());
       const answer = await fetch(`cloud/detail?box=${asked}`);
-      // The view may have moved on meanwhile.
+      // The view may have changed meanwhile.
       if (answer.status !== 200 || asked !== this.asked) return;
       await this.take(this.near, answer);
       this.colour();
       this.$el.dataset.detail = this.near.count;
     },
     seenBox() {
-      // The box about the points in view, a little wider; null where most are, so that no more can be gained.
+      // Box about the points in view, slightly enlarged; null if most points are in view, so that detail adds nothing.
       const matrix = new THREE.Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse);
       const point = new THREE.Vector3();
       const box = new THREE.Box3();
@@ -177,7 +177,7 @@ export default {
       const offset = column < 3 ? this.whole.origin[column] : 0;
       let low = values[Math.floor(0.01 * (values.length - 1))] ?? 0;
       let high = values[Math.ceil(0.99 * (values.length - 1))] ?? 1;
-      // Deviations are shown about zero.
+      // The scale of deviations is symmetric about zero.
       if (this.field === "deviation") { high = Math.max(Math.abs(low), Math.abs(high)); low = -high; }
       const span = high - low || 1;
       for (const layer of [this.whole, this.near]) {
@@ -224,7 +224,7 @@ export default {
       const box = this.whole.geometry.boundingBox;
       const middle = box.getCenter(new THREE.Vector3());
       const radius = Math.max(box.getSize(new THREE.Vector3()).length() / 2, 1);
-      // As the sensor sees it, a little from the side: X up, Z away.
+      // Slightly from the side of the sensor's view: X up, Z away.
       this.camera.up.set(1, 0, 0);
       this.camera.position.copy(middle).add(new THREE.Vector3(-0.5, 0.35, -1).multiplyScalar(radius));
       this.controls.target.copy(middle);
@@ -280,7 +280,7 @@ export default {
         for (let k = 0; k < layer.count; k++) {
           point.fromBufferAttribute(place, k).applyMatrix4(matrix);
           const off = Math.hypot(((point.x + 1) / 2) * box.width - u, ((1 - point.y) / 2) * box.height - v);
-          // Of those under the finger the one in front.
+          // Of the points under the finger, the one in front.
           if (off < 8 && point.z + off * 1e-3 < nearest) { nearest = point.z + off * 1e-3; best = [layer, k]; }
         }
       }

@@ -1,4 +1,4 @@
-"""The cloud in the page, an element of NiceGUI drawn by three.js."""
+"""View of the cloud in the page, a NiceGUI element drawn by three.js."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,11 +9,11 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
 _THREE = Path(nicegui.__file__).parent / "elements" / "scene" / "dist"
-"""NiceGUI's own copy of three.js, so that the page works without internet."""
+"""NiceGUI's copy of three.js, so that the page works without internet."""
 
 
 class CloudView(Element, component="cloud_view.js", esm={"nicegui-scene": str(_THREE)}, default_classes="w-full"):
-    """Shows the board's cloud; ``picked`` is called with the place (3,) in mm of a point that was clicked."""
+    """View of the board's cloud; ``picked`` is called with the position (3,) in mm of a clicked point."""
 
     def __init__(self, picked: Callable[[np.ndarray], None] | None = None):
         super().__init__()
@@ -22,19 +22,19 @@ class CloudView(Element, component="cloud_view.js", esm={"nicegui-scene": str(_T
             self.on("pick", lambda event: picked(_place(event)))
 
     def show_version(self, version: int) -> None:
-        """Have the browser fetch the cloud, if it has another one."""
+        """Make the browser fetch the cloud if its version differs."""
         self._set("version", version)
 
     def allow_detail(self, allowed: bool) -> None:
-        """Whether there are more points to fetch when someone looks closer."""
+        """Set whether more points can be fetched for a closer view."""
         self._set("closer", allowed)
 
     def colour_by(self, field: str) -> None:
-        """Colour by depth or one of the fields of a cloud."""
+        """Colour the points by depth or a field."""
         self._set("field", field)
 
     def mark_places(self, places_mm: Sequence[np.ndarray]) -> None:
-        """Mark places (3,)."""
+        """Mark positions (3,) in mm."""
         self._set("marks", [place.tolist() for place in places_mm])
 
     def fit(self) -> None:

@@ -1,4 +1,4 @@
-"""The files of the desk's folder: plans, captures, calibrations, clouds and reports."""
+"""Files of the desk's folder: plans, captures, calibrations, clouds and reports."""
 
 import os
 from contextlib import suppress
@@ -18,12 +18,12 @@ _SHOWN = 500
 _REMEMBERED = 4 * _SHOWN
 _FORMATS = {CALIBRATION_FORMAT: "calibration", POLYNOMIAL_FORMAT: "calibration", EVALUATION_FORMAT: "evaluation"}
 _LONGEST_NAME = 200
-"""Of a new file, in bytes: file systems take 255, with all that is appended."""
+"""Longest name of a new file in bytes: file systems allow 255, including appended endings."""
 
 
 @dataclass(frozen=True)
 class ListedFile:
-    """A file by its name, what it probably is, its size in bytes and when it was last changed, in s."""
+    """A file with its name, probable kind, size in bytes and modification time in s."""
 
     name: str
     kind: str
@@ -31,25 +31,25 @@ class ListedFile:
     time_s: float
 
 
-def listed(folder: Path) -> list[ListedFile]:
-    """The files that the program knows what to do with, the latest first; at most 500."""
+def list_files(folder: Path) -> list[ListedFile]:
+    """List the files of the kinds that the program uses, the latest first; at most 500."""
     found = []
     try:
         entries = list(os.scandir(folder))
     except OSError as error:
         raise DescriptionError(f"the folder {folder} cannot be read: {error.strerror}") from error
     for entry in entries:
-        # What was renamed or removed meanwhile, and links in a circle, are none.
+        # Files that were renamed or removed meanwhile, and circular links, are skipped.
         with suppress(OSError):
-            if kind_of(entry.name) and not entry.name.startswith(".") and entry.is_file():
+            if guess_kind(entry.name) and not entry.name.startswith(".") and entry.is_file():
                 about = entry.stat()
                 if kind := _kind_by_content(entry.path, about.st_mtime_ns):
                     found.append(ListedFile(entry.name, kind, about.st_size, about.st_mtime))
     return sorted(found, key=lambda file: file.time_s, reverse=True)[:_SHOWN]
 
 
-def kind_of(name: str) -> str:
-    """What a file may be by its name; empty where the program makes no such files."""
+def guess_kind(name: str) -> str:
+    """Return the kind of a file by its name; empty if the program does not use such files."""
     match name.split("."):
         case [_, *_, "h5", "part"]:
             return "interrupted capture"
@@ -71,8 +71,8 @@ def kind_of(name: str) -> str:
 
 @lru_cache(_REMEMBERED)
 def _kind_by_content(path: str, changed_ns: int) -> str:
-    """What a file is by the label in it, where its name does not tell; empty for those of other programs."""
-    kind = kind_of(os.path.basename(path))
+    """Return the kind of a file, by the label in it if its name is ambiguous; empty for other programs' files."""
+    kind = guess_kind(os.path.basename(path))
     try:
         if kind == "capture" and is_cloud(path):
             return "cloud"
@@ -83,27 +83,27 @@ def _kind_by_content(path: str, changed_ns: int) -> str:
     return kind
 
 
-def file_in(folder: Path, name: str) -> Path:
-    """A listed file's path; DescriptionError for names that lead elsewhere or to no regular file."""
+def find_file(folder: Path, name: str) -> Path:
+    """Return a listed file's path; raises DescriptionError if the name is not that of a regular file in the folder."""
     path = folder / name
-    if not _is_plain(name) or not kind_of(name) or not is_regular_file(path):
+    if not _is_plain(name) or not guess_kind(name) or not is_regular_file(path):
         raise DescriptionError(f"'{name}' is not a file of the folder {folder}")
     return path
 
 
-def new_in(folder: Path, name: str, *, suffix: str) -> Path:
-    """Path for a result in the folder; DescriptionError for names that lead elsewhere."""
+def new_path(folder: Path, name: str, *, suffix: str) -> Path:
+    """Return the path of a result in the folder; raises DescriptionError if the name is not a plain file name."""
     name = name.strip()
     if not _is_plain(name) or len(name.encode()) > _LONGEST_NAME:
-        raise DescriptionError(f"'{name}' is no name for a file of the folder: give letters, digits, - and _")
+        raise DescriptionError(f"'{name}' is not a name for a file in the folder: give letters, digits, - and _")
     return folder / (name if name.endswith(suffix) else f"{name}{suffix}")
 
 
 def _is_plain(name: str) -> bool:
-    """Whether a name is that of a file in the folder itself, and not hidden."""
+    """Return whether a name is that of a file in the folder itself, and not hidden."""
     return bool(name) and Path(name).name == name and not name.startswith(".") and name.isprintable()
 
 
-def interrupted(path: Path) -> bool:
-    """Whether an interrupted recording of a path can be continued."""
+def is_interrupted(path: Path) -> bool:
+    """Return whether an interrupted recording of a path can be continued."""
     return part_path(path).is_file()

@@ -1,4 +1,4 @@
-"""Guided calibrations on the page."""
+"""Guided calibration on the page."""
 
 import queue
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import ui
 
 from uwlts.calibration.guidance.pose_advice import Coverage
-from uwlts.desk.board import Board, Picture, png_of
+from uwlts.desk.board import Board, Picture, encode_png
 from uwlts.desk.board_page import BoardView, timed
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.server import DeskServer
@@ -25,11 +25,11 @@ _MAP_CELL_PX = 48
 
 
 class Ended(Exception):
-    """The operator has ended what was being recorded."""
+    """Raised when the operator has ended the recording."""
 
 
 class BoardScreen:
-    """Shows a guided calibration on a board, whose buttons answer; with a ``switch`` of its own unless given."""
+    """Display of a guided calibration on a board, with answers from buttons; makes a ``switch`` if none is given."""
 
     def __init__(self, board: Board, switch: LaserSwitch | None = None):
         self._board, self.switch = board, switch or LaserSwitch(board, self.laser_off)
@@ -38,63 +38,63 @@ class BoardScreen:
         self._ending = False
 
     def press(self, answer: str) -> None:
-        """A button's answer."""
+        """Store a button's answer."""
         self._given.put(answer)
 
     def end(self) -> None:
-        """End the recording when an answer is next asked for; what was accepted is kept."""
+        """End the recording at the next request for an answer; accepted images are kept."""
         self._ending = True
 
     def laser_off(self) -> None:
-        """Switch the laser off, whatever is being done; the recording ends, what was accepted is kept."""
+        """Switch the laser off at any time; the recording ends and accepted images are kept."""
         if isinstance(stage := self._stage, GrblStage):
             darken(stage, self._board)
         else:
             self._board.say("no laser is connected to this program: switch it off by its own switch", "warning")
 
     def answer(self) -> str | None:
-        """The answer of a button that was pressed since it was last asked, the first of several; Ended after `end`."""
+        """Return the oldest answer not yet returned, or None; raises Ended after `end`."""
         if self._ending:
             raise Ended
         return None if self._given.empty() else self._given.get()
 
     def request(self, text: str) -> None:
-        """Show what the operator is asked to do."""
+        """Show what the operator should do."""
         self._board.request, self._board.answers = text, ANSWERS
 
     def live(
         self, image: np.ndarray, *, full_dn: int, points: np.ndarray | None, stripe: np.ndarray | None, remark: str
     ) -> None:
-        """Show an image (H, W) with the points (N, 2) of the target and the stripe's pixels (N, 2) found in it."""
+        """Show an image (H, W) with the target's points (N, 2) and the stripe's pixels (N, 2) found in it."""
         self._board.show(Picture(image, full_dn=full_dn, caption=remark, stripe=stripe, points=points))
         if isinstance(self._stage, GrblStage):
             self._board.laser = "on" if self._stage.laser_power > 0 else "flashing"
 
     def recorded(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
         """Show the coverage, with the points (N, 2) of every image."""
-        self._board.coverage = png_of(coverage_picture(coverage, pixels))
+        self._board.coverage = encode_png(draw_coverage(coverage, pixels))
 
     def add(self, line: str) -> None:
         """Add a line to the log."""
         self._board.say(line)
 
     def connected(self, stage: LaserStage | None) -> None:
-        """The stage that switches the laser from now on; None once it is closed."""
+        """Set the stage that now switches the laser, or None once it is closed."""
         self._stage = stage
         self.switch.lend(stage)
         self._board.laser = "flashing" if isinstance(stage, GrblStage) else "none"
 
 
 def darken(stage: GrblStage, board: Board) -> None:
-    """Switch the laser off at once, whatever the stage does, and say so."""
+    """Switch the laser off at once, in any state of the stage, and report the result."""
     if stage.darken():
         board.say("laser switched off by hand: unlock the stage if it stood still, else home it", "warning")
     else:
         board.say("the laser CANNOT be switched off: switch its power off before going near", "error")
 
 
-def coverage_picture(coverage: Coverage, pixels: list[np.ndarray]) -> np.ndarray:
-    """Map (h, w, 3) of uint8: covered cells green, the others red, a dot for every point (N, 2) of every image."""
+def draw_coverage(coverage: Coverage, pixels: list[np.ndarray]) -> np.ndarray:
+    """Draw a map (h, w, 3) of uint8: covered cells green, others red, and a dot for each point (N, 2)."""
     cells = np.where(coverage.covered[..., None], _COVERED, _EMPTY).astype(np.uint8)
     picture = np.kron(cells, np.ones((_MAP_CELL_PX, _MAP_CELL_PX, 1), np.uint8))
     picture[::_MAP_CELL_PX] = picture[:, ::_MAP_CELL_PX] = 30
@@ -107,13 +107,13 @@ def coverage_picture(coverage: Coverage, pixels: list[np.ndarray]) -> np.ndarray
 
 
 def answer_buttons(board: Board, press: Callable[[str], None]) -> Callable[[], None]:
-    """What the operator is asked to do, with a button for each answer; a function that brings them up to date."""
+    """Build the request to the operator with a button for each answer; return a function that updates it."""
     with ui.column().classes("p-3 gap-2") as asked:
         request = ui.label().classes("text-lg font-bold").props('role="status" aria-live="polite"')
         with ui.row():
             for answer in ANSWERS:
                 ui.button(answer, on_click=partial(press, answer))
-        ui.label("take: what stands there now; skip: ask for something else; done: go on with what there is").classes(
+        ui.label("take: record it as it is; skip: ask for another pose; done: continue with what is recorded").classes(
             "text-xs"
         )
 
@@ -137,24 +137,24 @@ def record_guided(
     overwrite: bool = False,
     report: Callable[[str], None] = print,
 ) -> GuidedRecording:
-    """Lead through the images of a calibration and record the good ones, beside the calibration that they are for.
+    """Lead through the images of a calibration, and record accepted images in captures beside the calibration.
 
     Parameters
     ----------
     plan : GuidedPlan or path of a TOML file
-        What is recorded, and with what (docs/how-to/calibrate-live.md).
+        Description of the recording and its devices (docs/how-to/calibrate-live.md).
     out : str or Path
-        The calibration; captures are called like it, with ``-target.h5`` and ``-step.h5``.
+        The calibration; the captures have its name with ``-target.h5`` and ``-step.h5``.
     camera : str, optional
-        Guided: address of the camera, in place of the plan's.
+        Guided: address of the camera, instead of the plan's.
     stage : str, optional
-        Guided: serial port of the stage, in place of the plan's.
+        Guided: serial port of the stage, instead of the plan's.
     port : int
-        Guided: port of the page for the browser; the next free one is taken if it is in use.
+        Guided: port of the page for the browser; if it is in use, the next free one is taken.
     refractions, distortion
-        As the calibration is going to be made; see `calibrate`.
+        Options of the calibration that is to be made; see `calibrate`.
     resume : bool
-        Guided: continue with what is recorded, also with a finished capture of the target that is not enough.
+        Guided: continue an earlier recording, also a finished capture of the target that does not suffice.
     overwrite : bool
         Replace existing files; guided, and without ``resume``, earlier captures too.
     report : callable, optional
@@ -167,7 +167,7 @@ def record_guided(
     HardwareError
         Camera, stage or laser fail.
     CalibrationError
-        The target does not give a calibration by which the step standard could be judged.
+        The target does not determine a calibration to judge the step standard.
     OutputError
         A capture exists, or cannot be written.
     """
@@ -190,7 +190,7 @@ def record_guided(
         timed(lambda: (view.refresh(), refresh()))
 
     with DeskServer(board, build=build, port=port, switch=screen.switch) as server:
-        report(f"open {server.operator_address}; Ctrl-C ends it, what was accepted is kept")
+        report(f"open {server.operator_address}; Ctrl-C ends it, accepted images are kept")
         return guide(
             described,
             Path(out),

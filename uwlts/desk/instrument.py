@@ -1,6 +1,6 @@
-"""Camera, stage and laser behind the page: a thread does one piece of work after another and shows images between.
+"""Camera, stage and laser behind the page: a thread does one task after another and shows live images in between.
 
-Buttons put work into a queue; only `laser_off`, `pause`, `resume` and `stop` act at once, whatever is being done.
+Buttons put tasks into a queue. Only `laser_off`, `pause`, `resume` and `stop` act at once.
 """
 
 import math
@@ -31,7 +31,7 @@ from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.plan import GuidedPlan
 from uwlts.hardware.guided.record import guide
-from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, brightness, stripe_of
+from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, record_scan
 from uwlts.model.any_calibration import AnyCalibration
@@ -41,17 +41,17 @@ from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, Frame, part_path, picture_of
 
 _PREVIEW_S = 0.15
-"""Pause between two images that are only shown."""
+"""Pause between two live images."""
 _WAITING = 64
-"""Images that wait to be shown while a scan goes on; more are recorded, and not shown."""
+"""Images in the queue for display during a scan; further ones are recorded but not shown."""
 _MOST_LOST = 2
-"""Images in a row that may be lost without an end of the live image."""
+"""Consecutive live images that may be lost before an error is reported."""
 _EARLIER = 200
 """Images of an interrupted scan that are shown again when it is continued."""
 
 
 class InstrumentState(StrEnum):
-    """What the instrument does; it decides which buttons make sense."""
+    """State of the instrument, which determines the enabled buttons."""
 
     DISCONNECTED = "not connected"
     BUSY = "busy"
@@ -71,7 +71,7 @@ class _Connected:
 
 
 class Instrument:
-    """Does what the operator asks for and shows it on a board, from construction until `close`."""
+    """Execution of the operator's tasks, with results on a board, from construction until `close`."""
 
     def __init__(self, board: Board):
         self._board = board
@@ -88,10 +88,10 @@ class Instrument:
         self._thread = threading.Thread(target=self._run, name="instrument", daemon=True)
         self._thread.start()
 
-    # What acts at once.
+    # Immediate actions.
 
     def laser_off(self) -> None:
-        """Switch the laser off, whatever is being done; a movement or a scan ends with it."""
+        """Switch the laser off at any time; this also ends a movement or a scan."""
         self.light = None
         if (screen := self._screen) is not None:
             screen.laser_off()
@@ -109,41 +109,41 @@ class Instrument:
 
     @property
     def laser_in_use(self) -> bool:
-        """Whether the laser is lit now and then, or may be."""
+        """Whether the laser is on, or may be switched on by the current task."""
         return self._board.laser in ("on", "flashing") or self.state in (InstrumentState.SCANNING, InstrumentState.BUSY)
 
     def pause(self) -> None:
-        """Wait, with the laser off, after the image that is being taken."""
+        """Pause the scan after the present image, with the laser off."""
         if self.state == InstrumentState.SCANNING:
             self._paused.set()
 
     def resume(self) -> None:
-        """Go on with a scan that waits."""
+        """Resume a paused scan."""
         self._paused.clear()
 
     def stop(self) -> None:
-        """End a scan or a guided calibration after the image that is being taken; it can be continued later."""
+        """End a scan or a guided calibration after the present image; it can be continued later."""
         self._stop.set()
         self._paused.clear()
         if (screen := self._screen) is not None:
             screen.end()
 
-    # What waits for its turn.
+    # Queued tasks.
 
     def connect(self, plan: ScanPlan, *, camera: str, stage: str | None) -> None:
-        """Open the camera and the stage, where addresses are given, of a plan's sensor."""
+        """Open the camera, and the stage if its port is given, for a plan."""
         self._ask(lambda: self._connect(plan, camera, stage))
 
     def disconnect(self) -> None:
-        """Close both."""
+        """Close camera and stage."""
         self._ask(self._disconnect)
 
     def home(self) -> None:
-        """Find the limit switch."""
+        """Home the stage."""
         self._ask(lambda: self._moving("homing", lambda stage: stage.home()))
 
     def unlock(self) -> None:
-        """Take the stage's position as it is."""
+        """Unlock the stage and accept its position."""
         self._ask(lambda: self._moving("unlocking", lambda stage: stage.unlock()))
 
     def move(self, position_mm: float) -> None:
@@ -155,7 +155,7 @@ class Instrument:
         self._ask(lambda: self._jog(by_mm))
 
     def find_exposure(self) -> None:
-        """Settle the exposure of the light that is shown."""
+        """Find the exposure for the light that is shown."""
         self._ask(self._find_exposure)
 
     def scan(self, plan: ScanPlan, out: Path, *, calibration: Path | None, resume: bool, overwrite: bool) -> None:
@@ -163,23 +163,23 @@ class Instrument:
         self._ask(lambda: self._scan(plan, out, calibration, resume, overwrite))
 
     def calibrate(self, plan: GuidedPlan, out: Path, *, resume: bool, overwrite: bool) -> None:
-        """Lead through a guided calibration and calculate it; camera and stage are opened by it."""
+        """Lead through a guided calibration, which opens camera and stage itself, and calculate it."""
         refuse_unsuitable(out, overwrite=overwrite)
         self._ask(lambda: self._calibrate(plan, out, resume, overwrite))
 
     def answer(self, answer: str) -> None:
-        """The operator's answer in a guided calibration."""
+        """Pass the operator's answer to a guided calibration."""
         if (screen := self._screen) is not None:
             screen.press(answer)
 
     def close(self) -> None:
-        """End everything; the laser goes off. Without effect the second time."""
+        """End all tasks and switch the laser off, once."""
         self._ending.set()
         self.stop()
         self._ask(lambda: None)
         self._thread.join(30.0)
 
-    # The thread.
+    # Worker thread.
 
     def _ask(self, work: Callable[[], None]) -> None:
         self._work.put(work)
@@ -187,7 +187,7 @@ class Instrument:
     def _run(self) -> None:
         while not self._ending.is_set():
             try:
-                # An image is shown whenever there is nothing else to do.
+                # Live images are shown when no other task waits.
                 work = self._work.get(timeout=_PREVIEW_S)
             except queue.Empty:
                 work = self._preview
@@ -201,13 +201,13 @@ class Instrument:
         except Ended:
             self._board.say("stopped")
         except Error as error:
-            # What was under way when the laser was switched off by hand fails, as it should.
+            # A task that was interrupted by switching the laser off by hand is expected to fail.
             if not self._darkened:
                 self._board.say(str(error), "error")
             self.light = None
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
-            self._board.say(f"a defect of the program: {type(error).__name__}: {error}", "error")
+            self._board.say(f"a bug in the program: {type(error).__name__}: {error}", "error")
             self.light = None
         self._settle_state()
 
@@ -284,7 +284,7 @@ class Instrument:
         return connected.stage
 
     def _rig_of(self, connected: _Connected) -> Rig:
-        """What takes images; made anew when something else has used camera or stage."""
+        """Return the rig, a new one after another task has used camera or stage."""
         if self._rig is None:
             plan, stage = connected.plan, connected.stage
             self._rig = Rig(plan, plan.stage, connected.sensor, connected.camera, stage, ahead=plan.stage.step_mm)
@@ -309,13 +309,13 @@ class Instrument:
     def _after_darkening(self) -> None:
         connected = self._connected
         if connected is not None and isinstance(connected.stage, GrblStage) and not connected.stage.faulty:
-            # Meets the reset, so that what it did is known.
+            # The next exchange detects the reset and sets the fault.
             with suppress(HardwareError):
                 connected.stage.position_mm()
         self._darkened = False
 
     def _shown_light(self, connected: _Connected) -> Light | None:
-        """The light that is shown; nothing switches a laser without a stage, or with one that is locked."""
+        """Return the light that is shown; a laser needs a stage that is not locked."""
         switched = isinstance(connected.stage, GrblStage) and connected.stage.position_known
         return self.light if switched else self.light and "lamp"
 
@@ -324,7 +324,7 @@ class Instrument:
         light = self._shown_light(connected)
         if light is None:
             raise HardwareError("choose first which light is shown")
-        found = self._rig_of(connected).settled_exposure(light, start_ms=self.exposure_ms[light])
+        found = self._rig_of(connected).find_exposure(light, start_ms=self.exposure_ms[light])
         if found is None:
             self._board.say(f"too dark for a {light} image even at the longest exposure", "warning")
             return
@@ -336,24 +336,24 @@ class Instrument:
         if connected is None or (light := self._shown_light(connected)) is None:
             return
         if connected.stage.faulty:
-            # Until it is homed or unlocked; then all is set up anew.
+            # No live image until the stage is homed or unlocked; then the rig is set up again.
             self._rig = None
             return
         try:
             frame = self._rig_of(connected).frame(light, self.exposure_ms[light])
         except HardwareError:
-            # A busy computer loses frames now and then.
+            # A busy computer loses frames occasionally.
             self._lost += 1
             if self._lost > _MOST_LOST or connected.stage.faulty or not connected.camera.running:
                 raise
             return
         self._lost = 0
-        seen = brightness(frame.seen, connected.sensor, light)
+        seen = measure_brightness(frame.seen, connected.sensor, light)
         full, exposure_ms = connected.sensor.detector.full_scale_dn(), frame.exposure_ms or self.exposure_ms[light]
         level = "centre line" if math.isnan(seen.level) else f"{100 * seen.level:.0f} % of full scale"
         caption, pixels = f"live, {light}, exposure {exposure_ms:.4g} ms, {level}", None
         if light == "laser":
-            stripe = stripe_of(frame.seen, connected.sensor)
+            stripe = get_stripe(frame.seen, connected.sensor)
             pixels = stripe.pixels()
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
         saturated = seen.saturated / max(seen.counted, 1)
@@ -372,7 +372,7 @@ class Instrument:
         if resume and part_path(out).is_file():
             with Capture(part_path(out)) as earlier:
                 for number in range(0, len(earlier), -(-len(earlier) // _EARLIER) or 1):
-                    view.see(earlier[number], number)
+                    view.show(earlier[number], number)
 
         def progress(done: int, total: int, stage: str = "") -> None:
             begun[:] = begun or [done - 1]
@@ -384,11 +384,11 @@ class Instrument:
             if line in ("recording", "finding the exposures", "checking for lost steps"):
                 board.phase(line)
 
-        # The rig knows neither exposure nor place any more.
+        # The rig does not know exposure and position after the scan.
         self.state, self._rig, kept_light = InstrumentState.SCANNING, None, self.light
         self._show_laser()
         try:
-            with _Aside(view) as shown:
+            with _BackgroundView(view) as shown:
                 seen = record_scan(
                     plan,
                     out,
@@ -404,7 +404,7 @@ class Instrument:
                 )
         finally:
             board.phase("stopped", busy=False)
-            # Never the laser again by itself.
+            # Do not switch the laser on again automatically.
             self.light = kept_light and "lamp"
         board.position_mm = stage.position_mm()
         for warning in seen.warnings():
@@ -425,7 +425,7 @@ class Instrument:
             os.close(nobody)
             self._screen, board.request, board.answers = None, "", ()
         for line in recording.missing:
-            board.say(f"still missing: {line}; go on with it for more images", "warning")
+            board.say(f"still missing: {line}; continue it for more images", "warning")
         board.phase("calibrating")
         found = calibrate(
             air=recording.air, water=recording.water, step=recording.step, poses=recording.poses, refractions=2
@@ -439,7 +439,7 @@ class Instrument:
         board.phase("finished", busy=False)
 
     def _between(self) -> None:
-        """Between two images of a scan."""
+        """Pause or stop between two images of a scan, if requested."""
         if self._paused.is_set():
             self.state, before = InstrumentState.PAUSED, self._board.progress
             self._board.say("paused, the laser is off")
@@ -451,8 +451,8 @@ class Instrument:
         self._show_laser()
 
 
-class _Aside:
-    """Shows recorded images in a thread of its own, so that recording never waits for it."""
+class _BackgroundView:
+    """Display of recorded images in its own thread, so that recording never waits for it."""
 
     def __init__(self, view: RecordingView):
         self._view = view
@@ -460,18 +460,18 @@ class _Aside:
         self._fault: Exception | None = None
 
     def put(self, frame: Frame, number: int) -> None:
-        """Show an image soon; not at all where too many wait."""
+        """Queue an image for display, unless too many wait."""
         if not self._waiting.full():
             self._waiting.put((frame, number))
 
     def _show(self) -> None:
         while (seen := self._waiting.get()) is not None:
             try:
-                self._view.see(*seen)
+                self._view.show(*seen)
             except Exception as error:
                 self._fault = self._fault or error
 
-    def __enter__(self) -> "_Aside":
+    def __enter__(self) -> "_BackgroundView":
         self._thread = threading.Thread(target=self._show, name="view", daemon=True)
         self._thread.start()
         return self

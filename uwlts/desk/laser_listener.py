@@ -1,8 +1,8 @@
-"""Process that listens for the operator's Laser off and sends it to the controller, whatever becomes of the page.
+"""Process that listens for the operator's Laser off and sends it to the controller, even if the page's server hangs.
 
-`uwlts.desk.laser_switch` starts it with a listening socket and two sockets to the program. The first brings the rules
-of the page, and lends the open serial port of a stage. The second names each press to the program, which returns the
-name when it has switched the laser off and cannot light it any more. Until then Ctrl-X is repeated.
+`uwlts.desk.laser_switch` starts it with a listening socket and two sockets to the program. The first one brings the
+access rules, and lends the open serial port of a stage. The second one passes the name of each press to the program,
+which returns the name when the laser is off and cannot be switched on any more. Until then Ctrl-X is repeated.
 """
 
 import asyncio
@@ -18,24 +18,24 @@ from http import HTTPStatus
 from starlette.datastructures import Headers
 
 from uwlts.desk.access import PageAccess
-from uwlts.desk.request_limits import BACKLOG, HEAD_BYTES, AwaitedHeads
+from uwlts.desk.request_limits import BACKLOG, HEAD_BYTES, PendingHeads
 
 PRESS = re.compile(r"(off|escape)-\d{1,40}")
-"""Name of a press, made by the page. It goes two ways to the program, which obeys it once."""
+"""Name of a press, made by the page. It reaches the program on two paths, and is obeyed once."""
 MESSAGE_BYTES = 4096
 """Longer than every message between the two processes."""
 _SOFT_RESET = b"\x18"
 _ESCAPE_S = 0.2
-"""Escape also closes menus. For this long the program may say whether the laser is in use; then it is switched off."""
+"""Escape also closes menus. Within this time the program may answer; otherwise the laser is switched off."""
 _AGAIN_S = 0.2
-"""Time to the next Ctrl-X: a command that was under way may have lit the laser again."""
+"""Interval between repetitions of Ctrl-X: a command in progress may have switched the laser on again."""
 _GIVE_UP_S = 2.0
 """A press has failed if no port is lent and the program does not answer in this time."""
 _WATCH_S = 0.2
 
 
 class LaserListener:
-    """Obeys presses by the port that is lent, and names them to the program."""
+    """Obeys presses with the lent port, and passes their names to the program."""
 
     def __init__(self, lending: socket.socket, presses: socket.socket):
         self._lending, self._presses = lending, presses
@@ -44,10 +44,10 @@ class LaserListener:
         self._ended = False
         rules = json.loads(lending.recv(MESSAGE_BYTES))
         self.access, self.page_port = PageAccess(**rules["access"]), int(rules["page_port"])
-        self.heads = AwaitedHeads()
+        self.heads = PendingHeads()
 
     async def serve(self, listening: socket.socket) -> None:
-        """Listen until the program ends; a forked child of the program may keep its sockets open."""
+        """Listen until the program ends; sockets alone do not show that, because a forked child may keep them open."""
         loop, parent = asyncio.get_running_loop(), os.getppid()
         for each, read in ((self._lending, self._lend), (self._presses, self._answered)):
             each.setblocking(False)
@@ -76,10 +76,10 @@ class LaserListener:
             answered.set()
 
     async def obey(self, name: str, request: "_Request") -> None:
-        """Obey a press, and answer its request as soon as Ctrl-X is sent or the program has done it."""
+        """Obey a press, and answer its request when Ctrl-X is sent or the program has switched the laser off."""
         answered = self._answers.setdefault(name, asyncio.Event())
         deadline, wait_s = time.monotonic() + _GIVE_UP_S, 0.0
-        # A program that hangs takes no more names: it is not needed.
+        # A program that hangs accepts no more names; it is not needed.
         with suppress(OSError):
             self._presses.send(name.encode())
         if name.startswith("escape"):
@@ -94,7 +94,7 @@ class LaserListener:
         request.answer(HTTPStatus.NO_CONTENT if answered.is_set() else HTTPStatus.SERVICE_UNAVAILABLE)
 
     def _reset(self) -> bool:
-        """Send Ctrl-X, if a port is lent and takes it."""
+        """Send Ctrl-X, and return whether a port is lent and accepted it."""
         with suppress(OSError):
             return self._port is not None and os.write(self._port, _SOFT_RESET) > 0
         return False
@@ -107,7 +107,7 @@ async def _within(wait_s: float, event: asyncio.Event) -> bool:
 
 
 class _Request(asyncio.Protocol):
-    """One request, of which only the head is read; the connection ends with the answer."""
+    """One request without a body; the connection ends with the answer."""
 
     def __init__(self, listener: LaserListener):
         self._listener, self._head, self._headers = listener, b"", Headers()
@@ -150,7 +150,7 @@ class _Request(asyncio.Protocol):
             return
         lines = [f"HTTP/1.1 {status.value} {status.phrase}", "Connection: close"]
         if status == HTTPStatus.NO_CONTENT:
-            # The page may know that it was obeyed.
+            # Allow the page to read the answer.
             origin = self._headers["Origin"]
             lines += [f"Access-Control-Allow-Origin: {origin}", "Access-Control-Allow-Credentials: true"]
         else:

@@ -1,7 +1,7 @@
-"""The program's side of Laser off: the page's button, and the process that obeys it beside the page's server.
+"""Program's side of Laser off: the page's button, and the process that obeys it independently of the page's server.
 
-Whoever reaches the page can keep its server busy. The button therefore asks `uwlts.desk.laser_listener` first, at a
-port of its own, and the page's server as well. A press by both ways is obeyed once.
+Anyone who can reach the page can keep its server busy. Therefore the button sends its request to both
+`uwlts.desk.laser_listener`, at its own port, and the page's server. A press that arrives twice is obeyed once.
 """
 
 import json
@@ -27,13 +27,13 @@ from uwlts.hardware.rig import LaserStage
 _BUTTON = Path(__file__).with_name("laser_off.html")
 _START_S, _ANSWER_S, _END_S = 30.0, 5.0, 3.0
 _REMEMBERED = 100
-"""Presses that are told from those that come by the other way, at the most some seconds later."""
+"""Presses that are remembered to recognise their second arrival, at most some seconds later."""
 
 
 class LaserSwitch:
     """Calls ``switch_off`` at every press of Laser off, and at the key Escape while the laser is ``in_use``.
 
-    ``switch_off`` must work from every thread. What goes wrong is said on the board.
+    ``switch_off`` must be thread-safe. Errors are reported on the board.
     """
 
     def __init__(self, board: Board, switch_off: Callable[[], None], *, in_use: Callable[[], bool] = lambda: True):
@@ -44,13 +44,13 @@ class LaserSwitch:
         self._thread: threading.Thread | None = None
 
     def serve(self, access: PageAccess, listening: socket.socket, *, page_port: int) -> None:
-        """Start the process at a socket, which it takes; SetupError where it does not start."""
+        """Start the process with a socket, which it takes over; raises SetupError if it does not start."""
         self._port = listening.getsockname()[1]
         self._lending, lending = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._presses, presses = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with listening, lending, presses:
             given = [each.fileno() for each in (listening, lending, presses)]
-            # In a session of its own neither the terminal's Ctrl-C and Ctrl-Z nor signals to the group reach it.
+            # In a separate session, the terminal's Ctrl-C and Ctrl-Z and signals to the process group do not reach it.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "uwlts.desk.laser_listener", *map(str, given)],
                 pass_fds=given,
@@ -66,7 +66,7 @@ class LaserSwitch:
         self._thread.start()
 
     def _asked(self, message: bytes, descriptors: list[int], wait_s: float) -> bool:
-        """Whether the process answers a message."""
+        """Send a message, and return whether the process answers."""
         self._lending.settimeout(wait_s)
         try:
             if descriptors:
@@ -81,7 +81,7 @@ class LaserSwitch:
         with suppress(OSError):
             while name := self._presses.recv(MESSAGE_BYTES):
                 self.press(name.decode())
-                # Without this answer the process repeats Ctrl-X, also where `press` has failed.
+                # Without this answer the process repeats Ctrl-X, also if `press` has failed.
                 self._presses.send(name)
         if self._process is not None:
             self._board.say("the process that listens for Laser off has ended: restart this program", "error")
@@ -89,7 +89,7 @@ class LaserSwitch:
     def lend(self, stage: LaserStage | None) -> None:
         """Lend the process the port of a stage to switch its laser off; None takes the port back.
 
-        HardwareError where the process is gone or stopped.
+        Raises HardwareError if the process has ended or is suspended.
         """
         if self._process is None:
             return
@@ -99,13 +99,15 @@ class LaserSwitch:
         # It must not keep the port.
         self._process.kill()
         if lent:
-            raise HardwareError("the process that listens for Laser off is gone or stopped: restart this program")
+            raise HardwareError(
+                "the process that listens for Laser off has ended or is suspended: restart this program"
+            )
 
     def press(self, name: object) -> None:
-        """Obey a press, the first time that it comes; what is no press is refused."""
+        """Obey a press at its first arrival; other values are ignored."""
         if not isinstance(name, str) or not PRESS.fullmatch(name):
             return
-        # Who comes second waits until it is done.
+        # The second arrival waits until the press is obeyed.
         with self._lock:
             if name in self._obeyed:
                 return
@@ -114,7 +116,7 @@ class LaserSwitch:
                 self._switch_off()
 
     def show_button(self) -> None:
-        """Put the button into a page; it is there before the page's scripts, and stands above whatever they show."""
+        """Add the button to a page; it precedes the page's scripts, and is displayed above everything else."""
         ui.add_body_html(_BUTTON.read_text(encoding="utf-8").replace("LISTENER_PORT", str(self._port)))
         ui.on("laser_off", lambda event: self.press(event.args))
 

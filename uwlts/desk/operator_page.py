@@ -1,4 +1,4 @@
-"""The desk: the whole work of an operator on one page."""
+"""The desk: all of an operator's work on one page."""
 
 import asyncio
 import threading
@@ -17,11 +17,11 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from uwlts.desk.board import Board
 from uwlts.desk.board_page import BoardView, build_board, timed
-from uwlts.desk.desk_files import file_in, interrupted, kind_of, listed, new_in
+from uwlts.desk.desk_files import find_file, guess_kind, is_interrupted, list_files, new_path
 from uwlts.desk.guided import answer_buttons
 from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.server import DeskServer
-from uwlts.desk.thinned_cloud import table_of
+from uwlts.desk.thinned_cloud import point_table
 from uwlts.errors import DescriptionError, Error
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.guided.plan import load_guided_plan
@@ -37,7 +37,7 @@ from uwlts.storage.copc_file import is_copc
 _LIST_S = 2.0
 _MOST_SHOWN = 300_000
 _MOST_OPENED = 5_000_000
-"""Points of a file that are kept in memory, to be measured."""
+"""Points of a file that are kept in memory for measurements."""
 _JOGS_MM = (-10.0, -1.0, -0.1, 0.1, 1.0, 10.0)
 _FREE = (InstrumentState.READY, InstrumentState.LOCKED)
 _RUNNING = (InstrumentState.SCANNING, InstrumentState.PAUSED)
@@ -45,7 +45,7 @@ _RUNNING = (InstrumentState.SCANNING, InstrumentState.PAUSED)
 
 @dataclass
 class _Opened:
-    """The cloud that is shown and measured, and the places that were picked in it."""
+    """The cloud that is shown and measured, and the positions picked in it."""
 
     cloud: PointCloud | None = None
     picked: list[np.ndarray] = field(default_factory=list)
@@ -59,21 +59,21 @@ def serve_desk(
     port: int = 8080,
     report: Callable[[str], None] = print,
 ) -> None:
-    """Serve the operator's page until Ctrl-C: connect, look, calibrate, scan, reconstruct and measure in a browser.
+    """Serve the operator's page until Ctrl-C: connect, view, calibrate, scan, reconstruct and measure in a browser.
 
-    The address with the token is the operator's; at the other one everybody who reaches it may look. The page works
-    without internet.
+    The address with the token is the operator's; everybody who can reach the other one may view. The page works without
+    internet.
 
     Parameters
     ----------
     folder : str or Path
-        Folder with plans, calibrations, captures and clouds; the present one unless given. Results are written there.
+        Folder with plans, calibrations, captures and clouds, by default the current one. Results are written there.
     plan : str or Path, optional
         Plan of a scan (docs/how-to/scan.md) to begin with; others can be chosen on the page.
     host : str
-        Address at which the page is served; the default can be reached from this machine only.
+        Address of the page; the default can be reached from this machine only.
     port : int
-        Port of the page; the next free one is taken if it is in use.
+        Port of the page; if it is in use, the next free one is taken.
     report : callable, optional
         Called with lines of text, the first with the operator's address of the page.
 
@@ -99,13 +99,13 @@ def serve_desk(
                     report(f"warning: {server.warning}")
                 threading.Event().wait()
             except KeyboardInterrupt:
-                # Before the page, which may take its time.
+                # Before the page's server, whose end may take a while.
                 instrument.close()
                 report("closed")
 
 
 class _Desk:
-    """What all browsers share: the folder, the instrument, the chosen plan and the opened cloud."""
+    """State shared by all browsers: the folder, the instrument, the chosen plan and the opened cloud."""
 
     def __init__(
         self, folder: Path, board: Board, instrument: Instrument, plan_path: Path | None, plan: ScanPlan | None
@@ -115,17 +115,17 @@ class _Desk:
         self.opened = _Opened()
 
     def serve_files(self, server: DeskServer) -> None:
-        """Let browsers fetch the folder's reports."""
+        """Add a route for the files of the folder; viewers may fetch reports only."""
 
         @server.app.get("/files/{name}")
         def file(name: str, request: Request) -> Response:
             try:
-                path = file_in(self.folder, name)
+                path = find_file(self.folder, name)
             except Error as error:
                 return PlainTextResponse(f"{error}\n", 404)
-            if kind_of(name) != "report" and not server.is_operator(request):
+            if guess_kind(name) != "report" and not server.is_operator(request):
                 return PlainTextResponse("only the operator may fetch this\n", 403)
-            # A report's own scripts must not press the operator's buttons.
+            # Scripts in a report must not press the operator's buttons.
             return FileResponse(path, headers={"Content-Security-Policy": "sandbox allow-scripts allow-popups"})
 
     def build(self, board: Board, operator: bool) -> None:
@@ -136,8 +136,8 @@ class _Desk:
             build_board(board, False)
 
     def plans(self, load: Callable[[Path], object]) -> dict[str, str]:
-        """Names of the valid plans to choose from, as ``load`` reads them, by their paths."""
-        paths = [self.folder / file.name for file in listed(self.folder) if file.kind == "description"]
+        """Return the names of the valid plans that ``load`` reads, by their paths."""
+        paths = [self.folder / file.name for file in list_files(self.folder) if file.kind == "description"]
         if self.plan_path is not None and self.plan_path not in paths:
             paths.append(self.plan_path)
         found = {}
@@ -148,13 +148,13 @@ class _Desk:
         return found
 
     def calibrations(self) -> list[str]:
-        """The calibrations to choose from."""
-        return [file.name for file in listed(self.folder) if file.kind == "calibration"]
+        """Return the names of the calibrations."""
+        return [file.name for file in list_files(self.folder) if file.kind == "calibration"]
 
     def show_cloud(self, name: str, cloud: PointCloud, *, of: int | None = None, path: Path | None = None) -> None:
-        """Show a cloud, a part ``of`` so many points, thinned if it is large, and have it measured.
+        """Show a cloud, a sample ``of`` that many points, thinned if it is large, and make it the one to measure.
 
-        When someone looks closer, more points are shown: all of a COPC file's ``path``, else those of the cloud.
+        A closer view shows more points: those of a COPC file's ``path``, else those of the cloud.
         """
 
         def closer(low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -163,7 +163,7 @@ class _Desk:
             else:
                 inside = np.flatnonzero(np.all((cloud.points_mm >= low) & (cloud.points_mm <= high), axis=1))
                 found = cloud.selected(inside[:: -(-len(inside) // _MOST_SHOWN) or 1])
-            return table_of(found.points_mm, **_fields(found))
+            return point_table(found.points_mm, **_fields(found))
 
         self.opened = _Opened(cloud)
         self.board.detail = None
@@ -173,8 +173,8 @@ class _Desk:
         self.board.cloud.add(shown.points_mm, total, **_fields(shown))
         self.board.detail = closer if total > len(shown) else None
 
-    def measured(self) -> PointCloud:
-        """The cloud to measure: the opened one, else what a scan shows."""
+    def cloud_to_measure(self) -> PointCloud:
+        """Return the opened cloud, or else the cloud of the running scan."""
         if self.opened.cloud is not None:
             return self.opened.cloud
         points = self.board.cloud.points()
@@ -183,21 +183,21 @@ class _Desk:
 
 
 def _fields(cloud: PointCloud) -> dict[str, np.ndarray | None]:
-    """Fields (N,) by which a cloud's points are coloured."""
+    """Return fields (N,) for colouring a cloud's points."""
     known = cloud.uncertainty
     std = None if known is None else np.linalg.norm(known.std_mm(), axis=1)
     return {"intensity": cloud.intensity, "deviation": cloud.deviation_mm, "uncertainty": std}
 
 
 class _Number(ui.number):
-    """A field for a number that stays as it was typed.
+    """A field for a number that keeps what was typed.
 
-    NiceGUI's own is rewritten when it loses the focus, by a number that may be older than what was typed before the
+    NiceGUI's field is rewritten when it loses the focus, possibly with a number older than what was typed before the
     page was connected.
     """
 
     def sanitize(self) -> None:
-        """Nothing: limits are checked where the number is used."""
+        """Do nothing: limits are checked where the number is used."""
 
 
 class _OperatorPage:
@@ -211,7 +211,7 @@ class _OperatorPage:
         self._files: tuple[object, ...] = ()
 
     def build(self) -> None:
-        """Build all of it."""
+        """Build the page."""
         view = self._view
         view.header()
         with ui.element("main").classes("desk"):
@@ -242,7 +242,7 @@ class _OperatorPage:
     def _button(
         self, label: str, press: Callable[[], object], states: tuple[InstrumentState, ...] | None = None
     ) -> ui.button:
-        """A button whose errors are shown; it can be pressed in some states only."""
+        """Add a button whose errors are shown, and which is enabled in some states only."""
 
         async def pressed() -> None:
             try:
@@ -265,8 +265,8 @@ class _OperatorPage:
         if (shown := self._exposure_now()) != self._exposed:
             # Not while the operator types in it.
             self._exposed, self._exposure.value = shown, shown[1]
-        # Refreshed when it is built, and then only while it is connected. What was typed before that comes a moment
-        # after the connection; a button that is pressed in this moment would be obeyed first.
+        # A new page is refreshed twice before its buttons are enabled: text typed before the connection arrives a
+        # moment after it, and a button pressed in between would be obeyed first.
         self._refreshed += 1
         for element, states in self._only:
             element.set_enabled(self._refreshed > 2 and self._instrument.state in states)
@@ -276,8 +276,8 @@ class _OperatorPage:
     def _connect_part(self) -> None:
         plans, plan = self._desk.plans(load_plan), self._desk.plan
         chosen = None if self._desk.plan_path is None else str(self._desk.plan_path)
-        # Values go to the constructors here and below: one that is set later reaches the browser as a message, after
-        # what the operator may have typed by then.
+        # Here and below, values are passed to the constructors: a value set later reaches the browser as a message, and
+        # could overwrite what the operator has typed by then.
         camera, stage = _addresses(plan) if plan else ("", "")
         self._plan = ui.select(plans, label="plan of the scan", value=chosen, on_change=self._choose).classes("w-full")
         kinds = "gige:NAME, genicam:PRODUCER.cti, replay:FILE"
@@ -295,7 +295,7 @@ class _OperatorPage:
         self._exposed = self._exposure_now()
         self._exposure = _Number("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
         self._exposure.on("change", self._expose)
-        ui.label("With the laser's light the laser is lit only while an image is exposed.").classes("text-xs")
+        ui.label("The laser is on only while an image is exposed.").classes("text-xs")
 
     def _choose(self) -> None:
         if not self._plan.value or Path(self._plan.value) == self._desk.plan_path:
@@ -361,7 +361,7 @@ class _OperatorPage:
         with ui.row():
             self._button("begin", lambda: self._calibrate(resume=False), (InstrumentState.DISCONNECTED, *_FREE))
             self._button(
-                "go on with it", lambda: self._calibrate(resume=True), (InstrumentState.DISCONNECTED, *_FREE)
+                "continue it", lambda: self._calibrate(resume=True), (InstrumentState.DISCONNECTED, *_FREE)
             ).props("outline")
         self._show_request = answer_buttons(self._board, self._instrument.answer)
         self._button("stop", self._instrument.stop, (InstrumentState.BUSY,)).props("color=warning")
@@ -372,7 +372,7 @@ class _OperatorPage:
             raise DescriptionError("choose a plan of a calibration first (docs/how-to/calibrate-live.md)")
         plan = load_guided_plan(Path(self._guided_plan.value))
         plan = plan.connected(camera=self._camera.value or None, port=self._stage.value or None)
-        out = new_in(self._desk.folder, self._calibration_name.value or "", suffix=".json")
+        out = new_path(self._desk.folder, self._calibration_name.value or "", suffix=".json")
         self._instrument.calibrate(plan, out, resume=resume, overwrite=bool(self._replace.value))
 
     # Scan
@@ -399,7 +399,7 @@ class _OperatorPage:
             )
         with ui.row():
             self._button("pause", self._instrument.pause, (InstrumentState.SCANNING,))
-            self._button("go on", self._instrument.resume, (InstrumentState.PAUSED,))
+            self._button("resume", self._instrument.resume, (InstrumentState.PAUSED,))
             self._button("stop", self._instrument.stop, _RUNNING).props("color=warning")
 
     def _show_extent(self) -> None:
@@ -414,11 +414,11 @@ class _OperatorPage:
             raise DescriptionError("give the first position, the step and the number of positions")
         moved = {"start_mm": start, "step_mm": step, "count": count}
         stage = validated(StagePlan, plan.stage.model_dump() | moved, "the scan")
-        out = new_in(self._desk.folder, self._out.value or "", suffix=".h5")
+        out = new_path(self._desk.folder, self._out.value or "", suffix=".h5")
         overwrite = bool(self._overwrite.value)
         if out.exists() and not overwrite and not resume:
             raise DescriptionError(f"{out.name} exists: give another name, or tick 'replace'")
-        if interrupted(out) and not resume and not overwrite:
+        if is_interrupted(out) and not resume and not overwrite:
             raise DescriptionError(f"{out.name} was interrupted: continue it, give another name, or tick 'replace'")
         known = self._calibration.value
         self._desk.opened = _Opened()
@@ -437,13 +437,13 @@ class _OperatorPage:
         self._list()
 
     def _list(self) -> None:
-        """Bring the list of files and the choices up to date where the folder has changed."""
+        """Update the list of files and the choices if the folder has changed."""
         try:
-            files = listed(self._desk.folder)
+            files = list_files(self._desk.folder)
         except Error as error:
             self._board.say(str(error), "error")
             return
-        # A recording that grows is no other file.
+        # A growing recording is not a new file.
         known = tuple((file.name, None if file.kind == "interrupted capture" else file.time_s) for file in files)
         if known == self._files:
             return
@@ -468,15 +468,15 @@ class _OperatorPage:
                     self._button("about", partial(self._about, name)).props("flat dense")
 
     async def _show(self, name: str) -> None:
-        path = file_in(self._desk.folder, name)
+        path = find_file(self._desk.folder, name)
         cloud, total = await asyncio.to_thread(read_thinned_cloud, path, _MOST_OPENED)
         if total > len(cloud):
-            self._board.say(f"{name} has {total:,} points: {len(cloud):,}, evenly chosen, are measured", "warning")
+            self._board.say(f"{name} has {total:,} points: an even sample of {len(cloud):,} is measured", "warning")
         self._desk.show_cloud(name, cloud, of=total, path=path if is_copc(path) else None)
         self._view.mark([])
 
     async def _about(self, name: str) -> None:
-        text = await asyncio.to_thread(describe, file_in(self._desk.folder, name))
+        text = await asyncio.to_thread(describe, find_file(self._desk.folder, name))
         with ui.dialog() as dialog, ui.card().classes("max-w-none"):
             ui.label(name).classes("font-bold")
             ui.label(text).classes("whitespace-pre-wrap font-mono text-sm")
@@ -488,8 +488,8 @@ class _OperatorPage:
         if not known:
             raise DescriptionError("choose the calibration first, under Scan")
         folder, board = self._desk.folder, self._board
-        capture, calibration = file_in(folder, name), file_in(folder, known)
-        out = new_in(folder, Path(name).stem, suffix=".ply")
+        capture, calibration = find_file(folder, name), find_file(folder, known)
+        out = new_path(folder, Path(name).stem, suffix=".ply")
         refuse_unsuitable(out, overwrite=False)
         board.say(f"reconstructing {name} with {known}")
         cloud = await asyncio.to_thread(reconstruct, capture, calibration)
@@ -530,13 +530,13 @@ class _OperatorPage:
         self._places.set_text("no point is picked")
 
     def _length(self) -> None:
-        picked, cloud = self._desk.opened.picked, self._desk.measured()
+        picked, cloud = self._desk.opened.picked, self._desk.cloud_to_measure()
         if len(picked) < 2:
             raise DescriptionError("click two points in the cloud first")
         self._result(length_between(cloud, *(point_near(cloud, place) for place in picked)).text())
 
     async def _shape(self, shape: Shape) -> None:
-        picked, cloud = self._desk.opened.picked, self._desk.measured()
+        picked, cloud = self._desk.opened.picked, self._desk.cloud_to_measure()
         if not picked:
             raise DescriptionError("click a point in the cloud first")
         radius = float(self._radius.value or 0.0)
@@ -551,7 +551,7 @@ class _OperatorPage:
 
 
 def _addresses(plan: ScanPlan) -> tuple[str, str]:
-    """Of the camera and of the stage."""
+    """Return the addresses of the camera and the stage."""
     return plan.camera or "", plan.stage.port or ""
 
 

@@ -1,4 +1,4 @@
-"""A recording on the page while it grows: its latest image with the stripe, warnings, and the cloud so far."""
+"""Display of a recording in progress on the page: its latest image with the stripe, warnings, and the cloud so far."""
 
 import threading
 import time
@@ -18,15 +18,15 @@ from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, par
 from uwlts.stripe import CaptureStripes, stripe_in, warm_up
 
 LOOK_S = 0.1
-"""Time between two looks for new images; one takes some ms."""
+"""Interval between checks for new images; a check takes a few ms."""
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
-"""A laser image is faint below this part of the full scale, saturated with more than this part of its lines there; it
-shows hardly any stripe below this part of its lines."""
+"""A laser image is faint below this fraction of full scale, saturated above this fraction of saturated lines, and shows
+too little of the stripe below this fraction of its lines."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Profile:
-    """The stripe of one laser image: pixels (N, 2), points (N, 3) in mm, their grey values, warnings."""
+    """Stripe of one laser image: pixels (N, 2), points (N, 3) in mm, their grey values, warnings."""
 
     pixels: np.ndarray
     points_mm: np.ndarray
@@ -37,9 +37,9 @@ class _Profile:
 
 
 class RecordingView:
-    """Shows the images of one recording after another on a board; ``calibration`` is for the cloud.
+    """Display of the images of recordings on a board; ``calibration`` is for the cloud.
 
-    CalibrationError, from `see`, where the calibration does not fit the recording.
+    `show` raises CalibrationError if the calibration does not fit the recording.
     """
 
     def __init__(self, board: Board, header: CaptureHeader, calibration: AnyCalibration | None, *, name: str = ""):
@@ -50,8 +50,8 @@ class RecordingView:
         board.cloud.clear()
         board.cloud_name = name or header.name
 
-    def see(self, frame: Frame, number: int) -> None:
-        """Show an image, and its profile in the cloud."""
+    def show(self, frame: Frame, number: int) -> None:
+        """Show an image, and add its profile to the cloud."""
         board, full = self._board, self._header.saturation_dn
         light = "laser" if frame.laser_on else "lamp"
         caption = f"image {number + 1}, {light}, stage at {frame.stage_mm:.3f} mm, exposure {frame.exposure_ms:.3g} ms"
@@ -74,7 +74,7 @@ class RecordingView:
         if len(profile.points_mm):
             board.cloud.add(profile.points_mm, intensity=profile.intensity)
         for remark in profile.remarks:
-            # Once each: they stay in the log.
+            # Once each, because they stay in the log.
             if remark not in self._said:
                 self._said.add(remark)
                 board.say(f"image {number + 1}: {remark}", "warning")
@@ -97,16 +97,16 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
         if saturated > _MANY:
             remarks.append("saturated on many lines: shorten the exposure")
         elif np.quantile(brightest, 0.98) < _FAINT * full:
-            remarks.append("faint: lengthen the exposure, or is the laser lit?")
+            remarks.append("faint: lengthen the exposure, or is the laser off?")
     if len(line) < _FEW * len(stripe.status):
-        remarks.append("hardly any stripe: is the object in the volume?")
+        remarks.append("almost no stripe: is the object in the volume?")
     return _Profile(stripe.pixels(), points, intensity, len(stripe.status), saturated, tuple(remarks))
 
 
-def frames_of(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:
-    """Every image of a recording as it is written, with its number; None whenever there is nothing new.
+def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:
+    """Iterate over the images of a recording as it is written, with their numbers; None if there is no new one.
 
-    Ends after the finished file's. CaptureError where the finished file is damaged.
+    Ends with the last image of the finished file. Raises CaptureError if the finished file is damaged.
     """
     shown = 0
     while True:
@@ -118,7 +118,7 @@ def frames_of(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:
                     yield capture.header, number, capture[number]
                     shown = number + 1
         except CaptureError:
-            # Not there yet, or just being renamed.
+            # Not written yet, or being renamed.
             if finished:
                 raise
         if finished:
@@ -134,20 +134,19 @@ def watch(
     port: int = 8080,
     report: Callable[[str], None] = print,
 ) -> None:
-    """Show a recording while it grows, in a browser: the latest image with its stripe, and the cloud so far.
+    """Show a recording in progress in a browser: the latest image with its stripe, and the cloud so far.
 
-    It ends by Ctrl-C.
-
+    Ctrl-C ends it.
     Parameters
     ----------
     capture : str or Path
-        Capture that is being recorded, or is to be.
+        Capture that is being recorded, or will be.
     calibration : Calibration, PolynomialCalibration or path, optional
-        Calibration of the sensor, or one by polynomials, for the cloud.
+        Calibration of the sensor, or polynomial calibration, for the cloud.
     host : str
-        Address at which the page is served; the default can be reached from this machine only.
+        Address of the page; the default can be reached from this machine only.
     port : int
-        Port of the page; the next free one is taken if it is in use.
+        Port of the page; if it is in use, the next free one is taken.
     report : callable, optional
         Called with lines of text, the first with the address of the page.
 
@@ -166,7 +165,7 @@ def watch(
             if server.warning:
                 report(f"warning: {server.warning}")
             view, begun = None, 0
-            for seen in frames_of(path):
+            for seen in follow_frames(path):
                 if seen is None:
                     time.sleep(LOOK_S)
                     continue
@@ -174,7 +173,7 @@ def watch(
                 if view is None:
                     board.phase("recording")
                     view, begun = RecordingView(board, header, known, name=path.name), number
-                view.see(frame, number)
+                view.show(frame, number)
                 planned = header.provenance.get("images")
                 count = number + 1
                 if isinstance(planned, int) and planned >= count:

@@ -1,6 +1,6 @@
-"""Limits of bytes, time and number of connections in front of the parser of requests.
+"""Limits of size, time and number of connections in front of the parser of requests.
 
-A stranger cannot hold what the operator needs: where too many connections wait, the oldest ends, never the newest.
+Other clients cannot block the operator: if too many connections wait, the oldest is closed, never the newest.
 """
 
 import asyncio
@@ -10,25 +10,25 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEAD_BYTES = 64 * 1024
-"""Longest head of a request. Browsers send some KB, cookies of other programs of the machine included."""
+"""Longest head of a request. Browsers send some KB, including cookies of other programs on the machine."""
 HEAD_S = 5.0
-"""Longest time from the first byte, or the connection, to the end of a request's head: a slow network is faster."""
+"""Longest time from the first byte, or the connection, to the end of a request's head, even in a slow network."""
 BACKLOG = 64
-"""Connections accepted at a time. Below the limits, so that what came with the newest is read before any ends."""
+"""Connections accepted at once. Below the limits, so that the newest request is read before one is closed."""
 _OF_ONE_PEER, _IN_ALL = 128, 256
-"""Connections that wait for a head. A browser has 6; a process may open 1024 files, and the page needs some too."""
+"""Connections that wait for a head, of one peer and in total. A browser has 6; a process may open 1024 files."""
 TOO_LONG = "431 Request Header Fields Too Large"
 
 
-class AwaitedHeads:
-    """Connections of which the head of a request is awaited. Used by the thread of one event loop."""
+class PendingHeads:
+    """Connections that have not yet sent the head of a request. Used in the thread of one event loop."""
 
     def __init__(self) -> None:
         self._peers: dict[asyncio.Transport, str] = {}
         self._ends: dict[asyncio.Transport, asyncio.TimerHandle] = {}
 
     def add(self, transport: asyncio.Transport) -> None:
-        """Count a connection that waits; the oldest of its peer, or of all, is ended where there are too many."""
+        """Add a waiting connection; if there are too many, close the oldest of its peer, or of all."""
         self.remove(transport)
         peer = self._peers[transport] = (transport.get_extra_info("peername") or [""])[0]
         of_peer = [each for each, its in self._peers.items() if its == peer]
@@ -38,21 +38,21 @@ class AwaitedHeads:
                 waiting[0].abort()
 
     def limit_time(self, transport: asyncio.Transport) -> None:
-        """End a connection whose head is not complete in time, counted from the first call."""
+        """Close a connection whose head is not complete in time, counted from the first call."""
         if transport not in self._ends:
             self._ends[transport] = asyncio.get_running_loop().call_later(HEAD_S, transport.abort)
 
     def remove(self, transport: asyncio.Transport) -> None:
-        """Count a connection no more."""
+        """Remove a connection that no longer waits."""
         self._peers.pop(transport, None)
         if (end := self._ends.pop(transport, None)) is not None:
             end.cancel()
 
 
 class LimitedHttp(H11Protocol):
-    """HTTP with limited heads. Uvicorn's parser sees to the length; what it lacks is the status, time and numbers."""
+    """HTTP with limited heads: uvicorn's parser limits their length; this class adds status, time and number."""
 
-    def __init__(self, heads: AwaitedHeads, **settings: Any):
+    def __init__(self, heads: PendingHeads, **settings: Any):
         super().__init__(**settings)
         self._heads = heads
 
@@ -63,7 +63,7 @@ class LimitedHttp(H11Protocol):
         self._heads.limit_time(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Take a part of a request."""
+        """Receive a part of a request."""
         super().data_received(data)
         if self.conn.their_state is h11.IDLE:
             self._heads.limit_time(self.transport)
@@ -71,22 +71,22 @@ class LimitedHttp(H11Protocol):
             self._heads.remove(self.transport)
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """Give the connection away."""
+        """Hand the connection over to the websocket."""
         self._heads.remove(self.transport)
         super().handle_websocket_upgrade(event)
 
     def on_response_complete(self) -> None:
-        """Wait for the next head; the answer may still be on its way to a slow network, and has its time."""
+        """Wait for the next head; the response may still be in transmission, without a limit."""
         self._heads.add(self.transport)
         super().on_response_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End."""
+        """Remove the connection."""
         self._heads.remove(self.transport)
         super().connection_lost(exc)
 
     def send_400_response(self, msg: str) -> None:
-        """Refuse what is no request, or too long."""
+        """Refuse an invalid or too long request."""
         if len(self.conn.trailing_data[0]) <= HEAD_BYTES:
             super().send_400_response(msg)
             return

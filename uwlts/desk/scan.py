@@ -1,4 +1,4 @@
-"""A scan on its own, with the page of `uwlts watch` beside it where that is wanted."""
+"""A single scan, optionally with the page of `uwlts watch`."""
 
 import ctypes
 import os
@@ -23,7 +23,7 @@ from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import CAPTURES
 
 _POLITE = 10
-"""Priority given up in favour of the recording, as by ``nice``."""
+"""Reduction of the page's priority in favour of the recording, as by ``nice``."""
 _PATIENCE_S = 5.0
 _SIGNAL_WHEN_PARENT_ENDS = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""
@@ -49,12 +49,10 @@ def scan(
 ) -> ScanProgress:
     """Record a scan with a camera and a stage into a capture.
 
-    Moves, lets the stage settle, switches the laser, takes an image and stores it with the position read back.
-
-    The plan is checked against travel and volume before anything moves; the laser goes off however the scan ends. An
-    interrupted scan leaves its complete images in ``out.part``; ``resume`` goes on after them, at exposures that the
-    recorded images have.
-
+    For each image: move, let the stage settle, switch the laser, take the image, and store it with the position read
+    back. The plan is checked against travel and volume before anything moves. The laser goes off however the scan ends.
+    An interrupted scan leaves its complete images in ``out.part``; ``resume`` continues with the exposures of the
+    recorded images.
     Parameters
     ----------
     plan : ScanPlan or path of a TOML file
@@ -62,27 +60,27 @@ def scan(
     out : str or Path
         Capture to write.
     camera : str, optional
-        Address of the camera, in place of the plan's: gige:NAME, genicam:PRODUCER.cti or replay:PATH.
+        Address of the camera, instead of the plan's: gige:NAME, genicam:PRODUCER.cti or replay:PATH.
     stage : str, optional
-        Serial port of the stage, in place of the plan's.
+        Serial port of the stage, instead of the plan's.
     home : bool
-        Find the limit switch first.
+        Home the stage first.
     unlock : bool
-        Take the stage's position as it is, without homing.
+        Accept the stage's position without homing.
     watch : bool
-        Show the recording in a browser meanwhile, as uwlts watch does.
+        Show the recording in a browser, as uwlts watch does.
     calibration : str or Path, optional
-        Watched: calibration of the sensor, or one by polynomials, for the cloud.
+        Watched: calibration of the sensor, or polynomial calibration, for the cloud.
     port : int
-        Watched: port of the page; the next free one is taken if it is in use.
+        Watched: port of the page; if it is in use, the next free one is taken.
     resume : bool
-        Continue an interrupted scan; refused if the plan is another than the one it began with.
+        Continue an interrupted scan; refused if the plan differs from that of the interrupted scan.
     overwrite : bool
         Replace an existing capture.
     progress : callable, optional
-        Called with the number of images done and the number in all.
+        Called with the number of finished images and the total.
     report, warn : callable, optional
-        Called with lines of text about the scan, and about what needs attention.
+        Called with lines of text about the scan, and with warnings.
 
     Raises
     ------
@@ -91,9 +89,8 @@ def scan(
     RangeError, DesignError
         The plan cannot be carried out; nothing has moved.
     HardwareError
-        Camera, stage or laser fail, or the camera has another image size than the sensor's description. Or the stage
-        has lost steps, which is seen at the end: all images are in ``out.part`` then, and ``resume`` takes them as they
-        are.
+        Camera, stage or laser fail, or the camera's image size differs from the sensor's description. Also raised at
+        the end of a scan whose stage has lost steps: all images are in ``out.part``, and ``resume`` accepts them.
     OutputError
         The file exists, or cannot be written.
     """
@@ -108,7 +105,7 @@ def scan(
             raise DescriptionError("`calibration` is for the cloud on the page: give `watch` too")
         load_calibration(calibration)
     with ExitStack() as stack:
-        page = stack.enter_context(PageBeside(out, calibration=calibration, port=port, say=report)) if watch else None
+        page = stack.enter_context(WatchPage(out, calibration=calibration, port=port, say=report)) if watch else None
         moved, opened = stack.enter_context(GrblStage(serial_port)), stack.enter_context(open_camera(address))
         if home:
             report("homing")
@@ -129,12 +126,11 @@ def scan(
         )
 
 
-class PageBeside:
-    """Shows a recording from `start` on until the ``with`` ends; what goes wrong with it is said and has no effect.
+class WatchPage:
+    """Page that shows a recording from `start` until the ``with`` ends; its failures do not affect the recording.
 
-    The page is a process of its own: it can neither slow the recording nor end it.
-
-    ``say`` is called with the line that states the page's address, from another thread.
+    The page is a separate process, which can neither slow the recording nor end it. ``say`` is called, from another
+    thread, with a line that states the page's address.
     """
 
     def __init__(self, capture: Path, *, calibration: str | Path | None, port: int, say: Callable[[str], None]):
@@ -144,11 +140,11 @@ class PageBeside:
         self._process: subprocess.Popen[str] | None = None
 
     def start(self) -> None:
-        """Open the page; once the recording has begun, for before a file of its name would be an older one."""
+        """Open the page after the recording has begun: before that, a file of its name would be an older one."""
         if self._process is not None:
             return
         library = ctypes.CDLL(None)
-        # In a session of its own the terminal's Ctrl-C does not reach it. It ends with a scan that is killed, too.
+        # In a separate session, the terminal's Ctrl-C does not reach it. The kernel ends it if the scan is killed.
         self._process = subprocess.Popen(
             self._command,
             stdin=subprocess.DEVNULL,
@@ -161,7 +157,7 @@ class PageBeside:
         threading.Thread(target=self._announce, args=(self._process,), daemon=True).start()
 
     def _announce(self, process: "subprocess.Popen[str]") -> None:
-        # What comes later must not fill the pipe.
+        # Further lines are read, so that the pipe does not fill up.
         for line in process.stdout or ():
             if line.startswith("open "):
                 self._say(f"{line.split(';')[0]}, while the scan runs")

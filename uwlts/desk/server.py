@@ -1,4 +1,4 @@
-"""Serves the page, in a thread of its own, at the wanted port or the next free one."""
+"""Server of the page in its own thread, at the requested port or the next free one."""
 
 import asyncio
 import errno
@@ -22,13 +22,13 @@ from uwlts.desk.access import GuardedApp, PageAccess, is_local
 from uwlts.desk.board import Board
 from uwlts.desk.board_page import build_board
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.request_limits import BACKLOG, HEAD_BYTES, AwaitedHeads, LimitedHttp
-from uwlts.desk.thinned_cloud import packed
+from uwlts.desk.request_limits import BACKLOG, HEAD_BYTES, LimitedHttp, PendingHeads
+from uwlts.desk.thinned_cloud import pack
 from uwlts.errors import Error, SetupError
 
 _START_S, _END_S = 30.0, 5.0
 _PORTS = 100
-"""Ports that are tried after the wanted one."""
+"""Number of ports that are tried."""
 _LATEST = {"Cache-Control": "no-store"}
 _ALONE = threading.Lock()
 """Held by the page that is served."""
@@ -40,7 +40,7 @@ def _application(**settings: Any) -> FastAPI:
 
 @cache
 def _nicegui() -> FastAPI:
-    """NiceGUI, of which a process has one; it shows what its ``state.show`` builds, of one page after another."""
+    """Return the only NiceGUI application of the process; ``state.show`` builds its present page."""
     app = _application()
 
     def root(request: Request) -> None:
@@ -51,13 +51,26 @@ def _nicegui() -> FastAPI:
 
 
 class DeskServer:
-    """A page that shows a board; served from construction on, until the ``with`` ends. One at a time.
+    """Server of a page that shows a board, from construction until the ``with`` ends. Only one at a time.
 
-    A browser finds it at its ``address``. Everybody who opens it there may look; controls are shown, and obeyed, at the
-    ``operator_address``, which has a token. ``warning`` is what to say where the page can be seen from other machines.
-    ``build(board, operator)`` builds the page for the operator or for a viewer. The operator's page has the button of a
-    ``switch``, whose process listens at the next free port after the page's. SetupError where no port is free, the
-    address is not one of this machine, or this process serves a page already.
+    Everybody who opens the ``address`` may view the page. Only the ``operator_address``, which has a token, has
+    controls. ``warning`` is a warning to report if other machines can reach the page, else None.
+
+    Parameters
+    ----------
+    board : Board
+        Content of the page.
+    build : callable, optional
+        Function of the board and of whether the page is for the operator, which builds the page.
+    host, port
+        Address to serve at.
+    switch : LaserSwitch, optional
+        Switch with a button on the operator's page; its process listens at the next free port after the page's.
+
+    Raises
+    ------
+    SetupError
+        No port is free, the address is not one of this machine, or this process already serves a page.
     """
 
     def __init__(
@@ -72,7 +85,7 @@ class DeskServer:
         self._access, nicegui, self._switch = PageAccess(host), _nicegui(), switch
         self._app = _application(lifespan=nicegui.router.lifespan_context)
         self._add_content(board)
-        # What nothing else answers, whenever that is added.
+        # Handles all requests that no other route matches.
         self._app.router.default = nicegui
 
         def show(request: Request) -> None:
@@ -85,10 +98,10 @@ class DeskServer:
         if not _ALONE.acquire(blocking=False):
             raise SetupError("this program serves a page already: close that one first")
         try:
-            self._socket = _bound(host, port)
+            self._socket = _bind(host, port)
             own_port = self._socket.getsockname()[1]
             if switch is not None:
-                switch.serve(self._access, _bound(host, (own_port + 1) % 65536), page_port=own_port)
+                switch.serve(self._access, _bind(host, (own_port + 1) % 65536), page_port=own_port)
             named = f"[{host}]" if ":" in host else host
             self.address = f"http://{named}:{own_port}"
             self.operator_address = f"{self.address}/?token={self._access.token}"
@@ -100,11 +113,11 @@ class DeskServer:
                 )
             self._open = True
             nicegui.state.show = show
-            # Only errors: a browser that goes away in the middle of an answer is none.
+            # Only errors are logged: a browser that disconnects during a response is not an error.
             config = uvicorn.Config(
                 GuardedApp(self._app, self._access),
-                http=cast("type[asyncio.Protocol]", partial(LimitedHttp, AwaitedHeads())),
-                # Another loop may accept more connections at a time.
+                http=cast("type[asyncio.Protocol]", partial(LimitedHttp, PendingHeads())),
+                # Another event loop may accept more connections at once.
                 loop="asyncio",
                 backlog=BACKLOG,
                 h11_max_incomplete_event_size=HEAD_BYTES,
@@ -129,7 +142,7 @@ class DeskServer:
             time.sleep(0.02)
 
     def _add_content(self, board: Board) -> None:
-        """What browsers fetch apart from the page itself."""
+        """Add the routes for picture, coverage and cloud."""
 
         @self._app.get("/picture.jpg")
         def picture() -> Response:
@@ -156,11 +169,11 @@ class DeskServer:
 
     @property
     def app(self) -> FastAPI:
-        """The application, to serve more than the board."""
+        """The application, for further routes."""
         return self._app
 
     def is_operator(self, request: Request) -> bool:
-        """Whether a request is the operator's."""
+        """Return whether a request is the operator's."""
         return self._access.is_operator(request.headers)
 
     def close(self) -> None:
@@ -186,21 +199,21 @@ class DeskServer:
 
 
 def _cloud_answer(table: np.ndarray) -> Response:
-    """Points (N, 6) for the browser."""
-    origin, data = packed(table)
+    """Return points (N, 6) as a response to the browser."""
+    origin, data = pack(table)
     headers = _LATEST | {"X-Origin": ",".join(map(str, origin.tolist()))}
     return Response(data, 200, headers, "application/octet-stream")
 
 
-def _bound(host: str, port: int) -> socket.socket:
-    """A socket at the port, or the next free one."""
+def _bind(host: str, port: int) -> socket.socket:
+    """Return a socket at the port, or at the next free one."""
     try:
         family, *_, place = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
     except OSError as error:
         raise SetupError(f"'{host}' is no address to serve a page at: {error.strerror}") from error
     for wanted in range(port, min(port + _PORTS, 65536)) if port else (0,):
         found = socket.socket(family, socket.SOCK_STREAM)
-        # A port that was just closed can be used again.
+        # Allows reuse of a port that was just closed.
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             found.bind((place[0], wanted, *place[2:]))

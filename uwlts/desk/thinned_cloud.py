@@ -1,16 +1,16 @@
-"""A cloud of bounded size for the view: every n-th of all points, with n doubled whenever they become too many."""
+"""Cloud of bounded size for the view: every n-th point, where n doubles when there are too many."""
 
 import threading
 
 import numpy as np
 
 FIELDS = ("intensity", "deviation", "uncertainty")
-"""Fields by which points can be coloured besides depth: in grey values, mm and mm."""
+"""Fields for colouring points besides depth: in grey values, mm and mm."""
 _COLUMNS = 3 + len(FIELDS)
 
 
-def table_of(points_mm: np.ndarray, **fields: np.ndarray | None) -> np.ndarray:
-    """Points (N, 6): coordinates (N, 3) in mm, then fields (N,) by the names in `FIELDS`, NaN where unknown."""
+def point_table(points_mm: np.ndarray, **fields: np.ndarray | None) -> np.ndarray:
+    """Return points (N, 6): coordinates in mm, then fields (N,) by the names in `FIELDS`, NaN if unknown."""
     table = np.full((len(points_mm), _COLUMNS), np.nan)
     table[:, :3] = points_mm
     for column, name in enumerate(FIELDS, 3):
@@ -19,16 +19,16 @@ def table_of(points_mm: np.ndarray, **fields: np.ndarray | None) -> np.ndarray:
     return table
 
 
-def packed(table: np.ndarray) -> tuple[np.ndarray, bytes]:
-    """Origin (3,) in mm, and points (N, 6) from it with their fields as float32, row by row, for the browser."""
+def pack(table: np.ndarray) -> tuple[np.ndarray, bytes]:
+    """Return an origin (3,) in mm, and points (N, 6) relative to it with fields as float32, for the browser."""
     origin = np.round(np.median(table[:, :3], axis=0)) if len(table) else np.zeros(3)
     return origin, (table - np.append(origin, np.zeros(len(FIELDS)))).astype("<f4").tobytes()
 
 
 class ThinnedCloud:
-    """Points in mm with their fields, NaN where unknown; at most ``at_most`` of them are kept. Safe between threads.
+    """Points in mm with their fields, NaN if unknown; at most ``at_most`` are kept. Thread-safe.
 
-    ``version`` grows with every change, ``total`` counts all points that were added.
+    ``version`` increases with every change, ``total`` counts all points that were added.
     """
 
     def __init__(self, at_most: int = 300_000):
@@ -41,26 +41,26 @@ class ThinnedCloud:
         self._count, self._added, self._stride, self.total = 0, 0, 1, 0
 
     def clear(self) -> None:
-        """Begin anew without points."""
+        """Remove all points."""
         with self._lock:
             self._clear()
             self.version += 1
 
     def add(self, points_mm: np.ndarray, of: int | None = None, **fields: np.ndarray | None) -> None:
-        """Add points (N, 3), a part ``of`` so many, with fields (N,), by the names in `FIELDS`."""
+        """Add points (N, 3), a sample ``of`` that many, with fields (N,) by the names in `FIELDS`."""
         with self._lock:
             first = -self._added % self._stride
             self._added += len(points_mm)
             self.total += len(points_mm) if of is None else of
             kept = slice(first, None, self._stride)
             known = {name: values for name, values in fields.items() if values is not None}
-            table = table_of(points_mm[kept], **{name: values[kept] for name, values in known.items()})
+            table = point_table(points_mm[kept], **{name: values[kept] for name, values in known.items()})
             while len(table):
                 fitting, table = np.split(table, [self._at_most - self._count])
                 self._table[self._count : self._count + len(fitting)] = fitting
                 self._count += len(fitting)
                 if self._count == self._at_most:
-                    # As the points that are kept lie a stride apart, every other one of both.
+                    # Keep every second point of both parts, because one stride separates the kept points.
                     self._stride *= 2
                     halved = self._table[::2].copy()
                     self._table[: len(halved)], self._count = halved, len(halved)
@@ -68,6 +68,6 @@ class ThinnedCloud:
             self.version += 1
 
     def points(self) -> np.ndarray:
-        """The points (N, 6) that are kept: coordinates in mm, then the fields."""
+        """Return the kept points (N, 6): coordinates in mm, then the fields."""
         with self._lock:
             return self._table[: self._count].copy()

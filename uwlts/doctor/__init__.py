@@ -1,7 +1,7 @@
-"""Examination of this machine: what rendering, calibrating and scanning lack, and what to do about it.
+"""Examination of this machine for rendering, calibration and scanning, with advice.
 
-Nothing here moves the stage, switches the laser on, or keeps what it writes. A part of the examination that cannot be
-carried out because a library is broken becomes a finding itself.
+Nothing here moves the stage, switches the laser on, or leaves files. If a part of the examination cannot be carried out
+because a library is broken, that becomes a finding.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,15 +25,15 @@ def examine(
     Parameters
     ----------
     folder
-        Where captures are to be written; 64 MB are, and removed.
+        Folder for captures; 64 MB are written there and removed.
     camera
-        Address of a camera to take ten frames with: gige:NAME, genicam:PRODUCER.cti or replay:PATH. Its trigger is
-        switched off, its whole image read out.
+        Address of a camera to take ten frames: gige:NAME, genicam:PRODUCER.cti or replay:PATH. Its trigger
+        is switched off, and its whole image is read out.
     stage
-        Serial port of a stage to ask for its version, settings and state. It is not moved and the laser stays off, but
+        Serial port of a stage, whose version, settings and state are read. It is not moved and the laser stays off, but
         an Arduino Uno restarts: home before the next scan.
     progress
-        Called with the number of parts that are done and of all parts.
+        Called with the number of finished parts and the total.
     """
     parts: list[Callable[[], Sequence[Finding]]] = [
         _examine_libraries,
@@ -61,7 +61,7 @@ def examine(
 
 
 def _examine_libraries() -> list[Finding]:
-    # This module needs the library packaging, whose absence is a finding as well.
+    # The module needs the library packaging, whose absence is also a finding.
     from uwlts.doctor import libraries
 
     return libraries.examine()

@@ -1,7 +1,7 @@
-"""Findings about cameras, driver libraries, serial ports, and a camera and a stage tried for real.
+"""Findings about cameras, driver libraries and serial ports, including trials of a camera and a stage.
 
-A stage is not moved and the laser stays off: only questions are sent, and Ctrl-X at the end, at which Grbl switches the
-laser's pin off.
+The stage is not moved and the laser stays off: the trial only sends queries, and Ctrl-X at the end, at which Grbl
+switches the laser's pin off.
 """
 
 import os
@@ -23,14 +23,14 @@ except ImportError:
     grp = pwd = None  # Windows, where ports have no owners
 
 PRODUCERS = "GENICAM_GENTL64_PATH"
-# Aravis waits a second for answers; drivers of broken USB devices may take for ever.
+# Aravis waits for answers for a second; drivers of faulty USB devices may hang.
 _DISCOVERY_S = 2.5
 _USUAL_GROUP = "dialout"
 _JOIN_GROUP = "sudo usermod -aG {} $USER\nthen log out and in again"
 
 
 def examine_cameras() -> list[Finding]:
-    """The library of Aravis, and the cameras that it finds within 2.5 s."""
+    """Examine the library Aravis, and search for cameras for 2.5 s."""
     from uwlts.hardware.aravis import list_aravis_cameras
     from uwlts.runtime.shared_library import load_aravis
 
@@ -56,7 +56,7 @@ def examine_cameras() -> list[Finding]:
 
 
 def examine_producers(folders: str | None = None) -> list[Finding]:
-    """GenTL producers in folders separated by colons, those of the environment variable unless given."""
+    """Examine the GenTL producers in folders separated by colons, by default those of the environment variable."""
     named = os.environ.get(PRODUCERS, "") if folders is None else folders
     if not named:
         advice = (
@@ -68,16 +68,16 @@ def examine_producers(folders: str | None = None) -> list[Finding]:
     for folder in map(Path, filter(None, named.split(":"))):
         producers = sorted(folder.glob("*.cti"))
         if not producers:
-            what = "holds no producer (*.cti)" if folder.is_dir() else "is no folder"
+            what = "holds no producer (*.cti)" if folder.is_dir() else "is not a folder"
             findings.append(Finding("GenTL producers", "warning", f"{folder} {what}", f"correct {PRODUCERS}"))
         for path in producers:
-            # A producer's kind is read, not run: it is a program of the camera's maker.
+            # The producer's header is read, without running the producer.
             try:
                 fits = _kind_of_program(path) == _kind_of_program(Path(sys.executable))
             except OSError as error:
                 fault, advice = f": {error.strerror}", f"make {path} readable"
             else:
-                fault = "" if fits else " is no library for this machine"
+                fault = "" if fits else " is not a library for this machine"
                 advice = f"install the camera maker's software for {os.uname().machine}"
             if fault:
                 findings.append(Finding("GenTL producer", "warning", f"{path}{fault}", advice))
@@ -87,14 +87,14 @@ def examine_producers(folders: str | None = None) -> list[Finding]:
 
 
 def _kind_of_program(path: Path) -> tuple[bytes, bytes]:
-    """Mark, word length and byte order of an ELF file, and the machine it is for."""
+    """Return magic number, word length, byte order and machine of an ELF file."""
     with path.open("rb") as file:
         start = file.read(20)
     return start[:6], start[18:20]
 
 
 def examine_ports(ports: Sequence[str] | None = None) -> list[Finding]:
-    """Serial ports, those of this machine unless given, and whether this user may open them."""
+    """Examine serial ports, by default those of this machine, and whether this user may open them."""
     if ports is None:
         from serial.tools.list_ports import comports
 
@@ -102,7 +102,7 @@ def examine_ports(ports: Sequence[str] | None = None) -> list[Finding]:
     else:
         described = dict.fromkeys(ports, "n/a")
     if not described:
-        advice = "if the stage's controller is connected: check its cable, and that it is no charging cable"
+        advice = "if the stage's controller is connected: check that its cable carries data and not only power"
         return [Finding("serial ports", "warning", "none", advice)]
     return [_examine_port(port, description) for port, description in sorted(described.items())]
 
@@ -140,25 +140,25 @@ _DARKEST_MEAN = 0.002
 """Mean grey value, as a fraction of the full scale, below which an image is dark."""
 
 BEHAVIOUR = {
-    1: (255, "else the motor leaves its step at rest"),
+    1: (255, "otherwise the motor leaves its step at rest"),
     10: (1, "machine positions in the reports"),
     13: (0, "mm"),
     20: (1, "soft limits"),
-    21: (0, "else noise on the switch's line ends a scan"),
+    21: (0, "otherwise noise on the switch's line ends a scan"),
     22: (1, "homing, and locked until it is done"),
     23: (1, "the switch is at the lower end"),
     30: (1000, "S1000 is full power"),
-    31: (0, "S0 is none"),
-    32: (1, "laser mode fails to the dark side"),
+    31: (0, "S0 is off"),
+    32: (1, "laser mode switches the laser off at rest"),
 }
-"""Settings of docs/how-to/hardware-stage.md on which laser, limits and reports depend, with their reasons."""
+"""Settings in docs/how-to/hardware-stage.md that affect laser, limits and reports, with their reasons."""
 
 MECHANICS = {0: 10, 24: 60, 25: 600, 26: 25, 27: 2, 100: 80, 110: 900, 120: 50, 130: 750}
-"""Settings of docs/how-to/hardware-stage.md that follow from the thesis's bench; another stage has others."""
+"""Settings in docs/how-to/hardware-stage.md for the thesis's bench; other stages differ."""
 
 
 def try_camera(address: str) -> list[Finding]:
-    """Open a camera, take ten frames as fast as it gives them, and let go of it."""
+    """Open a camera, take ten frames at its own rate, and close it."""
     import numpy as np
 
     from uwlts.hardware.camera_addresses import open_camera
@@ -185,17 +185,17 @@ def try_camera(address: str) -> list[Finding]:
     faults = ", ".join(f"{number} {name}" for name, number in asdict(counts).items() if number and name != "ok")
     advice = []
     if faults:
-        found += f"; of the frames {faults}"
+        found += f"; frames: {faults}"
         advice.append("frames are lost or late: lower the frame rate, use jumbo packets, end other programs")
     if median > _BRIGHTEST_MEDIAN:
         advice.append("most of the image is saturated: shorten the exposure, close the aperture, shade the tank")
     if mean < _DARKEST_MEAN:
-        advice.append("the images are black: right in the dark without a laser, else check lens cap and exposure")
-    return [Finding.judged("camera", found, "\n".join(advice))]
+        advice.append("the images are black: expected in the dark without a laser, else check lens cap and exposure")
+    return [Finding.from_advice("camera", found, "\n".join(advice))]
 
 
 def try_stage(port: str) -> list[Finding]:
-    """Ask a Grbl controller for its version, settings and state."""
+    """Query version, settings and state of a Grbl controller."""
     from uwlts.hardware.grbl_line import GrblLine
 
     try:
@@ -218,15 +218,15 @@ def try_stage(port: str) -> list[Finding]:
 _LASER_GUARD = Finding(
     "laser",
     "ok",
-    "goes off within the exposure and 1 s when the program ends, is suspended or hangs, or its guard process ends; NOT "
-    "when program and guard are killed together, or the computer freezes: then a scan's laser stays on for the "
-    "exposure and 4 s, and only a hardware interlock helps sooner, or when the controller hangs: see 'Interlock' in "
+    "is switched off within the exposure and 1 s if the program ends, is suspended or hangs, or its guard process "
+    "ends; NOT if program and guard are killed together, or the computer freezes: then a scan's laser stays on for the "
+    "exposure and 4 s. Only a hardware interlock helps sooner, or if the controller hangs: see 'Interlock' in "
     "docs/how-to/hardware-stage.md",
 )
 
 
 def judge_settings(settings: Mapping[int, float]) -> list[Finding]:
-    """Differences from docs/how-to/hardware-stage.md in the answer to ``$$``, given by number."""
+    """Compare the answer to ``$$``, given by number, with docs/how-to/hardware-stage.md."""
     unsafe = {number: wanted for number, (wanted, _) in BEHAVIOUR.items() if settings.get(number) != wanted}
     other = {number: wanted for number, wanted in MECHANICS.items() if settings.get(number) != wanted}
     now = {n: f"${n} is {settings[n]:g}" if n in settings else f"${n} is not there" for n in (*unsafe, *other)}
@@ -249,10 +249,10 @@ def _lines(wanted: Mapping[int, float]) -> str:
 
 
 def _judge_state(state: str, pins: str, *, homing: bool) -> Finding:
-    """The state after opening: locked by homing, unless the board's reset is disabled."""
+    """Judge the state after opening: locked until homed, unless the board's reset is disabled."""
     advice = []
     if "X" in pins:
-        advice.append("the limit switch is pressed: right at the end of the travel, else check its wiring and $5")
+        advice.append("the limit switch is pressed: expected at the end of the travel, else check its wiring and $5")
     if others := pins.replace("X", ""):
         advice.append(f"the inputs {others} are active (Y, Z: limits, P: probe, D, H, R: buttons): check their wiring")
     if state == "Alarm" and homing:
@@ -263,4 +263,4 @@ def _judge_state(state: str, pins: str, *, homing: bool) -> Finding:
         found = state
         advice.append("restart the controller; then home the stage, or unlock it where it has no limit switch")
     found += f", inputs {pins} are active" if pins else ""
-    return Finding.judged("stage state", found, "\n".join(advice))
+    return Finding.from_advice("stage state", found, "\n".join(advice))

@@ -1,4 +1,4 @@
-"""Python, the libraries this project requires, and those that only some of its work needs."""
+"""Findings about Python, the required libraries, and the optional ones."""
 
 import platform
 import shlex
@@ -25,10 +25,10 @@ OPTIONAL = {
     "dask": "sweeps on several machines",
     "distributed": "sweeps on several machines",
 }
-"""Optional libraries, with what they are needed for."""
+"""Optional libraries, with the features that need them."""
 
 _LOAD_S = 120
-# What is begun last did not load, whether it raised an error or ended the process.
+# The last printed name is that of the module that did not load, by an error or by ending the process.
 _LOAD = "import importlib, sys\nfor name in sys.argv[1:]: print(name, flush=True); importlib.import_module(name)"
 
 
@@ -56,18 +56,18 @@ def project_requirements() -> tuple[str, list[str], list[str]]:
 
 
 def examine_python(wanted: str) -> Finding:
-    """Whether this Python has a version as ``wanted``, such as ">=3.11"."""
+    """Examine whether this Python has a version like ``wanted``, such as ">=3.11"."""
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"
     if not SpecifierSet(wanted).contains(platform.python_version(), prereleases=True):
         return Finding("Python", "missing", f"{found}; needed is {wanted}", f"install Python {wanted}")
     advice = "" if sys.platform == "linux" else "use Linux for cameras and stage: nothing else has been tried"
-    return Finding.judged("Python", found, advice)
+    return Finding.from_advice("Python", found, advice)
 
 
 def examine_required(requirements: Sequence[str]) -> list[Finding]:
-    """Whether libraries are there, in a suitable version, and can be imported.
+    """Examine whether libraries are installed in a suitable version, and can be imported.
 
-    One finding for all that are as they should be, and one for every other.
+    Returns one finding for all libraries without a fault, and one for every other.
     """
     examined = _examined(map(Requirement, requirements))
     good = ", ".join(f"{requirement.name} {version}" for requirement, version, fault in examined if not fault)
@@ -81,21 +81,21 @@ def examine_required(requirements: Sequence[str]) -> list[Finding]:
 
 
 def examine_optional(purposes: Mapping[str, str], *, requirements: Sequence[str] = ()) -> list[Finding]:
-    """Whether libraries are there that some work needs; ``purposes`` says which, by the library's name.
+    """Check optional libraries; ``purposes`` maps each library to the feature that needs it.
 
-    A version counts where one of the ``requirements`` asks for it.
+    A version is checked if one of the ``requirements`` specifies it.
     """
     asked = {canonicalize_name(each.name): each for each in map(Requirement, requirements)}
     examined = _examined(asked.get(canonicalize_name(name), Requirement(name)) for name in purposes)
     findings = []
     for (name, purpose), (requirement, version, fault) in zip(purposes.items(), examined, strict=True):
         advice = f"only for {purpose}:\n{_pip(shlex.quote(str(requirement)))}" if fault else ""
-        findings.append(Finding.judged(name, fault or f"{version}, for {purpose}", advice))
+        findings.append(Finding.from_advice(name, fault or f"{version}, for {purpose}", advice))
     return findings
 
 
 def _examined(requirements: Iterable[Requirement]) -> list[tuple[Requirement, str, str]]:
-    """Every library with its version, and what is wrong with it, empty if nothing is."""
+    """Return every library with its version and its fault, or an empty text."""
     states: list[tuple[Requirement, str, str]] = []
     for requirement in requirements:
         version = fault = ""
@@ -114,7 +114,7 @@ def _examined(requirements: Iterable[Requirement]) -> list[tuple[Requirement, st
 
 
 def _load_faults(names: Sequence[str]) -> dict[str, str]:
-    """Reasons why libraries cannot be imported, by name; tried in another process, which a library may end."""
+    """Return why libraries cannot be imported, by name; tested in a separate process, which a library may crash."""
     modules = {module: name for name in names for module in _modules(name)}
     faults, waiting = {}, list(modules)
     while waiting:
@@ -133,12 +133,12 @@ def _load_faults(names: Sequence[str]) -> dict[str, str]:
 
 
 def _modules(name: str) -> list[str]:
-    """Names by which a library is imported; pyserial, for one, as serial."""
+    """Return the module names of a library, such as serial for pyserial."""
     usual = name.lower().replace("-", "_")
     files = [file.parts for file in metadata.files(name) or ()]
     packages = {parts[0] for parts in files if len(parts) == 2 and parts[1] == "__init__.py"}
     if files and not any(parts[-1].endswith((".py", ".so", ".pyd")) and ".." not in parts for parts in files):
-        return []  # a shared library, which nothing imports
+        return []  # a shared library, which is not imported
     if usual in packages or not packages:
         return [usual]
     return sorted(package for package in packages if not package.startswith("_"))

@@ -29,8 +29,8 @@ _WIDTH = 110
 class Finding:
     """Result of one examination.
 
-    ``status`` is "missing" for what is required, or was asked for, and is not there or does not work; "warning" for
-    what limits some of the work. Both come with ``advice``, one thing to do for each line.
+    ``status`` is "missing" if something required, or named by the user, is absent or does not work, and "warning" if
+    some features are limited. Both come with ``advice``, one action per line.
     """
 
     subject: str
@@ -39,8 +39,8 @@ class Finding:
     advice: str = ""
 
     @classmethod
-    def judged(cls, subject: str, found: str, advice: str) -> "Finding":
-        """A warning where there is advice."""
+    def from_advice(cls, subject: str, found: str, advice: str) -> "Finding":
+        """Return a warning if there is advice, else ok."""
         return cls(subject, "warning" if advice else "ok", found, advice)
 
 
@@ -59,12 +59,12 @@ _LEAST_MEMORY = 4e9
 
 
 def examine(folder: Path) -> list[Finding]:
-    """All of them."""
+    """Examine folder, network buffer, processors, memory and clock."""
     return [examine_folder(folder), examine_buffer(), examine_computer(), examine_clock()]
 
 
 def examine_folder(folder: Path) -> Finding:
-    """Whether captures can be written to a folder, fast enough: 64 MB are, and vanish again whatever happens."""
+    """Examine whether captures can be written to a folder fast enough, by writing 64 MB, which are always removed."""
     path = folder.resolve()
     try:
         free = shutil.disk_usage(folder).free
@@ -82,14 +82,14 @@ def examine_folder(folder: Path) -> Finding:
     advice = f"make room: a long scan takes {_SCAN_BYTES / 1e9:.0f} GB" if free < _SCAN_BYTES else ""
     if rate < FRAME_BYTES * FRAMES_PER_S:
         advice = f"for {FRAMES_PER_S} frames/s use a faster disk, end what else writes to it, or read out a region"
-    return Finding.judged("folder", found, advice)
+    return Finding.from_advice("folder", found, advice)
 
 
 def _writing_rate(folder: Path) -> float:
-    """Bytes per s until they lie on the disk. Noise, so that no file system compresses it."""
+    """Return the rate of writing to the disk in bytes/s, measured with noise, which file systems cannot compress."""
     frame = os.urandom(FRAME_BYTES)
     frames = -(-_TRIAL_BYTES // FRAME_BYTES)
-    # It has no name where the system can do that: the kernel removes it even after a kill.
+    # Without a name if the system supports it: the kernel removes it even after a kill.
     with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
         began = time.perf_counter()
         for _ in range(frames):
@@ -101,7 +101,7 @@ def _writing_rate(folder: Path) -> float:
 
 
 def examine_buffer(limit: Path = _RMEM_MAX) -> Finding:
-    """Whether a frame of a GigE camera may wait in the network's buffer while the program is busy."""
+    """Examine whether the network buffer can hold a frame of a GigE camera while the program is busy."""
     try:
         allowed = int(limit.read_text())
     except (OSError, ValueError) as error:
@@ -113,11 +113,11 @@ def examine_buffer(limit: Path = _RMEM_MAX) -> Finding:
         f"sudo sysctl -w net.core.rmem_max={_RECOMMENDED_BUFFER}\n"
         f"echo net.core.rmem_max={_RECOMMENDED_BUFFER} | sudo tee /etc/sysctl.d/60-gige-camera.conf"
     )
-    return Finding.judged("network buffer", found, "" if allowed >= FRAME_BYTES else advice)
+    return Finding.from_advice("network buffer", found, "" if allowed >= FRAME_BYTES else advice)
 
 
 def examine_computer() -> Finding:
-    """Processors this program may use, and the memory."""
+    """Examine the processors that this program may use, and the memory."""
     from uwlts.runtime.workers import processors
 
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -125,13 +125,13 @@ def examine_computer() -> Finding:
     found = f"{processors()} processors, {load:.1f} of them busy in the last minute, {memory / 1e9:.0f} GB of memory"
     enough = processors() >= _LEAST_PROCESSORS and memory >= _LEAST_MEMORY
     advice = f"take a computer of {_LEAST_PROCESSORS} processors and {_LEAST_MEMORY / 1e9:.0f} GB or more"
-    return Finding.judged("computer", found, "" if enough else advice)
+    return Finding.from_advice("computer", found, "" if enough else advice)
 
 
 def examine_clock(files: Path | None = None) -> Finding:
-    """Whether the clock is behind the newest file of a folder, that of this software unless given.
+    """Examine whether the clock is behind the newest file of a folder, by default that of this software.
 
-    Small computers without a battery start in the past, and captures would carry its dates.
+    Small computers without a battery start with a date in the past, which captures would record.
     """
     folder = Path(__file__).parents[1] if files is None else files
     newest = max(path.stat().st_mtime for path in folder.rglob("*") if path.is_file())
@@ -151,7 +151,7 @@ _RENDERER_S = 330
 
 
 def examine_renderer() -> list[Finding]:
-    """Whether the twin's renderer finds a libLLVM and can run a kernel with it; the twin is asked, as a program."""
+    """Examine whether the twin finds a libLLVM and can run a kernel with it; the twin is run as a separate program."""
     if find_spec("twin") is None:
         return [Finding("libLLVM", "ok", "not needed: the twin is not installed")]
     command = [sys.executable, "-m", "twin.backend.llvm"]
@@ -163,14 +163,14 @@ def examine_renderer() -> list[Finding]:
     if asked.returncode == 0 and chosen:
         return [Finding("libLLVM", "ok", f"{chosen[0]}; a trial kernel ran")]
     said = asked.stderr.strip().splitlines() or [f"it ended with status {asked.returncode}"]
-    # An own error says most in its first line, a traceback in its last.
+    # The program's own errors are most specific in the first line, tracebacks in the last.
     reason = said[0].removeprefix("error: ") if said[0].startswith("error: ") else said[-1]
     advice = f"only for rendering by the twin; how to install it says\n{shlex.join(command)}"
     return [Finding("libLLVM", "warning", f"the twin cannot render: {reason}", advice)]
 
 
 def print_findings(findings: Sequence[Finding], *, console: Console | None = None) -> None:
-    """Print a table of the findings and, below it, what to do, in lines that can be copied."""
+    """Print a table of the findings, followed by the advice in lines that can be copied."""
     if console is None:
         usual = Console()
         console = usual if usual.is_terminal and not usual.is_dumb_terminal else Console(width=_WIDTH)
@@ -178,7 +178,7 @@ def print_findings(findings: Sequence[Finding], *, console: Console | None = Non
     for heading in ("", "examined", "found"):
         table.add_column(heading, no_wrap=heading == "", overflow="fold")
     for each in findings:
-        # Text, so that names from files are never taken for markup.
+        # Text objects, so that names from files are not interpreted as markup.
         table.add_row(Text(each.status, _STYLES[each.status]), Text(each.subject), Text(each.found))
     console.print(table)
     advised = [each for each in findings if each.advice]
@@ -186,7 +186,7 @@ def print_findings(findings: Sequence[Finding], *, console: Console | None = Non
         console.print("what to do", style="bold")
     for each in advised:
         lines = "".join(f"\n      {line}" for line in each.advice.splitlines())
-        # Not wrapped: a command that is broken over two lines cannot be copied.
+        # Not wrapped, so that commands can be copied.
         console.print(Text(f"  {each.subject}:{lines}"), soft_wrap=True)
     missing = [each.subject for each in findings if each.status == "missing"]
     warnings = sum(each.status == "warning" for each in findings)

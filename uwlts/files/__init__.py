@@ -1,1 +1,1 @@
-"""Files of a running command: safe reading of foreign files, outputs that appear whole or not at all, and JSON."""
+"""Files of a running command: safe reading of foreign files, complete writing of outputs, and JSON."""

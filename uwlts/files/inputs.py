@@ -1,8 +1,8 @@
-"""Inputs of a command or function: none of its outputs replaces one of them, under whatever name.
+"""Protection of inputs: no output of a command or function replaces one of its inputs, under whatever name.
 
-Within `inputs_kept` every file that is opened for reading (`uwlts.files.reading`) is noted, and so is every file that
-is to be written, before the work and again before it is moved to its place (`uwlts.files.writing`). The first that sees
-a file on both sides refuses it. Files are known by device and inode, which all their names share.
+Within `inputs_kept` every file opened for reading (`uwlts.files.reading`) is recorded. So is every file to be written,
+before the work and again before it is moved to its place (`uwlts.files.writing`). A file that is recorded as both is
+refused. Files are identified by device and inode, which all their names share.
 """
 
 import os
@@ -16,14 +16,14 @@ from pathlib import Path
 from uwlts.errors import OutputError
 
 OUTPUTS = frozenset({"out", "coloured", "pictures", "aligned", "page", "poses_out"})
-"""Names of the parameters of commands that say where to write; all others that name a file are read."""
+"""Names of command parameters that are outputs; all other parameters that name a file are inputs."""
 
 _Identity = tuple[int, int]
 
 
 @dataclass
 class _Work:
-    """Existing files that a piece of work reads, will replace, and has made itself; claims on outputs till its end."""
+    """Existing files that a task reads, will replace, and has made itself; claims on outputs until its end."""
 
     read: dict[_Identity, Path] = field(default_factory=dict)
     written: dict[_Identity, Path] = field(default_factory=dict)
@@ -36,9 +36,9 @@ _work: ContextVar[_Work | None] = ContextVar("work", default=None)
 
 @contextmanager
 def inputs_kept() -> Iterator[None]:
-    """Keep the inputs of a piece of work, as a context or as a decorator; what it calls belongs to it.
+    """Protect the inputs of a task, as a context or as a decorator; functions that it calls belong to it.
 
-    It holds in this thread. Other threads, such as those of a page, do works of their own.
+    It applies to this thread. Other threads, such as those of a page, have tasks of their own.
     """
     if _work.get() is not None:
         yield
@@ -53,7 +53,7 @@ def inputs_kept() -> Iterator[None]:
 
 
 def refuse_named_inputs(arguments: Mapping[str, object]) -> None:
-    """Raise OutputError if a command's arguments, by name, have one file as an input and as an output."""
+    """Raise OutputError if the same file is an input and an output among a command's arguments."""
     for name, value in arguments.items():
         if name not in OUTPUTS:
             for path in _paths(value):
@@ -64,16 +64,16 @@ def refuse_named_inputs(arguments: Mapping[str, object]) -> None:
 
 
 def note_input(path: str | os.PathLike[str]) -> None:
-    """Note a file that the running work reads; OutputError if it is to write it, unless it has made it itself."""
+    """Record a file that the task reads; raises OutputError if the task will write it and has not made it itself."""
     if (work := _work.get()) and (identity := _identity(path)) and identity not in work.made:
-        # A file that was replaced may have left its inode to another.
+        # A replaced file may have left its inode to another one.
         if (output := work.written.get(identity)) and _identity(output) == identity:
             raise _same(output, Path(path))
         work.read.setdefault(identity, Path(path))
 
 
 def refuse_input(target: str | os.PathLike[str]) -> None:
-    """Note a file that is to be written; OutputError if the running work has read it."""
+    """Record a file to be written; raises OutputError if the task has read it."""
     if (work := _work.get()) and (identity := _identity(target)):
         if read := work.read.get(identity):
             raise _same(Path(target), read)
@@ -81,15 +81,15 @@ def refuse_input(target: str | os.PathLike[str]) -> None:
 
 
 def note_made(path: str | os.PathLike[str]) -> None:
-    """Note a file that the running work has made, or that is its own: it may read it, and write it again."""
+    """Record a file that the task has made: it may read it, and write it again."""
     if (work := _work.get()) and (identity := _identity(path)):
         work.made.add(identity)
-        # What was read there is gone, and has left its inode to this file.
+        # The file that was read there is gone, and has left its inode to this one.
         work.read.pop(identity, None)
 
 
 def hold_until_end(claim: AbstractContextManager[None]) -> None:
-    """Enter a claim on an output until the running work ends; without a work nothing is claimed."""
+    """Enter a claim on an output until the task ends; without a task nothing is claimed."""
     if work := _work.get():
         work.claims.enter_context(claim)
 
@@ -100,7 +100,7 @@ def _same(output: Path, read: Path) -> OutputError:
 
 
 def _paths(value: object) -> Iterable[Path]:
-    """Paths that an argument may name, also behind a prefix, as in replay:PATH."""
+    """Iterate over paths that an argument may name, also after a prefix, as in replay:PATH."""
     if isinstance(value, str | os.PathLike):
         yield Path(value)
         yield Path(os.fspath(value).partition(":")[2])
@@ -110,7 +110,7 @@ def _paths(value: object) -> Iterable[Path]:
 
 
 def _identity(path: str | os.PathLike[str]) -> _Identity | None:
-    """Device and inode of a regular file; None for anything else, and for names that cannot be files."""
+    """Return device and inode of a regular file; None for anything else, and for names that cannot be files."""
     try:
         found = os.stat(path)
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Files of JSON: one object, whose "format" and "version" say what it is; how two of them differ."""
+"""Files of JSON: an object identified by its "format" and "version"; and differences between two of them."""
 
 import json
 from abc import ABC, abstractmethod
@@ -13,17 +13,17 @@ from uwlts.files.reading import MOST_JSON_BYTES, parsed_json, read_text, with_ar
 from uwlts.files.writing import written_aside
 
 _SHOWN = 3
-"""Most differing entries that a message names."""
+"""Largest number of different entries that a message names."""
 _BRIEF = 80
-"""Most characters of a value in a message."""
+"""Largest number of characters of a value in a message."""
 
 AnyModel = TypeVar("AnyModel", bound=BaseModel)
 
 
 def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
-    """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be.
+    """Read the object in a file; raises CaptureError if it is missing, not JSON or truncated.
 
-    Numbers are finite and no key occurs twice (`uwlts.files.reading`).
+    ``called`` names the expected content in messages. Numbers are finite and keys are unique (`uwlts.files.reading`).
     """
     text = read_text(path, most_bytes=MOST_JSON_BYTES, called=called)
     try:
@@ -40,7 +40,7 @@ def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
 def read_model(
     path: str | Path, model: type[AnyModel], *, format: str, version: int, called: str, advice: str = ""
 ) -> AnyModel:
-    """Content of a JSON file of the program; CaptureError where it is missing, foreign, newer or damaged."""
+    """Read a JSON file of the program as a model; raises CaptureError if it is missing, foreign, newer or damaged."""
     content = read_json(path, called=called)
     return model_in(content, path, model, format=format, version=version, called=called, advice=advice)
 
@@ -55,7 +55,7 @@ def model_in(
     called: str,
     advice: str = "",
 ) -> AnyModel:
-    """What `read_json` gave of a file as a model; CaptureError as from `read_model`."""
+    """Convert the result of `read_json` to a model; raises CaptureError like `read_model`."""
     content = dict(content)
     if content.pop("format", None) != format:
         raise CaptureError(f'{path} is JSON but not {with_article(called)}: expected "format": "{format}"')
@@ -65,7 +65,7 @@ def model_in(
 
 
 def validated_content(model: type[AnyModel], content: object, complaint: str, *, advice: str = "") -> AnyModel:
-    """The content of a file as a model; CaptureError that begins with ``complaint`` where it is not valid."""
+    """Convert content to a model; raises CaptureError, which begins with ``complaint``, if it is not valid."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -75,14 +75,14 @@ def validated_content(model: type[AnyModel], content: object, complaint: str, *,
 
 
 def write_model(path: str | Path, model: BaseModel, *, format: str, version: int, overwrite: bool) -> None:
-    """Write a model with its format and version as indented JSON, whole or not at all; OutputError where that fails."""
+    """Write a model with format and version as indented JSON, completely or not; raises OutputError if that fails."""
     content = {"format": format, "version": version} | model.model_dump(mode="json")
     with written_aside(path, overwrite=overwrite) as aside:
         aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def write_record(path: str | Path, record: object, *, overwrite: bool) -> None:
-    """Write the record of a result as indented JSON, whole or not at all; OutputError where that fails."""
+    """Write the record of a result as indented JSON, completely or not at all; raises OutputError if that fails."""
     with written_aside(path, overwrite=overwrite) as aside:
         aside.write_text(json_text(record, indent=1), encoding="utf-8")
 
@@ -92,17 +92,17 @@ class RecordFile(ABC):
 
     @abstractmethod
     def record(self) -> object:
-        """The result as JSON."""
+        """Return the result as JSON."""
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the record as indented JSON, whole or not at all; OutputError if that fails."""
+        """Write the record as indented JSON, completely or not at all; raises OutputError if that fails."""
         write_record(path, self.record(), overwrite=overwrite)
 
 
 def differences(there: object, now: object) -> str:
-    """Words for the entries in which two JSON values differ, each with both values; empty where they are the same.
+    """Describe the different entries of two JSON values, with both values; empty if they are equal.
 
-    ``there`` is what a file holds, ``now`` what is wanted.
+    ``there`` is the content of a file, ``now`` the wanted one.
     """
     found = list(_different(there, now, ""))
     more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
@@ -112,7 +112,7 @@ def differences(there: object, now: object) -> str:
 
 
 def another(there: dict[str, JsonValue], now: dict[str, JsonValue]) -> str:
-    """Words for a plan that a file holds and that is not the one wanted: "another" with its keys, and `differences`."""
+    """Describe how a file's plan differs from the wanted one: "another" with the different keys, and `differences`."""
     return f"another {', '.join(key for key in now if there.get(key) != now[key])} ({differences(there, now)})"
 
 
@@ -133,6 +133,6 @@ def _brief(value: object) -> str:
 
 
 def json_text(content: object, *, indent: int | None = None, ascii: bool = True) -> str:
-    """Text of a JSON file, of a model with the fields that were set; ValueError for numbers that are not finite."""
+    """Return JSON text, for a model that of its set fields; raises ValueError for numbers that are not finite."""
     plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
     return json.dumps(plain, indent=indent, ensure_ascii=ascii, allow_nan=False) + "\n"

@@ -1,7 +1,7 @@
-"""Files that come from outside: regular files of limited size, and text formats of limited depth and plain numbers.
+"""Reading of foreign files: regular files of limited size, and text formats of limited depth with plain numbers.
 
 Every reader opens its file here, so that no pipe blocks it, no size, depth or number in a file exhausts the machine,
-and no output replaces it. Limits hold before anything is parsed; what a file means is checked by the reader afterwards.
+and no output replaces it. Limits are checked before parsing; the reader checks the meaning of the content afterwards.
 """
 
 import json
@@ -27,12 +27,12 @@ Content = TypeVar("Content")
 
 MiB = 2**20
 MOST_TOML_BYTES = MiB
-"""The parser takes about a second for it; the longest descriptions, lists of positions, have a tenth."""
+"""The parser takes about a second for it; the longest descriptions, with lists of positions, have a tenth of it."""
 MOST_JSON_BYTES = 32 * MiB
 MOST_VALUES = 500_000
-"""Values in a JSON file: a covariance of 700 parameters. As Python objects they take less than 100 MB."""
+"""Values in a JSON file, enough for a covariance of 700 parameters. As Python objects they take less than 100 MB."""
 MOST_DEPTH = 64
-"""Nested tables and lists; the program's own files have fewer than ten."""
+"""Nesting of tables and lists; the program's own files have fewer than ten levels."""
 _LARGEST_INT = 2**63
 _LONGEST_KEY = 32  # parts of a dotted key; the parser takes time by the square of their number
 
@@ -46,7 +46,7 @@ _FOREIGN |= {b"%PDF": "a PDF document"}
 
 
 def is_regular_file(path: str | Path) -> bool:
-    """Whether there is a regular file; False also for names that no file can have."""
+    """Return whether there is a regular file; False also for names that no file can have."""
     try:
         return stat.S_ISREG(os.stat(path).st_mode)
     except (OSError, ValueError):
@@ -56,7 +56,7 @@ def is_regular_file(path: str | Path) -> bool:
 def require_regular_file(
     path: str | Path, *, most_bytes: int | None = None, error: type[Error] = CaptureError, called: str = "file"
 ) -> int:
-    """Size in bytes of a regular file that may be opened by its name; else ``error``, as from `opened`."""
+    """Return the size in bytes of a regular file that can be opened; raises ``error`` like `opened`."""
     with opened(path, most_bytes=most_bytes, error=error, called=called) as file:
         return os.fstat(file.fileno()).st_size
 
@@ -65,11 +65,10 @@ def require_regular_file(
 def opened(
     path: str | Path, *, most_bytes: int | None = None, error: type[Error] = CaptureError, called: str = "file"
 ) -> Iterator[BufferedReader]:
-    """A context with a regular file, opened for reading bytes.
+    """Return a context with a regular file opened for reading bytes, which no output of the task may replace.
 
-    It is an input of the running work, whose outputs do not replace it.
-    ``error`` where it is missing, unreadable, no regular file (a pipe or device would block), larger than
-    ``most_bytes``, or its name is too long or holds a null character. ``called`` is what it should be.
+    Raises ``error`` if the file is missing, unreadable, not regular (a pipe or device would block) or larger than
+    ``most_bytes``, or its name is too long or contains a null character. ``called`` names the expected content.
     """
     cannot = f"cannot read the {called} {_shown(path)}"
     try:
@@ -82,7 +81,7 @@ def opened(
         raise error(f"{cannot}: no file can have this name") from problem
     if not stat.S_ISREG(found.st_mode):
         is_folder = stat.S_ISDIR(found.st_mode)
-        raise error(f"{cannot}: it is {'a directory' if is_folder else 'no regular file, but a pipe or device'}")
+        raise error(f"{cannot}: it is {'a directory' if is_folder else 'not a regular file, but a pipe or device'}")
     if most_bytes is not None and found.st_size > most_bytes:
         sizes = f"{found.st_size / MiB:,.1f} MiB; this program reads up to {most_bytes / MiB:,.1f} MiB"
         raise error(f"the {called} {_shown(path)} has {sizes}")
@@ -95,20 +94,20 @@ def opened(
 
 
 def _shown(path: str | Path) -> str:
-    """A name as messages have it: printable, and not longer than a line."""
+    """Return a name for messages: printable, and not longer than a line."""
     return shortened(str(path).encode("unicode_escape").decode() if "\0" in str(path) else str(path))
 
 
 def shortened(text: str, most: int = 300) -> str:
-    """A text that fits into a message."""
+    """Shorten a text for a message."""
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, error: type[Error] = CaptureError, called: str = "file") -> bytes:
-    """Content of a regular file; ``error`` as from `opened`."""
+    """Read a regular file; raises ``error`` like `opened`."""
     with opened(path, most_bytes=most_bytes, error=error, called=called) as file:
         content = file.read(most_bytes + 1)
-    # Some files of the system state no size.
+    # Some system files report a size of 0.
     if len(content) > most_bytes:
         raise error(f"the {called} {_shown(path)} has more than {most_bytes / MiB:,.1f} MiB")
     return content
@@ -122,9 +121,10 @@ def read_text(
     called: str = "file",
     foreign: str | None = None,
 ) -> str:
-    """Text of a regular file in UTF-8, without byte order mark; ``error`` as from `opened`, or where it is no text.
+    """Read a regular file of text in UTF-8, without byte order mark.
 
-    ``foreign`` are words for what is no text, "is not a file" and the like unless given.
+    Raises ``error`` like `opened`, or if the content is not text.
+    ``foreign`` is the beginning of the message for other content, by default "is not a" and ``called``.
     """
     content = read_bytes(path, most_bytes=most_bytes, error=error, called=called)
     try:
@@ -135,14 +135,14 @@ def read_text(
 
 
 def with_article(called: str) -> str:
-    """The name of a thing with its article."""
+    """Return a name with its indefinite article."""
     return f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
 
 
 def parsed_json(text: str) -> "JsonValue":
-    """Content of JSON; ValueError where it is no JSON, too large, or as from `require_plain`.
+    """Parse JSON; raises ValueError if it is not valid, too large, or not plain (`require_plain`).
 
-    Also refused are keys that occur twice in a table, of which every reader takes another one.
+    Duplicate keys are refused as well, because readers differ in their choice.
     """
     if text.count(",") + text.count("[") + text.count("{") > MOST_VALUES:
         raise ValueError(f"it holds more than {MOST_VALUES:,} values")
@@ -154,9 +154,9 @@ def parsed_json(text: str) -> "JsonValue":
 
 
 def parsed_toml(text: str) -> "dict[str, JsonValue]":
-    """Content of TOML; ValueError where it is no TOML, has a key of too many parts, or as from `require_plain`.
+    """Parse TOML; raises ValueError if it is not valid, has a key of too many parts, or is not plain (`require_plain`).
 
-    Numbers that are not finite are left to the descriptions, which name all wrong keys at once.
+    Numbers that are not finite are left to the descriptions, which report all wrong keys at once.
     """
     if _LONG_KEY.search(text):
         raise ValueError(f"a key has more than {_LONGEST_KEY} parts")
@@ -171,7 +171,7 @@ _TOO_DEEP = f"its tables and lists are nested more than {MOST_DEPTH} deep"
 
 
 def require_plain(content: Content, *, finite: bool = True) -> Content:
-    """The content; ValueError where it is nested too deep, or a number is not finite or too large for 64 bits."""
+    """Return the content; raises ValueError if it is nested too deep, or a number is not finite or exceeds 64 bits."""
     level: list[Any] = [content]
     depth = 0
     while level:
@@ -179,7 +179,7 @@ def require_plain(content: Content, *, finite: bool = True) -> Content:
             raise ValueError(_TOO_DEEP)
         below: list[Any] = []
         for each in level:
-            # By their very type, as there may be a million; parsers make no others.
+            # Exact types, for speed with a million values; parsers return no others.
             kind = type(each)
             if kind is dict:
                 below.extend(each.values())
@@ -195,7 +195,7 @@ def require_plain(content: Content, *, finite: bool = True) -> Content:
 
 
 def _place_of(wanted: object, content: object) -> str:
-    """Return the keys and numbers that lead to a value."""
+    """Return the path of keys and indices to a value."""
     waiting: list[tuple[object, str]] = [(content, "")]
     while waiting:
         each, place = waiting.pop()

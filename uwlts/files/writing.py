@@ -1,8 +1,8 @@
-"""Outputs: they appear whole or not at all, replace nothing unless asked, and have one writer at a time.
+"""Writing of outputs: completely or not at all, without replacing files unless asked, and by one writer at a time.
 
-An output is written beside its place, flushed to the disk, then renamed. Its lock is advisory (flock), on the hidden
-file ``.NAME.lock`` beside it, so that it also holds between machines that share the folder. The system ends the lock
-with the process, however that ends; what a killed process leaves of it the next writer takes over. On systems and file
+An output is written under a temporary name, flushed to the disk, then renamed. Its lock is advisory (flock) on the
+hidden file ``.NAME.lock`` beside it, so that it also applies to other machines that share the folder. The system
+releases the lock when the process ends; the next writer takes over the file of a killed process. On systems and file
 systems without flock nothing is locked.
 """
 
@@ -27,8 +27,8 @@ except ImportError:
     fcntl = None
 
 _PATIENCE_S = 10.0
-"""How long a file that another process writes is waited for at the end of the work; results are written in less, and
-several machines may write those of one sweep."""
+"""Longest wait at the end of the work for a file that another process writes. Results are written faster, and several
+machines may write those of one sweep."""
 _AGAIN_S = 0.05
 
 
@@ -40,12 +40,12 @@ class OtherWriterError(OutputError):
 def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
     """Give the body a temporary file to write; move it to `path` when the body ends without an exception.
 
-    The temporary file lies empty in the folder of `path` (a rename is atomic only within one file system) and keeps
-    the suffix, by which some libraries choose the format. It is removed whatever exception leaves the body, and an
-    existing file at `path` is untouched until the new one is complete. Without ``overwrite`` an existing file is
-    refused, before the body runs and again at the end. A symbolic link is followed. OutputError where the folder is
-    missing or not writable, the file exists, is an input of the running command or is being written by another process,
-    `path` is a folder or a device, or the disk is full: for any OSError.
+    The temporary file is in the folder of `path`, as a rename is atomic only within a file system, and has the same
+    suffix, from which some libraries choose the format. It is removed if an exception leaves the body, and an existing
+    file at `path` is untouched until the new one is complete. Without ``overwrite`` an existing file is refused, before
+    the body runs and again at the end. A symbolic link is followed. Raises OutputError if the folder is missing or not
+    writable, the file exists, is an input of the running command or is being written by another process, `path` is a
+    folder or a device, or the disk is full: for any OSError.
     """
     require_possible_name(Path(path))
     target = Path(os.path.realpath(path))
@@ -53,14 +53,14 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
     with one_writer(target, patience_s=_PATIENCE_S), _unfinished(aside, lambda file: file.unlink(missing_ok=True)):
         try:
-            # Not tempfile: its files are private (mode 0600), and the finished one would stay so.
+            # Not tempfile, whose files are private (mode 0600): the finished file would be, too.
             os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             yield aside
             _flush(aside, os.O_RDWR)
             _require_suitable(target, overwrite=overwrite)
             os.replace(aside, target)
             note_made(target)
-            # Only POSIX systems can open a folder, to make the renaming itself last.
+            # Only POSIX systems can open a folder, to flush the renaming itself.
             if os.name == "posix":
                 _flush(target.parent, os.O_RDONLY)
         except OSError as error:
@@ -68,10 +68,10 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
 
 
 def refuse_unsuitable(target: Path, *, overwrite: bool, endings: Sequence[str] = ()) -> None:
-    """Raise OutputError where nothing may be written; commands ask before the work and not only after it.
+    """Raise OutputError if an output cannot be written; commands check this before the work, too.
 
-    With ``endings``, the name has to end with one of them. From here until the running command ends, other processes
-    are refused the same output.
+    With ``endings``, the name must end with one of them. Other processes are refused the same output until the running
+    command ends.
     """
     _require_suitable(target, overwrite=overwrite)
     require_ending(target, endings)
@@ -79,7 +79,7 @@ def refuse_unsuitable(target: Path, *, overwrite: bool, endings: Sequence[str] =
 
 
 def require_ending(target: Path, endings: Sequence[str]) -> None:
-    """Raise OutputError where a name ends with none of the endings of formats, if there are any."""
+    """Raise OutputError if a name lacks the required ending."""
     if endings and not target.name.lower().endswith(tuple(endings)):
         raise OutputError(
             f"{target} ends with none of {', '.join(endings)}, which name the format of this file; give a name like "
@@ -99,7 +99,7 @@ def _require_suitable(target: Path, *, overwrite: bool) -> None:
 
 
 def require_possible_name(target: Path) -> None:
-    """OutputError where no file can have this name: it is too long, or holds a null character."""
+    """Raise OutputError if no file can have this name: it is too long, or contains a null character."""
     try:
         os.stat(target)
     except (FileNotFoundError, NotADirectoryError):
@@ -130,18 +130,18 @@ def _flush(path: Path, flags: int) -> None:
 
 
 def sha256_of(path: str | Path) -> str:
-    """Hash of a file in hexadecimal; CaptureError where it cannot be read."""
+    """Return the hash of a file in hexadecimal; raises CaptureError if it cannot be read."""
     with opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 _locks: dict[Path, int] = {}
-"""Descriptors of the locks that this process has, or is about to have."""
+"""Descriptors of the locks that this process has, or is acquiring."""
 
 
 @contextmanager
 def one_writer(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
-    """Be the only process that writes a file; OtherWriterError where another one still does after ``patience_s``."""
+    """Lock a file for writing; raises OtherWriterError if another process still writes it after ``patience_s``."""
     target = Path(os.path.realpath(target))
     path = _lock_of(target)
     if fcntl is None or path in _locks:
@@ -150,7 +150,7 @@ def one_writer(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
     until = time.monotonic() + patience_s
     with _unfinished(path, _unlock):
         while not _lock(path):
-            # The one before may just have ended.
+            # The previous writer may just have ended.
             if time.monotonic() >= until and path.exists():
                 raise OtherWriterError(
                     f"cannot write {target}: {_holder(path)} is writing it; wait until it ends, or give another name"
@@ -160,25 +160,25 @@ def one_writer(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
 
 
 def refuse_other_writer(target: Path) -> None:
-    """Raise OtherWriterError if another process is writing a file; what a killed one has left of its lock goes."""
+    """Raise OtherWriterError if another process is writing a file; the lock file of a killed process is removed."""
     if _lock_of(Path(os.path.realpath(target))).exists():
         with one_writer(target):
             pass
 
 
 def _lock_of(target: Path) -> Path:
-    # No suffix of the output's, by which folders are searched.
+    # Without the output's suffix, so that searches in the folder do not find it.
     return target.with_name(f".{target.name.replace('.', '-')}.lock")
 
 
 def _lock(path: Path) -> bool:
-    """Whether this process has a lock now; also where nothing can be locked, and writing will say why."""
+    """Try to acquire a lock; return True also if nothing can be locked, because writing then reports the reason."""
     try:
         descriptor = _locks[path] = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
     except OSError:
         return True
     if _is_locked(descriptor, path):
-        # A full disk has room for the lock, which is empty then.
+        # On a full disk the lock file is empty, which suffices.
         with suppress(OSError):
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
@@ -196,21 +196,21 @@ def _holder(path: Path) -> str:
 
 
 def _unlock(path: Path) -> None:
-    """Remove a lock unless another process has it; harmless the second time."""
+    """Release a lock and remove its file, unless another process has it; may be called twice."""
     try:
-        # An interrupt may have come before it was noted.
+        # An interrupt may have prevented its registration.
         descriptor = _locks[path] if path in _locks else os.open(path, os.O_RDWR)
     except OSError:
         return
     if _is_locked(descriptor, path):
-        # Before it is unlocked: whoever waits for it then sees that it is gone.
+        # Removed before the lock is released, so that waiting processes notice.
         path.unlink(missing_ok=True)
     _locks.pop(path, None)
     os.close(descriptor)
 
 
 def _is_locked(descriptor: int, path: Path) -> bool:
-    """Whether a lock is this process's now; not if the one before has removed its file between opening and locking."""
+    """Lock a file; return False if another process has the lock, or has just removed the file."""
     assert fcntl is not None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -226,7 +226,7 @@ _removals: dict[Path, Callable[[Path], None]] = {}
 
 @contextmanager
 def _unfinished(path: Path, remove: Callable[[Path], None]) -> Iterator[None]:
-    """Remove a file when the body, which makes it, ends; `remove_unfinished` does it where an interrupt prevents it."""
+    """Remove a file when the body that makes it ends; `remove_unfinished` does so if an interrupt prevents it."""
     _removals[path] = remove
     try:
         yield
@@ -237,7 +237,7 @@ def _unfinished(path: Path, remove: Callable[[Path], None]) -> Iterator[None]:
 
 @atexit.register
 def remove_unfinished() -> None:
-    """Remove locks and outputs that are not complete, at the end of a process that may be within a library's code."""
+    """Remove locks and incomplete outputs at the end of a process, even if it is inside a library."""
     for path, remove in list(_removals.items()):
         with suppress(OSError):
             remove(path)

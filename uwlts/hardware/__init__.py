@@ -1,1 +1,1 @@
-"""Cameras, stages and lasers: what moves, lights and looks at the tank."""
+"""Cameras, stages and lasers: drivers, scans, and guided calibration."""

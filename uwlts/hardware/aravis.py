@@ -42,7 +42,7 @@ class _GError(ctypes.Structure):
 
 
 _INTEGER, _DOUBLE = POINTER(c_int), POINTER(c_double)
-# Result, names after arv_camera_, and the arguments after the camera and before the error, which all of them have.
+# Result type, names after arv_camera_, and the arguments between the camera and the error, which all functions have.
 _OF_CAMERA: tuple[tuple[Any, str, list[Any]], ...] = (
     (None, "clear_triggers software_trigger start_acquisition stop_acquisition", []),
     (None, "set_acquisition_mode set_exposure_time_auto set_gain_auto", [c_int]),
@@ -69,7 +69,7 @@ _OF_CAMERA: tuple[tuple[Any, str, list[Any]], ...] = (
     (c_int, "get_boolean", [c_char_p]),
     (c_char_p, "get_string", [c_char_p]),
 )
-# Result, whole names, and all arguments.
+# Result type, full names, and all arguments.
 _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
     (c_void_p, "arv_camera_new", [c_char_p, POINTER(POINTER(_GError))]),
     (None, "arv_update_device_list", []),
@@ -93,8 +93,8 @@ _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
 )
 
 
-def _functions() -> SimpleNamespace:
-    """The library's functions with their types, for this module alone."""
+def _load_functions() -> SimpleNamespace:
+    """Return the library's functions with types that apply in this module only."""
     library, functions = load_aravis(), SimpleNamespace()
     of_camera = (
         (result, f"arv_camera_{name}", [c_void_p, *arguments, POINTER(POINTER(_GError))])
@@ -114,19 +114,19 @@ def _text(value: bytes | None) -> str:
 
 
 _ANSWER_S = 0.1
-"""A camera on this machine answers a search within some ms."""
+"""Time limit of the answer of a camera on this machine, which takes a few ms."""
 _HEARTBEAT_S = 4.0
-"""GigE Vision's time is 3 s unless a program has set another."""
+"""The heartbeat timeout of GigE Vision is 3 s unless a program has changed it."""
 _SOCKET_BYTES = 2**23
-"""Room for the packets of some frames of 1280 x 1024 px."""
-# GigE Vision's discovery command: key, acknowledge, command 2, no content, request 1.
+"""Capacity for the packets of several frames of 1280 x 1024 px."""
+# GigE Vision's discovery command: key, acknowledge, command 2, no payload, request 1.
 _DISCOVERY = b"\x42\x01\x00\x02\x00\x00\x00\x01"
 _LOOPBACK, _CONTROL_PORT = "127.0.0.1", 3956
 
 
 @dataclass(frozen=True)
 class FoundCamera:
-    """A camera that answered: identifier, network address or bus position, protocol."""
+    """A discovered camera: identifier, serial number, network address or bus position, and protocol."""
 
     identifier: str
     serial: str
@@ -138,19 +138,19 @@ class FoundCamera:
 
 
 def list_aravis_cameras() -> list[FoundCamera]:
-    """Ask for all cameras on the networks and USB ports of this machine; takes about a second.
+    """Search the networks and USB ports of this machine for cameras, for about a second.
 
-    SetupError where Aravis is not installed.
+    Raises SetupError if Aravis is not installed.
     """
-    functions = _functions()
+    functions = _load_functions()
     functions.arv_update_device_list()
     asked = [getattr(functions, f"arv_get_device_{part}") for part in ("id", "serial_nbr", "address", "protocol")]
     count = functions.arv_get_n_devices()
-    return _served_on_loopback() + [FoundCamera(*(_text(ask(k)) for ask in asked)) for k in range(count)]
+    return _find_on_loopback() + [FoundCamera(*(_text(ask(k)) for ask in asked)) for k in range(count)]
 
 
-def _served_on_loopback() -> list[FoundCamera]:
-    """The camera that a program on this machine plays, which a search by broadcast does not reach."""
+def _find_on_loopback() -> list[FoundCamera]:
+    """Return the camera that a program on this machine serves, which a broadcast does not reach."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         asking.settimeout(_ANSWER_S)
         try:
@@ -158,7 +158,7 @@ def _served_on_loopback() -> list[FoundCamera]:
             asking.send(_DISCOVERY)
             answer = asking.recv(1024)
         except OSError:
-            # Nobody listens there, or not to this.
+            # Nothing listens there, or it does not answer.
             return []
     if len(answer) != 8 + 248 or answer[:4] != b"\0\0\0\x03":
         return []
@@ -170,7 +170,7 @@ def _served_on_loopback() -> list[FoundCamera]:
 
 
 class AravisCamera(CameraDevice):
-    """A camera by its identifier, serial number or IP address; the only one there is if the name is empty."""
+    """A camera selected by identifier, serial number or IP address; with an empty name, the only camera found."""
 
     def __init__(self, name: str, *, address: str | None = None):
         super().__init__(address or f"aravis:{name}")
@@ -183,13 +183,13 @@ class AravisCamera(CameraDevice):
         self._gone = False
 
     def _open(self) -> CameraInfo:
-        self._functions = functions = _functions()
+        self._functions = functions = _load_functions()
         self._gone = False
         self._camera = self._call("new", self._identifier())
         try:
-            # A GigE camera obeys one program at a time; Aravis opens it for reading where that is another one.
-            if functions.arv_camera_is_gv_device(self._camera) and not self._controlled():
-                raise HardwareError(f"the camera {self.address} is used by another program: end that one first")
+            # A GigE camera obeys one program at a time; Aravis opens a camera of another program for reading.
+            if functions.arv_camera_is_gv_device(self._camera) and not self._take_control():
+                raise HardwareError(f"the camera {self.address} is used by another program: end that program first")
             width, height = self._numbers("get_sensor_size", 2)
             maker, model, serial = (
                 _text(self._call(f"get_{part}")) or "?"
@@ -211,8 +211,8 @@ class AravisCamera(CameraDevice):
     def _offers(self, name: str) -> bool:
         return bool(self._call("is_feature_available", name.encode()))
 
-    def _controlled(self) -> bool:
-        """Whether the camera obeys this program; one whose program was killed does when it has missed its heartbeat."""
+    def _take_control(self) -> bool:
+        """Return whether this program controls the camera, after waiting for the heartbeat of a killed program."""
         device, deadline = self._functions.arv_camera_get_device(self._camera), time.monotonic() + _HEARTBEAT_S
         while not self._functions.arv_gv_device_is_controller(device):
             if time.monotonic() > deadline:
@@ -224,7 +224,7 @@ class AravisCamera(CameraDevice):
         return True
 
     def _identifier(self) -> bytes:
-        """Name of the camera in Aravis: an IP address as it is, for everything else there is a search."""
+        """Return the name of the camera in Aravis: an IP address unchanged, or the result of a search."""
         with suppress(ValueError):
             ip_address(self._name)
             return self._name.encode()
@@ -235,9 +235,9 @@ class AravisCamera(CameraDevice):
             how_many = "no camera is" if not fitting else f"{len(fitting)} cameras are"
             raise HardwareError(
                 f"{how_many} called '{self._name}'. Found:{listed}\n"
-                "Check power, cable and network settings; a GigE camera must be in the network of the computer"
+                "Check power, cable and network settings; a GigE camera must be in the computer's network"
             )
-        # An address is asked directly, which also reaches the loopback interface.
+        # An address is contacted directly, which also works on the loopback interface.
         return (fitting[0].address if fitting[0].protocol == "GigEVision" else fitting[0].identifier).encode()
 
     def _close(self) -> None:
@@ -245,7 +245,7 @@ class AravisCamera(CameraDevice):
         self._stream = self._camera = None
         self._chunks = ()
         if self._gone:
-            # Aravis asks it again and again to let go, for 10 s, in which a laser may have to be switched off.
+            # Aravis repeats the release command for 10 s, during which the laser may have to be switched off.
             threading.Thread(target=self._let_go, args=(things,), name="aravis-let-go").start()
         else:
             self._let_go(things)
@@ -292,7 +292,7 @@ class AravisCamera(CameraDevice):
         )
 
     def _set_chunks(self) -> None:
-        """Have what the camera knows of each frame, or of each of its profiles, sent with it."""
+        """Request the chunk data of each frame, or of each of its profiles."""
         if self._offers("ChunkModeActive"):
             self._chunks = tuple(each for each in CHUNKS if self._offers(f"Chunk{each}"))
         if self._chunks:
@@ -310,11 +310,11 @@ class AravisCamera(CameraDevice):
             self._call(f"set_{feature}_auto", 0)
         low, high = c_double(), c_double()
         self._call(f"get_{feature}_bounds", byref(low), byref(high))
-        # Some cameras refuse what is out of range, others stop answering.
+        # Some cameras reject values out of range, others stop answering.
         self._call(f"set_{feature}", min(max(value, low.value), high.value))
 
     def _has(self, feature: str) -> bool:
-        # A gain that is called otherwise is not in dB.
+        # A gain feature with another name is not in dB.
         if feature == "gain":
             return bool(self._call("is_feature_available", b"Gain"))
         return bool(self._call(f"is_{feature}_available"))
@@ -327,7 +327,7 @@ class AravisCamera(CameraDevice):
         self._stream = self._call("create_stream", None, None)
         payload = self._call("get_payload")
         if functions.arv_camera_is_gv_device(self._camera):
-            _widen(functions.arv_gv_stream_get_port(self._stream))
+            _enlarge_buffer(functions.arv_gv_stream_get_port(self._stream))
         for _ in range(BUFFERS):
             functions.arv_stream_push_buffer(self._stream, functions.arv_buffer_new(payload, None))
         self._call("start_acquisition")
@@ -375,7 +375,7 @@ class AravisCamera(CameraDevice):
         return self._profiles(image, frame, chunk)
 
     def _chunk(self, buffer: int, feature: str, row: int) -> int | None:
-        """The number of a feature that came with a frame, or with one of its profiles; None if it did not."""
+        """Return the chunk value that came with a frame, or with one of its profiles, or None."""
         functions = self._functions
         if feature.removeprefix("Chunk") not in self._chunks or not functions.arv_buffer_has_chunks(buffer):
             return None
@@ -396,7 +396,7 @@ class AravisCamera(CameraDevice):
         return [number.value for number in numbers]
 
     def _call(self, name: str, *arguments: object) -> Any:
-        """Call ``arv_camera_NAME``, for the camera once there is one; the library's error becomes a HardwareError."""
+        """Call ``arv_camera_NAME`` for the camera, if it is open; raises HardwareError for the library's errors."""
         receiver, error = () if self._camera is None else (self._camera,), POINTER(_GError)()
         result = getattr(self._functions, f"arv_camera_{name}")(*receiver, *arguments, byref(error))
         if error:
@@ -407,15 +407,15 @@ class AravisCamera(CameraDevice):
         return result
 
 
-def _widen(port: int) -> None:
-    """Make room in the system for the packets of whole frames; net.core.rmem_max limits it.
+def _enlarge_buffer(port: int) -> None:
+    """Enlarge the system's buffer of the socket at a port to hold several frames; net.core.rmem_max limits it.
 
-    Aravis does so only once the first frame has come, too late for it and for all others if its first packet was lost.
-    Aravis gives the port of its socket, but not the socket.
+    Aravis does so only after the first frame, which is too late if the first packet of that frame was lost. Aravis
+    reveals the port of its socket, but not the socket.
     """
     folder = Path("/proc/self/fd")
     for number in [int(entry.name) for entry in folder.iterdir()] if folder.is_dir() else []:
-        # The folder's own number is gone by now.
+        # The descriptor of the folder itself is already closed.
         with suppress(OSError):
             if not stat.S_ISSOCK(os.fstat(number).st_mode):
                 continue

@@ -1,4 +1,4 @@
-"""Opens a camera by its address; apart from the interface, because it knows all drivers."""
+"""Opening of a camera by its address; separate from the interface because it imports all drivers."""
 
 from uwlts.errors import HardwareError
 from uwlts.hardware.aravis import AravisCamera
@@ -14,14 +14,13 @@ ADDRESSES = """\
 
 
 def open_camera(address: str) -> CameraDevice:
-    """Open the camera at an address, `ADDRESSES`, such as "gige:127.0.0.1"; a context manager that closes it.
+    """Open the camera at an address such as "gige:127.0.0.1", see `ADDRESSES`.
 
-    The camera is open, not configured.
-
+    The camera is open but not configured. Use it as a context manager, which closes it.
     Raises
     ------
     HardwareError
-        The address is not understood, or there is no such camera; the message lists what there is.
+        The address has an unknown form, or no camera answers to it; the message lists the cameras found.
     SetupError
         A library is missing; the message says how to install it.
     """
@@ -35,6 +34,6 @@ def open_camera(address: str) -> CameraDevice:
     elif kind == "replay" and rest:
         camera = ReplayCamera(rest, address=address)
     else:
-        raise HardwareError(f"'{address}' is not the address of a camera; known are\n{ADDRESSES}")
+        raise HardwareError(f"'{address}' is not a camera address; expected one of\n{ADDRESSES}")
     camera.open()
     return camera

@@ -1,11 +1,11 @@
-"""Interface of all cameras: settings, frames, and the check of every frame, whatever the camera is connected by.
+"""Common interface of all cameras: settings, frames, and the check of every frame.
 
-A driver implements the methods with an underscore; `CameraDevice` keeps the order of the calls, checks every frame and
-reports what went wrong. `uwlts.hardware.camera_addresses.open_camera` opens a camera by its address. One thread uses a
-camera.
+A driver implements the methods that begin with an underscore. `CameraDevice` keeps the order of the calls, checks every
+frame and reports faults. `uwlts.hardware.camera_addresses.open_camera` opens a camera by its address. A camera must be
+used from one thread only.
 
-Cameras count their frames and stamp them with their own clock. What a driver delivers can still lack packets, come
-twice, come late, or leave out frames that were lost in transfer.
+Cameras number their frames and stamp them with their own clock. A delivered frame may lack packets, be repeated, be
+late, or follow frames that were lost in transfer.
 """
 
 import time
@@ -25,32 +25,33 @@ from uwlts.model.stripe import Coordinates, Stripe
 Trigger = Literal["free", "software", "line"]
 
 CENTRE_LINES = "Coord3D_C16"
-"""Pixel format of a 3D camera that finds the stripe itself (GenICam Pixel Format Naming Convention 2.4)."""
+"""Pixel format of a 3D camera that extracts the stripe itself (GenICam Pixel Format Naming Convention 2.4)."""
 
 LINE_RATE, LINE_SELECTOR = "AcquisitionLineRate", "ChunkScanLineSelector"
-"""Features of 3D cameras: profiles per second; and of which profile of a frame the chunk data are read."""
+"""Features of 3D cameras: the profile rate in Hz, and the selector of the profile whose chunk data are read."""
 
 CHUNKS = ("EncoderValue", "Timestamp")
-"""Chunk data that are asked for: Chunk... is the feature's name."""
+"""Requested chunk data; the name of each feature is prefixed with ``Chunk``."""
 
 BUFFERS = 32
-"""Frames that may wait in a driver to be fetched; at 60 frames/s half a second. Later ones are lost."""
+"""Capacity of a driver's frame queue: half a second at 60 frames/s. Further frames are lost."""
 MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
-"""Bits of the grey formats. Packed ones are left out: hardly any camera offers them alone, harvesters unpacks none."""
+"""Bit depths of the grey formats. Packed formats are omitted: harvesters cannot unpack them, and few cameras offer only
+them."""
 COORDINATE_BITS = 16
-"""Of the numbers of `CENTRE_LINES`."""
+"""Bit depth of the values in `CENTRE_LINES`."""
 _WAIT_S = 0.1
-"""A wait in a driver's library holds up Ctrl-C, so it lasts no longer."""
-# GigE Vision 1.x counts frames in 16 bits and leaves out 0.
+"""Longest single wait in a driver's library, during which Ctrl-C has no effect."""
+# GigE Vision 1.x counts frames in 16 bits and skips 0.
 _COUNTER_16_BIT = 2**16 - 1
 
 
 class FrameStatus(StrEnum):
-    """Fault of a frame, the worst first where several things are.
+    """Fault of a frame; the worst comes first if several apply.
 
-    SHORT: parts of the image are missing. DUPLICATED: the previous frame once more, by its number or its time stamp.
-    DROPPED: good, but frames before it are lost. LATE: good, but its time stamp is over a period later than its number
-    says, or it came after a later frame, or after nobody waited for it any more.
+    SHORT: parts of the image are missing. DUPLICATED: a repetition of the previous frame, by number or time stamp.
+    DROPPED: a good frame after lost frames. LATE: a good frame with a time stamp more than a period too late for its
+    number. LATE also marks a frame that arrived after a later frame or after its timeout.
     """
 
     SHORT = "short"
@@ -62,7 +63,7 @@ class FrameStatus(StrEnum):
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """Numbers of frames that were ok, short, duplicated, lost or late, and of unanswered triggers."""
+    """Numbers of frames of each status, and of unanswered triggers."""
 
     ok: int = 0
     short: int = 0
@@ -73,10 +74,9 @@ class FrameCounts:
 
 
 class FrameCheck:
-    """Compares each frame with the one before.
+    """Comparison of each frame with the previous one.
 
-    ``period_s`` is the time between frames of a free-running camera in s; without it no frame is late by its time
-    stamp.
+    ``period_s`` is the time between frames of a free-running camera. Without it the time stamp marks no frame as late.
     """
 
     def __init__(self, *, period_s: float | None = None):
@@ -91,7 +91,7 @@ class FrameCheck:
         return FrameCounts(**self._counts)
 
     def judge(self, *, frame_id: int, time_s: float | None, complete: bool) -> FrameStatus:
-        """Status of the next frame: its number, its time stamp in s (None: it has none), whether nothing is missing."""
+        """Return the status of the next frame; ``time_s`` is None without a time stamp."""
         advance = 1 if self._last_id is None else _advance(self._last_id, frame_id)
         since_s = None if time_s is None or self._last_time_s is None else time_s - self._last_time_s
         self._counts["dropped"] += max(advance - 1, 0)
@@ -105,40 +105,40 @@ class FrameCheck:
             status = FrameStatus.LATE
         else:
             status = FrameStatus.OK
-        # Frames that were lost are counted above, one by one.
+        # Lost frames are counted individually above.
         if status is not FrameStatus.DROPPED:
             self._counts[status.value] += 1
         if advance >= 0:
             self._last_id, self._last_time_s = frame_id, time_s
         return status
 
-    def begin_anew(self, counted: Literal["unanswered", "late"]) -> None:
-        """Count a trigger that was not answered, or a frame thrown away as nobody waited for it any more.
+    def restart_comparison(self, counted: Literal["unanswered", "late"]) -> None:
+        """Count an unanswered trigger or a discarded late frame, and forget the previous frame.
 
-        The next frame is not compared with those before: the camera may count afresh.
+        The next frame is not compared with earlier ones because the camera may restart its frame counter.
         """
         self._counts[counted] += 1
         self._last_id = self._last_time_s = None
 
 
 def _advance(last: int, now: int) -> int:
-    """Difference of a frame's number to that of the frame before: 1 is the next, 0 the same, negative an older one."""
+    """Return the increment of the frame number: 1 for the next frame, 0 for the same, negative for an older one."""
     wrapped = last <= _COUNTER_16_BIT and last - now > _COUNTER_16_BIT // 2
-    # A counter that does not leave out 0 would seem to stand still there.
+    # A counter that does not skip 0 would appear to stand still there.
     return max(now - last + _COUNTER_16_BIT, 1) if wrapped else now - last
 
 
 _MEANING = {
-    FrameStatus.SHORT: "short: parts of it were lost on the way; check cable, network load and packet size",
-    FrameStatus.DUPLICATED: "duplicated: it is the previous frame once more",
-    FrameStatus.DROPPED: "not the next one: frames before it were dropped; lower the frame rate or the load",
-    FrameStatus.LATE: "late: more than a frame's period after the one before",
+    FrameStatus.SHORT: "incomplete: packets were lost; check cable, network load and packet size",
+    FrameStatus.DUPLICATED: "duplicated: it repeats the previous frame",
+    FrameStatus.DROPPED: "preceded by dropped frames; lower the frame rate or the load",
+    FrameStatus.LATE: "late: more than one frame period after the previous one",
 }
 
 
 @dataclass(frozen=True)
 class Region:
-    """Part of the image sensor that is read out, in px, from its upper left pixel."""
+    """Part of the image sensor that is read out, in px from its upper left pixel."""
 
     x_px: int
     y_px: int
@@ -148,9 +148,9 @@ class Region:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """Which camera it is: name, serial number, pixels of the whole image sensor, and bits of a grey value.
+    """Identity of a camera: name, serial number, size of the image sensor, and bit depth.
 
-    ``coordinates`` say what the numbers of a 3D camera mean, which gives centre lines; None where it gives images.
+    ``coordinates`` is the encoding of a 3D camera's centre lines, or None if the camera delivers images.
     """
 
     name: str
@@ -163,9 +163,9 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Settings in force, None where the camera has no such setting, or does not report it.
+    """Camera settings, either requested from a driver or in force.
 
-    Settings that a driver is asked for, None leaving a setting as it is.
+    None in a request leaves a setting unchanged. None in a setting in force means that the camera does not report it.
     """
 
     exposure_ms: float | None
@@ -178,9 +178,10 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class Delivered:
-    """A frame from a driver: image (H, W) or centre line, None if incomplete, with what the camera reports about it.
+    """Frame from a driver, with the metadata that the camera reports.
 
-    ``later`` are the other centre lines of a frame that holds several, in their order.
+    ``seen`` is an image (H, W), a centre line, or None if the frame is incomplete. ``later`` holds the further centre
+    lines of a frame with several profiles, in order.
     """
 
     seen: np.ndarray | Stripe | None
@@ -193,11 +194,11 @@ class Delivered:
 
 @dataclass(frozen=True)
 class GrabbedFrame:
-    """An image (H, W) of uint8 or uint16 or a centre line, complete, with its number and the camera's time stamp in s.
+    """Complete frame: an image (H, W) of uint8 or uint16, or a centre line.
 
-    The camera's clock has an origin of its own. ``exposure_ms`` is None where the camera does not report it, and so is
-    ``encoder``, the count of an encoder that is wired to it. ``status`` is OK, or DROPPED or LATE where such frames are
-    wanted.
+    ``time_s`` is the time stamp of the camera's clock, whose origin is arbitrary. ``exposure_ms`` and ``encoder``, the
+    count of an encoder wired to the camera, are None if the camera does not report them. ``status`` is OK, or DROPPED
+    or LATE if the camera was started with ``faults="skip"``.
     """
 
     seen: np.ndarray | Stripe
@@ -209,7 +210,7 @@ class GrabbedFrame:
 
     @property
     def image(self) -> np.ndarray:
-        """The image (H, W); HardwareError where it is a centre line."""
+        """The image (H, W); raises HardwareError if the frame is a centre line."""
         if isinstance(self.seen, Stripe):
             raise HardwareError(
                 "the camera gives centre lines (Coord3D_C16) where an image is needed: set its PixelFormat to Mono8 "
@@ -219,10 +220,10 @@ class GrabbedFrame:
 
 
 class CameraDevice(ABC):
-    """A camera: ``open``, ``configure``, ``start``, then ``grab``, with ``trigger`` before it where that is wanted.
+    """A camera: ``open``, ``configure``, ``start``, then ``grab``, preceded by ``trigger`` for triggered cameras.
 
-    A context manager, which opens the camera if it is not open and closes it whatever happens. All methods raise
-    HardwareError where the camera does not answer, answers wrongly, or cannot do what is asked.
+    The context manager opens the camera if needed and always closes it. All methods raise HardwareError if the camera
+    does not answer, answers incorrectly, or cannot do what is requested.
     """
 
     def __init__(self, address: str):
@@ -236,35 +237,35 @@ class CameraDevice(ABC):
 
     @property
     def info(self) -> CameraInfo:
-        """Which camera it is; known once it is open."""
+        """Identity of the camera, available once the camera is open."""
         if self._info is None:
             raise HardwareError(f"the camera {self.address} is not open: call open() first")
         return self._info
 
     @property
     def settings(self) -> CameraSettings:
-        """Settings that the camera reports; known once it is configured."""
+        """Settings in force, available once the camera is configured."""
         if self._settings is None:
             raise HardwareError(f"the camera {self.address} is not configured: call configure() first")
         return self._settings
 
     @property
     def counts(self) -> FrameCounts:
-        """Numbers of frames since ``start`` that were good, and of each fault."""
+        """Numbers of good and faulty frames since ``start``."""
         return self._check.counts
 
     @property
     def running(self) -> bool:
-        """Whether it takes frames; no longer so after an error that says that it is gone."""
+        """Whether the camera is acquiring; False after an error that means that the camera is gone."""
         return self._started
 
     def open(self) -> None:
-        """Connect to the camera, alone; opening an open camera does nothing."""
+        """Connect to the camera for exclusive use, unless it is open."""
         if self._info is None:
             self._info = self._open()
 
     def close(self) -> None:
-        """Stop, let go of the camera; closing one that is closed, or gone, is no error."""
+        """Stop and release the camera, unless it is closed or gone."""
         if self._info is None:
             return
         try:
@@ -285,34 +286,37 @@ class CameraDevice(ABC):
         frame_rate_hz: float | None = None,
         profiles: int = 1,
     ) -> CameraSettings:
-        """Set up the camera, and return what it really set, which may be rounded or limited.
+        """Configure the camera and return the settings in force, which may be rounded or limited.
 
-        Exposure, gain, bits of a grey value, and frames per second of a free-running camera: None leaves what is set.
-        ``region`` is the part of the image sensor to read out; None for all of it. ``trigger`` is "free": one frame
-        after the other; "software": one for each call of ``trigger``; or "line": one for each pulse at the camera's
-        trigger input.
-
-        A 3D camera sends so many ``profiles`` in a frame, each with a time stamp and an encoder's count of its own
-        (``ChunkScanLineSelector``); ``grab`` returns them one by one. ``frame_rate_hz`` is that of profiles, and
-        ``bits`` are its own. A triggered one sends one profile.
+        Parameters
+        ----------
+        exposure_ms, gain_db, bits : optional
+            Exposure time, gain and bit depth; None leaves the setting unchanged.
+        region : Region, optional
+            Part of the image sensor to read out; None for all of it.
+        trigger : {"free", "software", "line"}
+            Free running, one frame for each call of ``trigger``, or one frame for each pulse at the trigger input.
+        frame_rate_hz : float, optional
+            Frame rate of a free-running camera, or profile rate of a 3D camera; None leaves it unchanged.
+        profiles : int
+            Profiles in each frame of a free-running 3D camera. Each has its own time stamp and encoder count
+            (``ChunkScanLineSelector``), and ``grab`` returns them one by one.
         """
         info = self.info
         if self._started:
             raise HardwareError(f"the camera {self.address} is running: call stop() before configure()")
         for name, value in (("exposure_ms", exposure_ms), ("frame_rate_hz", frame_rate_hz)):
             if value is not None and not (np.isfinite(value) and value > 0):
-                raise HardwareError(f"{name} is {value}: it must be positive")
+                raise HardwareError(f"{name} is {value}: expected a positive number")
         if gain_db is not None and not np.isfinite(gain_db):
-            raise HardwareError(f"gain_db is {gain_db}: it must be finite")
+            raise HardwareError(f"gain_db is {gain_db}: expected a finite number")
         region = region or Region(0, 0, info.width_px, info.height_px)
         right, below = region.x_px + region.width_px, region.y_px + region.height_px
         inside = min(region.x_px, region.y_px) >= 0 and min(region.width_px, region.height_px) > 0
         if not inside or right > info.width_px or below > info.height_px:
             raise HardwareError(f"{region} is not within the image sensor of {info.width_px} x {info.height_px} px")
         if profiles < 1 or (profiles > 1 and (info.coordinates is None or trigger != "free")):
-            raise HardwareError(
-                f"profiles is {profiles}: a free-running 3D camera sends 1 or more in a frame, any other camera 1"
-            )
+            raise HardwareError(f"profiles is {profiles}: expected 1, or more for a free-running 3D camera")
         if info.coordinates is not None:
             region = replace(region, y_px=0, height_px=profiles)
         if bits is None:
@@ -322,10 +326,10 @@ class CameraDevice(ABC):
         return self._settings
 
     def start(self, *, faults: Literal["raise", "skip"] = "raise") -> None:
-        """Begin to take frames.
+        """Start the acquisition.
 
-        With ``faults`` "raise" every fault of a frame is a HardwareError. With "skip" they are only counted: short and
-        duplicated frames are passed over, frames after a gap and late ones are returned with their status.
+        With ``faults="raise"`` every faulty frame raises HardwareError. With ``faults="skip"`` faults are only counted:
+        short and duplicated frames are discarded, and dropped and late ones are returned with their status.
         """
         settings = self.settings
         if self._started:
@@ -338,13 +342,13 @@ class CameraDevice(ABC):
         self._started = True
 
     def stop(self) -> None:
-        """Take no more frames; stopping a camera that does not run does nothing."""
+        """Stop the acquisition, if it is running."""
         if self._started:
             self._started = False
             self._stop()
 
     def trigger(self) -> None:
-        """Have one frame taken; the next ``grab`` returns it. Frames that still wait are thrown away."""
+        """Trigger one frame, which the next ``grab`` returns; frames still in the queue are discarded."""
         self._require_running()
         if self.settings.trigger != "software":
             raise HardwareError(
@@ -352,15 +356,14 @@ class CameraDevice(ABC):
             )
         self._later.clear()
         while self._next(0.0) is not None:
-            self._check.begin_anew("late")
+            self._check.restart_comparison("late")
         self._trigger()
 
     def grab(self, timeout_s: float, *, waiting: Callable[[], None] = lambda: None) -> GrabbedFrame:
-        """Wait for the next frame, at most so many seconds; ``waiting`` is called about every 0.1 s meanwhile.
+        """Return the next frame, waiting up to ``timeout_s``; ``waiting`` is called about every 0.1 s meanwhile.
 
-        HardwareError where no frame came in time, the camera is gone, or the frame has a fault (see ``start``). After a
-        trigger that was not answered in time the acquisition is restarted, so that its frame cannot be taken for the
-        answer to a later one.
+        Raises HardwareError if no frame arrives in time, the camera is gone, or the frame is faulty (see ``start``). An
+        unanswered trigger restarts the acquisition, so that its frame cannot be mistaken for the answer to a later one.
         """
         self._require_running()
         if self._later:
@@ -396,11 +399,11 @@ class CameraDevice(ABC):
         return GrabbedFrame(seen, time_s, frame.frame_id, exposure_ms, status, frame.encoder)
 
     def _no_frame(self, timeout_s: float) -> HardwareError:
-        """The error of a frame that did not come; another HardwareError where the camera is gone altogether."""
-        # Should the camera be gone, nothing is left to be stopped.
+        """Return the error for a missing frame; raises another HardwareError if the camera is gone."""
+        # If the camera is gone, there is nothing left to stop.
         self._started = False
         if self.settings.trigger == "software":
-            self._check.begin_anew("unanswered")
+            self._check.restart_comparison("unanswered")
             self._stop()
             self._start()
             self._started = True
@@ -416,24 +419,24 @@ class CameraDevice(ABC):
         )
 
     def _failed(self, doing: str, error: object) -> HardwareError:
-        """The error of a driver's library."""
+        """Return the HardwareError for an error of the driver's library."""
         return HardwareError(
             f"the camera {self.address} failed at {doing}: {error}. If it does not answer, check power and cable, and "
             "whether another program uses it"
         )
 
     def _grey_format(self, bits: int, offered: Sequence[str]) -> str:
-        """The pixel format for so many bits."""
+        """Return the name of the grey pixel format with this bit depth; raises HardwareError if it is not offered."""
         wanted = f"Mono{bits}"
         if wanted not in offered or wanted not in MONO_BITS:
-            raise HardwareError(f"the camera {self.address} does not give {wanted}, only {', '.join(offered)}")
+            raise HardwareError(f"the camera {self.address} does not offer {wanted}, only {', '.join(offered)}")
         return wanted
 
     def _profiles(self, numbers: np.ndarray, frame: Delivered, chunk: Callable[[str, int], int | None]) -> Delivered:
-        """The frame of a 3D camera with the centre lines of the rows of its numbers (N, W).
+        """Return the frame of a 3D camera with one centre line for each row of its values (N, W).
 
-        ``chunk(feature, row)`` is the number that came with a row, None where none did. HardwareError where places lie
-        beyond the profile lines, or the time of a row is not known.
+        ``chunk(feature, row)`` returns a row's chunk value, or None. Raises HardwareError if coordinates lie outside
+        the profile lines, or the time of a row is unknown.
         """
         meant, rows = self.info.coordinates or Coordinates(), range(len(numbers))
         try:
@@ -450,25 +453,25 @@ class CameraDevice(ABC):
         return replace(delivered[0], later=tuple(delivered[1:]))
 
     def _since_first(self, rows: range, chunk: Callable[[str, int], int | None]) -> list[float]:
-        """Times of a frame's profiles since the first one in s, by their own time stamps or the rate of profiles."""
+        """Return the times in s of a frame's profiles since the first, from their time stamps or the profile rate."""
         stamps = [each for row in rows if (each := chunk("ChunkTimestamp", row)) is not None]
-        # Some cameras have one time stamp a frame alone.
+        # Some cameras have only one time stamp per frame.
         if len(stamps) == len(rows) and stamps[-1] > stamps[0]:
             return [1e-9 * (each - stamps[0]) for each in stamps]
         if (rate_hz := self.settings.frame_rate_hz) is None:
             raise HardwareError(
                 f"the 3D camera {self.address} gives neither a ChunkTimestamp for each profile nor its "
-                "AcquisitionLineRate: when its profiles were taken is not known; have it send 1 profile in a frame"
+                "AcquisitionLineRate, so that the times of its profiles are unknown: configure 1 profile per frame"
             )
         return [row / rate_hz for row in rows]
 
     def _coordinates(self) -> Coordinates:
-        """What the numbers of a 3D camera mean; HardwareError where they are no places on its image sensor, in px."""
+        """Return the encoding of a 3D camera's values; raises HardwareError if they are not px of its image sensor."""
         mode = self._feature("Scan3dOutputMode", str)
         if mode is not None and not mode.startswith("Uncalibrated"):
             raise HardwareError(
                 f"the 3D camera {self.address} gives {mode}, which is not in pixels of its image sensor: set its "
-                "Scan3dOutputMode to UncalibratedC; the calibration is made here"
+                "Scan3dOutputMode to UncalibratedC, and calibrate it with `uwlts calibrate`"
             )
         scale, offset = (self._feature(f"Scan3dCoordinate{name}", float) for name in ("Scale", "Offset"))
         marked = self._feature("Scan3dInvalidDataFlag", bool)
@@ -476,7 +479,7 @@ class CameraDevice(ABC):
         return Coordinates(1.0 if scale is None else scale, offset or 0.0, invalid)
 
     def _feature(self, name: str, kind: type[str] | type[float] | type[bool]) -> Any:
-        """Value of a feature of the camera, None where it has none of this name."""
+        """Return the value of a camera feature, or None if the camera does not have it."""
         return None
 
     def _require_running(self) -> None:
@@ -492,32 +495,32 @@ class CameraDevice(ABC):
 
     @abstractmethod
     def _open(self) -> CameraInfo:
-        """Connect; whatever was acquired is let go if this fails."""
+        """Connect to the camera; release everything acquired if that fails."""
 
     @abstractmethod
     def _close(self) -> None:
-        """Let go of everything that ``_open`` acquired, even if the camera is gone."""
+        """Release everything that ``_open`` acquired, even if the camera is gone."""
 
     @abstractmethod
     def _configure(self, wanted: CameraSettings) -> CameraSettings:
-        """Set what is asked for, and read back what came of it."""
+        """Apply the settings and return those in force."""
 
     @abstractmethod
     def _start(self) -> None:
-        """Begin to take frames, with none from before."""
+        """Start the acquisition with an empty queue."""
 
     @abstractmethod
     def _stop(self) -> None:
-        """End it; HardwareError where the camera is gone."""
+        """Stop the acquisition; raises HardwareError if the camera is gone."""
 
     @abstractmethod
     def _trigger(self) -> None:
-        """Have one frame taken."""
+        """Trigger one frame."""
 
     @abstractmethod
     def _next(self, timeout_s: float) -> Delivered | None:
-        """The next frame, None after so many seconds, at most 0.1, without one."""
+        """Return the next frame, or None if none arrives within ``timeout_s`` (at most 0.1 s)."""
 
     @abstractmethod
     def _answers(self) -> None:
-        """HardwareError where the camera is gone."""
+        """Raise HardwareError if the camera is gone."""

@@ -1,8 +1,9 @@
-"""Continuous recording: the stage travels at a constant speed while the camera takes frames at its own rate.
+"""Continuous recording: the stage travels at a constant speed while the camera runs at its own frame rate.
 
-Frames are placed by time: the camera stamps them, the stage reports its position some ten times a second, and a line
-through the reports of a pass gives the position at any time of it. Or an encoder that is wired to the camera gives a
-count with every frame. What the clocks differ by shows in a pass back over the same surface (`measure_latency`).
+Frames are assigned positions by time. The camera stamps each frame, and the stage reports its position about ten times
+a second. A line fitted to the reports of a pass gives the position at any time. Alternatively, an encoder wired to the
+camera delivers a count with each frame. The delay between the two clocks is measured by a return pass over the same
+surface (`measure_latency`).
 """
 
 import math
@@ -30,27 +31,28 @@ from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import stripe_in
 
 _SPARE_MM, _SPARE_S = 1.0, 0.3
-"""Way and time of constant speed before and after the frames that are kept, in which the stage reports too."""
+"""Travel at constant speed before and after the stored frames: a distance, and in addition a time."""
 _TRIGGERS = 8
-"""Triggered frames by which the camera's clock is compared; the one that is answered fastest counts."""
+"""Triggered frames used to compare the clocks; the one with the shortest delay counts."""
 _PATIENCE_S = 3.0
 """Longest wait for a frame beyond its exposure."""
 _GAP_S = 0.8
-"""Longest delay of a frame with the laser on, less the time to brake; the report that shows it takes 0.1 s more."""
+"""Longest gap between frames while the laser is on, including the braking time. Its detection takes 0.1 s more."""
 _SLOW_REPORT = 2.0
-"""Reports that took so many times as long as the fastest say less exactly when they were made."""
+"""Reports that took this many times as long as the fastest are ignored: their time is less certain."""
 _FEWEST_REPORTS = 4
 _OUTLIER = 5.0
 _BUSY = 0.9
-"""Share of the time between frames that an exposure may take."""
+"""Largest fraction of the frame period that the exposure may take."""
 
 
 @dataclass(frozen=True)
 class FramePlaces:
-    """How the frames of a continuous scan were placed.
+    """Assignment of positions to the frames of a continuous scan.
 
-    ``latency_s`` with its standard uncertainty, None where it was given; ``scatter_s`` is that of the reports about
-    their line; ``speeds_mm_per_s`` are those of the passes.
+    ``latency_std_s`` is the standard uncertainty of ``latency_s``, or None if the latency was given. ``scatter_s`` is
+    the residual standard deviation of the stage's reports about the fitted line, as a time. ``speeds_mm_per_s`` has one
+    value for each pass.
     """
 
     latency_s: float
@@ -67,8 +69,8 @@ class FramePlaces:
         )
 
 
-def ways_of(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> list[tuple[float, float]]:
-    """Where each pass begins and ends in mm, with the ramps of the speed; RangeError where the stage cannot do it."""
+def plan_passes(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> list[tuple[float, float]]:
+    """Return the start and end of each pass in mm, ramps included; raises RangeError if the stage cannot do it."""
     speed, settings = continuous.speed_mm_per_s, stage.settings
     if 60 * speed > settings.max_feed_mm_per_min:
         raise RangeError(
@@ -76,8 +78,8 @@ def ways_of(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> list[tu
         )
     if speed > (fastest := stage.fastest_sweep_mm_per_s):
         raise RangeError(
-            f"speed_mm_per_s is {speed:g}, too fast for a laser that is lit on the way: at most {fastest:.3g} mm/s, "
-            "from which the stage comes to rest by itself in time ($120)"
+            f"speed_mm_per_s is {speed:g}, too fast for a moving stage with the laser on: at most {fastest:.3g} mm/s, "
+            "so that the stage stops by itself in time ($120)"
         )
     positions = plan.stage.positions_mm()
     ahead = 1.0 if positions[-1] >= positions[0] else -1.0
@@ -87,13 +89,13 @@ def ways_of(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> list[tu
     if min(first, last) < low or max(first, last) > high:
         raise RangeError(
             f"with {ramp:.1f} mm to reach {speed:g} mm/s the stage would go from {min(first, last):.1f} to "
-            f"{max(first, last):.1f} mm, its travel is {low:g} to {high:g} mm: travel more slowly, or scan less"
+            f"{max(first, last):.1f} mm, but its travel is {low:g} to {high:g} mm: travel more slowly, or scan less"
         )
     return [(first, last), (last, first)] if continuous.both_ways else [(first, last)]
 
 
 def _ramp_mm(speed: float, stage: GrblStage) -> float:
-    """Way from rest to a speed in mm/s."""
+    """Return the acceleration distance in mm to a speed in mm/s."""
     return speed**2 / (2 * stage.settings.acceleration_mm_per_s2)
 
 
@@ -114,22 +116,26 @@ def record_continuously(
     recorded: Callable[[Frame, int], None],
     counted: Callable[[Stripe], None],
 ) -> FramePlaces:
-    """Record the passes of a plan; ``counted`` is called with the stripe of every frame. Errors as of `scan`."""
-    positions, ways = plan.stage.positions_mm(), ways_of(plan, continuous, stage)
+    """Record the passes of a plan and assign positions to its frames.
+
+    ``counted`` is called with the stripe of every frame. The other parameters, and the errors, are those of
+    `uwlts.desk.scan.scan`.
+    """
+    positions, passes = plan.stage.positions_mm(), plan_passes(plan, continuous, stage)
     rate_hz = continuous.speed_mm_per_s / abs(plan.stage.step_mm)
     if 1e-3 * exposure_ms * rate_hz > _BUSY:
         raise RangeError(
             f"at {continuous.speed_mm_per_s:g} mm/s the camera has {1e3 / rate_hz:.3g} ms for a step of "
-            f"{abs(plan.stage.step_mm):g} mm, less than an exposure of {exposure_ms:.3g} ms needs: travel more slowly"
+            f"{abs(plan.stage.step_mm):g} mm, too little for an exposure of {exposure_ms:.3g} ms: travel more slowly"
         )
-    expected, lines = len(positions) * len(ways), camera.info.coordinates is not None
+    expected, lines = len(positions) * len(passes), camera.info.coordinates is not None
     dtype = np.dtype(np.uint16 if camera.info.bits > 8 and not lines else np.uint8)
     settings = {"exposure_ms": exposure_ms, "gain_db": plan.gain_db, "bits": sensor.detector.bits}
     camera.stop()
-    stage.move_to(ways[0][0], feed_mm_per_min=plan.stage.feed_mm_per_min)
+    stage.move_to(passes[0][0], feed_mm_per_min=plan.stage.feed_mm_per_min)
     camera.configure(**settings, trigger="software")
     camera.start(faults="skip")
-    clock = _compared(camera, exposure_ms)
+    clock = _compare_clocks(camera, exposure_ms)
     at_rest_mm = stage.position_mm()
     camera.stop()
     together = continuous.profiles_per_frame
@@ -138,48 +144,48 @@ def record_continuously(
         warn(f"the camera takes {rate_set} frames/s where the plan needs {rate_hz:.4g}: steps differ from the plan's")
     kinds = {"centre_lines": lines, "moving": True}
     with CaptureWriter(out, header, dtype=dtype, **kinds, plan=plan.recorded(), overwrite=overwrite) as writer:
-        reading = _Reading(camera, writer, clock, positions, exposure_ms, sensor, header.saturation_dn)
-        reading.frame_s = 1e-3 * exposure_ms + together / rate_hz
-        reading.gap_s = _GAP_S - continuous.speed_mm_per_s / stage.settings.acceleration_mm_per_s2
-        reading.hears = lambda frame, stripe, number: (
+        reader = _FrameReader(camera, writer, clock, positions, exposure_ms, sensor, header.saturation_dn)
+        reader.frame_s = 1e-3 * exposure_ms + together / rate_hz
+        reader.gap_s = _GAP_S - continuous.speed_mm_per_s / stage.settings.acceleration_mm_per_s2
+        reader.notify = lambda frame, stripe, number: (
             counted(stripe),
             progress(min(number + 1, expected), expected),
             recorded(frame, number),
         )
         camera.start(faults="skip")
-        thread = threading.Thread(target=reading.run, name="continuous-frames", daemon=True)
+        thread = threading.Thread(target=reader.run, name="continuous-frames", daemon=True)
         feed_mm_per_min = 60 * continuous.speed_mm_per_s
         try:
             thread.start()
-            for _, end in ways:
-                reading.begin_pass()
-                stage.sweep(end, feed_mm_per_min=feed_mm_per_min, power=plan.laser_power, reported=reading.report)
-            reading.end_s = time.monotonic()
+            for _, end in passes:
+                reader.begin_pass()
+                stage.sweep(end, feed_mm_per_min=feed_mm_per_min, power=plan.laser_power, reported=reader.report)
+            reader.end_s = time.monotonic()
             report("waiting for the last frames")
             thread.join()
         finally:
-            reading.ending.set()
-            with suppress(RuntimeError):  # it was not started
+            reader.ending.set()
+            with suppress(RuntimeError):  # raised if the thread was not started
                 thread.join()
             camera.stop()
-        if reading.error is not None:
-            raise reading.error
+        if reader.error is not None:
+            raise reader.error
         if lost := camera.counts.dropped + camera.counts.short:
-            warn(f"{lost} frames were lost on their way from the camera: the steps there are longer")
-        ends = sorted(ways[0])
+            warn(f"{lost} frames were lost between camera and computer: the steps there are larger")
+        ends = sorted(passes[0])
         ramp = _ramp_mm(continuous.speed_mm_per_s, stage)
-        return reading.place(continuous, (ends[0] + ramp, ends[1] - ramp), at_rest_mm, warn)
+        return reader.assign_positions(continuous, (ends[0] + ramp, ends[1] - ramp), at_rest_mm, warn)
 
 
 @dataclass(frozen=True)
 class _Clock:
-    """What to add to the camera's time stamps for the clock of `time.monotonic`, s; and an encoder's count at rest."""
+    """Offset in s from the camera's time stamps to `time.monotonic`, and the encoder count at rest."""
 
     offset_s: float
     encoder: int | None
 
 
-def _compared(camera: CameraDevice, exposure_ms: float) -> _Clock:
+def _compare_clocks(camera: CameraDevice, exposure_ms: float) -> _Clock:
     offsets, encoder = [], None
     for _ in range(_TRIGGERS):
         asked_s = time.monotonic()
@@ -187,12 +193,12 @@ def _compared(camera: CameraDevice, exposure_ms: float) -> _Clock:
         frame = camera.grab(_PATIENCE_S + 1e-3 * exposure_ms)
         offsets.append(asked_s - frame.time_s)
         encoder = frame.encoder
-    # The stamp of a frame that came late after its trigger lies late: the difference is too small, never too large.
+    # A delayed time stamp makes the difference too small, never too large.
     return _Clock(max(offsets), encoder)
 
 
-class _Reading:
-    """Takes frames from the camera in a thread of its own and stores those within the plan's positions."""
+class _FrameReader:
+    """Reader of camera frames in its own thread, which stores those within the planned positions."""
 
     def __init__(
         self,
@@ -207,7 +213,7 @@ class _Reading:
         self._camera, self._writer, self._clock = camera, writer, clock
         self._low, self._high = min(positions), max(positions)
         self._exposure_ms, self._sensor, self._full_dn = exposure_ms, sensor, full_dn
-        self.hears: Callable[[Frame, Stripe, int], object] = lambda frame, stripe, number: None
+        self.notify: Callable[[Frame, Stripe, int], object] = lambda frame, stripe, number: None
         self._passes: list[list[StageReport]] = []
         self._pending: deque[tuple[GrabbedFrame, float]] = deque()
         self._stripes: list[np.ndarray] = []
@@ -221,12 +227,12 @@ class _Reading:
         self.error: Exception | None = None
 
     def begin_pass(self) -> None:
-        """The reports from here on belong to another pass."""
+        """Assign the following reports to a new pass."""
         self._passes.append([])
         self._heard_s = time.monotonic()
 
     def report(self, report: StageReport) -> None:
-        """Hear of the stage's position; raises what has ended the reading, or that frames stay away."""
+        """Add a report of the stage; raises the error that ended the reading, or HardwareError without frames."""
         self._passes[-1].append(report)
         if self.error is not None:
             raise self.error
@@ -237,21 +243,21 @@ class _Reading:
             )
 
     def run(self) -> None:
-        """Read frames until one was taken after the end of the last pass."""
+        """Read frames until one was exposed after the end of the last pass."""
         try:
             while not self.ending.is_set():
                 frame = self._camera.grab(_PATIENCE_S + self.frame_s)
                 self._heard_s = time.monotonic()
                 middle_s = frame.time_s + self._clock.offset_s + 0.5e-3 * self._exposure_ms
                 self._pending.append((frame, middle_s))
-                self._store_what_is_known()
+                self._store_located()
                 if self.end_s is not None and middle_s > self.end_s:
                     return
         except Exception as error:
             self.error = error
 
-    def _store_what_is_known(self) -> None:
-        """Store the frames that were taken before the latest report, at the positions between reports."""
+    def _store_located(self) -> None:
+        """Store the frames exposed before the latest report, with positions interpolated between reports."""
         known = [each for one in list(self._passes) for each in list(one)]
         if not known:
             return
@@ -270,19 +276,20 @@ class _Reading:
             self._stripes.append(stripe.centre_px)
             self._times.append(middle_s)
             self._encoders.append(np.nan if encoder is None else encoder)
-            self.hears(stored, stripe, len(self._times) - 1)
+            self.notify(stored, stripe, len(self._times) - 1)
 
-    def place(
+    def assign_positions(
         self, continuous: Continuous, even: tuple[float, float], at_rest_mm: float, warn: Callable[[str], None]
     ) -> FramePlaces:
-        """Give all frames their places; HardwareError where no stripe was seen, or the stage's reports do not fit.
+        """Assign final positions to all frames, from lines fitted where the speed is constant.
 
-        Between the positions ``even`` the speed is constant.
+        ``even`` is the range of positions in mm with constant speed. Raises HardwareError if no frame shows a stripe,
+        or if there are too few reports.
         """
         times, centres = np.array(self._times), np.array(self._stripes)
         if not len(times) or not np.isfinite(centres).any():
             raise HardwareError(
-                f"no stripe in any of {len(times)} frames: is the laser lit (supply, key, interlock), the exposure "
+                f"no stripe in any of {len(times)} frames: is the laser on (supply, key, interlock), the exposure "
                 "long enough, the object in the volume?"
             )
         stage, speed, scatters, speeds = np.full(len(times), np.nan), np.zeros(len(times)), [], []
@@ -290,16 +297,16 @@ class _Reading:
             own = (times >= _time_of(one[0])) & (times <= _time_of(one[-1])) if one else np.zeros(len(times), bool)
             if not own.any():
                 continue
-            fitted = _line_through([each for each in one if even[0] <= each.position_mm <= even[1]])
-            stage[own], speed[own] = fitted.at(times[own]), fitted.speed
+            fitted = _fit_line([each for each in one if even[0] <= each.position_mm <= even[1]])
+            stage[own], speed[own] = fitted.position_at(times[own]), fitted.speed
             scatters.append(fitted.scatter_s)
             speeds.append(fitted.speed)
         if continuous.mm_per_count is not None:
-            stage = self._by_encoder(continuous.mm_per_count, at_rest_mm)
+            stage = self._read_encoder(continuous.mm_per_count, at_rest_mm)
         latency_s, std_s = 1e-3 * (continuous.latency_ms or 0.0), None
         if continuous.latency_ms is None and continuous.mm_per_count is None:
             if len(speeds) < 2:
-                warn("the latency of the stage is not known and taken as 0: both_ways = true measures it")
+                warn("the latency of the stage is unknown and taken as 0: both_ways = true measures it")
             else:
                 try:
                     found = measure_latency(centres, stage, speed)
@@ -311,7 +318,7 @@ class _Reading:
         self._writer.place(stage, speed, np.array(reports))
         return FramePlaces(latency_s, std_s, max(scatters), tuple(speeds))
 
-    def _by_encoder(self, mm_per_count: float, at_rest_mm: float) -> np.ndarray:
+    def _read_encoder(self, mm_per_count: float, at_rest_mm: float) -> np.ndarray:
         counts = np.array(self._encoders)
         if self._clock.encoder is None or not np.isfinite(counts).all():
             raise HardwareError(
@@ -327,40 +334,43 @@ def _time_of(report: StageReport) -> float:
 
 @dataclass(frozen=True)
 class _Line:
-    """A position over time, with how far in time the reports lie beside it."""
+    """Position as a linear function of time, with the scatter of the reports as a time."""
 
     start_s: float
     start_mm: float
     speed: float
     scatter_s: float
 
-    def at(self, times: np.ndarray) -> np.ndarray:
+    def position_at(self, times: np.ndarray) -> np.ndarray:
         return self.start_mm + self.speed * (times - self.start_s)
 
 
-def _line_through(reports: list[StageReport]) -> _Line:
-    """The line through reports of a pass at constant speed, late ones left out; HardwareError where it is not."""
+def _fit_line(reports: list[StageReport]) -> _Line:
+    """Fit a line to the reports of a pass at constant speed, without slow ones and outliers.
+
+    Raises HardwareError if there are too few reports.
+    """
     if len(reports) < _FEWEST_REPORTS:
         raise HardwareError(
-            f"the stage reported {len(reports)} positions at constant speed within a pass, {_FEWEST_REPORTS} are "
-            "needed: travel more slowly, or scan a longer way"
+            f"the stage reported {len(reports)} positions at constant speed within a pass, expected at least "
+            f"{_FEWEST_REPORTS}: travel more slowly, or scan a longer distance"
         )
-    # The fastest half counts in any case.
+    # At least half of the reports, the fastest, are used.
     took = np.sort([each.answered_s - each.asked_s for each in reports])
     longest = max(_SLOW_REPORT * took[0], took[max(len(reports) // 2, _FEWEST_REPORTS - 1)])
     used = [each for each in reports if each.answered_s - each.asked_s <= longest]
     times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
     middle, kept = times.mean(), np.ones(len(used), bool)
 
-    def fitted() -> tuple[float, float, np.ndarray]:
+    def refit() -> tuple[float, float, np.ndarray]:
         speed, start = np.polyfit(times[kept] - middle, places[kept], 1)
         return float(speed), float(start), places - (start + speed * (times - middle))
 
-    speed, start, away = fitted()
+    speed, start, away = refit()
     for _ in range(2):
         scatter = max(robust_std(away), 1e-6)
         kept = np.abs(away) <= _OUTLIER * scatter
-        speed, start, away = fitted()
-    # Two of the degrees of freedom are the line's.
+        speed, start, away = refit()
+    # The line takes two degrees of freedom.
     scatter = float(np.sqrt((away[kept] ** 2).sum() / max(np.count_nonzero(kept) - 2, 1)))
     return _Line(float(middle), start, speed, scatter / abs(speed))

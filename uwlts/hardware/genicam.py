@@ -1,6 +1,6 @@
-"""Cameras with a GenTL producer, the driver library (.cti) that comes with most machine-vision cameras, by harvesters.
+"""Cameras with a GenTL producer, the driver library (.cti) of most machine-vision cameras, through harvesters.
 
-XIMEA's producer for the thesis's camera is among them, and so are those of Basler, Allied Vision, FLIR, IDS and others.
+Producers exist for XIMEA, the thesis's camera, and for Basler, Allied Vision, FLIR, IDS and others.
 """
 
 import signal
@@ -29,21 +29,21 @@ from uwlts.hardware.camera_interface import (
     Region,
 )
 
-# GenApi's access modes count: not implemented, not available, write only, read only, both.
+# GenApi's access modes in order: not implemented, not available, write only, read only, read and write.
 _WRITE_ONLY = 2
-# Names after the standard, then those in use before it.
+# Standard names, followed by older ones.
 _EXPOSURE_US, _FRAME_RATE = ("ExposureTime", "ExposureTimeAbs"), ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
 _GAIN = ("Gain",)
 
 
 class GenicamCamera(CameraDevice):
-    """The camera of a serial number at a GenTL producer; the only one there is without a serial number."""
+    """A camera of a GenTL producer with a serial number; without a serial number, the only camera found."""
 
     def __init__(self, producer: str | Path, *, serial: str | None = None, address: str | None = None):
         super().__init__(address or f"genicam:{producer}" + (f":{serial}" if serial else ""))
         self._producer = Path(producer)
         self._serial = serial
-        # harvesters comes without type information.
+        # harvesters has no type information.
         self._harvester: Any = None
         self._acquirer: Any = None
         self._faults: tuple[type[BaseException], ...] = ()
@@ -82,7 +82,7 @@ class GenicamCamera(CameraDevice):
                     f"{len(fitting)} of the cameras at {self._producer} fit {self.address}, expected one. "
                     f"Found:{listed or ' none; check power, cable, and that the file is a producer for this machine'}"
                 )
-            with _own_interrupt():
+            with _keep_interrupt_handler():
                 self._acquirer = harvester.create(found.index(fitting[0]))
             self._acquirer.num_buffers = BUFFERS
             width, height = (self._whole(side) for side in ("Width", "Height"))
@@ -97,7 +97,7 @@ class GenicamCamera(CameraDevice):
 
     @contextmanager
     def _reporting(self, doing: str) -> Iterator[None]:
-        """Turn the errors of the libraries into a HardwareError."""
+        """Convert the errors of the libraries to HardwareError."""
         try:
             yield
         except self._faults as error:
@@ -136,7 +136,7 @@ class GenicamCamera(CameraDevice):
                         f"the camera {self.address} cannot be triggered by {source}: use trigger 'free'"
                     )
             exposure_us, gain, rate = (self._number(names) for names in (_EXPOSURE_US, _GAIN, of_rate))
-            x, y = (int(self._number((name,)) or 0) for name in ("OffsetX", "OffsetY"))
+            x, y = (int(self._feature(name, float) or 0) for name in ("OffsetX", "OffsetY"))
             width, height = (int(self._node(name).value) for name in ("Width", "Height"))
             return CameraSettings(
                 exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
@@ -148,7 +148,7 @@ class GenicamCamera(CameraDevice):
             )
 
     def _set_chunks(self) -> None:
-        """Have what the camera knows of each frame, or of each of its profiles, sent with it."""
+        """Request the chunk data of each frame, or of each of its profiles."""
         self._node("ChunkModeActive").value = True
         offered = self._node("ChunkSelector").symbolics if self._has("ChunkSelector") else ()
         for each in set(CHUNKS).intersection(offered):
@@ -156,7 +156,7 @@ class GenicamCamera(CameraDevice):
             self._set_if_there("ChunkEnable", True)
 
     def _set_region(self, wanted: Region) -> None:
-        # Moved to the corner first: a width is refused that would not fit beside the offset.
+        # Move to the corner first: a camera rejects a width that does not fit beside the offset.
         for name in ("OffsetX", "OffsetY"):
             self._set_if_there(name, 0)
         for name, size in (("Width", wanted.width_px), ("Height", wanted.height_px)):
@@ -182,10 +182,10 @@ class GenicamCamera(CameraDevice):
         node.value = min(max(factor * value, node.min), node.max)
 
     def _number(self, names: tuple[str, ...]) -> float | None:
-        return next((float(self._node(name).value) for name in names if self._has(name)), None)
+        return next((self._feature(name, float) for name in names if self._has(name)), None)
 
     def _set_if_there(self, name: str, value: object) -> None:
-        # Cameras with only one value refuse to have it set.
+        # Cameras with only one possible value reject its setting.
         if self._has(name) and self._node(name).value != value:
             self._node(name).value = value
 
@@ -197,7 +197,7 @@ class GenicamCamera(CameraDevice):
         return self._acquirer.remote_device.node_map.get_node(name)
 
     def _whole(self, side: str) -> int:
-        """Pixels of the whole image sensor along its width or height."""
+        """Return the size in px of the whole image sensor along its width or height."""
         for name in (f"Sensor{side}", f"{side}Max"):
             if self._has(name):
                 return int(self._node(name).value)
@@ -242,7 +242,7 @@ class GenicamCamera(CameraDevice):
         return self._profiles(image, frame, self._chunk)
 
     def _chunk(self, feature: str, row: int) -> int | None:
-        """The number of a feature that came with the latest frame, or with one of its profiles; None if it did not."""
+        """Return the chunk value of the latest frame, or of one of its profiles, or None."""
         with suppress(*self._faults):
             if self._has(feature):
                 if self._has(LINE_SELECTOR):
@@ -256,8 +256,8 @@ class GenicamCamera(CameraDevice):
 
 
 @contextmanager
-def _own_interrupt() -> Iterator[None]:
-    """Keep what Ctrl-C does: harvesters takes the signal for itself, and then it would end no scan."""
+def _keep_interrupt_handler() -> Iterator[None]:
+    """Restore the handler of Ctrl-C, which harvesters replaces, so that Ctrl-C still ends a scan."""
     before = signal.getsignal(signal.SIGINT)
     yield
     if before is not None and threading.current_thread() is threading.main_thread():

@@ -1,33 +1,32 @@
-"""The stage and the laser: a Grbl 1.1 controller that moves one axis and switches the laser by its spindle pin.
+"""Stage and laser: a Grbl 1.1 controller that moves one axis and switches the laser by its spindle pin.
 
 Positions are in mm from the lower end of travel in machine coordinates, so that 0 <= position <= travel once the stage
-is homed; the limit switch is at 0 if $23 is 1, else at the other end. Moves are given in machine coordinates (G53), so
-that work offsets left in the controller change nothing. Without homing ($22=0) positions count from where the
+is homed. The limit switch is at 0 if $23 is 1, else at the other end. Moves are given in machine coordinates (G53), so
+that work offsets left in the controller have no effect. Without homing ($22=0) positions count from the place where the
 controller was started.
 
-Grbl counts the pulses that it sends to the motor; it measures nothing. A position that differs from the target means
-that a command or pulses were lost before the motor. Steps that the motor itself loses show only when the limit switch
-is found pressed away from its place, which every move checks, or in the pictures: return to the first position and
-compare.
+Grbl counts the pulses that it sends to the motor; it measures nothing. If the position read back differs from the
+target, a command or pulses were lost before the motor. Steps lost by the motor itself show in two ways: the limit
+switch is pressed away from its place, which every move checks, or the image at the first position has changed.
 
-The controller itself ends the light, whatever becomes of the computer. At rest it has the dwell and the M5 that end the
-light before it lights the laser; light that shall last is renewed by `GrblStage.keep_lit`. On the way, in `sweep`, the
-laser is lit by M4, which Grbl's laser mode darkens at rest, and the controller knows of the next part of the way alone.
+The controller itself ends the light, even if the computer fails. At rest it receives the dwell and the M5 that end the
+light together with the command that starts it; `GrblStage.keep_lit` renews a light that shall last. In motion
+(`sweep`) the laser is on by M4, which Grbl's laser mode switches off at rest, and the controller knows only the next
+part of the travel.
 
-The laser goes off sooner:
+The laser is switched off earlier in these cases:
 
-- the ``with`` ends, normally or by an exception, Ctrl-C included: Ctrl-X, whose answer is awaited. Grbl's receiving
-  interrupt obeys it, so it works while the controller moves, waits or is locked;
-- a fault is found: Ctrl-X before the error is raised;
-- the program is killed (SIGTERM, SIGKILL), crashes or ends without closing, is suspended or hangs: `laser_guard`, a
-  process of its own, sends the Ctrl-X. It expects to hear of the program while the laser is on: every exchange with the
-  controller is heard, and longer waits are announced by `GrblStage.keep_lit`;
-- the guard is gone: the driver finds out at the next exchange, or `keep_lit`, and sends the Ctrl-X;
-- the cable is pulled out: the Uno, fed by it, loses its power and the pull-down at the laser's transistor does the
-  rest;
-- the controller restarts for any reason, the next opening of the port included: Grbl starts with the pin off.
+- the ``with`` block ends, normally or by an exception, including Ctrl-C: the driver sends Ctrl-X and awaits the answer.
+  Grbl obeys it in its receive interrupt, so it works while the controller moves, waits or is locked;
+- a fault is found: the driver sends Ctrl-X before it raises the error;
+- the program is killed (SIGTERM, SIGKILL), crashes, ends without closing, is suspended or hangs: `laser_guard`, a
+  separate process, sends Ctrl-X. While the laser is on it expects signs of life: every exchange with the controller is
+  one, and `GrblStage.keep_lit` announces longer waits;
+- the guard is gone: the driver notices at the next exchange or `keep_lit`, and sends Ctrl-X;
+- the cable is pulled out: the Uno is powered by it, and the pull-down at the laser's transistor switches the laser off;
+- the controller restarts for any reason, including the next opening of the port: Grbl starts with the pin off.
 
-Where the controller itself hangs only hardware helps, see docs/how-to/hardware-stage.md.
+If the controller itself hangs, only hardware helps; see docs/how-to/hardware-stage.md.
 """
 
 import math
@@ -40,30 +39,30 @@ from typing import Self
 from uwlts.errors import HardwareError, RangeError
 from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine, Status, parse_settings
 
-# A stage that moves by less than a step in this time, and in that of some steps, stands still.
+# A stage that moves by less than a step in this time, plus the time of some steps, is stalled.
 _STALL_S, _STALL_STEPS = 1.0, 5
-# Time allowed for a movement: this factor of the computed time, plus the time to answer.
+# Time limit of a movement: this factor of the computed time, plus the time to answer.
 _MARGIN, _MARGIN_S = 1.5, 2.0
-# The offset comes with every 10th report at rest and every 30th in motion.
+# The work offset is sent with every 10th report at rest and every 30th in motion.
 _REPORTS_TO_OFFSET = 31
-# A limit switch opens this far from where it closes.
+# Hysteresis of the limit switch.
 _PIN_MARGIN_MM = 0.5
 LIVE_S = 0.4
-"""Dwell of a light that is renewed. Two are with the controller at most, so that the light ends within 0.9 s; and one
-at least after a call of `GrblStage.keep_lit`, which may take half a second to come again, as the guard allows 0.8 s."""
+"""Dwell of a renewed light. The controller holds at most two, so that the light ends within 0.9 s. It holds at least
+one after a call of `GrblStage.keep_lit`, whose interval may be half a second, as the guard allows 0.8 s."""
 _LIGHTS_S = 0.3
-"""The controller lights the laser within some ms after it got the command."""
+"""Time limit of the controller to switch the laser, which takes a few ms."""
 _SWEEP_S = 0.9
-"""A stage that gets no further part of its way comes to rest, and darkens the laser, in this time."""
+"""Time within which a stage that receives no further part of its travel comes to rest and switches the laser off."""
 _LAG_S = 0.3
-"""Way at full speed that is left to it where the next part comes as late as a report and a busy computer allow."""
+"""Travel time at full speed that remains if the next part is delayed by a report and a busy computer."""
 _FULL = 0.9
-"""Share of the power that shows that the laser follows, as the speed is reported rounded."""
+"""Fraction of the set power that counts as reached, because the reported speed is rounded."""
 
 
 @dataclass(frozen=True)
 class StageReport:
-    """Position in mm that a controller reported between two moments, in s by the clock of `time.monotonic`."""
+    """Position reported by the controller between two moments of the clock `time.monotonic`."""
 
     asked_s: float
     answered_s: float
@@ -71,12 +70,32 @@ class StageReport:
 
 
 class GrblStage:
-    """A stage, open from construction on; a context manager that leaves the laser off. Not safe between threads.
+    """A stage that is open after construction; a context manager that leaves the laser off. Not thread-safe.
 
-    ``port`` is a serial port such as /dev/ttyACM0; ``boot_s`` is how long a controller that restarts when the port is
-    opened may take. Attributes are the ``settings`` as ``$$`` reports them, Grbl's ``version``, and ``limits_mm``, the
-    lowest and the highest position. HardwareError where the port cannot be opened, nothing answers, or not a Grbl 1.1
-    that can do this.
+    Only `darken` may be called from other threads.
+
+    Parameters
+    ----------
+    port : str
+        Serial port, such as /dev/ttyACM0.
+    baud : int
+        Baud rate.
+    boot_s : float
+        Longest start-up time of a controller that restarts when the port is opened.
+
+    Attributes
+    ----------
+    settings : GrblSettings
+        Settings reported by ``$$``.
+    version : str
+        Version of Grbl.
+    limits_mm : tuple of float
+        Lowest and highest position.
+
+    Raises
+    ------
+    HardwareError
+        The port cannot be opened, nothing answers, or the controller is not a Grbl 1.1 with variable spindle.
     """
 
     def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
@@ -95,7 +114,7 @@ class GrblStage:
             zero_at_low_end = "Z" in options and self.settings.homes_to_negative
             self._origin_mm = -travel if self.settings.homing and not zero_at_low_end else 0.0
             self.limits_mm = (0.0, travel) if self.settings.homing else (-travel, travel)
-            # Locked at the start: homing is enabled and has not been done. A board whose reset is disabled keeps it.
+            # A controller with homing is locked until it is homed. A board whose reset is disabled keeps its position.
             self._position_known = self._line.status().state != "Alarm"
         except BaseException as error:
             self._line.close(error)
@@ -103,23 +122,23 @@ class GrblStage:
 
     @property
     def position_known(self) -> bool:
-        """Whether the stage may move: it is homed or unlocked, and no fault came since."""
+        """Whether the stage may move: it was homed or unlocked, and no fault occurred since."""
         return self._position_known and self._line.fault is None
 
     @property
     def faulty(self) -> bool:
-        """Whether a fault has ended all movements, and switched the laser off, until `home` or `unlock`."""
+        """Whether a fault has stopped all movements and switched the laser off, until `home` or `unlock`."""
         return self._line.fault is not None
 
     @property
     def laser_power(self) -> float:
-        """Power last set, 0 when off."""
+        """Power set last; 0 if the laser is off."""
         return 0.0 if self._line.fault else self._power
 
     def home(self) -> float:
-        """Find the limit switch and return the position read back in mm; ends a fault. The laser goes off.
+        """Home the stage and return its position in mm; clears a fault and switches the laser off.
 
-        HardwareError where homing is disabled, fails, or takes too long, and for every other fault.
+        Raises HardwareError if homing is disabled, fails or takes too long, and for all other faults.
         """
         settings = self.settings
         if not settings.homing:
@@ -129,19 +148,20 @@ class GrblStage:
             self.laser(False)
         seek, feed = settings.homing_seek_mm_per_min / 60, settings.homing_feed_mm_per_min / 60
         pull_off = settings.homing_pull_off_mm
-        # Grbl seeks over 1.5 times the travel and then, twice the pull-off at the seek rate, 5 times it at the feed.
+        # Grbl seeks over 1.5 times the travel, then over twice the pull-off at the seek rate and 5 times at the feed
+        # rate.
         longest_s = (1.5 * settings.travel_mm + 2 * pull_off) / seek + 5 * pull_off / feed
         longest_s += 4 * (settings.homing_debounce_ms / 1000 + seek / settings.acceleration_mm_per_s2)
         self._position_known = False
-        # No status queries: Grbl does not answer them while it homes.
+        # No status queries: Grbl does not answer them during homing.
         self._line.command("$H", timeout_s=_MARGIN * longest_s + _MARGIN_S)
         self._position_known = True
         return self.position_mm()
 
     def unlock(self) -> float:
-        """End an alarm, a hold or a fault, taking the controller's position for true, and return that in mm.
+        """Clear an alarm, a hold or a fault, accept the controller's position, and return it in mm.
 
-        Right where nothing moved (noise on the line at rest, a soft limit) or where there is no limit switch.
+        Use it if nothing moved (noise on the line at rest, a soft limit) or if there is no limit switch.
         """
         self._recover()
         self._line.command("$X")
@@ -156,7 +176,7 @@ class GrblStage:
         self._forget_light()
         self._held = False
         self._line.restart()
-        # A reset that met a movement leaves an alarm behind.
+        # A reset during a movement leaves an alarm.
         self._position_known = self._position_known and self._line.status().state != "Alarm"
 
     def move_to(
@@ -166,13 +186,24 @@ class GrblStage:
         feed_mm_per_min: float,
         reported: Callable[[StageReport], None] = lambda report: None,
     ) -> float:
-        """Move, wait until the stage rests, and return the position read back in mm.
+        """Move, wait until the stage is at rest, and return the position read back in mm.
 
-        ``reported`` is called with every position that the controller reports meanwhile, about ten times a second.
+        Parameters
+        ----------
+        position_mm : float
+            Target within ``limits_mm``.
+        feed_mm_per_min : float
+            Speed, at most that of the stage ($110).
+        reported : callable
+            Called with every `StageReport` during the movement, about ten times a second.
 
-        RangeError where the target lies outside the travel, or the feed outside what the stage can do; nothing has
-        moved then. HardwareError where the position is not known, and for every fault: alarm, stall, hold, lost steps,
-        restart, silence, noise, lost line.
+        Raises
+        ------
+        RangeError
+            The target is outside the travel, or the feed outside the stage's range; nothing has moved.
+        HardwareError
+            The position is unknown, or a fault occurred: alarm, stall, hold, lost steps, restart, silence, noise, lost
+            connection.
         """
         start_mm = self._start_of(position_mm, feed_mm_per_min)
         self._go(position_mm, feed_mm_per_min)
@@ -188,8 +219,8 @@ class GrblStage:
 
     @property
     def fastest_sweep_mm_per_s(self) -> float:
-        """Highest speed of `sweep`: faster, the stage takes too long to come to rest by itself."""
-        # With the ramps it rests in _SWEEP_S from a way that suffices to brake, and _LAG_S more.
+        """Highest speed of `sweep`: at a higher one the stage takes too long to stop by itself."""
+        # Including the ramps the stage stops within _SWEEP_S from a distance that suffices to brake, plus _LAG_S.
         return (_SWEEP_S - _LAG_S) / 1.5 * self.settings.acceleration_mm_per_s2
 
     def sweep(
@@ -200,20 +231,20 @@ class GrblStage:
         power: float = 1.0,
         reported: Callable[[StageReport], None] = lambda report: None,
     ) -> float:
-        """Move as `move_to` does, with the laser on while the stage moves; below its full speed the light is weaker.
+        """Move like `move_to`, with the laser on during the movement; on the ramps the light is weaker.
 
-        The controller gets the way part by part: where this program stops, the stage comes to rest and the laser goes
-        off within a second. Whatever ``reported`` raises brakes the stage, which is held then as by `stop`.
+        The controller receives the travel part by part. If this program stops, the stage comes to rest and the laser
+        goes off within a second. An exception from ``reported`` brakes the stage, which is then held as by `stop`.
 
-        RangeError, HardwareError as by `move_to` and `laser`. HardwareError also where the next part came too late for
-        a constant speed.
+        Raises RangeError and HardwareError like `move_to` and `laser`. Also raises HardwareError if the next part was
+        sent too late for a constant speed.
         """
         speed = self._speed_of(power)
         start_mm, feed_mm_s = self._start_of(position_mm, feed_mm_per_min), feed_mm_per_min / 60
         if feed_mm_s > (fastest := self.fastest_sweep_mm_per_s):
             raise RangeError(
-                f"{feed_mm_s:g} mm/s is too fast for a laser that is lit on the way: at most {fastest:.3g} mm/s, from "
-                "which the stage comes to rest by itself in time ($120)"
+                f"{feed_mm_s:g} mm/s is too fast for a moving stage with the laser on: at most {fastest:.3g} mm/s, "
+                "so that the stage stops by itself in time ($120)"
             )
         ramp_s = feed_mm_s / self.settings.acceleration_mm_per_s2
         ahead_mm = math.copysign(feed_mm_s * (_SWEEP_S - ramp_s), position_mm - start_mm)
@@ -231,7 +262,7 @@ class GrblStage:
         self._line.keep_lit()
         self._power = power
         try:
-            # Dark until the stage moves; G1 needs a feed to be accepted.
+            # The laser stays off until the stage moves. Grbl rejects G1 without a feed.
             self._line.command(f"G21G90G94G1F{feed_mm_per_min:.2f}M4S{speed}")
             while sent_mm != position_mm:
                 to_mm = at_mm + ahead_mm
@@ -242,8 +273,8 @@ class GrblStage:
                     since_s = time.monotonic() - self._line.asked_s
                     if sent_mm != start_mm and abs(sent_mm - at_mm) < feed_mm_s * (since_s + ramp_s / 2):
                         raise self._line.failed(
-                            f"the stage slowed down near {sent_mm:.2f} mm, as this program was too late to send the "
-                            "next part of its way: the computer is too busy"
+                            f"the stage slowed down near {sent_mm:.2f} mm because this program sent the next part of "
+                            "its travel too late: the computer is too busy"
                         )
                     sent_mm = to_mm
                 time.sleep(POLL_S)
@@ -252,28 +283,30 @@ class GrblStage:
         except BaseException:
             with suppress(HardwareError):
                 self._line.realtime(FEED_HOLD)
-            # A fault has stopped it otherwise.
+            # After a fault the stage has been stopped by a reset.
             self._held = not self.faulty
             raise
         reaches_speed = abs(position_mm - start_mm) > feed_mm_s * (ramp_s + 3 * POLL_S)
         if reaches_speed and brightest < _FULL * speed:
             raise self._line.failed(
-                f"the laser's pin does not follow: at most S{brightest:g} is reported where S{speed} was sent: an "
-                "override of the spindle, or $31 above it"
+                f"the laser's pin does not follow: at most S{brightest:g} is reported, S{speed} was sent: a spindle "
+                "override, or $31 above it"
             )
         self.laser(False)
         return reached_mm
 
     def _start_of(self, position_mm: float, feed_mm_per_min: float) -> float:
-        """Position in mm from which a movement begins; its errors as of `move_to`."""
+        """Return the start position of a movement in mm; raises the errors of `move_to`."""
         low, high = self.limits_mm
         if not low <= position_mm <= high:
-            raise RangeError(f"{position_mm:g} mm is outside the stage's travel of {low:g} to {high:g} mm")
+            raise RangeError(f"{position_mm:g} mm is outside the stage's travel from {low:g} to {high:g} mm")
         fastest = self.settings.max_feed_mm_per_min
         if not 0 < feed_mm_per_min <= fastest:
-            raise RangeError(f"the feed {feed_mm_per_min:g} mm/min is not above 0 and up to {fastest:g} mm/min ($110)")
+            raise RangeError(
+                f"the feed is {feed_mm_per_min:g} mm/min; expected above 0 and up to {fastest:g} mm/min ($110)"
+            )
         if self._held:
-            raise HardwareError("the stage is held since it was stopped: unlock or home it")
+            raise HardwareError("the stage is held after a stop: unlock or home it")
         if not self._position_known and self._line.fault is None:
             raise HardwareError("the stage does not know where it is: home it first")
         if self.laser_power:
@@ -286,23 +319,23 @@ class GrblStage:
     def _arrive(
         self, position_mm: float, way_mm: float, feed_mm_per_min: float, watch: Callable[[Status], None]
     ) -> float:
-        """Wait until the stage rests at the end of a way, and return the position read back in mm."""
+        """Wait until the stage is at rest at the end of its travel, and return the position read back in mm."""
         feed_mm_s = feed_mm_per_min / 60
-        # Distance at full speed plus a ramp up and one down: never less than the real time, however short the way.
+        # Distance at full speed plus two ramps: never less than the real time, however short the distance.
         expected_s = abs(way_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
-        # A dwell is acknowledged when all movements before it are done.
+        # Grbl acknowledges a dwell when all earlier movements are done.
         self._line.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
         reached_mm = self._rest()
         missing = round((reached_mm - position_mm) * self.settings.steps_per_mm)
         if abs(missing) > 1:
             raise self._line.failed(
-                f"missed steps: {reached_mm:.3f} mm read back where {position_mm:.3f} mm was asked for, {missing:+d} "
-                "steps; a command or pulses were lost: check the wiring for interference, then home"
+                f"missed steps: the position is {reached_mm:.3f} mm where {position_mm:.3f} mm was requested, "
+                f"{missing:+d} steps; a command or pulses were lost: check the wiring for interference, then home"
             )
         return reached_mm
 
     def _motion_watch(self, start_mm: float, feed_mm_s: float) -> Callable[[Status], None]:
-        """Check of a movement's status reports for a stall and for states in which it will not end."""
+        """Return a check of status reports during a movement, for a stall and for states that never end."""
         last_mm, since = start_mm, time.monotonic()
         patience_s = _STALL_S + _STALL_STEPS * self.settings.step_mm / feed_mm_s
 
@@ -314,14 +347,14 @@ class GrblStage:
                 last_mm, since = position_mm, now
             elif now - since > patience_s:
                 raise self._line.failed(
-                    f"stall: the stage has stood at {position_mm:.3f} mm for {now - since:.1f} s although the "
-                    "controller says it runs: restart the controller, then home"
+                    f"stall: the stage has been at {position_mm:.3f} mm for {now - since:.1f} s although the "
+                    "controller reports that it runs: restart the controller, then home"
                 )
 
         return check
 
     def _rest(self) -> float:
-        """Wait until the controller says Idle and return the position."""
+        """Wait until the controller reports Idle, and return the position in mm."""
         deadline = time.monotonic() + _MARGIN_S
         while (report := self._line.status()).state != "Idle":
             self._refuse_stop(report)
@@ -342,19 +375,19 @@ class GrblStage:
             if machine_mm is None and report.work_mm is not None and self._line.offset_mm is not None:
                 machine_mm = report.work_mm + self._line.offset_mm
             if machine_mm is not None:
-                # The report is rounded to 1 um; what the controller counts is steps.
+                # The report is rounded to 1 um; the controller counts steps.
                 return round(machine_mm * self.settings.steps_per_mm) / self.settings.steps_per_mm - self._origin_mm
             report = self._line.status()
-        raise self._line.failed("work positions without their offset (WCO) are reported: send $10=1")
+        raise self._line.failed("work positions are reported without their offset (WCO): send $10=1")
 
     def _refuse_stop(self, report: Status) -> None:
-        """Raise for a state in which a movement will not end, and for a switch pressed where it should not be."""
+        """Raise HardwareError if the movement cannot end in this state, or the limit switch is pressed elsewhere."""
         advice = {
-            "Hold": "feed hold: its button was pressed, or noise on the line or on A1 was taken for it; home or unlock",
+            "Hold": "feed hold: its button was pressed, or there was noise on the line or on A1; home or unlock",
             "Door": "the safety door is open: close it, then home or unlock",
             "Alarm": "locked by an alarm: home",
             "Sleep": "asleep: home",
-            "Check": "in check mode, in which nothing moves: send $C",
+            "Check": "in check mode, without movements: send $C",
             "Jog": "jogging",
         }
         if report.state in advice:
@@ -365,33 +398,44 @@ class GrblStage:
         switch_mm = 0.0 if self.settings.homes_to_negative else self.settings.travel_mm
         if abs(position_mm - switch_mm) > self.settings.homing_pull_off_mm + _PIN_MARGIN_MM:
             raise self._line.failed(
-                f"missed steps: the limit switch at {switch_mm:g} mm is pressed where {position_mm:.3f} mm is counted: "
-                "the motor lost steps (feed or acceleration too high, or something is in the way); home"
+                f"missed steps: the limit switch at {switch_mm:g} mm is pressed at the position {position_mm:.3f} mm: "
+                "the motor lost steps (feed or acceleration too high, or an obstacle); home"
             )
 
     def laser(self, on: bool, *, power: float = 1.0, at_most_s: float | None = None) -> None:
-        """Switch the laser at rest and see that the controller says so; only the camera can show whether it is lit.
+        """Switch the laser at rest and check the reported state; only the camera can show whether it emits light.
 
-        ``power``, 0 < power <= 1, is the share of the time in which the pin is on: below 1 it is pulsed at some kHz.
-        RangeError where it is outside this range; HardwareError where the controller is locked or does not follow, the
-        guard process is gone or has switched the laser off, and for every other fault.
+        Until the laser is switched off the stage cannot move. The guard also switches it off if no method of the stage
+        is called for more than half a second, unless `keep_lit` has announced it.
 
-        The controller itself switches it off after ``at_most_s``, in whole steps of 0.05 s, even if nothing is left
-        that could tell it to: the lines that do so are with it before the laser is lit. Without ``at_most_s`` it does
-        so within 0.9 s after the last call of `keep_lit`, which has to come every half second.
+        Parameters
+        ----------
+        on : bool
+            Whether the laser shall be on.
+        power : float
+            Duty cycle of the pin, 0 < power <= 1; below 1 it is pulsed at some kHz.
+        at_most_s : float, optional
+            Time after which the controller itself switches the laser off, rounded to 0.05 s. The controller holds the
+            commands for that before the laser is on, so it does not depend on the computer. By default that time is 0.9
+            s after the last call of `keep_lit`, which is needed every half second.
 
-        Until the laser is switched off the stage cannot move. The guard, too, switches it off if nothing of the stage
-        is called for more than half a second, unless `keep_lit` was told so.
+        Raises
+        ------
+        RangeError
+            The power is out of range.
+        HardwareError
+            The controller is locked or does not follow, the guard process is gone or has switched the laser off, or
+            another fault occurred.
         """
         speed = self._speed_of(power)
-        # A fault has switched it off already.
+        # A fault has already switched it off.
         if self._line.fault is not None and not on:
             return
         if self._lighting:
             self._line.keep_lit()
             report = self._line.status()
             self._refuse_stop(report)
-            # Light that ended before its time, and a hold, would be hidden by the reset. One that is renewed blinks.
+            # The reset would hide a hold, or a light that ended too early. A renewed light blinks.
             if self._line.answered_s < self.lit_until_s < math.inf:
                 self._require_spindle(report, self._power)
             self._line.end()
@@ -400,15 +444,15 @@ class GrblStage:
         if not on or self._lighting:
             self._forget_light()
             self._see_spindle(0.0)
-            self._line.darkened()
+            self._line.report_dark()
         if not on:
             return
         self._line.keep_lit()
-        # In laser mode the pin stays off under G0, the mode after every reset; G1 needs a feed to be accepted.
+        # In laser mode the pin stays off under G0, the mode after every reset. Grbl rejects G1 without a feed.
         self._line.command(f"G21G90G94G1F{min(100.0, self.settings.max_feed_mm_per_min):.2f}")
         self._power = power
         dwell_s = LIVE_S if at_most_s is None else at_most_s
-        # Two lines, not three: a line that is cut off between them would keep the laser lit.
+        # Two lines, not three: if the third were cut off, the laser would stay on.
         self._lighting = f"M3S{speed}G4P{dwell_s:.3f}", "M5"
         self.lit_until_s = time.monotonic() + dwell_s
         self._line.begin(*self._lighting)
@@ -418,34 +462,34 @@ class GrblStage:
             self.keep_lit()
 
     def _speed_of(self, power: float) -> int:
-        """The S word of a power; RangeError, HardwareError where it cannot be set."""
+        """Return the S word for a power; raises RangeError or HardwareError if it cannot be set."""
         if not 0 < power <= 1:
-            raise RangeError(f"the laser's power {power:g} is not above 0 and up to 1")
+            raise RangeError(f"the laser's power is {power:g}; expected above 0 and up to 1")
         if not self.settings.laser_mode:
-            raise HardwareError("laser mode is off ($32=0): a hold would keep the laser lit; send $32=1")
+            raise HardwareError("laser mode is off ($32=0), so that a hold would keep the laser on: send $32=1")
         return max(1, round(power * self.settings.spindle_max))
 
     def _forget_light(self) -> None:
         self._power, self._lighting, self.lit_until_s = 0.0, (), -math.inf
 
     def keep_lit(self, wait_s: float = 0.0) -> None:
-        """Announce that ``wait_s`` may pass without a call while the laser is on; then the guard switches it off.
+        """Announce that up to ``wait_s`` may pass without a call while the laser is on; afterwards the guard acts.
 
-        To be called again and again while something is waited for, every half second for a laser that is lit without
-        ``at_most_s``, as this renews its light. HardwareError where the guard is gone, or has switched the laser off
-        already, or the controller does not answer.
+        Call it repeatedly during a wait. A laser switched on without ``at_most_s`` needs it every half second, because
+        it renews the light. Raises HardwareError if the guard is gone or has switched the laser off, or if the
+        controller does not answer.
         """
         if not self.laser_power:
             return
         self._line.keep_lit(wait_s)
         if self.lit_until_s == math.inf:
             self._refuse_stop(self._line.status())
-            # The last light has begun.
+            # The last light has started.
             if self._line.unacknowledged <= len(self._lighting):
                 self._line.begin(*self._lighting)
 
     def _see_spindle(self, power: float) -> None:
-        """See that the pin is as expected, for which the controller may take some ms."""
+        """Check that the pin gets into the expected state, which may take the controller a few ms."""
         deadline = time.monotonic() + _LIGHTS_S
         while not self._follows(report := self._line.status(), power) and time.monotonic() < deadline:
             time.sleep(POLL_S / 20)
@@ -458,25 +502,25 @@ class GrblStage:
         self._refuse_stop(report)
         if not self._follows(report, power):
             raise self._line.failed(
-                f"the laser's pin does not follow: S{report.spindle:g} is reported where "
-                f"S{power * self.settings.spindle_max:g} was sent (state {report.state}): a hold, an override of the "
-                "spindle, or $31 above it"
+                f"the laser's pin does not follow: S{report.spindle:g} is reported, "
+                f"S{power * self.settings.spindle_max:g} was sent (state {report.state}): a hold, a spindle override, "
+                "or $31 above it"
             )
 
     def stop(self, *, reset: bool = False) -> float:
-        """Brake to a rest by a feed hold and return the position in mm.
+        """Brake to rest by a feed hold and return the position in mm.
 
-        Without ``reset`` the controller stays held until `unlock` or `home`, and the laser stays as it is unless $32=1,
-        with which Grbl switches it off. With ``reset`` the laser goes off and the stage can move again. The position
-        is kept, because nothing moves at the reset.
+        Without ``reset`` the controller is held until `unlock` or `home`, and the laser keeps its state unless $32=1,
+        with which Grbl switches it off. With ``reset`` the laser goes off and the stage can move again; the position is
+        kept because nothing moves during the reset.
         """
         self._line.realtime(FEED_HOLD)
         braking_s = self.settings.max_feed_mm_per_min / 60 / self.settings.acceleration_mm_per_s2
         deadline = time.monotonic() + _MARGIN * braking_s + _MARGIN_S
-        # Hold:1 brakes, Hold:0 has come to rest.
+        # Hold:1 is braking, Hold:0 is at rest.
         while (report := self._line.status()).state in ("Run", "Hold", "Jog") and report.substate != 0:
             if time.monotonic() > deadline:
-                raise self._line.failed(f"the stage does not stop on a feed hold, its state is {report.state}")
+                raise self._line.failed(f"the stage does not stop after a feed hold, its state is {report.state}")
             time.sleep(POLL_S / 5)
         self._held = True
         if reset:
@@ -485,7 +529,7 @@ class GrblStage:
 
     @property
     def descriptor(self) -> int:
-        """The open serial port, to lend it to another process that switches the laser off by Ctrl-X."""
+        """File descriptor of the serial port, for another process that switches the laser off by Ctrl-X."""
         return self._line.descriptor
 
     @property
@@ -494,15 +538,15 @@ class GrblStage:
         return self._line.unreachable
 
     def darken(self) -> bool:
-        """Switch the laser off from any thread, whatever the stage does: by Ctrl-X, which also stops a movement.
+        """Switch the laser off by Ctrl-X, from any thread and in any state, which also stops a movement.
 
-        Returns whether the command could be sent. What is under way fails at its next exchange with the controller;
-        then `unlock` where nothing moved, or `home`.
+        Returns whether the command could be sent. A call in progress fails at its next exchange with the controller.
+        Afterwards use `unlock` if nothing moved, or `home`.
         """
         return self._line.darken()
 
     def close(self, error: BaseException | None = None) -> None:
-        """Switch the laser off and close the port; HardwareError where the controller does not confirm."""
+        """Switch the laser off and close the port; raises HardwareError if the controller does not confirm."""
         self._line.close(error)
 
     def __enter__(self) -> Self:

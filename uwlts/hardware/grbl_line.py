@@ -1,4 +1,4 @@
-"""Serial line to a Grbl 1.1 controller, and the meaning of its replies, status reports, alarms, errors and settings.
+"""Serial line to a Grbl 1.1 controller, and parsing of its replies, status reports and settings.
 
 Source: ``doc/markdown/interface.md``, ``doc/csv`` and the C code of https://github.com/gnea/grbl, version 1.1h.
 """
@@ -33,7 +33,7 @@ _PATTERNS: tuple[tuple[ReplyKind, str], ...] = (
     ("ok", "ok"),
     ("error", r"error:(?P<number>\d{1,3})"),
     ("ALARM", r"ALARM:(?P<number>\d{1,3})"),
-    # Noise may stand before the first character that a starting controller sends.
+    # Noise may precede the first character of a starting controller.
     ("banner", r".*Grbl (?P<text>1\.1[a-z]?) \['\$' for help\]"),
     ("setting", rf"\$(?P<number>\d+)=(?P<value>{_NUMBER})(?: \(.*\))?"),
     ("message", r"\[(?P<text>[ -~]*)\]"),
@@ -45,9 +45,9 @@ _PATTERNS: tuple[tuple[ReplyKind, str], ...] = (
 class Reply:
     """A line from the controller other than a status report.
 
-    "ok": a line was accepted; "error": it was not executed; "ALARM": the controller has stopped everything; "banner":
-    the greeting after every start and reset, ``text`` being the version; "setting": one line of the answer to ``$$``;
-    "message": a line in brackets, without them, or the report of a startup line; "garbage": what Grbl does not say.
+    "ok": a line was accepted; "error": a line was rejected; "ALARM": the controller has stopped; "banner": the greeting
+    after every start and reset, with the version as ``text``; "setting": one line of the answer to ``$$``; "message":
+    the content of a line in brackets, or the report of a startup line; "garbage": anything else.
     """
 
     kind: ReplyKind
@@ -58,11 +58,11 @@ class Reply:
 
 @dataclass(frozen=True)
 class Status:
-    """Answer to ``?``. Positions are of the X axis in mm, as the controller counts its step pulses.
+    """Answer to ``?``; positions are those of the X axis in mm, from the controller's count of step pulses.
 
-    Either ``machine_mm`` or ``work_mm`` is given; ``offset_mm`` (machine minus work) comes only now and then.
-    ``spindle`` is the S word in force, 0 when the laser's pin is off, or None where the firmware does not say.
-    ``pins`` names the inputs that are active, X being the limit switch.
+    Either ``machine_mm`` or ``work_mm`` is given. ``offset_mm`` (machine minus work) is sent only occasionally.
+    ``spindle`` is the S word in force, 0 if the laser's pin is off, or None if the firmware does not report it.
+    ``pins`` names the active inputs; X is the limit switch.
     """
 
     state: str
@@ -75,7 +75,7 @@ class Status:
 
 
 def parse_reply(line: str) -> Reply | Status:
-    """One line from the controller, without its end. What Grbl 1.1 does not say becomes "garbage"."""
+    """Parse one line from the controller, without its end; a line unknown to Grbl 1.1 becomes "garbage"."""
     for kind, pattern in _PATTERNS:
         if found := re.fullmatch(pattern, line):
             part = found.groupdict()
@@ -105,9 +105,9 @@ def _parse_status(body: str) -> Status | None:
 
 @dataclass(frozen=True)
 class GrblSettings:
-    """The settings that the stage depends on; X axis only.
+    """Settings of the X axis that the stage depends on.
 
-    ``homes_to_negative`` says that the limit switch is at the lower end of travel ($23, bit 0).
+    ``homes_to_negative``: the limit switch is at the lower end of travel ($23, bit 0).
     """
 
     steps_per_mm: float
@@ -126,12 +126,12 @@ class GrblSettings:
 
     @property
     def step_mm(self) -> float:
-        """Smallest movement."""
+        """Smallest movement in mm."""
         return 1 / self.steps_per_mm
 
 
 def parse_settings(values: Mapping[int, float]) -> GrblSettings:
-    """Settings of the X axis from the answer to ``$$``; HardwareError where they cannot move a stage."""
+    """Parse the answer to ``$$``; raises HardwareError if the settings cannot move a stage."""
     needed = (13, 20, 21, 22, 23, 24, 25, 26, 27, 30, 31, 32, 100, 110, 120, 130)
     if missing := [f"${number}" for number in needed if number not in values]:
         raise HardwareError(
@@ -140,9 +140,9 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
         )
     for number, name in ((100, "steps/mm"), (110, "greatest feed"), (120, "acceleration"), (130, "travel"), (30, "S")):
         if not values[number] > 0:
-            raise HardwareError(f"${number} ({name}) is {values[number]:g}; it must be positive: set it")
+            raise HardwareError(f"${number} ({name}) is {values[number]:g}; expected a positive value: set it")
     if values[13] != 0:
-        raise HardwareError("the controller reports inches ($13=1) where millimetres are expected: send $13=0")
+        raise HardwareError("the controller reports inches ($13=1), expected millimetres: send $13=0")
     return GrblSettings(
         steps_per_mm=values[100],
         max_feed_mm_per_min=values[110],
@@ -161,16 +161,16 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
 
 
 def code_text(kind: Literal["error", "ALARM"], number: int) -> str:
-    """Meaning of an ``error:N`` or ``ALARM:N`` and, where the operator can do something, what to do."""
+    """Return the meaning of an ``error:N`` or ``ALARM:N``, with advice if the operator can do something."""
     if kind == "error":
         return f"error:{number}, {_ERRORS.get(number, 'unknown to Grbl 1.1')}"
     return f"ALARM:{number}, {_ALARMS.get(number, 'unknown to Grbl 1.1; reset the controller and home')}"
 
 
 _ALARMS = {
-    1: "hard limit: the limit switch was hit, or its line caught noise; the position is lost: see why it happened, "
+    1: "hard limit: the limit switch was hit, or there was noise on its line; the position is lost: find the cause, "
     "then home",
-    2: "soft limit: the target lies outside the travel; the position is kept: unlock, and stay within the travel",
+    2: "soft limit: the target is outside the travel; the position is kept: unlock, and stay within the travel",
     3: "reset while moving; the position is lost: home",
     4: "probe: not in the expected state at the start; check the wiring of A5, then unlock",
     5: "probe: no contact within the movement; check the probe, then unlock",
@@ -178,7 +178,7 @@ _ALARMS = {
     7: "homing: the safety door was opened; close it and home again",
     8: "homing: the limit switch stayed pressed after the pull-off; check its wiring, or enlarge the pull-off $27",
     9: "homing: no limit switch was found; check the switch, its wiring, the direction $23 and the travel $130; "
-    "a firmware that homes axes which are not there ends so too",
+    "a firmware that homes axes which do not exist fails in the same way",
 }
 _ERRORS = {
     1: "a word does not begin with a letter",
@@ -221,33 +221,33 @@ _ERRORS = {
 
 SOFT_RESET, STATUS_QUERY, FEED_HOLD = b"\x18", b"?", b"!"
 ANSWER_S = 2.0
-# Grbl's documentation asks for no more than 5 to 10 status queries a second while it moves.
+# Grbl's documentation recommends at most 5 to 10 status queries a second during a movement.
 POLL_S = 0.1
 # Grbl's own lines are shorter than 130 characters.
 _LONGEST_LINE = 200
-# A read returns after this time, so that deadlines and Ctrl-C are seen.
+# Longest blocking read; deadlines and Ctrl-C are handled in between.
 _READ_S = 0.05
-# A restarted controller that sends nothing for this long has nothing more to say.
+# After a restart the controller has sent everything when it is silent for this long.
 _QUIET_S = 0.2
-# Time to the greeting after Ctrl-X, which comes within some ms.
+# Time limit of the greeting after Ctrl-X, which takes a few ms.
 _WAKE_S = 1.0
-# Status queries are answered within some ms; one that was lost is repeated.
+# Status queries are answered within a few ms; a lost one is repeated.
 _QUERY_S = 0.7
 _QUERIES = 3
 _STOOD_STILL = (
-    f"the laser was switched off by its guard, as this program stood still for over {GRACE_S:g} s while it was on: "
-    "suspended (Ctrl-Z), hung in a driver, or the computer too busy; what is recorded is kept"
+    f"the guard switched the laser off because this program stood still for over {GRACE_S:g} s while it was on: "
+    "suspended (Ctrl-Z), hung in a driver, or the computer is too busy; recorded data are kept"
 )
 _HUNG_WRITE_S = 0.2
 _ASKED_TO_DARKEN = "the laser was switched off by hand: unlock the stage if it stood still, else home it"
 
 
 class GrblLine:
-    """An open line to a controller of version 1.1, just restarted. Not safe between threads.
+    """Open line to a controller of version 1.1, which has just restarted. Not thread-safe, apart from `darken`.
 
-    ``port`` is a serial port such as /dev/ttyACM0. ``boot_s`` is how long the greeting of a controller that restarts
-    when the port is opened may take; then Ctrl-X asks for it. HardwareError where the port is missing, forbidden or in
-    use, nothing answers, or what answers is not Grbl 1.1.
+    ``port`` is a serial port such as /dev/ttyACM0. ``boot_s`` is the longest time to the greeting of a controller that
+    restarts when the port is opened; after that Ctrl-X requests the greeting. Raises HardwareError if the port is
+    missing, forbidden or in use, nothing answers, or the answer is not that of Grbl 1.1.
     """
 
     def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
@@ -264,15 +264,17 @@ class GrblLine:
             self._hang_up_on_close()
             self._guard = Heartbeat(self._serial.fileno())
             self.version = self._greeting(boot_s)
-            self._heard_out()
+            self._discard_replies()
         except BaseException as error:
             self.close(error)
             raise
 
     def _hang_up_on_close(self) -> None:
-        """Have DTR drop when the port is closed by any process; docs/how-to/hardware-stage.md explains why."""
+        """Make DTR drop when any process closes the port; docs/how-to/hardware-stage.md explains why."""
         if termios is None:
-            raise HardwareError("a stage with a laser needs Linux or macOS: the laser's guard cannot work here")
+            raise HardwareError(
+                "a stage with a laser needs Linux or macOS: the laser guard does not work on this system"
+            )
         try:
             attributes = termios.tcgetattr(self._serial.fileno())
             attributes[2] |= termios.HUPCL
@@ -281,17 +283,17 @@ class GrblLine:
             raise HardwareError(f"the serial port cannot be set up: {error}") from error
 
     def keep_lit(self, wait_s: float = 0.0) -> None:
-        """Say that the laser is lit, or about to be, and that nothing may be heard of the program for ``wait_s``.
+        """Tell the guard that the laser is on, or about to be, and that the next beat may take ``wait_s``.
 
-        Every exchange with the controller says it again. HardwareError where the guard process is gone, or has switched
-        the laser off because the program stood still.
+        Every exchange with the controller sends a beat. Raises HardwareError if the guard process is gone, or has
+        switched the laser off because the program stood still.
         """
         self._refuse_after_fault()
         self._lit = True
         self._beat(wait_s + GRACE_S)
 
-    def darkened(self) -> None:
-        """Say that the laser is off; HardwareError as by `keep_lit` where it was lit before."""
+    def report_dark(self) -> None:
+        """Tell the guard that the laser is off; raises HardwareError like `keep_lit` if it was on before."""
         if self._lit:
             self._beat(math.inf)
             self._lit = False
@@ -304,7 +306,8 @@ class GrblLine:
                 raise self.failed(_STOOD_STILL)
             case "gone":
                 raise self.failed(
-                    "the process that switches the laser off after a crash is gone or stopped; open the stage again"
+                    "the guard process, which switches the laser off after a crash, is gone or suspended: open the "
+                    "stage again"
                 )
 
     def _greeting(self, boot_s: float) -> str:
@@ -319,10 +322,11 @@ class GrblLine:
                     return reply.text
                 heard = line
                 if "Grbl" in line or "FluidNC" in line:
-                    raise HardwareError(f"{self.port} is not Grbl 1.1, it says {heard!r}: flash Grbl 1.1h")
+                    raise HardwareError(f"{self.port} is not Grbl 1.1, it answers {heard!r}: flash Grbl 1.1h")
         if heard := heard or _readable(self._received[:60]):
             raise HardwareError(
-                f"{self.port} does not speak Grbl, it says {heard!r}: wrong port, or not {self._serial.baudrate} baud"
+                f"{self.port} does not speak Grbl, it answers {heard!r}: wrong port, or not "
+                f"{self._serial.baudrate} baud"
             )
         raise HardwareError(
             f"nothing answers on {self.port} within {boot_s + _WAKE_S:g} s: is it the controller's port, is the "
@@ -332,13 +336,13 @@ class GrblLine:
     def command(
         self, line: str, *, timeout_s: float = ANSWER_S, watch: Callable[[Status], None] | None = None
     ) -> list[Reply]:
-        """Send one line, without its end, wait until it and all before it are acknowledged, and return what came first.
+        """Send one line, wait until it and all earlier ones are acknowledged, and return the other replies before that.
 
-        ``watch`` is called with every status report while waiting; without it no status is asked for. HardwareError
-        where the line is refused or not done in ``timeout_s``, and for every fault of the line or the controller.
+        ``watch`` is called with every status report while waiting; without it the status is not queried. Raises
+        HardwareError if the line is rejected or not done within ``timeout_s``, and for every fault.
         """
         self._refuse_after_fault()
-        # A line feed alone: with a carriage return as well Grbl acknowledges twice.
+        # Only a line feed: Grbl acknowledges a carriage return with a line feed twice.
         self._write(line.encode("ascii") + b"\n")
         self.unacknowledged += 1
         deadline, answers = time.monotonic() + timeout_s, []
@@ -355,32 +359,32 @@ class GrblLine:
         return answers
 
     def begin(self, *lines: str) -> None:
-        """Send lines at once and wait for nothing; `end` cuts them short.
+        """Send lines without waiting for their acknowledgement; `end` aborts them.
 
-        The controller does them by itself, whatever becomes of the computer meanwhile. HardwareError as by `command`.
+        The controller executes them even if the computer fails. Raises HardwareError like `command`.
         """
         self._refuse_after_fault()
         self.unacknowledged += len(lines)
         self._write("".join(f"{line}\n" for line in lines).encode("ascii"))
 
     def end(self) -> None:
-        """End what was begun, by Ctrl-X, which also switches the laser off; the position is kept if nothing moves."""
+        """Abort the lines of `begin` by Ctrl-X, which also switches the laser off; the position is kept at rest."""
         self._refuse_after_fault()
         self._reset()
 
     def settings(self) -> dict[int, float]:
-        """Answer to ``$$``, by number."""
+        """Return the answer to ``$$``: values by number."""
         return {each.number: each.value for each in self.command("$$") if each.kind == "setting"}
 
     def options(self) -> str:
-        """Letters of the firmware's options in the answer to ``$I``; empty where it has none."""
+        """Return the letters of the firmware's options in the answer to ``$I``; empty without options."""
         texts = [each.text for each in self.command("$I")]
         return next((text.removeprefix("OPT:").split(",")[0] for text in texts if text.startswith("OPT:")), "")
 
     def status(self) -> Status:
-        """Ask for a status report; HardwareError where none comes, and for every fault.
+        """Query the status; raises HardwareError if no report arrives, and for every fault.
 
-        ``asked_s`` and ``answered_s`` are when that was, by the clock of `time.monotonic`.
+        ``asked_s`` and ``answered_s`` are the times of query and answer by the clock `time.monotonic`.
         """
         for _ in range(_QUERIES):
             self.asked_s = time.monotonic()
@@ -395,22 +399,22 @@ class GrblLine:
         )
 
     def realtime(self, byte: bytes) -> None:
-        """Send a character that Grbl obeys at once and does not acknowledge."""
+        """Send a real-time character, which Grbl obeys at once and does not acknowledge."""
         self._refuse_after_fault()
         self._write(byte)
 
     @property
     def descriptor(self) -> int:
-        """The open port."""
+        """File descriptor of the open port."""
         return self._serial.fileno()
 
     def darken(self) -> bool:
-        """Send Ctrl-X and wait for nothing, from any thread; whether it could be sent.
+        """Send Ctrl-X from any thread, without waiting for an answer; return whether it could be sent.
 
-        Nothing else is sent until `restart`: what is under way fails at its next exchange.
+        Until `restart` nothing else is sent: a call in progress fails at its next exchange.
         """
         self.darkened_by_hand = True
-        # Not for long: a write that hangs must not hold it up.
+        # Only for a short time: a write that hangs must not delay the reset.
         held = self._writing.acquire(timeout=_HUNG_WRITE_S)
         try:
             return self._send_reset()
@@ -426,15 +430,15 @@ class GrblLine:
         return not self.unreachable
 
     def restart(self) -> None:
-        """Reset by Ctrl-X: the laser goes off and a fault is over; the position is kept only if nothing moved."""
+        """Reset by Ctrl-X: the laser goes off and a fault is cleared; the position is kept only if nothing moved."""
         self.darkened_by_hand = False
         self._reset()
-        self._heard_out()
+        self._discard_replies()
 
-    def _heard_out(self) -> None:
-        """Throw away what else is said after a restart; another greeting must not look like a restart of its own.
+    def _discard_replies(self) -> None:
+        """Discard further replies after a restart: a second greeting must not be mistaken for a spontaneous restart.
 
-        There is one after an alarm, and where the resets by which a program has ended come after the port's opening.
+        A second greeting follows an alarm, or resets that an earlier program sent before it ended.
         """
         while self._read_line(time.monotonic() + _QUIET_S) is not None:
             pass
@@ -443,7 +447,7 @@ class GrblLine:
         self.fault, self.unacknowledged = None, 0
         self._received.clear()
         self._write(SOFT_RESET)
-        self._told_dark()
+        self._tell_guard_dark()
         deadline = time.monotonic() + ANSWER_S
         while (line := self._read_line(deadline)) is not None:
             reply = parse_reply(line)
@@ -452,33 +456,33 @@ class GrblLine:
         raise self.failed("the controller does not restart on Ctrl-X: switch its power off and on")
 
     def failed(self, what: str) -> HardwareError:
-        """Make everything safe after a fault and return the error to raise."""
+        """Switch the laser off after a fault, and return the error to raise."""
         laser = "the laser CANNOT be switched off: switch its power off before going near"
         if self._send_reset():
             laser = "the command to switch the laser off was sent"
-        # What the guard's reset makes the controller say would be taken for a fault of the controller.
-        if self._told_dark():
+        # The controller's greeting after the guard's reset would look like a fault of the controller.
+        if self._tell_guard_dark():
             what = _STOOD_STILL
         elif self.darkened_by_hand:
             what = _ASKED_TO_DARKEN
         self.fault = what
         return HardwareError(f"stage on {self.port}: {what} ({laser})")
 
-    def _told_dark(self) -> bool:
-        """Say that the laser is off; whether the guard had switched it off."""
+    def _tell_guard_dark(self) -> bool:
+        """Tell the guard that the laser is off; return whether the guard had switched it off before."""
         lit, self._lit = self._lit, False
         return lit and self._guard is not None and self._guard.beat(math.inf) == "switched off"
 
     def close(self, error: BaseException | None = None) -> None:
-        """Switch the laser off and close; after an ``error`` without asking whether it worked.
+        """Switch the laser off and close the port; after an ``error`` without waiting for the confirmation.
 
-        HardwareError where the controller did not confirm and there was no error before.
+        Raises HardwareError if the controller does not confirm and there was no error before.
         """
         if not self._serial.is_open:
             return
         try:
             if error is None and self.fault is None and self._guard is not None:
-                self.darkened()
+                self.report_dark()
                 self._reset()
             else:
                 self._send_reset()
@@ -504,7 +508,7 @@ class GrblLine:
     def _write(self, data: bytes) -> None:
         try:
             with self._writing:
-                # Behind the Ctrl-X of another thread a command would light the laser again.
+                # After the Ctrl-X of another thread a command would switch the laser on again.
                 if self.darkened_by_hand and data != SOFT_RESET:
                     raise self.failed(_ASKED_TO_DARKEN)
                 self._serial.write(data)
@@ -512,7 +516,7 @@ class GrblLine:
             raise self.failed(f"the connection is lost: {error}; is the cable plugged in?") from error
 
     def _next_reply(self, deadline: float) -> Reply | Status | None:
-        """The next reply that is no fault, or None at the deadline."""
+        """Return the next reply that is not a fault, or None at the deadline."""
         line = self._read_line(deadline)
         if line is None:
             return None
@@ -522,12 +526,14 @@ class GrblLine:
             return reply
         match reply.kind:
             case "ok" | "error" if self.unacknowledged == 0:
-                raise self.failed(f"{line!r} came although nothing was sent: does another program use the port?")
+                raise self.failed(
+                    f"{line!r} was received although nothing was sent: does another program use the port?"
+                )
             case "ok":
                 self.unacknowledged -= 1
             case "error":
                 self.unacknowledged -= 1
-                raise HardwareError(f"the stage on {self.port} refuses: {code_text('error', reply.number)}")
+                raise HardwareError(f"the stage on {self.port} rejects: {code_text('error', reply.number)}")
             case "ALARM":
                 raise self.failed(code_text("ALARM", reply.number))
             case "banner":
@@ -544,7 +550,7 @@ class GrblLine:
         return reply
 
     def _read_line(self, deadline: float) -> str | None:
-        """The next line that is not empty, or None at the deadline."""
+        """Return the next line that is not empty, or None at the deadline."""
         while True:
             while (end := self._received.find(b"\n")) >= 0:
                 line = _readable(self._received[:end].strip(b"\r"))

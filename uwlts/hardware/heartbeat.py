@@ -1,7 +1,7 @@
-"""The program's side of the laser guard: starts its process and tells it how long the laser may stay on.
+"""Program's side of the laser guard: starts its process and sends the times until which the laser may stay on.
 
-Beats are sent by the thread that works with the camera and the stage, between two calls of their drivers. A thread of
-their own would go on beating while a driver hangs.
+The thread that works with camera and stage sends the beats, between the calls of their drivers. A thread that only
+sends beats would continue while a driver hangs.
 """
 
 import math
@@ -16,12 +16,12 @@ from uwlts.errors import HardwareError
 from uwlts.hardware import laser_guard
 
 GRACE_S = 0.8
-"""A program that makes no progress for this long, beyond the waits that it announces, is taken for hung. The laser has
-to be off within 1 s; the guard needs some ms to wake and to send."""
+"""A program without progress for this long, beyond announced waits, counts as hung. The laser must be off within 1 s,
+and the guard needs a few ms to wake up and send."""
 BEAT_S = 0.1
-"""Longest time between two beats of a loop that waits."""
+"""Longest time between two beats in a waiting loop."""
 _ANSWER_S = 0.5
-"""The guard answers within a ms; one that is suspended does not."""
+"""Time limit of the guard's answer, which takes less than 1 ms unless the guard is suspended."""
 _END_S = 3.0
 
 GuardState = Literal["watching", "switched off", "gone"]
@@ -30,14 +30,14 @@ not answer."""
 
 
 class Heartbeat:
-    """A guard that has the open serial port ``descriptor``; HardwareError where it cannot be started.
+    """Process of the laser guard, which shares the open serial port ``descriptor``; ``pid`` is its identifier.
 
-    ``pid`` is its process.
+    Raises HardwareError if the guard cannot be started.
     """
 
     def __init__(self, descriptor: int):
         try:
-            # In a session of its own neither the terminal's Ctrl-C and Ctrl-Z nor signals to the group reach it.
+            # In a separate session, the terminal's Ctrl-C and Ctrl-Z and signals to the process group do not reach it.
             self._guard = subprocess.Popen(
                 [sys.executable, "-I", "-S", laser_guard.__file__, str(os.getpid()), str(descriptor)],
                 pass_fds=(descriptor,),
@@ -53,7 +53,7 @@ class Heartbeat:
         self._gone = False
 
     def beat(self, allowed_s: float) -> GuardState:
-        """Allow the laser to stay on for so long from now without a further beat; inf says that it is off."""
+        """Allow the laser to stay on for ``allowed_s`` without a further beat; inf means that the laser is off."""
         wants, answers = self._guard.stdin, self._guard.stdout
         assert wants is not None and answers is not None
         if not self._gone:
@@ -66,12 +66,12 @@ class Heartbeat:
                 answer = b""
             if answer:
                 return "switched off" if answer == laser_guard.SWITCHED_OFF else "watching"
-            # An answer that comes later would be taken for that to another beat.
+            # A later answer would be mistaken for that to another beat.
             self._gone = True
         return "gone"
 
     def end(self) -> None:
-        """End the guard, which switches the laser off."""
+        """End the guard process, which switches the laser off."""
         for pipe in (self._guard.stdin, self._guard.stdout):
             if pipe is not None:
                 pipe.close()

@@ -1,10 +1,10 @@
-"""Switches the laser off when the program that lit it makes no progress any more, or is gone.
+"""Laser guard: a process that switches the laser off when the program that controls it hangs or has ended.
 
-A process of its own, started by `uwlts.hardware.heartbeat` with the open port. The program writes beats to its standard
-input: until when the laser may stay on without a further beat. Each is answered on its standard output. When a beat is
-late, as the program is suspended or hangs, the guard sends Ctrl-X, on which Grbl switches its spindle pin off at once;
-so it does when its standard input ends, which it does however the program ends, and when it is asked to end itself. It
-runs as a plain script so that it starts within milliseconds and needs nothing but the standard library.
+`uwlts.hardware.heartbeat` starts it with the open port. The program writes beats to the guard's standard input: the
+time until which the laser may stay on without a further beat. The guard answers each on its standard output. If a beat
+is late because the program is suspended or hangs, the guard sends Ctrl-X, on which Grbl switches its spindle pin off at
+once. It does the same when its standard input ends, which happens however the program ends, and when it is asked to end
+itself. It runs as a plain script with only the standard library, so that it starts within milliseconds.
 """
 
 import math
@@ -21,19 +21,19 @@ except ImportError:
     termios = None  # Windows, where no stage can be used
 
 BEAT = struct.Struct("d")
-"""Until when the laser may stay on, by the monotonic clock, which all processes share; inf while it is off."""
+"""Time until which the laser may stay on, by the monotonic clock that all processes share; inf while it is off."""
 WATCHING, SWITCHED_OFF = b"w", b"o"
-"""Answers to a beat: in time; or the laser was switched off since the last beat that said that it is off."""
+"""Answers to a beat: in time, or the guard has switched the laser off since the last beat with inf."""
 _SOFT_RESET = b"\x18"
 _WATCH_S, _GIVE_UP_S = 0.2, 2.0
 _AGAIN_S = 0.5
-"""After a late beat the reset is repeated, as the program may be continued just before a line that lights the laser."""
+"""Interval between resets after a late beat: the program may resume just before a laser command."""
 
 
 def watch(parent: int, port: int) -> None:
-    """Answer beats until standard input ends, or the process ``parent`` is no longer this one's parent.
+    """Answer beats until standard input ends, or the process ``parent`` is no longer the parent of this one.
 
-    The second way is for a pipe that a forked child of the program keeps open.
+    The second condition is for a pipe that a forked child of the program keeps open.
     """
     deadline, late = math.inf, False
     while os.getppid() == parent:
@@ -59,7 +59,7 @@ def watch(parent: int, port: int) -> None:
 
 
 def switch_off(port: int) -> None:
-    """Send the reset and see it out of the computer; a port that is gone has no laser to switch off."""
+    """Send the reset and wait until it is transmitted; if the port is gone, there is no laser to switch off."""
     assert termios is not None
     deadline = time.monotonic() + _GIVE_UP_S
     while time.monotonic() < deadline:

@@ -1,4 +1,4 @@
-"""A folder of images or a capture, shown like a camera: at a frame rate of its own, or one frame for each trigger."""
+"""Replay of a folder of images or of a capture as a camera, at its own frame rate or triggered."""
 
 import math
 import time
@@ -18,12 +18,12 @@ from uwlts.storage.import_.matching import natural_key
 
 
 class ReplayCamera(CameraDevice):
-    """Images in the order of their names, numbers in them counting as numbers, or of a capture.
+    """Images of a folder in natural order of their names, or of a capture.
 
-    A free-running replay without a frame rate shows an image whenever one is asked for. With one it does not wait for a
-    program that is too slow: what no longer fits into its buffers is dropped, as by a real camera. Exposures are those
-    of the capture; of a folder's images nobody knows it, so the one that is configured counts. With ``repeat`` it
-    begins again after the last image; without it grabbing more is a HardwareError.
+    A free-running replay without a frame rate delivers an image on every request. With a frame rate it does not wait
+    for a slow program: frames that exceed its buffers are dropped, as by a real camera. Exposures are those of the
+    capture; for a folder, the configured one. With ``repeat`` it restarts after the last image; otherwise a further
+    ``grab`` raises HardwareError.
     """
 
     def __init__(self, path: str | Path, *, repeat: bool = False, address: str | None = None):
@@ -42,14 +42,14 @@ class ReplayCamera(CameraDevice):
             images = (path for path in self._path.iterdir() if path.suffix.lower() in SUFFIXES)
             self._files = sorted(images, key=lambda path: natural_key(path.name))
             if not self._files:
-                raise HardwareError(f"the folder {self._path} holds no image ({', '.join(SUFFIXES)})")
+                raise HardwareError(f"the folder {self._path} contains no image ({', '.join(SUFFIXES)})")
             first = _read(self._files[0])
             (height, width), bits = first.shape, 8 * first.itemsize
         elif is_regular_file(self._path):
             self._capture = Capture(self._path)
             if len(self._capture) == 0:
                 self._close()
-                raise HardwareError(f"the capture {self._path} holds no frame")
+                raise HardwareError(f"the capture {self._path} contains no frame")
             sensor = self._capture.header.sensor
             height, width, bits = sensor.camera.height_px, sensor.camera.width_px, sensor.detector.bits
             if not self._capture.has_image.all():
@@ -57,7 +57,7 @@ class ReplayCamera(CameraDevice):
                     f"replay of {self._path.name}", self._path.name, width, height, bits, coordinates=Coordinates()
                 )
         else:
-            raise HardwareError(f"there is no folder of images and no capture at {self._path}")
+            raise HardwareError(f"{self._path} is neither a folder of images nor a capture")
         return CameraInfo(f"replay of {self._path.name}", self._path.name, width, height, bits)
 
     def _close(self) -> None:
@@ -71,7 +71,7 @@ class ReplayCamera(CameraDevice):
         if wanted.bits != self.info.bits:
             raise HardwareError(f"{self.address} has images of {self.info.bits} bits, not {wanted.bits}")
         if wanted.gain_db is not None:
-            raise HardwareError(f"{self.address} has no gain: its images are what they are")
+            raise HardwareError(f"{self.address} has no gain setting: leave gain_db out")
         return wanted if self._capture is None else replace(wanted, exposure_ms=float(self._capture.exposure_ms[0]))
 
     def _start(self) -> None:
@@ -98,7 +98,7 @@ class ReplayCamera(CameraDevice):
         return self._deliver(self._shown - 1, stamp_s)
 
     def _wait_for_frame(self, timeout_s: float, period_s: float) -> float | None:
-        """Time of the next frame once it has come; None if it does not come in time."""
+        """Return the time of the next frame when it is due, or None if it is not due within ``timeout_s``."""
         now_s = time.monotonic()
         lost = int((now_s - self._began_s) / period_s) - self._due - BUFFERS
         if lost > 0:
@@ -131,15 +131,15 @@ class ReplayCamera(CameraDevice):
         return Delivered(np.ascontiguousarray(part), index + 1, stamp_s, exposure_ms)
 
     def _answers(self) -> None:
-        """Files need no check; reading a missing one raises an error."""
+        """Files need no check: reading a missing one raises an error."""
 
 
 def _read(path: Path) -> np.ndarray:
-    """A grey image (H, W) of uint8 or uint16; ImageError for anything else."""
+    """Read a grey image (H, W) of uint8 or uint16; raises ImageError for any other image."""
     image = read_image(path)
     if image.ndim != 2:
         raise ImageError(
             f"{path} is a colour image, expected a grey image of 8 or 16 bit: "
-            "`uwlts import` takes colour images, and makes a capture of them that can be shown"
+            "`uwlts import` converts colour images to a capture, which can be replayed"
         )
     return image

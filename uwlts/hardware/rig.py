@@ -1,8 +1,8 @@
 """Images taken by camera, stage and laser together, and automatic exposure.
 
-Automatic exposure keeps the brightest lines of an image below full scale by a given share. It considers the profile
-lines that show light: in laser images those with a stripe, in images without laser those that are not dark compared
-with the brightest one.
+Automatic exposure keeps the brightest lines of an image at a given fraction of full scale. It considers the profile
+lines with light: in laser images those with a stripe, in images without laser those that are not dark compared with the
+brightest line.
 """
 
 import math
@@ -25,38 +25,38 @@ from uwlts.storage.capture import CaptureHeader, Seen
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 BRIGHT_SHARE = 0.98
-"""The brightest pixel of every line that counts is looked at; 2 % of the lines may be brighter than wanted."""
+"""Quantile of the peak values of the considered lines; 2 % of the lines may be brighter than requested."""
 START_MS = 1.0
-"""First exposure that is tried: in the middle of the usual range, on a logarithmic scale."""
+"""First exposure: in the middle of the usual range, on a logarithmic scale."""
 _FEW_SHARE = 0.01
 _FEWEST_LINES = 3
-"""Fewer lines, as a share of all and as a number, are a reflection or noise."""
+"""Fewer lines than this fraction and number are attributed to a reflection or noise."""
 _DIM_SHARE = 0.05
-"""Lines below this share of the brightest one are dark."""
+"""Lines below this fraction of the brightest one are dark."""
 _MANY_SHARE = 0.05
-"""More saturated lines than this share are more than a reflection accounts for."""
+"""A larger fraction of saturated lines cannot be attributed to a reflection."""
 _CLOSE = 0.1
-"""Relative change of the exposure below which no further image is taken."""
+"""Relative change of the exposure that ends the search."""
 _SHORTEST_MS = 1e-3
 """Shortest exposure of usual cameras."""
 _STEPS = 12
-"""Images at most: from the start to either end of the range takes three, and the bisection in between a few more."""
+"""Largest number of images: either end of the range is reached in three, and bisection takes a few more."""
 _DOWN = 1 / 16
-"""Factor from a saturated image, in which it is unknown by how much it is too bright."""
+"""Factor after a saturated image, whose excess is unknown."""
 _UP = 30.0
-"""Largest factor from a dark image, in which noise limits the estimate."""
+"""Largest factor after a dark image, where noise limits the estimate."""
 
 
-def stripe_of(seen: Seen, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:
-    """The stripe in what a sensor saw: a centre line, or an image (H, W) less a background (H, W) if there is one."""
+def get_stripe(seen: Seen, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:
+    """Return a centre line unchanged, or extract the stripe of an image (H, W) minus a background (H, W), if given."""
     if isinstance(seen, Stripe):
         return seen
     along, full_dn = sensor.camera.stripe_along, sensor.detector.full_scale_dn()
     return extract_stripe(seen, stripe_along=along, saturation=full_dn, background=background)
 
 
-def not_few(count: int, lines: int) -> bool:
-    """Whether so many of all lines are a sign of light, rather than a reflection or noise."""
+def are_enough(count: int, lines: int) -> bool:
+    """Return whether ``count`` of all lines are too many for a reflection or noise."""
     return count >= max(_FEW_SHARE * lines, _FEWEST_LINES)
 
 
@@ -64,8 +64,8 @@ def not_few(count: int, lines: int) -> bool:
 class Brightness:
     """Brightness of an image.
 
-    ``level`` is the share of the full scale that all but 2 % of the ``counted`` lines keep to: 0 where no line counts,
-    1 where it is too bright by an unknown amount. ``saturated`` of the counted lines reach the full scale.
+    ``level`` is the fraction of full scale below which 98 % of the ``counted`` lines stay. It is 0 if no line counts,
+    and 1 if the image is too bright by an unknown amount. ``saturated`` counts the lines that reach full scale.
     """
 
     lines: int
@@ -75,19 +75,19 @@ class Brightness:
 
     @property
     def dark(self) -> bool:
-        """Whether too few lines count to derive an exposure from them."""
-        return not not_few(self.counted, self.lines)
+        """Whether too few lines count to derive an exposure."""
+        return not are_enough(self.counted, self.lines)
 
     @property
     def overexposed(self) -> bool:
-        """Whether many lines are saturated, more than a reflection accounts for."""
-        return self.saturated > _MANY_SHARE * self.counted and not_few(self.saturated, self.lines)
+        """Whether more lines are saturated than a reflection explains."""
+        return self.saturated > _MANY_SHARE * self.counted and are_enough(self.saturated, self.lines)
 
 
-def brightness(image: Seen, sensor: Sensor, light: Light) -> Brightness:
-    """Brightness of an image (H, W) in grey values, as the sensor's detector gives them, in a light.
+def measure_brightness(image: Seen, sensor: Sensor, light: Light) -> Brightness:
+    """Measure the brightness of an image (H, W) in grey values of the sensor's detector.
 
-    Of a centre line only the lines are known, the level is NaN.
+    For a centre line only the number of lines is known, and the level is NaN.
     """
     if isinstance(image, Stripe):
         return Brightness(len(image.status), len(image.lines), 0, math.nan)
@@ -95,7 +95,7 @@ def brightness(image: Seen, sensor: Sensor, light: Light) -> Brightness:
     peak = image.max(axis=0 if sensor.camera.stripe_along == "width" else 1).astype(float)
     counts = peak - black > _DIM_SHARE * (peak.max() - black)
     if light == "laser":
-        counts &= stripe_of(image, sensor).status != StripeStatus.NO_STRIPE
+        counts &= get_stripe(image, sensor).status != StripeStatus.NO_STRIPE
     if not counts.any():
         return Brightness(peak.size, 0, 0, 0.0)
     level = float(np.quantile(peak[counts], BRIGHT_SHARE))
@@ -103,22 +103,22 @@ def brightness(image: Seen, sensor: Sensor, light: Light) -> Brightness:
     return Brightness(peak.size, int(counts.sum()), int((peak[counts] >= full).sum()), share)
 
 
-def settled_exposure(
+def find_exposure(
     take: Callable[[float], np.ndarray], *, sensor: Sensor, light: Light, start_ms: float = START_MS
 ) -> float | None:
-    """Exposure in ms at which an image just keeps to the sensor's ``auto_level``; None if even the longest is dark.
+    """Find the exposure in ms that brings an image to the sensor's ``auto_level``; None if all are too dark.
 
-    ``take(exposure_ms)`` returns an image (H, W) in the light. The longest is the sensor's ``longest_ms``.
+    ``take(exposure_ms)`` returns an image (H, W) in the light. The longest exposure is the sensor's ``longest_ms``.
     """
     wanted, longest_ms = sensor.exposure.auto_level, sensor.exposure.longest_ms
     exposure_ms, too_long_ms = min(start_ms, longest_ms), math.inf
     for _ in range(_STEPS):
-        seen = brightness(take(exposure_ms), sensor, light)
+        seen = measure_brightness(take(exposure_ms), sensor, light)
         if seen.level >= 1:
             if exposure_ms <= _SHORTEST_MS:
                 break
             too_long_ms = exposure_ms
-            # At full scale it is unknown by how much it is too bright; from below one more step is enough.
+            # At full scale the excess is unknown; from below, one more step suffices.
             exposure_ms = max(exposure_ms * _DOWN, _SHORTEST_MS)
             continue
         needed_ms = math.inf if seen.dark else exposure_ms * wanted / max(seen.level, 1e-6)
@@ -132,24 +132,26 @@ def settled_exposure(
 
 
 _TRIES = 3
-"""Attempts to get an image whose frame was lost on its way."""
+"""Attempts to get an image whose frame was lost in transfer."""
 _PATIENCE_S = 3.0
-"""Longest wait for a frame beyond its exposure, the last part in the dark: several repeats of a lost GigE command."""
+"""Longest wait for a frame beyond its exposure, long enough for several repetitions of a lost GigE command. The laser
+is off for the last part."""
 _LIGHT_S = 0.5
-"""Longest light beyond an exposure: what the camera takes to begin it and, as the light usually ends with the frame, to
-send it. The controller ends the light within 0.1 s more, so that a second is kept."""
+"""Longest light beyond an exposure: the camera's delay before the exposure and, because the light usually ends with the
+frame, the transfer time. The controller ends the light within 0.1 s more, so that the total stays below a second."""
 _LATENCIES = 8
-"""Frames by which a late one is judged: a few, as the clocks of camera and computer drift apart."""
+"""Frames for comparison with a late one: only a few, because the clocks of camera and computer drift."""
 _PROMPT_S = 0.1
-"""A camera begins an exposure within this time after its trigger."""
+"""Longest delay between a trigger and the start of the exposure."""
 _RUN_UP_MM = 1.0
+"""More than the backlash of a ball screw or belt."""
 """More than the play of a ball screw or belt."""
 
 
-def with_provenance(
+def add_provenance(
     header: CaptureHeader, plan: RigPlan, camera: CameraDevice, *, source: str, stage: str, **more: JsonValue
 ) -> CaptureHeader:
-    """The header of a capture, with where its images come from."""
+    """Return the header of a capture with the provenance of its images."""
     provenance = {
         "source": source,
         "title": plan.title,
@@ -163,7 +165,7 @@ def with_provenance(
 
 
 class HandSwitchedLaser:
-    """In place of a stage where there is none: the operator is asked to switch the laser, and nothing moves."""
+    """Substitute for a missing stage: asks the operator to switch the laser, and does not move."""
 
     limits_mm = (-math.inf, math.inf)
     lit_until_s = math.inf
@@ -174,33 +176,33 @@ class HandSwitchedLaser:
         self.laser_power = 0.0
 
     def position_mm(self) -> float:
-        """Nothing moves."""
+        """Return 0."""
         return 0.0
 
     def move_to(self, position_mm: float, *, feed_mm_per_min: float) -> float:
-        """Nothing moves."""
+        """Return 0 without moving."""
         return 0.0
 
     def laser(self, on: bool, *, power: float = 1.0, at_most_s: float | None = None) -> None:
-        """Ask for it."""
+        """Ask the operator to switch the laser."""
         self._ask("switch the laser on and the lamp off" if on else "switch the laser off and the lamp on")
         self.laser_power = power if on else 0.0
 
     def keep_lit(self, wait_s: float = 0.0) -> None:
-        """No guard watches over it."""
+        """Do nothing: there is no guard."""
 
 
 LaserStage = GrblStage | HandSwitchedLaser
 
 
 class Rig:
-    """Takes the images of a plan one by one. A switched laser is on while the camera exposes its images, and no longer.
+    """Camera, stage and laser that take the images of a plan one by one.
 
-    A frame that comes late is waited for in the dark, and taken where the camera's time stamp says that it was exposed
-    in the light.
+    A switched laser is on only while the camera exposes. If a frame is late, the laser is switched off while waiting,
+    and the frame is accepted if its time stamp shows that it was exposed in the light.
 
-    ``ahead`` is the direction in which the stage reaches every position, 1 or -1, so that play of the drive does not
-    show. ``repeated`` counts images that were asked for again, as their frames were lost or damaged on their way.
+    ``ahead`` is the direction of motion towards every position, 1 or -1, to eliminate backlash.
+    ``repeated`` counts images that were taken again because their frames were lost or damaged.
     """
 
     def __init__(
@@ -223,7 +225,7 @@ class Rig:
         self.repeated = 0
 
     def move_to(self, position_mm: float) -> float:
-        """Move with the laser off and let the stage settle; the position read back in mm."""
+        """Move with the laser off, let the stage settle, and return the position read back in mm."""
         if self._position_mm is None or abs(self._position_mm - position_mm) > 1e-9:
             self._laser(False)
             if (position_mm - self._read_back_mm) * self._ahead < 0:
@@ -235,15 +237,15 @@ class Rig:
         return self._read_back_mm
 
     def image(self, light: Light, exposure_ms: float) -> tuple[np.ndarray, float]:
-        """Image (H, W) in a light, "lamp" being that without laser, and its exposure in ms as the camera says.
+        """Take an image (H, W) in a light, "lamp" being without laser; return it with its exposure in ms.
 
-        HardwareError where the camera gives centre lines.
+        Raises HardwareError if the camera delivers centre lines.
         """
         frame = self.frame(light, exposure_ms)
         return frame.image, exposure_ms if frame.exposure_ms is None else frame.exposure_ms
 
     def frame(self, light: Light, exposure_ms: float) -> GrabbedFrame:
-        """What the camera sees in a light: an image or a centre line."""
+        """Take a frame in a light: an image or a centre line."""
         if self._exposure_ms is None or abs(self._exposure_ms / exposure_ms - 1) >= 1e-6:
             self._rest()
             camera, gain_db, bits = self._camera, self._plan.gain_db, self._sensor.detector.bits
@@ -253,9 +255,9 @@ class Rig:
             self._exposure_ms = exposure_ms
         return self._grab(light)
 
-    def settled_exposure(self, light: Light, *, start_ms: float) -> float | None:
-        """Exposure in ms for what is seen now; None if even the longest is dark."""
-        return settled_exposure(
+    def find_exposure(self, light: Light, *, start_ms: float) -> float | None:
+        """Find the exposure in ms for the present scene; None if even the longest is too dark."""
+        return find_exposure(
             lambda exposure_ms: self.image(light, exposure_ms)[0], sensor=self._sensor, light=light, start_ms=start_ms
         )
 
@@ -265,34 +267,34 @@ class Rig:
             self._stage.laser(on, power=self._plan.laser_power, at_most_s=longest_s)
 
     def _rest(self) -> None:
-        """Switch the laser off; an operator is asked only when an image without laser is next."""
+        """Switch the laser off; an operator is asked only before an image without laser."""
         if not isinstance(self._stage, HandSwitchedLaser):
             self._laser(False)
 
     def _grab(self, light: Light) -> GrabbedFrame:
-        """One image; asked for again if its frame was lost, as the stage is at rest. Between tries the laser is off."""
+        """Take one frame, repeated if it is lost, as the stage is at rest; the laser is off between attempts."""
         last = None
         for _ in range(_TRIES):
             self._laser(light == "laser")
             try:
                 frame = self._one()
             except HardwareError as error:
-                # At once: closing a camera that is gone takes its time.
+                # Switch off first: closing a camera that is gone takes time.
                 with suppress(HardwareError):
                     self._rest()
-                # A camera whose driver hangs has the guard switch the laser off; what to mend is the camera.
+                # If the camera's driver hangs, the guard switches the laser off; the fault to report is the camera's.
                 if self._stage.faulty or not self._camera.running:
                     raise
                 last = error
                 self.repeated += 1
             else:
-                # Also shows whether the laser was on all the time.
+                # Also checks whether the laser was on all the time.
                 self._rest()
                 return frame
-        raise HardwareError(f"{last} (asked for {_TRIES} times)")
+        raise HardwareError(f"{last} (tried {_TRIES} times)")
 
     def _one(self) -> GrabbedFrame:
-        """Trigger and wait. The laser's guard hears of every step, so that a driver that hangs leaves no laser on."""
+        """Trigger and wait; every step sends a beat to the laser guard, in case a driver hangs."""
         exposure_s = 1e-3 * (self._exposure_ms or 0.0)
         lit, lit_until_s = self._stage.laser_power > 0, self._stage.lit_until_s
         self._stage.keep_lit(exposure_s)
@@ -307,12 +309,12 @@ class Rig:
 
         frame = self._camera.grab(_PATIENCE_S + exposure_s, waiting=waiting)
         came_s, known = time.monotonic(), len(self._latencies_s) > 0
-        # Includes the unknown difference of both clocks, which all frames share.
+        # Includes the unknown offset between the clocks, which all frames share.
         self._latencies_s.append(frame.time_s - asked_s)
         began_s = asked_s + self._latencies_s[-1] - min(self._latencies_s)
         if not lit or came_s <= lit_until_s:
             return frame
-        # First of all, as this shows whether the guard, and not the controller's time, has ended the light.
+        # Before anything else: it shows whether the guard, not the controller, has ended the light.
         self._rest()
         if not (known and began_s + exposure_s + _PROMPT_S < lit_until_s):
             raise HardwareError(

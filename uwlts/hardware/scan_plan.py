@@ -1,4 +1,4 @@
-"""Plan of a scan with real hardware (a TOML file), and what it shares with the plan of a guided calibration."""
+"""Plan of a scan with real hardware (a TOML file), and the parts it shares with the plan of a guided calibration."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,14 +29,14 @@ def _unit(value: Vector) -> Vector:
 
 
 Direction = Annotated[Vector, AfterValidator(_unit)]
-"""Made a unit vector."""
+"""Vector normalised to a unit vector."""
 
 
 class StageSettings(Description):
-    """A stage and how it moves.
+    """A stage and its motion.
 
-    ``direction`` is the unit direction in which growing positions move the sensor, in the OCS. ``settle_s`` is how long
-    the stage rests before an image, as the sensor's description says unless given.
+    ``direction`` is the sensor's motion for growing positions, a unit vector in the OCS. ``settle_s`` is the rest
+    before an image, by default that of the sensor's description.
     """
 
     port: str | None = None
@@ -45,7 +45,7 @@ class StageSettings(Description):
     settle_s: NotNegative | None = None
 
     def check(self, positions_mm: Sequence[float], stage: GrblStage) -> None:
-        """Refuse positions outside the travel, or a feed that is too high, before anything moves; RangeError."""
+        """Raise RangeError if a position is outside the travel, or the feed is too high; nothing moves."""
         low, high = stage.limits_mm
         first, last = min(positions_mm, default=low), max(positions_mm, default=low)
         if not low <= first <= last <= high:
@@ -62,7 +62,7 @@ class RigPlan(Description):
     """Camera, lights and laser of a plan.
 
     ``camera`` is an address for `uwlts.hardware.camera_addresses.open_camera`. Exposures are in ms, or "auto".
-    ``laser_power`` is the share of the laser's power.
+    ``laser_power`` is a fraction of the full power.
     """
 
     title: str
@@ -74,20 +74,20 @@ class RigPlan(Description):
     laser_power: Annotated[float, Field(gt=0, le=1)] = 1.0
 
     def described_sensor(self) -> Sensor:
-        """The sensor of the plan, with its window; DescriptionError where it is unknown or not valid."""
+        """Return the plan's sensor with its window; raises DescriptionError if it is unknown or not valid."""
         return load_sensor(self.sensor)
 
     def planned_ms(self) -> dict[Light, float]:
-        """Exposures of the lights for which they are given."""
+        """Return the given exposures in ms by light."""
         exposures: tuple[tuple[Light, float | str], ...] = ("laser", self.laser_ms), ("lamp", self.lamp_ms)
         return {light: ms for light, ms in exposures if not isinstance(ms, str)}
 
     def capture_header(
         self, name: str, sensor: Sensor, *, medium: str, direction: Vector, zero_dn: int = 0, **shown: Table | None
     ) -> CaptureHeader:
-        """Header of a capture that shows a ``target`` or an ``artefact``; DescriptionError where one is not valid.
+        """Return the header of a capture of a ``target`` or ``artefact``; raises DescriptionError if one is not valid.
 
-        ``zero_dn`` stands for no difference in images from which a background is subtracted.
+        ``zero_dn`` is the grey value of zero difference in images with a subtracted background.
         """
         table = {
             "name": name,
@@ -101,24 +101,24 @@ class RigPlan(Description):
 
 
 class StagePlan(StageSettings):
-    """Positions of the stage in its own coordinate: ``count`` of them from ``start_mm`` in steps of ``step_mm``."""
+    """Positions of the stage in its own coordinate: ``count`` positions from ``start_mm`` in steps of ``step_mm``."""
 
     start_mm: float
     step_mm: float = 1.0
     count: Annotated[int, Field(ge=1, le=100000)] = 1
 
     def positions_mm(self) -> list[float]:
-        """All positions in their order."""
+        """Return all positions in order."""
         return [self.start_mm + k * self.step_mm for k in range(self.count)]
 
 
 class Continuous(Description):
-    """A scan without stops: the stage travels at a constant speed, and the camera takes a frame a step.
+    """A scan without stops: the stage travels at a constant speed, and the camera takes one frame per step.
 
-    With ``both_ways`` it travels back as well, which shows the latency between camera and stage; ``latency_ms`` gives
-    that instead: by how much the stage's positions are older than the frames. ``mm_per_count`` places the frames by an
-    encoder that is wired to the camera and sent with them (GenICam's ChunkEncoderValue). ``profiles_per_frame`` is how
-    many profiles a 3D camera sends together: more of them cost the network and this computer less.
+    With ``both_ways`` the stage also travels back, which measures the latency between camera and stage. Alternatively
+    ``latency_ms`` gives the age of the stage's positions relative to the frames. ``mm_per_count`` assigns positions by
+    an encoder that is wired to the camera and sent with the frames (GenICam's ChunkEncoderValue). A 3D camera sends
+    ``profiles_per_frame`` profiles together: larger values reduce the load on network and computer.
     """
 
     speed_mm_per_s: Positive
@@ -131,11 +131,11 @@ class Continuous(Description):
 class ScanPlan(RigPlan):
     """A scan as read from TOML.
 
-    At every position the images in ``lights`` are taken in turn: "laser" with the laser on, "lamp" with it off, under
-    whatever other light there is. With ``background`` an image without laser is taken before every laser image and
-    subtracted from it. Laser images are taken at every multiple of their exposure in ``bracket``, to be fused into one
-    that shows bright and dark surfaces (`uwlts.stripe.exposures`). With ``check_steps`` an early position is visited
-    again at the end, to see whether the stage has lost steps. With ``continuous`` the stage does not stop.
+    At every position the images in ``lights`` are taken in turn: "laser" with the laser on, "lamp" with the laser off
+    in the ambient light. With ``background`` an image without laser is taken before every laser image and subtracted
+    from it. Laser images are taken at every multiple of their exposure in ``bracket``, and fused into one that shows
+    bright and dark surfaces (`uwlts.stripe.exposures`). With ``check_steps`` an early position is revisited at the end,
+    to detect lost steps. With ``continuous`` the stage does not stop.
     """
 
     medium: str
@@ -152,16 +152,16 @@ class ScanPlan(RigPlan):
     def _one_light_in_motion(self) -> "ScanPlan":
         if self.continuous is not None and (self.images() != [("laser", 1.0)] or self.background):
             raise ValueError(
-                "a continuous scan takes laser images alone, one a step: leave out lamp, bracket and background"
+                "a continuous scan takes one laser image per step and no others: leave out lamp, bracket and background"
             )
         return self
 
     def images(self) -> list[tuple[Light, float]]:
-        """Light, and multiple of its exposure, of each image at a position."""
+        """Return the light, and the multiple of its exposure, of each image at a position."""
         return [(light, each) for light in self.lights for each in (self.bracket if light == "laser" else (1.0,))]
 
     def header(self, name: str) -> CaptureHeader:
-        """Header of the capture; DescriptionError or EvaluationError where what the plan describes is not valid."""
+        """Return the capture's header; raises DescriptionError or EvaluationError if the plan is not valid."""
         sensor = self.described_sensor()
         if self.target is not None:
             parse_target(self.target)
@@ -178,21 +178,21 @@ class ScanPlan(RigPlan):
         )
 
     def recorded(self) -> Table:
-        """What the plan says of the images to take, as JSON; not by which camera and port, nor how the stage moves."""
-        aside = {"title", "sensor", "camera", "check_steps"}
-        table = self.model_dump(mode="json", exclude=aside)
+        """Return the part of the plan that determines the images, as JSON, without addresses and motion settings."""
+        omitted = {"title", "sensor", "camera", "check_steps"}
+        table = self.model_dump(mode="json", exclude=omitted)
         for key in ("port", "feed_mm_per_min", "settle_s"):
             del table["stage"][key]
         return table
 
     def zero_dn(self, sensor: Sensor) -> int:
-        """Grey value of no difference in laser images from which a background is subtracted; 0 without one."""
+        """Return the grey value of zero difference in laser images with a subtracted background; 0 without one."""
         return sensor.detector.full_scale_dn() + 1 if self.background else 0
 
     def check(self, stage: GrblStage) -> None:
-        """Refuse what the stage or the sensor cannot do, before anything moves.
+        """Check that stage and sensor can do what is planned; nothing moves.
 
-        RangeError where a position lies outside the travel, or the feed is too high; DesignError where the sensor
+        Raises RangeError if a position is outside the travel or the feed is too high, and DesignError if the sensor
         cannot work in the medium.
         """
         self.stage.check(self.stage.positions_mm(), stage)
@@ -204,15 +204,15 @@ class ScanPlan(RigPlan):
 
 
 def load_plan(path: Path) -> ScanPlan:
-    """Plan in a TOML file; a sensor beside it is found by its file name.
+    """Read a plan from a TOML file, which may name a sensor file in its own folder.
 
-    DescriptionError where the file is missing, no TOML, or holds an unknown or wrong key.
+    Raises DescriptionError if the file is missing, is not TOML, or has an unknown or wrong key.
     """
-    return validated(ScanPlan, plan_table(path, wanted="sensor, medium and stage (docs/how-to/scan.md)"), path)
+    return validated(ScanPlan, read_plan_table(path, wanted="sensor, medium and stage (docs/how-to/scan.md)"), path)
 
 
-def plan_table(path: Path, *, wanted: str) -> Table:
-    """A plan's TOML with the path of a sensor that lies beside it; DescriptionError where it is missing or no TOML."""
+def read_plan_table(path: Path, *, wanted: str) -> Table:
+    """Read a plan's TOML and resolve the path of a sensor file beside it; raises DescriptionError if it cannot."""
     if not is_regular_file(path):
         raise DescriptionError(f"no plan at {path}: write one that gives {wanted}")
     table = read_table(path)

@@ -1,7 +1,7 @@
-"""Records a scan: moves the stage, waits until it rests, switches the laser, has the camera take an image, stores it.
+"""Recording of a scan: moves the stage, waits until it is at rest, switches the laser, takes an image and stores it.
 
-Every complete image is in the file before the next one is asked for, with the position read back from the stage. The
-laser is on for its own images only; the stage's driver switches it off however a scan ends.
+Every complete image is in the file before the next one is taken, with the position read back from the stage. The laser
+is on only for its own images; the stage's driver switches it off however a scan ends.
 """
 
 import time
@@ -15,32 +15,41 @@ import numpy as np
 from uwlts.errors import DescriptionError, HardwareError
 from uwlts.files.inputs import inputs_kept
 from uwlts.hardware.camera_interface import CameraDevice
-from uwlts.hardware.continuous import record_continuously, ways_of
+from uwlts.hardware.continuous import plan_passes, record_continuously
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.replay import ReplayCamera
-from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, stripe_of, with_provenance
+from uwlts.hardware.rig import START_MS, Brightness, Rig, add_provenance, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
-from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWatch, centres_of, shows_laser, spread
+from uwlts.hardware.scan_watch import (
+    LOOKS,
+    LaserWatch,
+    LitPlace,
+    Place,
+    SlipWatch,
+    select_centres,
+    select_evenly,
+    shows_laser,
+)
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.import_.grey_values import without_background
+from uwlts.storage.import_.grey_values import subtract_background
 from uwlts.stripe import Stripe, StripeStatus
 
 _FAINT = 0.1
-"""Laser images below this share of the full scale are reported as faint."""
+"""Laser images below this fraction of full scale are reported as faint."""
 _EXPOSED_AT = 5
-"""Positions, evenly spread over a plan, at which automatic exposure looks."""
+"""Number of positions, evenly distributed over a plan, used by automatic exposure."""
 
 
 @dataclass
 class ScanProgress:
     """Summary of the images of a scan so far.
 
-    ``lines`` and ``found`` count the profile lines of laser images and those with a stripe, ``saturated`` and ``faint``
-    the laser images on which many of the lit lines are at the full scale, or hardly reach a tenth of it; ``repeated``
-    the images that were asked for again. ``exposure_ms`` are the exposures used last.
+    ``lines`` and ``found`` count the profile lines of laser images and those with a stripe. ``saturated`` and ``faint``
+    count the laser images with many lines at full scale, or with all below a tenth of it. ``repeated`` counts images
+    taken again. ``exposure_ms`` are the latest exposures.
     """
 
     lines: int = 0
@@ -51,20 +60,20 @@ class ScanProgress:
     exposure_ms: dict[Light, float] = field(default_factory=dict)
 
     def warnings(self) -> list[str]:
-        """Warnings for the operator."""
-        said = []
+        """Return warnings for the operator."""
+        texts = []
         if self.saturated:
-            said.append(f"{self.saturated} laser images are saturated on many lines: shorten laser_ms")
+            texts.append(f"{self.saturated} laser images are saturated on many lines: shorten laser_ms")
         if self.faint:
-            said.append(f"{self.faint} laser images are faint: lengthen laser_ms, or is the laser lit?")
+            texts.append(f"{self.faint} laser images are faint: lengthen laser_ms, or is the laser off?")
         if self.lines and self.found < 0.05 * self.lines:
-            said.append(
-                f"only {self.found} of {self.lines} profile lines show a stripe: is the laser lit, the object "
+            texts.append(
+                f"only {self.found} of {self.lines} profile lines show a stripe: is the laser on, the object "
                 "in the volume?"
             )
         if self.repeated:
-            said.append(f"{self.repeated} images were lost on their way from the camera and taken again")
-        return said
+            texts.append(f"{self.repeated} images were lost between camera and computer and taken again")
+        return texts
 
 
 @inputs_kept()
@@ -82,12 +91,11 @@ def record_scan(
     between: Callable[[], None] = lambda: None,
     recorded: Callable[[Frame, int], None] = lambda frame, number: None,
 ) -> ScanProgress:
-    """Record a scan with a camera and a stage that are open and may move.
+    """Record a scan with an open camera and a stage that may move.
 
-    Parameters and errors are those of `uwlts.desk.scan.scan`.
-
-    ``between`` is called before every image, with the laser off: it may wait, or end the scan by an exception.
-    ``recorded`` is called with every image that is in the file, and its number.
+    Parameters and errors are those of `uwlts.desk.scan.scan`, with two more callbacks. ``between`` is called before
+    every image, with the laser off: it may wait, or end the scan by an exception. ``recorded`` is called with every
+    image that is in the file, and its number.
     """
     positions_mm = plan.stage.positions_mm()
     shots = list(product(positions_mm, plan.images()))
@@ -102,7 +110,7 @@ def record_scan(
         check_lines_plan(plan)
     plan.check(stage)
     dtype = np.dtype(np.uint16 if plan.background or (camera.info.bits > 8 and not lines) else np.uint8)
-    header = with_provenance(
+    header = add_provenance(
         plan.header(out.stem),
         plan,
         camera,
@@ -114,7 +122,7 @@ def record_scan(
     if plan.continuous is not None:
         if resume:
             raise DescriptionError("a continuous scan cannot be resumed: give `overwrite` to scan again")
-        ways_of(plan, plan.continuous, stage)
+        plan_passes(plan, plan.continuous, stage)
         rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
         seen = ScanProgress()
         taking = _Taking(plan, sensor, rig, seen, warn)
@@ -139,7 +147,7 @@ def record_scan(
         )
         report(f"{placed}")
         return seen
-    known_ms, before_s = left_over(out, [multiple for _, multiple in plan.images()]) if resume else ({}, 0.0)
+    known_ms, before_s = read_unfinished(out, [multiple for _, multiple in plan.images()]) if resume else ({}, 0.0)
     seen = ScanProgress(exposure_ms=known_ms)
     files = {"overwrite": overwrite, "resume": resume}
     with CaptureWriter(out, header, dtype=dtype, centre_lines=lines, plan=plan.recorded(), **files) as writer:
@@ -160,15 +168,15 @@ def record_scan(
             writer.append(frame)
             progress(done, len(shots))
             recorded(frame, done - 1)
-        # What is replayed does not know where the stage is.
+        # A replay does not know where the stage is.
         if plan.check_steps and not isinstance(camera, ReplayCamera):
             report("checking for lost steps")
             taking.check_steps()
         return seen
 
 
-def left_over(path: Path, multiples: Sequence[float] = (1.0,)) -> tuple[dict[Light, float], float]:
-    """Exposures in ms that an interrupted recording of a path used last, and the time in s of its last image.
+def read_unfinished(path: Path, multiples: Sequence[float] = (1.0,)) -> tuple[dict[Light, float], float]:
+    """Read the latest exposures in ms of an interrupted recording, and the time in s of its last image.
 
     ``multiples`` of a light's exposure are taken in turn.
     """
@@ -182,12 +190,12 @@ def left_over(path: Path, multiples: Sequence[float] = (1.0,)) -> tuple[dict[Lig
 
 
 def check_camera(camera: CameraDevice, sensor: Sensor) -> None:
-    """Refuse a camera that is not the sensor's: another image size, or fewer bits; HardwareError."""
+    """Raise HardwareError if a camera is not the sensor's: another image size, or fewer bits."""
     described, found = sensor.camera, camera.info
     if (found.width_px, found.height_px) != (described.width_px, described.height_px):
         raise HardwareError(
             f"the camera has {found.width_px} x {found.height_px} px, the sensor '{sensor.name}' "
-            f"{described.width_px} x {described.height_px} px: give the description of this sensor"
+            f"{described.width_px} x {described.height_px} px: give the description of this camera's sensor"
         )
     if found.coordinates is not None and described.stripe_along != "width":
         raise HardwareError(
@@ -201,7 +209,7 @@ def check_camera(camera: CameraDevice, sensor: Sensor) -> None:
 
 
 def check_lines_plan(plan: ScanPlan) -> None:
-    """DescriptionError where a plan needs images of a camera that gives centre lines."""
+    """Raise DescriptionError if a plan needs images but the camera delivers centre lines."""
     needs = {
         "lights holds 'lamp'": "lamp" in plan.lights,
         "background is true": plan.background,
@@ -210,13 +218,13 @@ def check_lines_plan(plan: ScanPlan) -> None:
     }
     if wrong := [name for name, found in needs.items() if found]:
         raise DescriptionError(
-            f"the camera finds the stripe itself and gives no images (Coord3D_C16), but {' and '.join(wrong)}: change "
-            "the plan, or set the camera's PixelFormat to Mono8"
+            f"the camera extracts the stripe itself and gives no images (Coord3D_C16), but {' and '.join(wrong)}: "
+            "change the plan, or set the camera's PixelFormat to Mono8"
         )
 
 
 class _Taking:
-    """Takes the images of a scan, with exposures settled before the first one of each light."""
+    """Images of a scan, with exposures settled before the first one of each light."""
 
     def __init__(self, plan: ScanPlan, sensor: Sensor, rig: Rig, seen: ScanProgress, warn: Callable[[str], None]):
         self._plan, self._sensor, self._rig, self._seen, self._warn = plan, sensor, rig, seen, warn
@@ -225,13 +233,13 @@ class _Taking:
         self._slip = SlipWatch()
 
     def settle_exposures(self, between: Callable[[], None]) -> None:
-        """Exposures as planned, or the shortest that is needed at positions over the whole plan."""
+        """Set the planned exposures, or the shortest that is needed at positions over the whole plan."""
         exposures, planned_ms = self._seen.exposure_ms, self._plan.planned_ms()
         lights: list[Light] = [light for light in dict.fromkeys(self._plan.lights) if light not in exposures]
         missing: list[Light] = [light for light in lights if light not in planned_ms]
         exposures.update({light: planned_ms[light] for light in lights if light in planned_ms})
-        looked = spread(self._positions_mm, _EXPOSED_AT)
-        further = [position for position in spread(self._positions_mm, LOOKS) if position not in looked]
+        looked = select_evenly(self._positions_mm, _EXPOSED_AT)
+        further = [position for position in select_evenly(self._positions_mm, LOOKS) if position not in looked]
         for position in looked + further if missing else ():
             if position in further and "laser" in exposures:
                 break
@@ -247,13 +255,13 @@ class _Taking:
                 exposures[light] = longest_ms
 
     def _settle(self, light: Light, position_mm: float) -> None:
-        """Shorten the exposure of a light if it is too long here; settle it if nothing was seen in it before."""
+        """Shorten the exposure of a light if it is too long here; find it if nothing was seen in this light before."""
         exposures = self._seen.exposure_ms
         if light in exposures:
-            here = brightness(self._rig.image(light, exposures[light])[0], self._sensor, light)
+            here = measure_brightness(self._rig.image(light, exposures[light])[0], self._sensor, light)
             if here.level <= self._sensor.exposure.auto_level:
                 return
-        exposure_ms = self._rig.settled_exposure(light, start_ms=exposures.get(light, START_MS))
+        exposure_ms = self._rig.find_exposure(light, start_ms=exposures.get(light, START_MS))
         if exposure_ms is None:
             return
         if light == "laser":
@@ -265,15 +273,15 @@ class _Taking:
         exposures[light] = min(exposure_ms, exposures.get(light, exposure_ms))
 
     def take(self, position_mm: float, light: Light, multiple: float, *, last: bool) -> Frame:
-        """What is stored, at the position read back, exposed by a multiple of the light's own time; without its time.
+        """Take the frame to store, at a multiple of the light's own exposure; its time is not set.
 
-        Only images at the light's own exposure are watched; longer ones of a bracket are meant to be saturated.
+        Only images at the light's own exposure are checked; longer ones of a bracket may be saturated.
         """
         rig, seen, zero_dn = self._rig, self._seen, self._plan.zero_dn(self._sensor)
         position = rig.move_to(position_mm)
         asked_ms = seen.exposure_ms[light] * multiple
         frame = rig.frame(light, asked_ms)
-        bright = brightness(frame.seen, self._sensor, light)
+        bright = measure_brightness(frame.seen, self._sensor, light)
         if (
             multiple == 1
             and bright.overexposed
@@ -282,45 +290,45 @@ class _Taking:
         ):
             asked_ms = seen.exposure_ms[light]
             frame = rig.frame(light, asked_ms)
-            bright = brightness(frame.seen, self._sensor, light)
+            bright = measure_brightness(frame.seen, self._sensor, light)
         image, exposure_ms = frame.seen, asked_ms if frame.exposure_ms is None else frame.exposure_ms
         unlit = rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
         if light == "laser" and multiple == 1:
-            stripe, place = stripe_of(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
-            self._slip.see(Place(position, exposure_ms, centres_of(stripe)))
-            self._watch.see(image, stripe, bright.level, place, unlit=unlit, last=last)
+            stripe, place = get_stripe(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
+            self._slip.add(Place(position, exposure_ms, select_centres(stripe)))
+            self._watch.check(image, stripe, bright.level, place, unlit=unlit, last=last)
             self._count(stripe, bright)
         seen.repeated = rig.repeated
         if zero_dn and isinstance(image, np.ndarray):
-            image = image.astype(np.uint16) if unlit is None else without_background(image, unlit, zero_dn=zero_dn)
+            image = image.astype(np.uint16) if unlit is None else subtract_background(image, unlit, zero_dn=zero_dn)
         return Frame(image, position, light == "laser", exposure_ms, 0.0, encoder=frame.encoder)
 
     def check_steps(self) -> None:
-        """Visit an early place again, if one has relief; HardwareError where the stage stands elsewhere than before."""
+        """Revisit an early place with relief, if any; raises HardwareError if the stage is displaced."""
         if (relief := self._slip.relief) is None:
             return
         place = relief.place
         self._rig.move_to(place.position_mm)
         image = self._rig.frame("laser", place.exposure_ms).seen
         unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
-        slip_mm, error_mm = relief.slip(centres_of(stripe_of(image, self._sensor, background=unlit)))
+        slip_mm, error_mm = relief.measure_slip(select_centres(get_stripe(image, self._sensor, background=unlit)))
         if not np.isfinite(slip_mm):
             seen = "shows no stripe where it was; or the laser has failed since the last image"
         elif relief.is_significant(slip_mm, error_mm):
-            seen = f"looks as if the stage stood {slip_mm:+.2f} mm (std {error_mm:.2f} mm) beside it"
+            seen = f"shows a displacement of the stage of {slip_mm:+.2f} mm (std {error_mm:.2f} mm)"
         else:
             return
         raise HardwareError(
             f"the stage has lost steps, or sensor or object were moved: the image back at {place.position_mm:g} mm "
-            f"{seen}. All images are recorded, but from somewhere on at wrong positions: find the cause (feed, "
-            "acceleration, something in the way) and scan again with `overwrite`, or take them as they are with "
+            f"{seen}. All images are recorded, but some at wrong positions: find the cause (feed, "
+            "acceleration, an obstacle) and scan again with `overwrite`, or accept them with "
             "`resume`"
         )
 
     def _shorten(self, light: Light, position_mm: float) -> bool:
-        """Settle the exposure of a light again if it turns out to be too long; False if that does not help."""
+        """Find the exposure of a light again if it is too long; return False if that does not help."""
         before_ms = self._seen.exposure_ms[light]
-        shorter_ms = self._rig.settled_exposure(light, start_ms=before_ms)
+        shorter_ms = self._rig.find_exposure(light, start_ms=before_ms)
         if shorter_ms is None or shorter_ms >= before_ms:
             return False
         self._seen.exposure_ms[light] = shorter_ms

@@ -1,4 +1,4 @@
-"""Numbers and their names as text: lengths to a micrometre, no negative zero, a dash for what is missing."""
+"""Text for numbers and their names: lengths to a micrometre, no negative zero, a dash for missing values."""
 
 import math
 import re
@@ -11,7 +11,7 @@ _UNITS = {"px": "px", "mm": "mm", "deg": "°", "rad": "rad", "nm": "nm"}
 
 
 def fixed(value: float | None, decimals: int = 3, *, signed: bool = False) -> str:
-    """A number with fixed decimals; what rounds to zero has no sign."""
+    """Format a number with fixed decimals; a number that rounds to zero has no sign."""
     if value is None or not math.isfinite(value):
         return MISSING
     text = f"{value:{'+' if signed else ''}.{decimals}f}"
@@ -19,7 +19,7 @@ def fixed(value: float | None, decimals: int = 3, *, signed: bool = False) -> st
 
 
 def small_length(value_mm: float | None, *, signed: bool = False) -> str:
-    """A length with its unit: micrometres with one decimal (two below 1 µm), or from 1 mm on millimetres with three."""
+    """Format a length with its unit: below 1 mm in µm with one decimal (below 1 µm with two), else in mm with three."""
     if value_mm is None or not math.isfinite(value_mm):
         return MISSING
     if abs(value_mm) < 1:
@@ -28,46 +28,46 @@ def small_length(value_mm: float | None, *, signed: bool = False) -> str:
 
 
 def plain(value: float) -> str:
-    """Any figure with four significant digits, whole numbers as they are."""
+    """Format a number with four significant digits, or an integer with all digits."""
     if float(value).is_integer() and abs(value) < 1e9:
         return f"{value:.0f}"
     return f"{value:.4g}"
 
 
 def as_fine_as(value: float, scale: float, *, digits: int = 3) -> str:
-    """A number with as many decimals as the significant digits of a scale have."""
+    """Format a number with as many decimals as a scale with some significant digits has."""
     decimals = digits - 1 - math.floor(math.log10(scale)) if scale > 0 else 3
     return fixed(value, max(0, decimals))
 
 
 def unit_of(name: str) -> str:
-    """Unit that ends a name, as in ``rms_px``; nothing for a pure number."""
+    """Return the unit at the end of a name, as in ``rms_px``; empty for a pure number."""
     return _UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
 
 
 def words_of(name: str) -> str:
-    """A name in words, without its unit."""
+    """Return a name as words, without its unit."""
     bare = name.rsplit("_", 1)[0] if unit_of(name) else name
     return re.sub(r"_+", " ", bare)
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Whether a value from JSON is a finite number."""
+    """Return whether a value from JSON is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def number_list(value: Any) -> list[float | None] | None:
-    """A list of finite numbers from JSON, None for missing ones; None if the value is anything else."""
+    """Return a list from JSON if it contains only finite numbers and None, else None."""
     return value if isinstance(value, list) and all(each is None or is_number(each) for each in value) else None
 
 
 def numbers_in(table: Any) -> dict[str, float]:
-    """The finite numbers in a table from JSON by their names; none if the value is no table."""
+    """Return the finite numbers in a table from JSON by name; empty if the value is not a table."""
     return {name: value for name, value in table.items() if is_number(value)} if isinstance(table, dict) else {}
 
 
 def entries_of(table: Mapping[str, Any], group: str = "") -> Iterator[tuple[str, str, Any]]:
-    """Group, name and value of the entries of nested tables; a group is the names of its tables."""
+    """Iterate over group, name and value of the entries of nested tables; a group is the names of its tables."""
     for name, value in table.items():
         if isinstance(value, dict):
             yield from entries_of(value, f"{group} {name}".strip())
@@ -76,5 +76,5 @@ def entries_of(table: Mapping[str, Any], group: str = "") -> Iterator[tuple[str,
 
 
 def unit_for(spread_mm: float) -> tuple[str, float]:
-    """Unit in which deviations of this spread are drawn, and how many of it are in a millimetre."""
+    """Return the unit for drawing deviations of this spread, and its number per millimetre."""
     return ("µm", 1e3) if spread_mm < 0.5 else ("mm", 1.0)

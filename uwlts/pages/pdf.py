@@ -1,4 +1,4 @@
-"""Pages printed as PDF by a browser, so that both come from one source."""
+"""Printing of pages as PDF by a browser, so that both have one source."""
 
 import os
 import shutil
@@ -10,40 +10,40 @@ from uwlts.errors import OutputError, SetupError
 from uwlts.files.writing import written_aside
 
 BROWSERS = ("chromium", "chromium-headless-shell", "google-chrome", "google-chrome-stable", "msedge")
-"""Names on PATH; the environment variable CHROMIUM names another one."""
+"""Names of browsers on PATH; the environment variable CHROMIUM names another one."""
 
 _PATIENCE_S = 120.0
-"""A page of a few pictures takes 2 s; a slow machine much longer."""
+"""Time limit: a page with a few pictures takes 2 s, or much longer on a slow machine."""
 
 
 def print_pdf(page: str, path: Path, *, overwrite: bool = False) -> None:
-    """Print the text of a page as PDF, whole or not at all.
+    """Print the text of a page as PDF, completely or not at all.
 
-    SetupError where there is no Chromium, Chrome or Edge, or it does not print; OutputError where the file exists or
+    Raises SetupError if there is no Chromium, Chrome or Edge, or it does not print; OutputError if the file exists or
     cannot be written.
     """
     browser = find_browser()
     with written_aside(path, overwrite=overwrite) as aside, tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "page.html"
         source.write_text(page, encoding="utf-8", errors="replace")
-        # The page is the program's own and loads nothing; the sandbox is refused to root.
+        # The page is the program's own and loads nothing; root cannot use the sandbox.
         words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}/profile"]
         words += ["--no-pdf-header-footer", f"--print-to-pdf={aside.absolute()}", source.as_uri()]
         try:
             done = subprocess.run([browser, *words], capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
         except (OSError, subprocess.TimeoutExpired) as error:
-            raise SetupError(f"{browser} does not print {path.name}: {error}") from error
+            raise SetupError(f"{browser} cannot print {path.name}: {error}") from error
         if not aside.stat().st_size:
             said = " ".join(done.stderr.split())[-300:]
             raise SetupError(f"{browser} has not printed {path.name} (exit status {done.returncode}): {said}")
 
 
 def find_browser() -> str:
-    """The browser that prints; SetupError where there is none."""
+    """Return the path of the browser that prints; raises SetupError without a browser."""
     if chosen := os.environ.get("CHROMIUM"):
         if found := shutil.which(chosen):
             return found
-        raise SetupError(f"the environment variable CHROMIUM names {chosen}, which is no program")
+        raise SetupError(f"the environment variable CHROMIUM names {chosen}, which is not a program")
     for name in BROWSERS:
         if found := shutil.which(name):
             return found
@@ -54,7 +54,7 @@ def find_browser() -> str:
 
 
 def refuse_unsuitable_pdf(path: Path) -> None:
-    """Raise an error before the work where a PDF cannot be made."""
+    """Raise an error if a PDF cannot be made; called before the work."""
     if path.suffix.lower() != ".pdf":
         raise OutputError(f"{path} is to be a PDF; give a name like findings.pdf")
     find_browser()

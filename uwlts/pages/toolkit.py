@@ -12,8 +12,8 @@ A page is a Jinja template that extends ``base.html.j2`` and imports what it nee
                        histogram=svg_of(static), cloud=figures.add(interactive, "All points."))
     write_page(path, text, overwrite=overwrite)
 
-Pages contain everything that they show and load nothing from the network. This module computes nothing and imports
-nothing of the measurement software, so the twin may use it, too.
+Pages contain all their content and load nothing from the network. This module computes nothing and imports nothing of
+the measurement software, so that the twin can use it, too.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ if TYPE_CHECKING:
     Drawn = Figure | SubFigure | Axes
 
 MISSING = "-"
-"""Stands for a missing value in tables of text."""
+"""Placeholder for a missing value in tables of text."""
 
 INK, SOFT, FAINT, BLUE, RED = "#2b3440", "#5c6875", "#dde2e8", "#3573b1", "#b5303c"
-"""Colours of text, notes, grid lines, and of the main and the contrasting line; those of ``style.css``."""
+"""Colours of text, notes, grid lines, and of the main and the contrasting line, as in ``style.css``."""
 
 COLOURS = (BLUE, "#d9822b", "#2e8b57", RED, "#7b4fa3", "#5b6770", "#12a3a8", "#a0722a")
 """Colours of the lines of one figure, in order."""
@@ -66,12 +66,12 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
-# Text stays text, and the same figure gives the same file.
+# Text remains text, and the same figure gives the same file.
 _SVG: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "page"}
 
 
 def render_page(package: str, template: str, /, *, interactive: FigureCollector | None = None, **values: Any) -> str:
-    """Text of a page from a template and values.
+    """Render the text of a page from a template and values.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     if scripts:
         from plotly.offline import get_plotlyjs
 
-        # Nothing in plotly's script may look like the script's end.
+        # The script must not contain the end tag of a script element.
         plotly = Markup(get_plotlyjs().replace("</script", "<\\/script"))
     return environment.get_template(template).render(
         page_style=Markup((templates / "style.css").read_text(encoding="utf-8")),
@@ -104,29 +104,29 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
 
 
 HTML = (".html", ".htm")
-"""Endings of pages."""
+"""File name endings of pages."""
 
 
 def write_page(
     path: str | Path, text: str, *, beside: str | None = None, kind: str = "", overwrite: bool = False
 ) -> None:
-    """Write a page, and a JSON text beside it (`json_beside`) if one is given, each whole or not at all.
+    """Write a page, and optionally a JSON text beside it (`json_beside`), each completely or not at all.
 
-    Raises OutputError: a file exists and ``overwrite`` is not given, or cannot be written.
+    Raises OutputError if a file exists and ``overwrite`` is not set, or cannot be written.
     """
     with ExitStack() as stack:
         if beside is not None:
             aside = stack.enter_context(written_aside(json_beside(Path(path), kind), overwrite=overwrite))
             aside.write_text(beside, encoding="utf-8")
         aside = stack.enter_context(written_aside(path, overwrite=overwrite))
-        # A file name on the page may hold bytes that are no text.
+        # A file name on the page may contain bytes that are not text.
         aside.write_text(text, encoding="utf-8", errors="replace")
 
 
 def json_beside(page: Path, kind: str = "") -> Path:
-    """Path of the JSON of a page: PAGE.json, or with a kind PAGE.KIND.json unless the page is named by its kind.
+    """Return the path of a page's JSON: PAGE.json, or PAGE.KIND.json unless the page's name ends with the kind.
 
-    Pages of findings and registrations are named after the object, as are its other JSON files.
+    Pages of findings and registrations are named after the object, like its other JSON files.
     """
     return page.with_suffix(".json" if page.stem.rpartition(".")[2] == kind or not kind else f".{kind}.json")
 
@@ -139,7 +139,7 @@ def refuse_unsuitable_page(page: Path, *, kind: str = "", overwrite: bool) -> No
 
 @dataclass(frozen=True)
 class InteractiveFigure:
-    """Place of an interactive figure in a page; ``still`` is the address of a picture that replaces it in print."""
+    """Position of an interactive figure in a page; ``still`` is the address of a picture that replaces it in print."""
 
     number: int
     caption: str
@@ -149,7 +149,7 @@ class InteractiveFigure:
 
 
 class FigureCollector:
-    """Numbers the interactive figures of a page and keeps their JSON for the page's end."""
+    """Interactive figures of a page, numbered, with their JSON for the end of the page."""
 
     def __init__(self) -> None:
         self.scripts: list[Markup] = []
@@ -157,8 +157,8 @@ class FigureCollector:
     def add(
         self, figure: go.Figure, caption: str = "", *, webgl: bool = False, still: str | None = None
     ) -> InteractiveFigure:
-        """Keep a plotly figure that has a height; those with ``webgl`` are drawn near the screen, browsers keep few."""
-        # Within a script element nothing is escaped, and nothing may look like its end.
+        """Add a plotly figure with a height; browsers allow few ``webgl`` figures, which are drawn near the screen."""
+        # There is no escaping in a script element, so the text must not contain its end tag.
         text = figure.to_json(validate=False) or ""
         self.scripts.append(Markup(text.replace("<", "\\u003c")))
         return InteractiveFigure(len(self.scripts) - 1, caption, int(figure.layout.height), webgl, still)
@@ -183,7 +183,7 @@ class ComparisonTable:
 
 
 def figure_of(width: float, height: float, *, layout: Literal["constrained"] | None = "constrained") -> Figure:
-    """An empty matplotlib figure of a size in inches, which no window shows."""
+    """Return an empty matplotlib figure of a size in inches, which is not shown in a window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -201,7 +201,7 @@ def new_figure(
     height_ratios: list[float] | None = None,
     width_ratios: list[float] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """A matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
+    """Return a matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
     import matplotlib
 
     figure = figure_of(width, height)
@@ -211,7 +211,7 @@ def new_figure(
 
 
 def legend_below(figure: Figure, *, columns: int = 4) -> None:
-    """One legend below all axes of a figure, each label once."""
+    """Add one legend below all axes of a figure, with each label once."""
     handles = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -222,23 +222,23 @@ def legend_below(figure: Figure, *, columns: int = 4) -> None:
 
 
 def svg_of(drawn: Drawn) -> Markup:
-    """A matplotlib figure, or that of axes, as an SVG element to stand in a page."""
+    """Return a matplotlib figure, or the figure of axes, as an SVG element for a page."""
     text = _saved(drawn, format="svg", metadata={"Date": None}).decode("utf-8")
-    # Ids of groups would occur in every figure, and nothing refers to them; within HTML, SVG needs no namespaces.
+    # Ids of groups would be repeated in every figure and are not referenced; SVG in HTML needs no namespaces.
     text = re.sub(r'(?<=<g) id="[^"]*"|<metadata>.*?</metadata>| xmlns(:\w+)?="[^"]*"', "", text, flags=re.S)
     return Markup(text[text.index("<svg") :].replace("xlink:href", "href"))
 
 
 def png_of(drawn: Drawn, *, dpi: int = 100, few_colours: bool = False) -> bytes:
-    """A matplotlib figure, or that of axes, as PNG; with ``few_colours`` of 256 colours, in a third of the room."""
-    # The software's name with its version would change the file.
+    """Return a matplotlib figure, or the figure of axes, as PNG; ``few_colours`` are 256, for a third of the size."""
+    # The name and version of the software would change the file.
     data = _saved(drawn, format="png", dpi=dpi, metadata={"Software": None})
     if not few_colours:
         return data
     from PIL import Image
 
     smaller = io.BytesIO()
-    # Of Pillow's methods the octree takes a fifth of the others' time.
+    # Pillow's octree method takes a fifth of the time of the others.
     reduced = Image.open(io.BytesIO(data)).convert("RGB")
     reduced.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(smaller, "png")
     return smaller.getvalue()
@@ -253,25 +253,25 @@ def _saved(drawn: Drawn, **options: Any) -> bytes:
         figure = figure.figure
     data = io.BytesIO()
     with matplotlib.rc_context(_SVG), warnings.catch_warnings():
-        # Names from files may have letters that the font lacks; a browser has others.
+        # The font may lack characters in names of files; browsers have other fonts.
         warnings.filterwarnings("ignore", "Glyph .* missing")
         figure.savefig(data, **options)
     return data.getvalue()
 
 
 def plain_text(text: str) -> str:
-    """Text in which matplotlib finds no formulas."""
+    """Escape a text so that matplotlib finds no formulas in it."""
     return text.replace("$", r"\$")
 
 
 def png_data_uri(picture: Drawn | bytes, *, dpi: int = 100) -> str:
-    """A matplotlib figure, or the bytes of a PNG, as an address that holds the whole picture."""
+    """Return a matplotlib figure, or the bytes of a PNG, as an address that contains the whole picture."""
     data = picture if isinstance(picture, bytes) else png_of(picture, dpi=dpi)
     return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
 
 
 def typographic(text: str) -> str:
-    """A number as text with a proper minus sign; a dash for what is missing."""
+    """Replace a minus sign of a number by the typographic one, and a missing value by a dash."""
     if text == MISSING:
         return "\N{EN DASH}"
     return "\N{MINUS SIGN}" + text[1:] if text.startswith("-") else text

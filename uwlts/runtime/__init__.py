@@ -1,1 +1,1 @@
-"""Working processes, the terminal, and system libraries: what both packages need to run."""
+"""Worker processes, the terminal, and system libraries, which both packages need to run."""

@@ -1,7 +1,7 @@
-"""Commands that are made of public functions: parameters, types, defaults and help are the functions' own.
+"""Commands made from public functions, with the functions' parameters, types, defaults and help.
 
-A command is a body that is called with a `Call` of its function, and with the options that the body alone has. What a
-function takes beside text (arrays, opened files) stays out of the command line.
+A command has a body, which is called with a `Call` of the function and with the options that only the body has.
+Parameters that cannot be given as text, such as arrays and opened files, are not options.
 """
 
 import ast
@@ -22,13 +22,20 @@ from cyclopts import App, Parameter
 from uwlts.runtime.console import as_options, progress_bar
 
 _LISTENERS = ("progress", "report", "warn")
-"""Parameters by which functions show what they do; a command prints it."""
-_WORDS = (str, int, float, bool)
+"""Parameters through which functions report; a command prints the reports."""
+
+
+class PathText(str):
+    """Text of a path, an option's type where a function takes both `str` and `Path`; help shows it as PATH."""
+
+
+PathText.__name__ = "Path"
+_WORDS = (PathText, str, int, float, bool)
 
 
 @dataclass(frozen=True)
 class Before:
-    """Check of a command's output before the work; in the annotation of its option."""
+    """Check of a command's output before the work, as an annotation of its option."""
 
     check: Callable[..., None]
     """Called with the path and ``overwrite``."""
@@ -36,7 +43,7 @@ class Before:
 
 @dataclass(frozen=True)
 class Shortcuts:
-    """Options that give entries of a function's settings, such as ``--method`` for an entry of ``stripe``."""
+    """Options that set entries of a function's settings, such as ``--method`` for an entry of ``stripe``."""
 
     setting: str
     options: Mapping[str, Any]
@@ -52,13 +59,12 @@ def derived(
     shortcuts: Shortcuts | None = None,
     summary: str | None = None,
 ) -> Callable[[Callable[..., None]], "Derived"]:
-    """Make a command of a public function of a package; what is decorated is its body, named as the command.
+    """Make a command from a public function of a package; the decorated function is the body and names the command.
 
-    The body takes a `Call`, and as parameters of its own what the command takes besides. Those without an annotation
-    are parameters of the function, or of one of the functions ``also``, whose defaults and text they have.
-
-    The function is imported when the command is run or its own help is shown. ``summary`` replaces the prose of its
-    docstring, if the command does more.
+    The body takes a `Call`, and the command's additional options as parameters. Parameters without an annotation are
+    taken from the function, or from one of the functions ``also``, with default and description. The function is
+    imported when the command is run or its own help is shown. ``summary`` replaces the prose of the function's
+    docstring.
     """
 
     def register(body: Callable[..., None]) -> Derived:
@@ -72,14 +78,14 @@ def derived(
 
 @dataclass(frozen=True)
 class Call:
-    """The function of a command with what was given on the command line.
+    """Function of a command with the arguments from the command line.
 
     Attributes
     ----------
     given : dict
-        Arguments of the function that were given, by name, in the types that it takes; those of ``*`` under that name.
+        Arguments by name, in the types of the function's parameters; those for ``*args`` have the name ``*``.
     title : str
-        Title of its progress.
+        Title of the progress bar.
     """
 
     function: Callable[..., Any]
@@ -88,7 +94,7 @@ class Call:
     title: str
 
     def __call__(self, **more: Any) -> Any:
-        """Call the function with what was given and more, while its progress is shown."""
+        """Call the function with the given and further arguments, and show its progress."""
         heard = {name: listen for name, listen in (("report", say), ("warn", warn)) if name in self.parameters}
         given = self.given | more | heard
         with progress_bar(self.title) if "progress" in self.parameters else nullcontext() as progress:
@@ -97,7 +103,7 @@ class Call:
 
 
 class Derived:
-    """A command as cyclopts takes it: callable, with a signature and a docstring."""
+    """A command in the form that cyclopts needs: a callable with a signature and a docstring."""
 
     def __init__(
         self,
@@ -116,7 +122,7 @@ class Derived:
 
     @property
     def function(self) -> Callable[..., Any]:
-        """The function that the command is made of."""
+        """The function of the command."""
         return getattr(self._package, self._function)
 
     @property
@@ -129,16 +135,16 @@ class Derived:
 
     @cached_property
     def _taken(self) -> dict[str, inspect.Parameter]:
-        """Parameters of the function, with their types."""
+        """Return the parameters of the function, with their types."""
         hints, parameters = get_type_hints(self.function), inspect.signature(self.function).parameters
         return {name: one.replace(annotation=hints[name]) for name, one in parameters.items()}
 
     @cached_property
     def _own(self) -> dict[str, inspect.Parameter]:
-        """Parameters of the body behind the call; those without an annotation are made like the functions'."""
+        """Return the body's parameters after the call; those without an annotation are taken from the functions."""
         own = dict(list(inspect.signature(self._body, eval_str=True).parameters.items())[1:])
         like = [name for name, one in own.items() if one.annotation is one.empty and name not in self._taken]
-        # The first function that has an option gives it.
+        # Of several functions with the option, the first one counts.
         sources = [_options_of(*function) for function in reversed(self._also)] if like else []
         options = {name: one for source in sources for name, one in source.items()}
         for name in like:
@@ -160,6 +166,7 @@ class Derived:
     def __call__(self, *args: Any, **kwargs: Any) -> None:
         """Check the outputs, and run the body."""
         bound = self._made.bind(*args, **kwargs)
+        bound.arguments.update({name: _plain_text(value) for name, value in bound.arguments.items()})
         explicit = dict(bound.arguments)
         bound.apply_defaults()
         for name, one in self._made.parameters.items():
@@ -182,14 +189,14 @@ class Derived:
         self._body(call, **{name: bound.arguments[name] for name in self._own})
 
     def _plain(self, name: str, value: Any) -> Any:
-        """A value as the function takes it: one of its single words by itself, not as a tuple."""
+        """Return a value as the function takes it: a single literal word is not a tuple."""
         kinds = _members(self._taken[name].annotation)
         alone = [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
         return value[0] if isinstance(value, tuple) and len(value) == 1 and value[0] in alone else value
 
 
 def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Parameter]:
-    """Parameters of a function that can be given as text, typed for the command line."""
+    """Return the parameters of a function that can be given as text, typed for the command line."""
     taken, described = getattr(package, function), descriptions(package, function)
     hints, options = get_type_hints(taken), {}
     for name, one in inspect.signature(taken).parameters.items():
@@ -208,13 +215,20 @@ def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Paramet
     return options
 
 
+def _plain_text(value: Any) -> Any:
+    """Convert `PathText` to `str`, also in a tuple."""
+    if isinstance(value, tuple):
+        return tuple(map(_plain_text, value))
+    return str(value) if isinstance(value, PathText) else value
+
+
 def _place(one: inspect.Parameter) -> tuple[int, bool]:
-    """Order in a signature: by kind, and those without default first."""
+    """Return a sort key for a signature: by kind, and parameters without a default first."""
     return one.kind, one.default is not one.empty
 
 
 def _members(hint: Any) -> Iterator[Any]:
-    """Types of a union, or the type itself, without their annotations."""
+    """Iterate over the types of a union, or the type itself, without annotations."""
     if get_origin(hint) is Annotated:
         yield from _members(get_args(hint)[0])
     elif get_origin(hint) in (Union, UnionType):
@@ -225,8 +239,10 @@ def _members(hint: Any) -> Iterator[Any]:
 
 
 def typed(hint: Any) -> Any:
-    """The type of an option for a parameter: what of its type can be given as text; None where nothing can."""
+    """Return the type of an option for a parameter of some type, or None if it cannot be given as text."""
     kinds = list(_members(hint))
+    if Path in kinds:
+        kinds = [PathText if kind is str else kind for kind in kinds]
     words = [kind for kind in _WORDS if kind in kinds] or [kind for kind in kinds if kind is Path]
     literals = [kind for kind in kinds if get_origin(kind) is Literal]
     for kind in kinds:
@@ -250,7 +266,7 @@ def _or_none(kind: Any, kinds: Iterable[Any]) -> Any:
 
 
 def settings_of(option: str, texts: Sequence[str]) -> dict[str, Any]:
-    """Settings that were given as NAME=VALUE; DescriptionError for another text."""
+    """Return settings from texts NAME=VALUE; raises DescriptionError for another text."""
     from uwlts.errors import DescriptionError
     from uwlts.files.reading import parsed_json
 
@@ -266,11 +282,11 @@ def settings_of(option: str, texts: Sequence[str]) -> dict[str, Any]:
     return settings
 
 
-# --- docstrings, read from the source: the list of all commands needs none of the functions' libraries
+# --- docstrings, read from the source: the list of commands does not import the functions' libraries
 
 
 def descriptions(package: ModuleType, function: str) -> dict[str, str]:
-    """The docstring's text of each parameter; "As for `other`" leads to that function's."""
+    """Return the descriptions of parameters in a docstring; "As for `other`" refers to that function's."""
     found = {}
     sections = _sections(docstring(package, function))
     parameters = dict(zip(sections[1::2], sections[2::2], strict=True)).get("Parameters", "")
@@ -283,18 +299,18 @@ def descriptions(package: ModuleType, function: str) -> dict[str, str]:
 
 
 def _as_help(text: str, names: Collection[str]) -> str:
-    """Text of a docstring as a command's help: options in place of parameters, and no backticks."""
+    """Return docstring text as a command's help: options instead of parameters, and no backticks."""
     return as_options(text, names).replace("`", "")
 
 
 def _sections(text: str) -> list[str]:
-    """The docstring's prose, then titles and texts of its sections in turn."""
+    """Split a docstring into its prose, and then titles and texts of its sections in turn."""
     return re.split(r"^(\w+)\n-+\n", f"{text}\n", flags=re.MULTILINE)
 
 
 @cache
 def _modules(package: ModuleType) -> dict[str, str]:
-    """Modules of the names in a package's stub."""
+    """Return the modules of the names in a package's stub."""
     stub = Path(f"{package.__file__}i").read_text(encoding="utf-8")
     return {
         alias.name: node.module
@@ -306,7 +322,7 @@ def _modules(package: ModuleType) -> dict[str, str]:
 
 @cache
 def docstring(package: ModuleType, function: str) -> str:
-    """Docstring of a function that the package's stub names, without importing it."""
+    """Return the docstring of a function in the package's stub, without importing the function."""
     place = Path(str(package.__file__)).parent.joinpath(*_modules(package)[function].split("."))
     source = (place / "__init__.py" if place.is_dir() else place.with_suffix(".py")).read_text(encoding="utf-8")
     found = re.search(rf'^def {function}\(.*?"""(.*?)"""', source, flags=re.MULTILINE | re.DOTALL)
@@ -315,11 +331,11 @@ def docstring(package: ModuleType, function: str) -> str:
     return inspect.cleandoc(found[1])
 
 
-# --- what commands print
+# --- output of commands
 
 
 def say(line: str) -> None:
-    """Print a line at once, also into a pipe."""
+    """Print a line at once, also to a pipe."""
     print(line, flush=True)
 
 

@@ -1,4 +1,4 @@
-"""Loops over lines and pixels, compiled to machine code when they are first called and kept on disk from then on."""
+"""Loops over lines and pixels that are compiled to machine code on their first call and cached on disk."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _FASTMATH = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 _OPTIONS: dict[str, Any] = {"fastmath": _FASTMATH, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
 
 _NO_ARRAYS: dict[str, Any] = {**_OPTIONS, "_nrt": False}
-"""Without Numba's runtime, which counts references to arrays, a function takes a tenth less to compile."""
+"""Without Numba's runtime, which counts references to arrays, compilation takes 10 % less time."""
 
 
-# Freed arrays are kept for the next ones. glibc gives memory back to the system, to be had anew page by page, unless a
-# larger block, of up to 32 MiB, was freed before (mallopt(3), M_MMAP_THRESHOLD). A fifth of points' time went there.
+# glibc returns freed arrays to the system and requests them again page by page, unless a larger block, of up to
+# 32 MiB, was freed before (mallopt(3), M_MMAP_THRESHOLD). This took a fifth of the time of reconstruction.
 np.empty(24 << 20, np.uint8)
 
 
 class _WithoutCollection(event.Listener):
-    """Keeps Python from collecting garbage while Numba compiles: it makes a lot, and a tenth of the time went there."""
+    """Disables garbage collection while Numba compiles, which otherwise takes 10 % of the time."""
 
     depth = 0
 
@@ -52,23 +52,25 @@ event.register("numba:compile", _WithoutCollection())
 
 
 def compiled(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """A function compiled by Numba that makes no arrays but takes all that it needs.
+    """Compile a function with Numba that allocates no arrays.
 
-    It may call such functions, of other packages only those that call none of another. Without a folder that can be
-    written it is compiled anew in every process.
+    It may call other such functions; those in other packages may not call functions of a third package. Without a
+    writable folder for the cache it is compiled again in every process.
     """
-    return _kept(function, _NO_ARRAYS)
+    return _compile_cached(function, _NO_ARRAYS)
 
 
 def compiled_with_arrays(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """As `compiled`, of a function that makes arrays."""
-    return _kept(function, _OPTIONS)
+    """Compile a function with Numba like `compiled`, but one that allocates arrays."""
+    return _compile_cached(function, _OPTIONS)
 
 
-def _kept(function: Callable[_Parameters, _Result], options: dict[str, Any]) -> Callable[_Parameters, _Result]:
+def _compile_cached(
+    function: Callable[_Parameters, _Result], options: dict[str, Any]
+) -> Callable[_Parameters, _Result]:
     try:
         kept: Any = njit(cache=True, **options)(function)
-        # Numba takes a function as unchanged where its own file is; here a change of what it calls shows as well.
+        # Numba recompiles a function only if its own file has changed; here also if the functions it calls have.
         called = (function.__globals__.get(name) for name in function.__code__.co_names)
         files = {
             inspect.getfile(each) for each in (function, *(c.py_func for c in called if isinstance(c, Dispatcher)))
@@ -80,22 +82,23 @@ def _kept(function: Callable[_Parameters, _Result], options: dict[str, Any]) -> 
 
 
 def compiled_part(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """A part of `compiled` functions that Python itself does not call.
+    """Compile a function that is only called by `compiled` functions.
 
-    Without what converts arguments, and kept only within its callers, a short one takes half the time to compile.
+    It has no conversion of arguments and is cached only within its callers, which halves the time to compile a short
+    one.
     """
     options: dict[str, Any] = {**_NO_ARRAYS, "no_cpython_wrapper": True}
     return njit(**options)(function)
 
 
 def compiled_inline(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """A part that is called at one place: it is compiled within the function there, and not once more by itself."""
+    """Compile a function with a single caller as a part of that caller, and not separately."""
     return njit(inline="always", **_NO_ARRAYS)(function)
 
 
 @cache
 def _stamp(folder: Path) -> tuple[tuple[str, int, int], ...]:
-    """Names, times and sizes of the source files of a folder's package: the one next below ``uwlts``."""
+    """Return names, times and sizes of the source files of a folder's package: the one directly below ``uwlts``."""
     package = next((each for each in (folder, *folder.parents) if each.parent.name == "uwlts"), folder)
     found = ((path, path.stat()) for path in sorted(package.rglob("*.py")))
     return tuple((str(path.relative_to(package)), status.st_mtime_ns, status.st_size) for path, status in found)

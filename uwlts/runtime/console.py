@@ -22,13 +22,14 @@ USER_ERROR, INTERRUPTED = 2, 130
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[ProgressListener]:
-    """A bar on standard error, moved by calling ``progress(done, total)``; silent where that is no terminal.
+    """Return a context with a progress bar on standard error, updated by ``progress(done, total)``.
 
-    A bar that is full stands still, so that other programs may print below it; the next stage begins another.
+    Without a terminal it prints nothing. A full bar stops, so that other output can follow below it; the next stage
+    begins another bar.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
-        # A disabled bar of rich before 14.3 prints an empty line.
+        # In rich before 14.3 a disabled bar prints an empty line.
         yield unheard
         return
     times = TimeElapsedColumn(), TimeRemainingColumn()
@@ -51,9 +52,9 @@ def run(app: App) -> int:
 
     A wrong command line is explained by cyclopts, on standard error like all errors.
     """
-    # Matrices are small here: threads for their products gain nothing, and wait for each other where other work runs.
+    # Matrices are small here: threads for their products gain nothing, and delay each other when other programs run.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # A shell starts what a script puts in the background with SIGINT ignored, and a laser could not be stopped by it.
+    # Scripts start background commands with SIGINT ignored, so that it could not stop a laser.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     command: object = None
@@ -74,7 +75,7 @@ def run(app: App) -> int:
         print("interrupted; what is complete is kept: run it again, recordings with --resume", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # The reader has seen enough; what is left unwritten must not be tried again when Python ends.
+        # The reader has closed the pipe; Python must not try to write the rest when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         print(f"error: {error.strerror or error}: {error.filename}", file=sys.stderr)
@@ -83,7 +84,7 @@ def run(app: App) -> int:
 
 
 def as_options(text: str, names: Collection[str]) -> str:
-    """A function's text with the command's options in place of parameters with these names, which are in backticks."""
+    """Replace parameters in backticks by the command's options, for parameters with these names."""
     return re.sub(
         r"(`+)(\w+)\1", lambda found: f"--{found[2].replace('_', '-')}" if found[2] in names else found[0], text
     )

@@ -1,4 +1,4 @@
-"""Ctrl-C that is never lost, for the commands and the processes they start; imports nothing that takes time."""
+"""Delivery of Ctrl-C that cannot get lost, for commands and their worker processes; imports only fast modules."""
 
 import _thread
 import sys
@@ -8,21 +8,21 @@ from contextlib import contextmanager
 from typing import Any
 
 _AGAIN_S = 0.01
-"""Callbacks of weak references take microseconds."""
+"""Delay; callbacks of weak references take microseconds."""
 
 
 @contextmanager
 def interrupts_kept() -> Iterator[None]:
-    """Deliver an interrupt that Python or a library has changed into something else.
+    """Deliver an interrupt that Python or a library has converted to something else.
 
-    One that falls into the callback of a weak reference is reported and dropped by Python; one that falls into a loop
-    that Dr.Jit records is the cause of a RuntimeError.
+    Python reports and drops an interrupt in the callback of a weak reference. An interrupt in a loop that Dr.Jit
+    records becomes the cause of a RuntimeError.
     """
     plain = sys.unraisablehook
 
     def report(dropped: Any) -> None:
         if isinstance(dropped.exc_value, KeyboardInterrupt):
-            # Not from here, where it would be dropped too.
+            # Not here, where it would be dropped, too.
             threading.Timer(_AGAIN_S, _thread.interrupt_main).start()
         else:
             plain(dropped)

@@ -1,4 +1,4 @@
-"""Libraries that only some features need; a missing one is named with the extra that installs it."""
+"""Libraries that only some features need; the message for a missing one states the extra that installs it."""
 
 from importlib import import_module
 from types import ModuleType
@@ -7,7 +7,7 @@ from uwlts.errors import SetupError
 
 
 def optional_library(module: str, *, needed_by: str, extra: str, instead: str = "") -> ModuleType:
-    """Import a library, or a module of it; SetupError if it is not installed, ending with ``instead``."""
+    """Import a library, or a module of it; raises SetupError, ending with ``instead``, if it is not installed."""
     library = module.partition(".")[0]
     try:
         import_module(library)

@@ -1,15 +1,15 @@
-"""How long calculations of both packages tell their progress."""
+"""Interface for reports of progress by long calculations of both packages."""
 
 from typing import Protocol
 
 
 class ProgressListener(Protocol):
-    """Function that is told the progress of a calculation, to draw a bar or to write a line."""
+    """Function that receives the progress of a calculation, to draw a bar or to write a line."""
 
     def __call__(self, done: int, total: int, stage: str = "") -> None:
-        """Take the number of parts done, the number in all, and the name of the stage where there are several."""
+        """Receive the number of finished parts, the total, and the name of the stage if there are several."""
         ...
 
 
 def unheard(done: int, total: int, stage: str = "") -> None:
-    """Progress that nobody follows."""
+    """Ignore the progress."""

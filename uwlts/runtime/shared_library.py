@@ -1,4 +1,4 @@
-"""The shared library of Aravis, by which sensor and twin both speak to cameras.
+"""Shared library of Aravis, for communication of sensor and twin with cameras.
 
 `python -m uwlts.runtime.shared_library` prints the library in use. Exit status 0, or 1 if there is none.
 """

@@ -1,9 +1,9 @@
-"""Working processes of this machine, or the workers of a Dask cluster, for many jobs at a time.
+"""Worker processes on this machine, or workers of a Dask cluster, for many jobs in parallel.
 
-`work_through` does a list of jobs in processes that it starts and ends. `open_workers` keeps processes (or the workers
-of a Dask scheduler) for several rounds of jobs, and survives jobs whose process dies. Processes end when their command
-ends, however that happens: `concurrent.futures` finishes what it has begun and queued before it lets a command end,
-and leaves its processes behind where the command is killed.
+`work_through` runs a list of jobs in processes that it starts and ends. `open_workers` keeps processes (or the workers
+of a Dask scheduler) for several rounds of jobs, and survives jobs whose process dies. These processes
+always end with their command. `concurrent.futures` completes running and queued jobs before a command ends, and leaves
+processes behind if the command is killed.
 """
 
 import gc
@@ -38,39 +38,39 @@ Send = Callable[[Any], None]
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 _GRACE_S = 5.0
-"""Time in which a process that is stopped may leave its files in order; then it removes those that are not complete."""
+"""Time for a stopped process to clean up its files; afterwards it removes incomplete ones."""
 _LEAVE_S = 5.0
-"""Further time, on a busy machine, before it is killed."""
+"""Further time, for a busy machine, before the process is killed."""
 
 _AHEAD = 2
-"""Jobs handed to a cluster per worker: one in work, one waiting, so that no worker waits for this process."""
+"""Jobs submitted to a cluster per worker: one running and one queued, so that no worker waits for this process."""
 
 
 @dataclass(frozen=True)
 class Lost:
-    """A job whose process ended first, with the reason; an error of the program (``by_error``) shows its traceback."""
+    """A job whose process ended first, with the reason; ``by_error``: a program error, whose traceback was printed."""
 
     reason: str
     by_error: bool = False
 
 
 class Workers(ABC):
-    """Workers that do ``count`` jobs at a time, for as many rounds of jobs as needed; made by `open_workers`."""
+    """Workers that run ``count`` jobs in parallel, for any number of rounds; made by `open_workers`."""
 
     count: int
 
     @abstractmethod
     def processes_for(self, jobs: int) -> int:
-        """Number of processes that each of so many jobs may start itself."""
+        """Return the number of processes that each of ``jobs`` jobs may start itself."""
 
     @abstractmethod
     def completed(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
-        """Pairs of a job and the result of ``function(job)``, in the order in which they are done.
+        """Iterate over jobs and results of ``function(job)``, in the order of completion.
 
-        Jobs are taken from ``jobs`` only shortly before they are begun. A job whose process dies is done once more; if
-        its process dies again, its result is `Lost`. What a job raises leaves this function.
+        Jobs are taken from ``jobs`` shortly before they start. A job whose process dies is run again; if its process
+        dies again, its result is `Lost`. Exceptions of jobs are raised here.
 
-        Raises SetupError: the cluster is gone, or a job fails unexpectedly; its traceback stands on standard error.
+        Raises SetupError if the cluster is gone, or a job fails unexpectedly; its traceback is on standard error.
         """
 
 
@@ -78,12 +78,12 @@ class Workers(ABC):
 def open_workers(
     *, workers: int | None = None, scheduler: str | None = None, patience_s: float = 20.0
 ) -> Iterator[Workers]:
-    """So many processes of this machine (one per processor unless given), or the workers of a Dask scheduler.
+    """Open ``workers`` processes on this machine (default: one per processor), or the workers of a Dask scheduler.
 
-    ``patience_s`` is how long the scheduler at the address may take to answer. Processes share the machine's threads.
-    When an exception leaves the body, KeyboardInterrupt stops the jobs that are under way; no process is left.
+    ``patience_s`` is the time limit of the scheduler's answer. Processes share the machine's threads. If an exception
+    leaves the body, running jobs are stopped by KeyboardInterrupt; no process is left.
 
-    Raises SetupError: Dask is not installed, or no scheduler answers at the address, or it has no workers.
+    Raises SetupError if Dask is not installed, no scheduler answers at the address, or it has no workers.
     """
     if scheduler is not None:
         with _cluster(scheduler, patience_s) as cluster:
@@ -101,14 +101,14 @@ def work_through(
     workers: int | None = None,
     on_message: Send = lambda message: None,
 ) -> list[Result]:
-    """Results of ``work(job, send)`` for all jobs, in their order, from several processes.
+    """Return the results of ``work(job, send)`` for all jobs, in order, from several processes.
 
-    Jobs are begun in their order. A job's messages, passed to ``send``, are passed to ``on_message`` in this process.
-    When an exception leaves this function, KeyboardInterrupt stops the jobs that are under way, and no process is left.
-    ``workers`` is the number of processes, one per processor unless given; with 1, jobs run in this process. Each
-    process does linear algebra in one thread, unless the environment sets another number.
+    Jobs start in order. Messages that a job passes to ``send`` are passed to ``on_message`` in this process. If an
+    exception leaves this function, running jobs are stopped by KeyboardInterrupt, and no process is left. ``workers``
+    is the number of processes (default: one per processor); with 1, jobs run in this process. Each process uses one
+    thread for linear algebra, unless the environment sets another number.
 
-    Raises Error or OSError as the first job that fails; SetupError: a process has ended before its job.
+    Raises the Error or OSError of the first job that fails; SetupError if a process ends before its job.
     """
     if workers == 1:
         return [work(job, on_message) for job in jobs]
@@ -122,10 +122,10 @@ def work_through(
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
-    """Pairs of an item and ``function(item)``, in their order, from one thread per processor.
+    """Iterate over items and ``function(item)``, in order, computed in one thread per processor.
 
     For functions that spend their time outside the interpreter, in OpenCV, NumPy or compiled code. Items are taken in
-    this thread, only shortly before their turn. What a function raises leaves this function.
+    this thread, shortly before their turn. Exceptions of the function are raised here.
     """
     threads = processors()
     with ThreadPoolExecutor(threads) as pool:
@@ -140,15 +140,15 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
 
 
 def processors() -> int:
-    """Number of processors that this process may use."""
-    # Only Linux knows which processors a process is confined to.
+    """Return the number of processors that this process may use."""
+    # Only Linux reports a restriction of the process to some processors.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Processes(Workers):
-    """Processes of this machine, started when the first jobs come.
+    """Processes on this machine, started with the first jobs.
 
-    The context ends them, by KeyboardInterrupt if an exception leaves it; after a while they are killed.
+    At its end the context stops them, by KeyboardInterrupt after an exception; after a time limit they are killed.
     """
 
     def __init__(self, count: int, *, threads: int):
@@ -166,7 +166,7 @@ class _Processes(Workers):
             process.end(deadline)
 
     def processes_for(self, jobs: int) -> int:
-        """More than one where there are more processes than jobs."""
+        """Return more than one if there are more processes than jobs."""
         return max(1, self.count // max(jobs, 1))
 
     def completed(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
@@ -179,14 +179,14 @@ class _Processes(Workers):
                 lost.append(job)
             else:
                 yield job, result
-        # One at a time: a process that died for want of memory has all of it now.
+        # One at a time: a process that died due to lack of memory now has all of it.
         for job in lost:
             yield from ((job, result) for _, _, result in self.run(silent, [job]))
 
     def run(
         self, work: Callable[[Job, Send], Result], jobs: Iterable[Job], on_message: Send = lambda message: None
     ) -> Iterator[tuple[int, Job, Result | Lost]]:
-        """Number, job and result of each job as it is done; its process has the next job by then."""
+        """Iterate over number, job and result of each job as it is completed; its process has the next job by then."""
         waiting = enumerate(jobs)
         busy: dict[object, tuple[_Process, int, Job]] = {}
         idle = deque(self._processes)
@@ -225,18 +225,18 @@ def _without_messages(function: Callable[[Job], Result], job: Job, send: Send) -
 
 
 class _Process:
-    """A process, which starts when it is given its first job, and the connection to it."""
+    """A process, which starts with its first job, and the connection to it."""
 
     def __init__(self, threads: int):
         context = multiprocessing.get_context("spawn")
         self.connection, self._theirs = context.Pipe()
-        # Not a daemon, which could start no processes of its own; it watches its parent itself.
+        # Not a daemon, because daemons cannot start processes; it watches its parent itself.
         self._process = context.Process(target=_serve, args=(self._theirs,))
         self._threads = threads
         self._work: Callable[[Any, Send], Any] | None = None
 
     def give(self, work: Callable[[Any, Send], Any], job: Any) -> None:
-        """Hand over a job, and what to do with it where that is new."""
+        """Send a job, and its function if that is new."""
         if self._process.pid is None:
             _start(self._process, self._threads)
             self._theirs.close()
@@ -248,7 +248,7 @@ class _Process:
             self.connection.send(("job", job))
 
     def message(self) -> tuple[Literal["message", "raised", "done"], Any] | Lost:
-        """A message of the job, its result ("done") or its error ("raised"), or that the process has ended."""
+        """Receive a message of the job, its result ("done"), its error ("raised"), or the end of the process."""
         try:
             return self.connection.recv()
         except (EOFError, ConnectionResetError):
@@ -256,8 +256,8 @@ class _Process:
             code = self._process.exitcode
             how = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
             return Lost(
-                f"a working process has ended unexpectedly ({how}), perhaps for want of memory: run fewer workers at a "
-                "time",
+                f"a worker process has ended unexpectedly ({how}), perhaps due to lack of memory: run "
+                "fewer workers at a time",
                 by_error=code == 1,  # Python's exit code after an exception.
             )
 
@@ -281,14 +281,14 @@ class _Process:
 
 
 def _start(process: BaseProcess, threads: int) -> None:
-    """Start a process that does linear algebra in so many threads, unless the environment says otherwise.
+    """Start a process that uses ``threads`` threads for linear algebra, unless the environment sets another number.
 
-    With a thread for each processor in each of as many processes they wait for each other: two joint calibrations at a
-    time took 17 to 25 s instead of 6 to 8 s on two processors. SIGINT is blocked meanwhile, so that the process never
-    receives Ctrl-C, which the command alone handles.
+    With one thread per processor in every process, the threads delay each other: two joint calibrations in parallel
+    took 17 to 25 s instead of 6 to 8 s on two processors. SIGINT is blocked during the start, so that only the command,
+    and never the process, receives Ctrl-C.
     """
     given = {name: os.environ[name] for name in _THREADS if name in os.environ}
-    # Starting Python's tracker of shared resources would let interrupts through again.
+    # Started here, because starting Python's resource tracker later would unblock interrupts.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(dict.fromkeys(_THREADS, str(threads)) | given)
@@ -301,7 +301,7 @@ def _start(process: BaseProcess, threads: int) -> None:
 
 
 def _serve(connection: Connection) -> None:
-    """Do one job after the other in a process, until there are no more or it is stopped."""
+    """Run one job after another in a process, until there are no more or it is stopped."""
     stopped = threading.Event()
 
     def stop(*_: object) -> None:
@@ -334,27 +334,27 @@ def _serve(connection: Connection) -> None:
                 else:
                     send("done", result)
                     if not frozen:
-                        # What is imported by now stays, and the collector need not look through it again.
+                        # Modules imported by now are kept, so the garbage collector need not scan them again.
                         gc.freeze()
                         frozen = True
     finally:
-        # Whatever the interrupt has become on its way through a library, there is nothing to say about it.
+        # Whatever a library has made of the interrupt, there is nothing to report.
         if stopped.is_set():
             remove_unfinished()
             os._exit(1)
 
 
 def _signals() -> socket.socket:
-    """A socket that can be read as soon as a signal comes, also while a library computes, when no handler runs."""
+    """Return a socket that becomes readable at a signal, even while a library computes and no handler runs."""
     reader, writer = socket.socketpair()
     writer.setblocking(False)
-    # Without a warning where the socket is full: one signal is enough.
+    # No warning if the socket is full: one signal suffices.
     signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
     return reader
 
 
 def _end_when_stopped(signals: socket.socket) -> None:
-    """End the process after a signal, or after the end of the process that has started it."""
+    """End the process after a signal, or after the end of its parent process."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     while True:
@@ -370,13 +370,13 @@ def _end_when_stopped(signals: socket.socket) -> None:
 
 
 class _Cluster(Workers):
-    """Workers of a Dask cluster, which does jobs of lost workers again by itself."""
+    """Workers of a Dask cluster, which repeats the jobs of lost workers itself."""
 
     def __init__(self, executor: Any, count: int, killed: type[Exception]):
         self._executor, self.count, self._killed = executor, count, killed
 
     def processes_for(self, jobs: int) -> int:
-        """One: a worker of a cluster may not start processes."""
+        """Return 1: a worker of a cluster may not start processes."""
         return 1
 
     def completed(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
@@ -419,5 +419,5 @@ def _cluster(address: str, patience_s: float) -> Iterator[_Cluster]:
         try:
             yield _Cluster(executor, count, KilledWorker)
         finally:
-            # What waits is not begun.
+            # Queued jobs are not started.
             executor.shutdown(wait=False)

@@ -1,4 +1,4 @@
-"""Files of calibrations: JSON, written whole or not at all, and checked when they are read."""
+"""Files of calibrations: JSON, written completely or not at all, and validated when read."""
 
 from pathlib import Path
 from typing import TypedDict
@@ -14,7 +14,7 @@ from uwlts.model.polynomial_calibration import (
 
 
 class _Known(TypedDict):
-    """By what a file of calibrations is recognised."""
+    """Properties that identify a file of calibrations."""
 
     format: str
     version: int
@@ -30,17 +30,17 @@ _POLYNOMIALS: _Known = {
 
 
 def read_calibration(path: str | Path) -> Calibration:
-    """Read a calibration; CaptureError where the file is missing, foreign, newer or damaged."""
+    """Read a calibration; raises CaptureError if the file is missing, foreign, newer or damaged."""
     return read_model(path, Calibration, **_CALIBRATION)
 
 
 def read_polynomials(path: str | Path) -> PolynomialCalibration:
-    """Read a polynomial calibration; CaptureError where the file is missing, foreign, newer or damaged."""
+    """Read a polynomial calibration; raises CaptureError if the file is missing, foreign, newer or damaged."""
     return read_model(path, PolynomialCalibration, **_POLYNOMIALS)
 
 
 def load_calibration(path: str | Path) -> AnyCalibration:
-    """Read a calibration of any kind; CaptureError if the file is missing, foreign, newer or damaged."""
+    """Read a calibration of any kind; raises CaptureError if the file is missing, foreign, newer or damaged."""
     content = read_json(path, called="calibration")
     if content.get("format") == POLYNOMIALS_FORMAT:
         return model_in(content, path, PolynomialCalibration, **_POLYNOMIALS)
@@ -48,5 +48,5 @@ def load_calibration(path: str | Path) -> AnyCalibration:
 
 
 def loaded_calibration(calibration: AnyCalibration | str | Path) -> AnyCalibration:
-    """The calibration itself, or the one in a file; CaptureError as from `load_calibration`."""
+    """Return a calibration unchanged, or read it from a file; raises the errors of `load_calibration`."""
     return load_calibration(calibration) if isinstance(calibration, str | Path) else calibration

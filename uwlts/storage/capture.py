@@ -1,21 +1,20 @@
-"""The capture file: what a camera saw of a scan, with everything known about it; `capture_writer` writes it.
+"""Capture file: the frames of a camera with all metadata; `capture_writer` writes it.
 
 An HDF5 file with ``frames (N, H, W)`` (8 or 16 bit, one chunk per frame, Blosc zstd with bit shuffle, Fletcher-32
-checksum), per frame ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposure_ms`` and ``time_s``, perhaps
-``pose_covariance`` (6, 6), and attributes
-``format``, ``version`` and ``header``: JSON with sensor, medium, target, artefact and provenance. Nothing in it is ever
-executed, and real and synthetic captures look the same.
+checksum) and, per frame, ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposure_ms``, ``time_s`` and optionally
+``pose_covariance`` (6, 6). Its attributes are ``format``, ``version`` and ``header``: JSON with sensor, medium, target,
+artefact and provenance. Nothing in the file is ever executed, and real and synthetic captures have the same structure.
 
-The frames of a 3D camera, which finds the stripe itself, are centre lines (version 2): ``centre_lines (N, 4, L)`` has
-the rows centre, amplitude, width and status of a `Stripe`, ``has_image (N,)`` says which frames are images all the
-same, such as those of a target, and ``encoder (N,)`` is the count of an encoder at each frame, NaN where there is none.
-A part of ``frames`` or ``centre_lines`` that a frame does not have takes no space.
+The frames of a 3D camera, which extracts the stripe itself, are centre lines (version 2). ``centre_lines (N, 4, L)``
+has the rows centre, amplitude, width and status of a `Stripe`. ``has_image (N,)`` marks frames that are images, such as
+those of a target. ``encoder (N,)`` is the encoder count of each frame, or NaN. Parts of ``frames`` or ``centre_lines``
+that a frame does not use take no space.
 
-Frames of a stage that moves have its ``speed_mm_per_s (N,)`` (version 2 too), positive where positions grow, and the
-capture holds what the stage reported meanwhile: ``stage_reports (M, 2)``, time in s of the frames' clock and position.
+A capture of a moving stage has ``speed_mm_per_s (N,)`` (also version 2), positive for growing positions, and the
+stage's reports during the motion: ``stage_reports (M, 2)`` with time in s on the frames' clock and position in mm.
 
-While it is being recorded the file is called ``NAME.part`` and every frame is flushed in HDF5's single-writer mode, so
-an interrupted recording keeps all its complete frames; closing it gives it its name.
+During recording the file is called ``NAME.part`` and every frame is flushed in HDF5's single-writer mode, so that an
+interrupted recording keeps all its complete frames. Closing the file renames it.
 """
 
 import re
@@ -40,43 +39,43 @@ from uwlts.storage.unfinished_hdf5 import UnfinishedFile, has_writer
 
 FORMAT = "uwlts-capture"
 VERSION = 2
-"""Of captures with centre lines or a moving stage; those of images at rest have version 1."""
+"""Version of captures with centre lines or a moving stage; captures of images at rest have version 1."""
 PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
-"""Columns of every capture, with the shape of a frame's value."""
+"""Columns of every capture, with the shape of one frame's value."""
 COVARIANCE = "pose_covariance"
 MORE = {"has_image": bool, "encoder": float, "speed_mm_per_s": float}
 """Columns of version 2."""
 POSE_ROUNDED = 1e-4
-"""By how much a pose's elements may be off a rotation, as tables give them with four decimals or more."""
+"""Largest deviation of a pose's elements from a rotation, for tables with four or more decimals."""
 
 Seen = np.ndarray | Stripe
-"""What a camera gives of a moment: an image (H, W) of uint8 or uint16, or of a 3D camera the stripe that it found."""
+"""Content of a frame: an image (H, W) of uint8 or uint16, or the stripe extracted by a 3D camera."""
 
 
 def image_of(seen: Seen, called: str) -> np.ndarray:
-    """What was seen as an image (H, W); ImageError where it is a centre line."""
+    """Return an image (H, W) unchanged; raises ImageError for a centre line."""
     if isinstance(seen, Stripe):
         raise ImageError(
-            f"{called} is a centre line, as a 3D camera gives it, where an image is needed: take images with its pixel "
+            f"{called} is a centre line from a 3D camera where an image is needed: take images with its pixel "
             "format Mono8 for targets and exposures"
         )
     return seen
 
 
 def picture_of(seen: Seen, camera: Camera) -> np.ndarray:
-    """What was seen as an image (H, W) to draw on: dark for a centre line."""
+    """Return an image (H, W) to draw on; it is black for a centre line."""
     return np.zeros((camera.height_px, camera.width_px), np.uint8) if isinstance(seen, Stripe) else seen
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What was seen, with its stage position, light, exposure, time, and pose ``T_scene_object`` (4, 4) if known.
+    """A frame with its stage position, light, exposure, time, and pose ``T_scene_object`` (4, 4) if known.
 
-    ``pose_covariance`` (6, 6) is that of the pose, if it is known: of the shift in mm, then of a further rotation in
-    rad about the scene's axes. Where the capture states a mount the pose is the platform's.
+    ``pose_covariance`` (6, 6) is that of the shift in mm, then of a further rotation in rad about the scene's axes, if
+    known. If the capture states a mount, the pose is that of the platform. ``encoder`` is the encoder count, if any.
 
-    ``encoder`` is the count of an encoder at that moment, where there is one. Of a stage that moves, position and time
-    are those in the middle of the exposure, of an image's middle row where the shutter is rolling.
+    For a moving stage, position and time are those at the middle of the exposure; with a rolling shutter, of the
+    image's middle row.
     """
 
     seen: Seen
@@ -91,16 +90,16 @@ class Frame:
 
     @property
     def image(self) -> np.ndarray:
-        """The image (H, W); ImageError where it is a centre line."""
+        """The image (H, W); raises ImageError if the frame is a centre line."""
         return image_of(self.seen, f"the frame at {self.time_s:g} s")
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTable:
-    """What is known of each image of a recording besides its pixels, as of a `Capture`.
+    """Metadata of the images of a recording, with the attributes of `Capture`.
 
-    ``stage_mm``, ``exposure_ms`` and ``speed_mm_per_s`` are (N,), ``pose`` is (N, 4, 4), NaN where an image has none;
-    ``path`` is what the recording is called.
+    ``stage_mm``, ``exposure_ms`` and ``speed_mm_per_s`` are (N,). ``pose`` is (N, 4, 4), NaN for images without one.
+    ``path`` is the name of the recording.
     """
 
     header: CaptureHeader
@@ -112,7 +111,7 @@ class FrameTable:
 
     @classmethod
     def of(cls, header: CaptureHeader, frames: Sequence[Frame]) -> "FrameTable":
-        """The table of frames that are in memory."""
+        """Return the table of frames in memory."""
         none = np.full((4, 4), np.nan)
         return cls(
             header,
@@ -125,17 +124,17 @@ class FrameTable:
 
 
 def sensor_poses(capture: "Capture | FrameTable") -> np.ndarray:
-    """``T_scene_object`` (N, 4, 4) of the sensor's OCS: the poses, or the platform's with the mount of the drawing."""
+    """Return ``T_scene_object`` (N, 4, 4) of the sensor's OCS: the poses, combined with the mount if there is one."""
     mount = capture.header.T_platform_sensor
     return capture.pose if mount is None else capture.pose @ np.array(mount)
 
 
 CAPTURES = (".h5",)
-"""Endings of captures."""
+"""File name endings of captures."""
 
 
 def part_path(path: Path) -> Path:
-    """Name of an unfinished recording of ``path``."""
+    """Return the name of an unfinished recording of ``path``."""
     return path.with_name(path.name + ".part")
 
 
@@ -147,7 +146,7 @@ def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
 
 
 def require_covariances(values: np.ndarray, path: Path) -> None:
-    """CaptureError where values (N, 6, 6) are no covariances."""
+    """Raise CaptureError if values (N, 6, 6) are not covariances."""
     if values.shape[1:] != (6, 6) or not np.isfinite(values).all():
         raise CaptureError(f"{path}: the covariance of a pose is a finite array (6, 6)")
     sizes = np.sqrt(np.maximum(np.einsum("nii->ni", values), 1e-30))
@@ -157,43 +156,42 @@ def require_covariances(values: np.ndarray, path: Path) -> None:
 
 
 def _what_is_wrong(error: Exception) -> str:
-    """HDF5's message about a file that it cannot open; the two most usual ones in plain English."""
+    """Return HDF5's message about a file that it cannot open; the two most frequent ones in plain English."""
     if found := re.search(r"truncated file: eof = (\d+).*stored_eof = (\d+)", str(error)):
-        return f"{int(found[1]):,} of its {int(found[2]):,} bytes are there; copy it again"
+        return f"it has {int(found[1]):,} of its {int(found[2]):,} bytes; copy it again"
     if "file signature not found" in str(error):
-        return "it is no HDF5 file"
-    return f"HDF5 says: {error}"
+        return "it is not an HDF5 file"
+    return f"HDF5 reports: {error}"
 
 
 class Capture(AbstractContextManager["Capture"]):
-    """A capture opened for reading: per-frame arrays in memory, images read on demand.
+    """A capture opened for reading: metadata in memory, images read on demand.
 
-    A recording that is still going on can be read too; it has the frames that were complete when it was opened.
+    A recording in progress can be read, too; it has the frames that were complete when it was opened.
 
     Attributes
     ----------
     header : CaptureHeader
-        What holds for all frames.
+        Metadata common to all frames.
     dtype : dtype
         Type of the images, uint8 or uint16.
     stage_mm, exposure_ms, time_s : (N,) float64
-        Stage position in mm, exposure in ms, time in s of every frame; finite, exposures not negative, and times not
-        running backwards.
+        Stage position, exposure and time of every frame: finite, exposures not negative, times not decreasing.
     laser_on : (N,) bool
         Whether the laser was on, rather than the lamp.
     pose : (N, 4, 4) float64
         ``T_scene_object`` of the sensor's OCS, a rotation with a shift; all NaN for a frame without one. It is that of
-        the platform, ``T_scene_platform``, where the header states ``T_platform_sensor``.
-    pose_covariance : (N, 6, 6) float64 or None
-        Covariance of each pose (`Frame`), all NaN where it is not known; None in captures without any.
+            the platform, ``T_scene_platform``, if the header states ``T_platform_sensor``.
+        pose_covariance : (N, 6, 6) float64 or None
+            Covariance of each pose (`Frame`), all NaN if unknown; None in captures without any.
     has_image : (N,) bool
         Whether a frame is an image, rather than a centre line.
     encoder : (N,) float64
-        Count of an encoder at each frame; NaN where there is none.
+        Encoder count at each frame; NaN without an encoder.
     speed_mm_per_s : (N,) float64
-        Speed of the stage at each frame, positive where positions grow; 0 at rest.
+        Speed of the stage at each frame, positive for growing positions; 0 at rest.
     stage_reports : (M, 2) float64
-        What a stage reported while it moved: time in s, as of ``time_s``, and position in mm.
+        Reports of the stage during the motion: time in s on the clock of ``time_s``, and position in mm.
 
     Raises
     ------
@@ -280,20 +278,20 @@ class Capture(AbstractContextManager["Capture"]):
         if (self.exposure_ms < 0).any():
             raise CaptureError(f"{self.path} holds negative exposures")
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
-            # The writer was killed between making room for its last frame and storing it.
+            # The writer was killed between extending the datasets and storing its last frame.
             self._count -= 1
             for name in (*PER_FRAME, *MORE, *([] if self.pose_covariance is None else [COVARIANCE])):
                 setattr(self, name, getattr(self, name)[: self._count])
         if (np.diff(self.time_s) < 0).any():
-            raise CaptureError(f"{self.path} holds times that run backwards")
+            raise CaptureError(f"{self.path} holds times that decrease")
 
     def _require_stored(self, parts: h5py.Dataset, count: int, called: str) -> None:
-        # HDF5 shows chunks that were never stored as zeros.
+        # HDF5 returns zeros for chunks that were never stored.
         if parts.id.get_num_chunks() < count:
             raise CaptureError(f"{self.path} is damaged: it holds {parts.id.get_num_chunks()} of {count} {called}")
 
     def _dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
-        """A dataset with one row of a shape per frame; CaptureError where it is something else."""
+        """Return a dataset with one row of this shape per frame; raises CaptureError for any other dataset."""
         dataset = _dataset(self.file, name, self.path)
         if dataset.shape[1:] != shape or dataset.dtype.kind != kind:
             raise CaptureError(
@@ -303,7 +301,7 @@ class Capture(AbstractContextManager["Capture"]):
         return dataset
 
     def __repr__(self) -> str:
-        """Name of the file, and numbers of images."""
+        """Return the file name and the numbers of images."""
         return f"Capture: {self.path.name}, {len(self)} images, {int(self.laser_on.sum())} with the laser on"
 
     def __len__(self) -> int:
@@ -311,15 +309,15 @@ class Capture(AbstractContextManager["Capture"]):
 
     @property
     def finished(self) -> bool:
-        """Whether the recording was closed, rather than interrupted."""
+        """Whether the recording was finished, rather than interrupted."""
         return self.path.suffix != ".part"
 
     def plan(self) -> Table | None:
-        """The plan of an unfinished recording; None where it has none."""
+        """Return the plan of an unfinished recording, or None."""
         return read_plan(self.file)
 
     def seen(self, index: int) -> Seen:
-        """Image (H, W) or centre line of a frame; raises CaptureError where its data are damaged."""
+        """Return the image (H, W) or centre line of a frame; raises CaptureError if its data are damaged."""
         if not 0 <= index < self._count:
             raise IndexError(f"frame {index} of {self._count}")
         try:
@@ -344,11 +342,11 @@ class Capture(AbstractContextManager["Capture"]):
         return Stripe(centre, amplitude.astype(np.float32), width.astype(np.float32), status.astype(np.uint8), along)
 
     def image(self, index: int) -> np.ndarray:
-        """Image (H, W) of a frame; ImageError where it is a centre line, CaptureError where its data are damaged."""
+        """Return the image (H, W) of a frame; raises ImageError for a centre line, CaptureError for damaged data."""
         return image_of(self.seen(index), f"frame {index} of {self.path.name}")
 
     def __getitem__(self, index: int) -> Frame:
-        """A frame with everything known about it; raises CaptureError where its data are damaged."""
+        """Return a frame with its metadata; raises CaptureError if its data are damaged."""
         index = index + self._count if index < 0 else index
         seen = self.seen(index)
         columns = (self.stage_mm, self.laser_on, self.exposure_ms, self.time_s)
@@ -361,7 +359,7 @@ class Capture(AbstractContextManager["Capture"]):
         return Frame(seen, *(column[index].item() for column in columns), **known)
 
     def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:
-        """Index and image of all frames, or only of those with the laser on or off; ImageError at a centre line."""
+        """Iterate over indices and images, of one light if given; raises ImageError at a centre line."""
         for index in range(self._count):
             if laser_on is None or bool(self.laser_on[index]) == laser_on:
                 yield index, self.image(index)
@@ -379,18 +377,18 @@ class Capture(AbstractContextManager["Capture"]):
 
 @contextmanager
 def opened_captures(captures: Iterable[Capture | str | Path]) -> Iterator[list[Capture]]:
-    """A context with several captures, each as from `opened_capture`."""
+    """Open several captures as a context, each as by `opened_capture`."""
     with ExitStack() as stack:
         yield [stack.enter_context(opened_capture(each)) for each in captures]
 
 
 def opened_capture(capture: Capture | str | Path) -> AbstractContextManager[Capture]:
-    """A context with an opened capture: one that is open already stays so, a file is opened and closed."""
+    """Return a context with a capture: a path is opened and closed, an open capture stays open."""
     return nullcontext(capture) if isinstance(capture, Capture) else Capture(capture)
 
 
 def source_of(capture: Capture) -> CaptureSource:
-    """Name, SHA-256 and number of images of a capture, its medium and window, and its subject."""
+    """Return name, SHA-256, numbers of images, medium, window and subject of a capture."""
     header, laser = capture.header, int(np.count_nonzero(capture.laser_on))
     medium = header.medium
     known: Table = {"medium": header.medium_name, "window": header.sensor.camera.window.mounted}

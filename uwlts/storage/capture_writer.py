@@ -1,4 +1,4 @@
-"""Writes capture files frame by frame, so that an interrupted recording keeps all its complete frames."""
+"""Writing of capture files frame by frame, so that an interrupted recording keeps all its complete frames."""
 
 import math
 import os
@@ -32,19 +32,39 @@ from uwlts.storage.capture import (
 )
 from uwlts.storage.hdf5_file import forget_plan, write_label, write_plan
 
-# Room for HDF5's own bookkeeping when a frame is added: its index and the chunks of the other datasets.
+# Space for HDF5's metadata of an added frame: its index and the chunks of the other datasets.
 _MARGIN_BYTES = 2**18
 
 
 class CaptureWriter(AbstractContextManager["CaptureWriter"]):
-    """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
+    """Recording of a capture, as a context manager: a normal exit finishes the file, an exception keeps the part.
 
-    ``dtype`` is that of images; with ``centre_lines`` laser frames are centre lines, with ``moving`` frames have a
-    speed, and the stage's reports are added by `place`; with ``covariances`` frames may have that of their pose.
-    ``plan`` says, as JSON, what is to be recorded beyond what the header states; it is kept in the part and not in the
-    finished capture. OutputError where the file exists (give ``overwrite``), is an input of the running command or is
-    being written by another process, a part is left over (give ``resume`` or ``overwrite``), or storage fails;
-    CaptureError for ``resume`` of a part that is damaged, or of another header or plan.
+    Parameters
+    ----------
+    path : str or Path
+        The capture.
+    header : CaptureHeader
+        Metadata common to all frames.
+    dtype : dtype
+        Type of the images, uint8 or uint16.
+    centre_lines : bool
+        Laser frames are centre lines.
+    moving : bool
+        Frames have a speed, and `place` adds the stage's reports.
+    plan : dict, optional
+        Further description of the recording as JSON, kept in the part but not in the finished capture.
+    covariances : bool
+        Frames may have a covariance of their pose.
+    overwrite, resume : bool
+        Replace an existing capture or part; continue a part.
+
+    Raises
+    ------
+    OutputError
+        The file exists, is an input of the running command or is being written by another process, a part exists, or
+        writing fails.
+    CaptureError
+        The part to resume is damaged, or has another header or plan.
     """
 
     def __init__(
@@ -76,22 +96,22 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 refuse_input(self._part)
             if self._part.exists() and not (resume or overwrite):
                 raise OutputError(
-                    f"{self._part} is left from an interrupted run; give `resume` to go on or `overwrite`"
+                    f"{self._part} is left from an interrupted run; give `resume` to continue it or `overwrite`"
                 )
-            with self._left_over() if resume and self._part.exists() else nullcontext(()) as unfinished:
+            with self._open_part() if resume and self._part.exists() else nullcontext(()) as unfinished:
                 self._begin(unfinished)
-            # Nothing is locked: whoever looks at a running recording must not stop it.
+            # Without a lock, so that readers cannot stop a running recording.
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
             self._arrays = _arrays(self._file)
             self._claimed = claimed.pop_all()
 
-    def _left_over(self) -> "Capture":
-        """The unfinished recording to go on with; CaptureError where it is not one of this capture."""
+    def _open_part(self) -> "Capture":
+        """Open the unfinished recording to continue; raises CaptureError if it is not one of this capture."""
         try:
             unfinished = Capture(self._part)
         except CaptureError as error:
-            raise CaptureError(f"cannot resume: {error}; give `overwrite` to start afresh") from error
+            raise CaptureError(f"cannot resume: {error}; give `overwrite` to start again") from error
         held = unfinished.header, unfinished.dtype, unfinished.plan()
         there = _recording_table(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
         kinds = {"lines": bool(self._lines), "moving": self._moving}
@@ -99,16 +119,16 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         if others := differences(there, wanted):
             unfinished.close()
             raise CaptureError(
-                f"{self._part} belongs to another recording: {others}. Go on with the plan of that one, give "
-                "another name, or `overwrite` to start afresh"
+                f"{self._part} belongs to another recording: {others}. Continue with the plan of that one, give "
+                "another name, or `overwrite` to start again"
             )
         return unfinished
 
     def _begin(self, unfinished: "Capture | Sequence[Frame]") -> None:
-        """Put a valid part in place, empty or with the complete frames of the one left over.
+        """Create a valid part, empty or with the complete frames of the unfinished one.
 
-        HDF5 cannot append to a killed writer's file, so a new one is made; it is made aside, so that a run that is
-        killed meanwhile leaves the old one.
+        HDF5 cannot append to a killed writer's file, so a new file is written. It has a temporary name, so that a run
+        that is killed meanwhile leaves the old part.
         """
         fresh = self._part.with_suffix(".fresh")
         try:
@@ -117,7 +137,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 write_label(self._file, format=FORMAT, version=self._version(), header=self.header)
                 if self._plan is not None:
                     write_plan(self._file, self._plan)
-                # The checksum finds damage that the compression would decode to a different picture.
+                # The checksum detects damage that would otherwise be decompressed to another image.
                 parts = {"frames": (self._shape, self._dtype)}
                 if self._lines:
                     parts["centre_lines"] = (len(ROWS), self._lines), np.dtype(float)
@@ -136,12 +156,13 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                     self._file.create_dataset("stage_reports", (0, 2), float, maxshape=(None, 2), chunks=(256, 2))
                 for name, shape in columns.items():
                     kind, chunks = MORE.get(name, bool if name == "laser_on" else float), (256, *shape)
-                    # No checksum: a kill while 256 rows are rewritten would then lose them all, not only the last one.
+                    # No checksum: if a kill interrupts the rewriting of a chunk, it would lose 256 rows instead of the
+                    # last one.
                     self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
                 self._arrays = _arrays(self._file)
                 for frame in unfinished:
                     self._store(frame)
-            _cut_to_used(fresh)
+            _truncate(fresh)
             os.replace(fresh, self._part)
         finally:
             fresh.unlink(missing_ok=True)
@@ -150,16 +171,22 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         return VERSION if self._lines or self._moving else 1
 
     def __len__(self) -> int:
-        """Number of complete frames written."""
+        """Return the number of complete frames written."""
         return len(self._arrays["time_s"])
 
     def append(self, frame: Frame) -> None:
         """Store one frame; once this returns, the frame survives the end of the program.
 
-        ImageError where what was seen has another size or type than the capture, or a laser frame is an image where the
-        capture has centre lines; CaptureError where stage position,
-        exposure, time or pose is not finite, the exposure is negative, the time is before the last frame's, or the pose
-        is no rotation with a shift (4, 4); OutputError where storage fails, the frames before being kept.
+        Raises
+        ------
+        ImageError
+            The frame has another size or type than the capture, or is an image with the laser on in a capture of centre
+            lines.
+        CaptureError
+            Stage position, exposure, time or pose is not finite, the exposure is negative, the time is before that of
+            the last frame, or the pose is not a rotation with a shift (4, 4).
+        OutputError
+            Writing fails; earlier frames are kept.
         """
         self._require_fitting(frame)
         if frame.speed_mm_per_s and not self._moving:
@@ -171,12 +198,12 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             )
         if frame.time_s < self._last_s:
             raise CaptureError(
-                f"a frame at {frame.time_s} s cannot follow one at {self._last_s} s: give times that grow"
+                f"a frame at {frame.time_s} s cannot follow one at {self._last_s} s: give increasing times"
             )
         if frame.pose is not None and (np.shape(frame.pose) != (4, 4) or not np.isfinite(frame.pose).all()):
-            raise CaptureError(f"a pose is a finite array (4, 4); found {frame.pose}")
+            raise CaptureError(f"a pose must be a finite array (4, 4); found {frame.pose}")
         if frame.pose is not None and not is_rigid(frame.pose, within=POSE_ROUNDED):
-            raise CaptureError(f"a pose is a rotation, a shift and 0 0 0 1; found {frame.pose.tolist()}")
+            raise CaptureError(f"a pose must be a rotation, a shift and 0 0 0 1; found {frame.pose.tolist()}")
         if frame.pose_covariance is not None:
             if COVARIANCE not in self._per_frame:
                 raise CaptureError("the capture was begun without covariances of poses: begin it with covariances=True")
@@ -185,7 +212,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             self._store(frame)
 
     def place(self, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray, reports: np.ndarray) -> None:
-        """Correct positions and speeds (N,) of the frames, once the stage's ``reports`` (M, 2) are complete."""
+        """Correct positions and speeds (N,) of the frames when the stage's ``reports`` (M, 2) are complete."""
         with self._storage():
             for name, values in (
                 ("stage_mm", stage_mm),
@@ -222,10 +249,10 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             kept, seen = "frames", frame.seen
         if COVARIANCE in self._per_frame:
             values[COVARIANCE] = np.full((6, 6), np.nan) if frame.pose_covariance is None else frame.pose_covariance
-        # The time comes last: by its number frames are counted.
+        # The time is written last: its length is the number of frames.
         values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
         count = len(self)
-        # A piece of a dataset that is not written takes no space.
+        # Chunks of a dataset that are not written take no space.
         for name in ("frames", "centre_lines") if self._lines else ("frames",):
             dataset = self._arrays[name]
             dataset.resize(count + 1, axis=0)
@@ -240,7 +267,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._last_s = frame.time_s
 
     def _claim_space(self) -> None:
-        """Make the file long enough for one more frame, by zeros behind what HDF5 uses; OSError where the disk is full.
+        """Extend the file by zeros to hold one more frame; raises OSError if the disk is full.
 
         HDF5 does not survive a full disk: closing the file fails and the process may crash.
         """
@@ -253,7 +280,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
 
     @contextmanager
     def _storage(self) -> Iterator[None]:
-        """A context in which failures of the storage become OutputErrors."""
+        """Convert errors of the file system and of HDF5 to OutputError."""
         try:
             yield
         except (OSError, RuntimeError) as error:
@@ -268,24 +295,24 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             if kind is None:
                 if self._plan is not None:
                     forget_plan(self._part)
-                _cut_to_used(self._part)
+                _truncate(self._part)
                 refuse_input(self.path)
                 os.replace(self._part, self.path)
                 note_made(self.path)
 
 
-def _cut_to_used(path: Path) -> None:
-    """Cut off space that was claimed and not used, as HDF5 does when a file is opened and closed once more."""
+def _truncate(path: Path) -> None:
+    """Cut off unused space, which HDF5 does when a file is opened and closed again."""
     h5py.File(path, "r+", locking=False).close()
 
 
 def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, lines: bool, moving: bool) -> Table:
-    """What a recording is to hold, as JSON."""
+    """Return a description of a recording as JSON."""
     held = f"{dtype}{' and centre lines' if lines else ''}{', moving' if moving else ''}"
     return {"plan": plan, "images": held, "header": header.model_dump(mode="json")}
 
 
 def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """A capture's datasets by their names, in a file of this program's."""
+    """Return the datasets of a capture by name."""
     names = ("frames", "centre_lines", "stage_reports", *MORE, COVARIANCE, *PER_FRAME)
     return {name: cast(h5py.Dataset, file[name]) for name in names if name in file}

@@ -1,4 +1,4 @@
-"""A measured point cloud: points, what is known of each, and its uncertainty. `cloud_files` reads and writes it."""
+"""A measured point cloud: points with their attributes and uncertainty. `cloud_files` reads and writes it."""
 
 import json
 import os
@@ -14,26 +14,26 @@ from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
+"""Stored elements of the symmetric 3x3 covariance matrix: xx, xy, xz, yy, yz, zz."""
 
 FOOTPRINT, FOOTPRINT_STD = "footprint_mm", "footprint_std"
-"""Metadata of clouds of unmoved sensors: standard deviations of the part of a surface that a point is the mean of,
-across the sheet (X) and along the stripe (Y), mm, and the relative standard uncertainty of their squares."""
+"""Metadata of clouds of sensors at rest: standard deviations of the footprint, the surface area that a point averages,
+across the sheet (X) and along the stripe (Y), mm; and the relative standard uncertainty of their squares."""
 
 NO_INDEX = -1
-"""Frame and line of points whose file does not name them."""
+"""Frame and line of points whose file does not state them."""
 
 PER_POINT = ("points_mm", "intensity", "frame", "line")
-"""Columns that every cloud has."""
+"""Columns of every cloud."""
 KINDS = dict(zip(PER_POINT, (np.float64, np.float32, np.int32, np.int32), strict=True)) | {"deviation_mm": np.float32}
 KINDS |= {"time_s": np.float64}
 """Types of all columns."""
 WATER = "water"
-"""With what the names of errors of a medium's index begin, which may drift between scans."""
+"""Prefix of error names for a medium's index, which may drift between scans."""
 _BLOCK = 8192
-"""Points whose covariances are added up at a time: their parts stay in the processor's cache."""
+"""Points whose covariances are summed together: their parts fit in the processor's cache."""
 _FARTHEST_MM = 1e12
-"""Coordinates of maps in mm reach 1e10; squares and products of larger ones would leave the range of numbers."""
+"""Coordinates of maps in mm reach 1e10; squares and products of larger ones would overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,18 +43,17 @@ class PointUncertainty:
     Attributes
     ----------
     random_mm2 : (N, 6) float32
-        Covariance of each point by the stripe's noise, independent from point to point; see `PAIRS`.
+        Covariance of each point due to the stripe's noise, independent between points; see `PAIRS`.
     position_mm : (N, 3) float32
-        How each point moves for one standard deviation of its image's stage position, independent from image to image.
+        Displacement of each point for one standard deviation of its image's stage position, independent between images.
     patterns_mm : (M, N, 3) float32
-        How each point moves for one standard deviation of what is independent in calibration, stage and path.
+        Displacement of each point for one standard deviation of each independent error of calibration, stage and path.
     poses_mm : (K, N, 3) float32 or None
-        How each point moves for one standard deviation of each independent part of its image's pose, which is
-        independent from image to image.
+        Displacement of each point for one standard deviation of each independent part of its image's pose, which is
+        independent between images.
     shared : dict of str to (M, Q) float64
-        What clouds have in common, by the name of a calibration of the sensor or its mount, or of the water it was
-        used in (`WATER`): each pattern holds so much of Q independent parts of its errors, each of standard deviation
-        one. Clouds that name the same share these.
+        Errors shared by clouds, by the name of a calibration of sensor or mount, or of its water (`WATER`): the weight
+        of Q independent errors of unit standard deviation in each pattern. Clouds with the same name share them.
     """
 
     random_mm2: np.ndarray
@@ -64,22 +63,22 @@ class PointUncertainty:
     shared: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __getitem__(self, selection: Any) -> "PointUncertainty":
-        """That of a selection of the points, by a slice, indices or a mask."""
+        """Return the uncertainty of selected points, by a slice, indices or a mask."""
         poses = None if self.poses_mm is None else self.poses_mm[:, selection]
         patterns = self.patterns_mm[:, selection]
         return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses, self.shared)
 
     def by_image_mm(self) -> np.ndarray:
-        """All that moves the points of an image together and is independent from image to image (1 + K, N, 3)."""
+        """Return the displacements (1 + K, N, 3) common to an image's points and independent between images."""
         position = self.position_mm[None]
         return position if self.poses_mm is None else np.concatenate([position, self.poses_mm])
 
     def systematic_mm2(self) -> np.ndarray:
-        """Covariance (N, 6) of each point by calibration and stage."""
+        """Return the covariance (N, 6) of each point due to calibration and stage."""
         return _pairs_of(self.patterns_mm)
 
     def covariance_mm2(self) -> np.ndarray:
-        """Covariance (N, 3, 3) of the coordinates of each point, of all kinds together."""
+        """Return the total covariance (N, 3, 3) of each point's coordinates."""
         result = np.empty((len(self.random_mm2), 3, 3), self.random_mm2.dtype)
         for start in range(0, len(result), _BLOCK):
             some = self[start : start + _BLOCK]
@@ -88,12 +87,12 @@ class PointUncertainty:
         return result
 
     def std_mm(self) -> np.ndarray:
-        """Standard uncertainty (N, 3) of each coordinate, of all kinds together."""
+        """Return the total standard uncertainty (N, 3) of each coordinate."""
         return np.sqrt(np.einsum("nii->ni", self.covariance_mm2()))
 
 
 def _pairs_of(parts_mm: np.ndarray) -> np.ndarray:
-    """Covariance (N, 6) of points that independent parts (M, N, 3) move; see `PAIRS`."""
+    """Return the covariances (N, 6) of points displaced by independent parts (M, N, 3); see `PAIRS`."""
     axes = np.ascontiguousarray(parts_mm.transpose(2, 0, 1))
     return np.stack([np.einsum("mn,mn->n", axes[i], axes[j]) for i, j in PAIRS], axis=1)
 
@@ -110,19 +109,19 @@ def turned_pairs(pairs: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 
 def images_along(known: PointUncertainty, normals: np.ndarray) -> np.ndarray:
-    """Motions (1 + K, N) along normals (N, 3) for one standard deviation of each part that an image's points share."""
+    """Return the displacements (1 + K, N) along normals (N, 3) for one standard deviation of each error of an image."""
     return np.einsum("kni,ni->kn", known.by_image_mm(), normals)
 
 
 def variance_along(pairs: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Variance (N,) along unit directions (N, 3) by covariances (N, 6) in the order of `PAIRS`."""
+    """Return the variance (N,) along unit directions (N, 3) for covariances (N, 6) in the order of `PAIRS`."""
     parts = [(1 if i == j else 2) * directions[:, i] * directions[:, j] for i, j in PAIRS]
     return np.einsum("ni,in->n", pairs, np.stack(parts))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointCloud(Brief):
-    """Points in the object coordinate system (OCS) and what is known of each.
+    """Points in the object coordinate system (OCS) and their attributes.
 
     OCS: X normal to the laser sheet (the direction of the scan), Y along the stripe, Z parallel to the laser's axis,
     away from the sensor.
@@ -138,23 +137,23 @@ class PointCloud(Brief):
     deviation_mm : (N,) float32 or None
         Signed distance to the fitted or true surface; NaN where not evaluated.
     time_s : (N,) float64 or None
-        Time of each point's image by the camera's clock, of scans by a moving platform.
+        Time of each point's image on the camera's clock, for scans by a moving platform.
     uncertainty : PointUncertainty or None
-        How well the points are known.
+        Uncertainty of the points.
     metadata : dict
-        Medium, sensor, artefact, capture, digest of the calibration; of a foreign cloud anything that JSON can hold.
+        Medium, sensor, artefact, capture, digest of the calibration; for a foreign cloud any JSON.
     lines_by_status : dict
-        Of the cloud of a whole capture, not kept in files: number of profile lines by the name of their `StripeStatus`,
-        and ``blurred`` by a joint calibration.
+        For the cloud of a whole capture, not kept in files: number of profile lines by the name of their
+        `StripeStatus`, and ``blurred`` with a joint calibration.
     rays_by_status : dict
         The same for stripe centres by the name of their `RayStatus`.
     warnings : list of str
-        The same: what speaks against the calibration's being that of the sensor.
+        The same: evidence that the calibration is not that of the sensor.
 
     Raises
     ------
     CaptureError
-        The arrays do not fit together, points are not finite, or the metadata is not JSON.
+        The shapes of the arrays do not match, points are not finite, or the metadata is not JSON.
     """
 
     points_mm: np.ndarray
@@ -169,7 +168,7 @@ class PointCloud(Brief):
     rays_by_status: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     writer: ClassVar[Callable[..., None]]
-    """How clouds are written: `uwlts.storage.cloud_files`, which knows the formats, sets it."""
+    """Function that writes clouds; `uwlts.storage.cloud_files`, which knows the formats, sets it."""
 
     def __post_init__(self) -> None:
         for name, kind in KINDS.items():
@@ -183,7 +182,7 @@ class PointCloud(Brief):
         if unusable := np.count_nonzero(~np.isfinite(points).all(axis=1)):
             raise CaptureError(f"{unusable} of {len(points)} points of the cloud are not finite; leave them out")
         if len(points) and (farthest := np.abs(points).max()) > _FARTHEST_MM:
-            raise CaptureError(f"a point lies {farthest:g} mm from the origin; expected at most {_FARTHEST_MM:g} mm")
+            raise CaptureError(f"a point is {farthest:g} mm from the origin; expected at most {_FARTHEST_MM:g} mm")
         for name in (*PER_POINT[1:], "deviation_mm", "time_s"):
             column = getattr(self, name)
             if column is not None and column.shape != (len(points),):
@@ -200,14 +199,14 @@ class PointCloud(Brief):
         return len(self.points_mm)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the cloud in the format that the ending names; errors as `uwlts.storage.cloud_files.write_cloud`.
+        """Write the cloud in the format of the ending; raises the errors of `uwlts.storage.cloud_files.write_cloud`.
 
         .ply, .h5, .xyz (text), .laz, .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers).
         """
         self.writer(path, self, overwrite=overwrite)
 
     def selected(self, selection: slice | np.ndarray) -> "PointCloud":
-        """The cloud of a selection of the points, by a slice, indices or a mask."""
+        """Return the cloud of selected points, by a slice, indices or a mask."""
         known, deviation = self.uncertainty, self.deviation_mm
         return PointCloud(
             *(getattr(self, name)[selection] for name in PER_POINT),
@@ -219,7 +218,7 @@ class PointCloud(Brief):
 
     @property
     def covariance_mm2(self) -> np.ndarray | None:
-        """Covariance (N, 3, 3) of the coordinates of each point, mm2, of all kinds together; None where not known."""
+        """Total covariance (N, 3, 3) of each point's coordinates, mm2; None if unknown."""
         return None if self.uncertainty is None else self.uncertainty.covariance_mm2()
 
 
@@ -232,7 +231,7 @@ def cloud_of(
     deviation_mm: np.ndarray | None = None,
     time_s: np.ndarray | None = None,
 ) -> PointCloud:
-    """A cloud of another program, whose intensity, frame or line may be unknown; CaptureError as from `PointCloud`."""
+    """Make a cloud of another program, without uncertainty; raises CaptureError like `PointCloud`."""
     unknown = np.full(len(points_mm), NO_INDEX)
     return PointCloud(
         points_mm,
@@ -245,7 +244,7 @@ def cloud_of(
 
 
 def joined(parts: Sequence[PointCloud]) -> PointCloud:
-    """One cloud of the parts of one cloud."""
+    """Concatenate the parts of one cloud."""
     known = [part.uncertainty for part in parts if part.uncertainty is not None]
     poses = [each.poses_mm for each in known if each.poses_mm is not None]
     deviations = [part.deviation_mm for part in parts if part.deviation_mm is not None]
@@ -268,7 +267,7 @@ def joined(parts: Sequence[PointCloud]) -> PointCloud:
 
 
 def metadata_json(metadata: Table) -> str:
-    """Metadata as text; CaptureError where that is not plain JSON."""
+    """Return metadata as text; raises CaptureError if it is not plain JSON."""
     try:
         require_plain(metadata)
         text = json.dumps(metadata, ensure_ascii=True, allow_nan=False, separators=(",", ":"))

@@ -1,5 +1,4 @@
-"""Files of point clouds: HDF5, or binary PLY that CloudCompare and MeshLab open with all its fields; and those of other
-programs."""
+"""Files of point clouds: HDF5, PLY with all fields for CloudCompare and MeshLab, and formats of other programs."""
 
 import os
 import re
@@ -34,22 +33,22 @@ FORMAT = "uwlts-cloud"
 VERSION = 1
 
 POINTS_OF_PART = 1_000_000
-"""Points of a part of a large cloud."""
+"""Number of points in a part of a large cloud."""
 
 CLOUD_ENDINGS = (".ply", ".h5", ".copc.laz", *FOREIGN_FORMATS)
 """Endings of the clouds that can be read."""
 CLOUD_FORMATS = (".ply", ".h5", *WRITTEN_FORMATS)
-"""Endings of the clouds that can be written; ``.copc.laz`` and ``.foxglove.mcap`` are among them."""
+"""Endings of the clouds that can be written, including ``.copc.laz`` and ``.foxglove.mcap``."""
 COLOURED_FORMATS = (".ply", ".h5", ".laz", ".las", ".e57")
-"""Endings of those that can be written with a colour of each point."""
+"""Endings of the clouds that can be written with a colour of each point."""
 PLY_COLOURS = ("red", "green", "blue")
 _CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57")
-"""Endings of clouds and of nothing else that is measured."""
+"""Endings that only clouds have."""
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _SHARED = "shared_errors"
 _COMMENT = "uwlts-metadata"
-# CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
+# CloudCompare reads PLY with rply, which rejects a file with a comment of 1024 characters or more.
 _PIECE_LENGTH = 900
 _PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
 _LONGEST_PLY_HEADER = 2**24
@@ -62,36 +61,34 @@ _Rows = Callable[[int], slice]
 def write_cloud(
     path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool = False, colours: np.ndarray | None = None
 ) -> None:
-    """Write a cloud in the format that the path's ending names, whole or not at all.
+    """Write a cloud in the format of the path's ending, completely or not at all.
 
-    - ``.ply``, ``.h5``: mm, everything kept. In HDF5 the datasets are those of `PointCloud` and `PointUncertainty`, by
-      their names, with systematic_mm2 (N, 6) besides. In PLY, binary and little-endian, the vertex properties are x, y,
-      z (double), intensity, deviation (float), frame, line (int), and perhaps time (double, s). Where the uncertainty
-      is known there are its covariances in mm2, random_xx to random_zz and systematic_xx to systematic_zz, and in mm
-      position_x to position_z, pattern0_x, pattern0_y and so on, and perhaps pose0_x to pose5_z (`PointUncertainty`).
-      The metadata is JSON in numbered comments, short enough for every reader.
-    - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan where unknown) of every point, with all
-      the digits that they have.
+    - ``.ply``, ``.h5``: mm, with all attributes. In HDF5 the datasets have the names in `PointCloud` and
+      `PointUncertainty`, plus systematic_mm2 (N, 6). In PLY, binary and little-endian, the vertex properties are x, y,
+      z (double), intensity, deviation (float), frame, line (int), and optionally time (double, s). If the uncertainty
+      is known, further properties are the covariances in mm2, random_xx to random_zz and systematic_xx to
+      systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on, and optionally pose0_x to
+      pose5_z (`PointUncertainty`). The metadata is JSON in numbered comments that every reader accepts.
+    - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan if unknown) of every point, with all
+      digits.
     - ``.laz``, ``.las``: LAS 1.4, point format 6, or 7 with colours, metres in steps of 1e-7 m. The standard intensity
-      is rounded to whole numbers (0 where unknown); ``amplitude`` holds it as it is, the standard ``gps_time`` the time
-      in s where it is known, ``frame``, ``line``, ``deviation_mm`` and the covariance ``cov_xx_mm2`` to ``cov_zz_mm2``
-      the rest.
+      is rounded to integers (0 if unknown) and ``amplitude`` holds its value; the standard ``gps_time`` is the time in
+      s if known. Extra fields are ``frame``, ``line``, ``deviation_mm``, and the covariance ``cov_xx_mm2`` to
+      ``cov_zz_mm2``.
     - ``.copc.laz``: the same without times and covariances as COPC, in an octree with levels of detail.
-    - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the
-      image as column, the line as row where both are known and below 65536; ``timeStamp`` in 64 bits since
-      ``acquisitionStart`` where times are known; the covariance as extension, ``uwlts:cov_xx_mm2`` to
-      ``uwlts:cov_zz_mm2``.
-    - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, and where the name ends with ``.foxglove.mcap``
-      foxglove.PointCloud; one for each image where the points' times are known (`uwlts.storage.mcap_clouds`).
+    - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the image as
+      column and the line as row if both are known and below 65536; ``timeStamp`` in 64 bits since ``acquisitionStart``
+      if times are known; the covariance as an extension, ``uwlts:cov_xx_mm2`` to ``uwlts:cov_zz_mm2``.
+    - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, or foxglove.PointCloud if the name ends with
+      ``.foxglove.mcap``; one for each image if the points' times are known (`uwlts.storage.mcap_clouds`).
 
-    Other programs show the points in ``colours`` (N, 3) uint8, red, green and blue, if these are given: with
-    PLY, LAS, LAZ and E57 (`COLOURED_FORMATS`; in HDF5 the deviation stands for them).
-
+    ``colours`` (N, 3) uint8, red, green and blue, are stored for other programs in PLY, LAS, LAZ and E57
+    (`COLOURED_FORMATS`); HDF5 has the deviation instead.
     Raises
     ------
     OutputError
-        The ending is another one, the file exists and `overwrite` is not set, the folder is missing, the disk is full,
-        the format does not hold such a cloud or colours.
+        The ending is unknown, the file exists and `overwrite` is not set, the folder is missing, the disk is full, or
+        the format cannot hold such a cloud or colours.
     SetupError
         The format's library is not installed.
     """
@@ -120,7 +117,7 @@ PointCloud.writer = staticmethod(write_cloud)
 def write_ply_points(
     path: Path, columns: Mapping[str, np.ndarray], *, comments: Sequence[str] = (), overwrite: bool
 ) -> None:
-    """Write columns (N,) as properties of vertices, binary and little-endian, whole or not at all."""
+    """Write columns (N,) as properties of vertices, binary and little-endian, completely or not at all."""
     count = len(next(iter(columns.values())))
     vertices = np.empty(count, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
@@ -131,7 +128,7 @@ def write_ply_points(
 
 
 def refuse_unsuitable_cloud(path: str | os.PathLike[str], *, overwrite: bool, coloured: bool = False) -> None:
-    """Raise OutputError or SetupError where a cloud, perhaps with colours, cannot be written (`refuse_unsuitable`)."""
+    """Raise OutputError or SetupError if a cloud, possibly with colours, cannot be written (`refuse_unsuitable`)."""
     path = Path(path)
     refuse_unsuitable(path, overwrite=overwrite)
     _require_format(path, coloured=coloured)
@@ -145,29 +142,29 @@ def _require_format(path: Path, *, coloured: bool) -> None:
 
 
 def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
-    """Read a cloud from HDF5 (``.h5``), COPC (``.copc.laz``) or PLY, also another program's (x, y, z suffice).
+    """Read a cloud from HDF5 (``.h5``), COPC (``.copc.laz``), PLY, or a format of other programs.
 
-    Points of other programs may also come as text (``.xyz``, ``.csv`` and others, mm), LAS or E57 (m).
-    Fields that CloudCompare has saved again (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
-    missing frame and line are -1, a deviation that is missing or NaN throughout is None.
+    PLY of other programs needs only x, y, z. Further formats are text (``.xyz``, ``.csv`` and others, mm), LAS and E57
+    (m). Field names as changed by CloudCompare (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
+    missing frame and line are -1, and a deviation that is missing or all NaN is None.
 
     Raises
     ------
     CaptureError
-        The file is missing, no cloud, truncated, without vertices' x, y, z, or its metadata is damaged.
+        The file is missing, not a cloud, or truncated, has no x, y, z, or its metadata is damaged.
     """
     return read_thinned_cloud(path)[0]
 
 
 def loaded_cloud(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
-    """The cloud itself, or the one in a file; CaptureError as from `read_cloud`."""
+    """Return a cloud unchanged, or read it from a file; raises the errors of `read_cloud`."""
     return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
 
 
 def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None) -> tuple[PointCloud, int]:
-    """Every n-th point of a cloud's file, ``at_most`` so many, and the number of points in the file; see `read_cloud`.
+    """Read every n-th point of a cloud's file, at most ``at_most``, and the number of points; see `read_cloud`.
 
-    Of HDF5 and binary PLY only these are held in memory. Of COPC the upper levels are read, an even sample.
+    For HDF5 and binary PLY only these are held in memory. For COPC the upper levels are read, an even sample.
     """
     with _naming(path):
         if is_copc(path):
@@ -181,9 +178,9 @@ def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None)
 def read_region(
     path: str | os.PathLike[str], low_mm: ArrayLike, high_mm: ArrayLike, at_most: int | None = None
 ) -> PointCloud:
-    """The points of a cloud's file in the box from ``low_mm`` (3,) to ``high_mm`` (3,), an even sample of ``at_most``.
+    """Read the points in the box from ``low_mm`` (3,) to ``high_mm`` (3,), or an even sample of ``at_most``.
 
-    Of COPC only the nodes in the box are read, of other files a part at a time.
+    For COPC only the nodes in the box are read, for other files one part at a time.
     """
     low, high = np.asarray(low_mm, float), np.asarray(high_mm, float)
     if low.shape != (3,) or high.shape != (3,) or not (np.isfinite([low, high]).all() and (low < high).all()):
@@ -200,9 +197,9 @@ def read_region(
 
 
 def cloud_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Iterator[PointCloud]:
-    """The points of a cloud's file in their order, so many at a time, as `read_cloud` gives all of them.
+    """Read a cloud's file in parts of at most ``most`` points, in order.
 
-    Of HDF5 and binary PLY only one part is held in memory.
+    For HDF5 and binary PLY only one part is held in memory.
     """
     if is_copc(path) or _is_foreign(path):
         whole = read_cloud(path)
@@ -222,7 +219,7 @@ def _is_foreign(path: str | os.PathLike[str]) -> bool:
 
 @contextmanager
 def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """A context whose CaptureErrors name the file."""
+    """Add the file's name to CaptureErrors without it."""
     try:
         yield
     except CaptureError as error:
@@ -230,7 +227,7 @@ def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
-    """The rows of a file that are selected by the number of all, and that number."""
+    """Read selected rows of a file, and the number of all; ``rows`` selects them by that number."""
     if path.suffix.lower() not in (".ply", ".h5"):
         with opened(path, called="cloud") as file:
             if not file.read(4).startswith(b"ply"):
@@ -239,12 +236,12 @@ def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
 
 
 def _every(count: int, at_most: int | None) -> slice:
-    """The selection of every n-th of so many points."""
+    """Return a slice with an even sample of at most ``at_most`` of ``count`` points."""
     return slice(None, None, 1 if at_most is None else max(1, -(-count // at_most)))
 
 
 def is_cloud(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is a cloud: by its ending, where that is not the captures' as well, and else by its label."""
+    """Return whether a file is a cloud, by its ending, or by its label if captures have the same ending."""
     if _in_hdf5(path):
         return format_of(Path(path)) == FORMAT
     return is_copc(path) or Path(path).suffix.lower() in _CLOUDS_ALONE
@@ -259,7 +256,7 @@ def _move_names(patterns: int) -> list[str]:
 
 
 def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.ndarray]:
-    """Columns (N,) float32 by the names of their vertex properties."""
+    """Return columns (N,) float32 by the names of their vertex properties."""
     if uncertainty is None:
         return {}
     names = [f"{kind}_{pair}" for kind in ("random", "systematic") for pair in _PAIR_NAMES]
@@ -278,7 +275,7 @@ def _pose_names(count: int) -> list[str]:
 
 
 def _with_shared(cloud: PointCloud) -> Table:
-    """Metadata in a file: with what the patterns share with other clouds."""
+    """Return the metadata to store, with the errors shared with other clouds."""
     if cloud.uncertainty is None or not cloud.uncertainty.shared:
         return cloud.metadata
     shared: Table = {name: np.round(each, 9).tolist() for name, each in cloud.uncertainty.shared.items()}
@@ -286,7 +283,7 @@ def _with_shared(cloud: PointCloud) -> Table:
 
 
 def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Table, PointUncertainty | None]:
-    """Metadata and uncertainty of a cloud from those in a file; CaptureError where they do not fit together."""
+    """Separate metadata from shared errors; raises CaptureError if the latter do not match the uncertainty."""
     if _SHARED not in metadata:
         return metadata, known
     rest = {name: each for name, each in metadata.items() if name != _SHARED}
@@ -311,7 +308,7 @@ def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Ta
 def _comments(metadata: Table) -> list[str]:
     text = metadata_json(metadata)
     pieces = [text[start : start + _PIECE_LENGTH] for start in range(0, len(text), _PIECE_LENGTH)]
-    # The semicolon keeps a piece's last blank from being stripped by readers.
+    # The semicolon protects a trailing blank of a piece, which readers strip.
     return [f"{_COMMENT} {number}/{len(pieces)} {piece};" for number, piece in enumerate(pieces, start=1)]
 
 
@@ -333,8 +330,7 @@ def _metadata(comments: list[str]) -> Table:
 
 
 def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
-    with opened(path, called="cloud") as file:
-        _refuse_impossible_header(file.read(_LONGEST_PLY_HEADER), size=os.fstat(file.fileno()).st_size, path=path)
+    require_ply_size(path, called="cloud")
     try:
         ply = PlyData.read(str(path))
     except OSError as error:
@@ -389,8 +385,10 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     return cloud, len(whole)
 
 
-def _refuse_impossible_header(start: bytes, *, size: int, path: Path) -> None:
-    """CaptureError where a PLY file is shorter than what its header declares; other faults are left to the reader."""
+def require_ply_size(path: Path, *, called: str) -> None:
+    """Raise CaptureError if a PLY file is shorter than its header declares; the reader finds other faults."""
+    with opened(path, called=called) as file:
+        start, size = file.read(_LONGEST_PLY_HEADER), os.fstat(file.fileno()).st_size
     header, end, _ = start.partition(b"end_header")
     if not end:
         raise CaptureError(f"{path} is not a complete PLY file: its header has no end in the first 16 MiB")
@@ -400,9 +398,9 @@ def _refuse_impossible_header(start: bytes, *, size: int, path: Path) -> None:
             case ["element", _, number] if number.isdecimal() and len(number) <= 18:
                 count = int(number)
             case ["element", *_]:
-                raise CaptureError(f"{path} is not a complete PLY file: {shortened(repr(line))} is no element")
+                raise CaptureError(f"{path} is not a complete PLY file: {shortened(repr(line))} is not an element")
             case ["property", kind, *_]:
-                # In text a number takes a digit and what parts it from the next; a list at least its length.
+                # In text a number takes at least a digit and a separator; a list takes at least its length.
                 least += count * (2 if in_text else _TYPE_BYTES.get(kind, 1))
                 properties += 1
     if properties > _MOST_PROPERTIES:
@@ -426,7 +424,7 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     if cloud.uncertainty is not None:
         arrays |= {name: each for name in _UNCERTAINTY if (each := getattr(cloud.uncertainty, name)) is not None}
         arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
-    # In memory first: HDF5 does not survive a full disk.
+    # Written in memory first: HDF5 does not survive a full disk.
     content = BytesIO()
     with h5py.File(content, "w", libver="latest") as file:
         write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
@@ -451,7 +449,7 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     except DAMAGE as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
     arrays = {name: values for name, values in found.items() if values is not None}
-    # Whole numbers may not be cut, nor fractions become whole.
+    # Conversion must not truncate integers, nor round fractions.
     wanted_kinds = {name: np.dtype(KINDS.get(name, np.float32)).kind for name in arrays}
     if unusable := [name for name, values in arrays.items() if values.dtype.kind != wanted_kinds[name]]:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers of the expected kind")

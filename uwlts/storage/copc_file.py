@@ -1,7 +1,7 @@
 """Large clouds as COPC (cloud-optimised point cloud, copc.io): written in bounded memory, read by region and level.
 
-A COPC file is LAZ 1.4 whose points stand in an octree. Every level of the tree holds a random share of the points of
-its nodes, four times as many as the level above, as a surface has; all levels down to one give an even sample.
+A COPC file is LAZ 1.4 with its points in an octree. Every level of the tree holds a random sample of the points of its
+nodes, four times as many as the level above, as suits a surface. All levels down to one form an even sample.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from uwlts.files.reading import opened
 from uwlts.files.writing import written_aside
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud, cloud_of
-from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, brief, las_middle, library
+from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, las_middle, load_library, shorten_error
 
 SUFFIX = ".copc.laz"
 
 _POINTS_OF_NODE = 60_000
-"""Points of the root, and of the usual node: compressed they are some 500 kB, one request of a viewer."""
+"""Points of the root, and of a typical node: compressed about 500 kB, one request of a viewer."""
 _DEEPEST = 7
 _MOST_LEVELS = 16
 _FIELDS: dict[str, type] = {"amplitude": np.float32, "frame": np.int32, "line": np.int32, "deviation_mm": np.float32}
 
 
 def is_copc(path: str | os.PathLike[str]) -> bool:
-    """Whether a file's name ends with ``.copc.laz``."""
+    """Return whether a file's name ends with ``.copc.laz``."""
     return Path(path).name.lower().endswith(SUFFIX)
 
 
 @dataclass(eq=False)
 class _Sorter:
-    """Points of nodes, in a temporary file in the order in which they came, and where each node's runs lie."""
+    """Points of nodes in a temporary file in the order of their arrival, and the position of each node's runs in it."""
 
     file: Any
     kind: np.dtype
@@ -55,11 +55,11 @@ class _Sorter:
         self.end += len(nodes)
 
     def merge(self, node: int, into: int) -> None:
-        """Count the records of one node as those of another."""
+        """Assign the records of one node to another."""
         self.runs.setdefault(into, []).extend(self.runs.pop(node))
 
-    def of(self, node: int) -> np.ndarray:
-        """All records of a node."""
+    def read(self, node: int) -> np.ndarray:
+        """Read all records of a node."""
         parts = []
         for start, count in self.runs[node]:
             self.file.seek(start * self.kind.itemsize)
@@ -74,15 +74,15 @@ def write_copc(
     overwrite: bool = False,
     progress: ProgressListener = unheard,
 ) -> int:
-    """Write the parts of a cloud as COPC, whole or not at all; returns the number of points.
+    """Write the parts of a cloud as COPC, completely or not at all, and return the number of points.
 
-    ``parts`` gives the parts anew whenever it is called, which is twice. One part and one node are in memory at a time;
-    the rest waits in a temporary file beside the output, of some 46 bytes for each point. Coordinates are in m in steps
-    of 1e-7 m, the fields those of LAZ (`uwlts.export`).
+    ``parts`` is called twice and returns an iterable of all parts each time. One part and one node are in memory at a
+    time. The other points are in a temporary file beside the output, about 46 bytes per point. Coordinates are in m in
+    steps of 1e-7 m, and the fields those of LAZ (`uwlts.export`).
 
-    OutputError where the file exists, the cloud is empty or too wide, or storage fails; SetupError without copclib.
+    Raises OutputError if the file exists, the cloud is empty or too wide, or writing fails; SetupError without copclib.
     """
-    copc, _ = library("copclib", "COPC"), library("laspy", "COPC")
+    copc, _ = load_library("copclib", "COPC"), load_library("laspy", "COPC")
     low, high, total = np.full(3, np.inf), np.full(3, -np.inf), 0
     for part in parts():
         if len(part.points_mm):
@@ -91,7 +91,7 @@ def write_copc(
     if not total:
         raise OutputError("the cloud has no points: there is nothing to export")
     middle = las_middle(1e-3 * low, 1e-3 * high)
-    # The cube of the root, not quite filled, so that no point lies on its last face.
+    # The root's cube is not filled completely, so that no point is on its last face.
     half = max(5.05e-4 * float((high - low).max()), 1e-3)
     centre = 5e-4 * (low + high)
     depth = int(np.clip(np.ceil(np.log(max(0.75 * total / _POINTS_OF_NODE, 1)) / np.log(4)), 0, _DEEPEST))
@@ -113,12 +113,12 @@ def write_copc(
         for node in sorted(sorter.runs, reverse=True):
             level, *cell = np.unravel_index(node, shape)
             above = int(np.ravel_multi_index((level - 1, *(n >> 1 for n in cell)), shape)) if level else node
-            # A reader finds a node through those above it; few points may have none there.
+            # A reader reaches a node through its ancestors; with few points an ancestor may be missing.
             if level and above not in sorter.runs:
                 sorter.merge(node, above)
         writer = _writer(copc, header, aside, low=1e-3 * low, high=1e-3 * high, centre=centre, half=half)
         for node in sorted(sorter.runs):
-            table = sorter.of(node)
+            table = sorter.read(node)
             key = [int(n) for n in np.unravel_index(node, shape)]
             writer.AddNode(copc.VoxelKey(*key), copc.VectorChar(table.view(np.int8).ravel()))
             done += len(table)
@@ -128,19 +128,19 @@ def write_copc(
 
 
 def _header(middle: np.ndarray) -> Any:
-    laspy = library("laspy", "COPC")
+    laspy = load_library("laspy", "COPC")
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.offsets, header.scales = middle, np.full(3, LAZ_STEP_M)
-    # Which copclib demands of point format 6.
+    # copclib requires this for point format 6.
     header.global_encoding.wkt = True
     header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=kind) for name, kind in _FIELDS.items()])
     return header
 
 
 def _writer(copc: Any, header: Any, aside: Path, *, low: Any, high: Any, centre: np.ndarray, half: float) -> Any:
-    laspy = library("laspy", "COPC")
+    laspy = load_library("laspy", "COPC")
     with tempfile.TemporaryDirectory() as folder:
-        # copclib takes the fields' names from a file only.
+        # copclib reads the names of fields from files only.
         empty = os.path.join(folder, "fields.laz")
         table = laspy.LasData(header)
         table.x = table.y = table.z = np.zeros(1)
@@ -151,7 +151,7 @@ def _writer(copc: Any, header: Any, aside: Path, *, low: Any, high: Any, centre:
     settings.las_header.min, settings.las_header.max = copc.Vector3(*low.tolist()), copc.Vector3(*high.tolist())
     info = settings.copc_info
     info.center_x, info.center_y, info.center_z = centre.tolist()
-    # Some 250 points along the edge of a node of a surface.
+    # About 250 points along the edge of a node on a surface.
     info.halfsize, info.spacing = half, 2 * half / np.sqrt(_POINTS_OF_NODE)
     return copc.FileWriter(str(aside), settings)
 
@@ -172,22 +172,22 @@ def _table(part: PointCloud, kind: np.dtype, middle: np.ndarray) -> np.ndarray:
 def read_copc(
     path: str | os.PathLike[str], *, box_mm: tuple[np.ndarray, np.ndarray] | None = None, at_most: int | None = None
 ) -> tuple[PointCloud, int]:
-    """The points of a COPC file within a box, and the number of points in the file.
+    """Read the points of a COPC file within a box, and the number of points in the file.
 
-    With ``at_most`` only as many levels are read as hold about so many points in the box, at least the first, and an
-    even sample of these is taken if they are more. Fields of other programs' files that are missing are left out.
+    With ``at_most``, levels are read until they hold about that many points in the box; the result is an even sample
+    of at most that many. Fields missing in other programs' files are left out.
 
-    CaptureError where it cannot be read or is no COPC; SetupError without laspy.
+    Raises CaptureError if the file cannot be read or is not COPC; SetupError without laspy.
     """
-    laspy, path = library("laspy", "COPC"), Path(path)
+    laspy, path = load_library("laspy", "COPC"), Path(path)
     try:
         with opened(path, called="cloud") as file:
             reader = laspy.CopcReader(file)
             total = int(reader.header.point_count)
             box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
-            found = _queried(reader, box, at_most)
+            found = _query(reader, box, at_most)
     except (OSError, RuntimeError, ValueError, KeyError, laspy.errors.LaspyException) as error:
-        raise CaptureError(f"{path} is not a complete COPC file: {brief(error)}") from error
+        raise CaptureError(f"{path} is not a complete COPC file: {shorten_error(error)}") from error
     columns = {name: np.asarray(found[name]) for name in found.point_format.dimension_names if name in _FIELDS}
     intensity = columns.pop("amplitude", found["intensity"])
     if np.isnan(columns.get("deviation_mm", np.nan)).all():
@@ -195,8 +195,8 @@ def read_copc(
     return cloud_of(1e3 * np.column_stack([found.x, found.y, found.z]), intensity=intensity, **columns), total
 
 
-def _queried(reader: Any, box: Any, at_most: int | None) -> Any:
-    """Points of the levels that are needed, those of each level read once."""
+def _query(reader: Any, box: Any, at_most: int | None) -> Any:
+    """Read the points of the levels that are needed, each level once."""
     if at_most is None:
         return reader.query(bounds=box)
     count, found = 0, []

@@ -12,16 +12,16 @@ import numpy as np
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import require_regular_file
 from uwlts.storage.cloud import PointCloud, cloud_of
-from uwlts.storage.las_file import brief, library
+from uwlts.storage.las_file import load_library, shorten_error
 
 PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"
-"""Of the fields that the standard does not have: an extension is a prefix of their names, and its own name as a URI."""
+"""Extension for fields that the standard does not define: the prefix of their names, and its name as a URI."""
 
 COLOURS = "colorRed", "colorGreen", "colorBlue"
 """Columns of the standard for 8 bits of each colour."""
 _LIMITS: tuple[tuple[str, Callable[[np.ndarray], Any]], ...] = (("Minimum", np.min), ("Maximum", np.max))
 _PLACES = ("cartesianInvalidState", "sphericalInvalidState")
-"""Fields of points that have no place."""
+"""Fields that mark points without a position."""
 
 
 def write_e57(
@@ -35,15 +35,15 @@ def write_e57(
 ) -> None:
     """Write points (N, 3), columns (N,) by their names in the standard, times (N,) and further fields as one scan.
 
-    Coordinates and real numbers are of 32 bits, times of 64. A time is ``acquisitionStart``, the last whole second
-    before all of them, and ``timeStamp`` from there on, which the standard wants positive; further fields are
-    ``uwlts:NAME``. ``to`` is the name that the file gets in the end.
+    Coordinates and real numbers have 32 bits, times 64. A time is the sum of ``acquisitionStart``, the whole second
+    before all of them, and a positive ``timeStamp``. Further fields are ``uwlts:NAME``. ``to`` is the final name of the
+    file.
 
-    OutputError where storage fails; SetupError where pye57 is not installed.
+    Raises OutputError if writing fails; SetupError if pye57 is not installed.
     """
-    pye57 = library("pye57", "E57")
+    pye57 = load_library("pye57", "E57")
     lib = pye57.libe57
-    # Rounded before, so that the bounds in the file hold for the numbers in the file.
+    # Rounded first, so that the bounds in the file apply to the numbers in the file.
     coordinates = (1e-3 * points_mm).astype(np.float32).astype(np.float64).T
     fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), coordinates, strict=True)) | columns
     fields |= {f"{PREFIX}:{label}": values for label, values in (further or {}).items()}
@@ -52,7 +52,7 @@ def write_e57(
         fields["timeStamp"] = time_s - start
     fields = {label: np.ascontiguousarray(values) for label, values in fields.items()}
     try:
-        # The library's own writer of scans has neither times nor extensions.
+        # The library's own scan writer supports neither times nor extensions.
         with pye57.E57(str(path), mode="w") as file:
             image = file.image_file
             if further:
@@ -99,20 +99,20 @@ def write_e57(
             writer.write(len(points_mm))
             writer.close()
     except lib.E57Exception as error:
-        raise OutputError(f"cannot write {to}: {brief(error)}") from error
+        raise OutputError(f"cannot write {to}: {shorten_error(error)}") from error
 
 
 def _limits(named: Sequence[tuple[str, np.ndarray]], kind: type[int] | type[float]) -> dict[str, int | float]:
-    """``xMinimum``, ``xMaximum`` and so on of columns (N,) by their names."""
+    """Return ``xMinimum``, ``xMaximum`` and so on of columns (N,) by name."""
     return {f"{label}{end}": kind(of(values)) for label, values in named for end, of in _LIMITS}
 
 
 def read_e57(path: Path) -> PointCloud:
-    """All points of a file, each scan at its pose; times by the scanner's clock.
+    """Read all points of a file, each scan at its pose; times are on the scanner's clock.
 
-    CaptureError where the file is damaged or has no scans; SetupError where pye57 is not installed.
+    Raises CaptureError if the file is damaged or has no scans; SetupError if pye57 is not installed.
     """
-    pye57 = library("pye57", "E57")
+    pye57 = load_library("pye57", "E57")
     require_regular_file(path, called="cloud")
     try:
         with pye57.E57(str(path)) as file:
@@ -122,7 +122,7 @@ def read_e57(path: Path) -> PointCloud:
                 for number in range(file.scan_count)
             ]
     except (pye57.libe57.E57Exception, OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
-        raise CaptureError(f"{path} is not a complete E57 file: {brief(error)}") from error
+        raise CaptureError(f"{path} is not a complete E57 file: {shorten_error(error)}") from error
     if not scans:
         raise CaptureError(f"{path} is an E57 file without scans")
     points = 1e3 * np.concatenate([np.column_stack([scan[f"cartesian{axis}"] for axis in "XYZ"]) for scan in scans])
@@ -136,7 +136,7 @@ def read_e57(path: Path) -> PointCloud:
 
 
 def _times(pye57: Any, file: Any, number: int) -> np.ndarray | None:
-    """Times (N,) of the points of a scan that are valid, s; None where some are not known."""
+    """Return the times (N,) in s of a scan's valid points; None if some are unknown."""
     header = file.get_header(number)
     if "timeStamp" not in header.point_fields:
         return None

@@ -1,4 +1,4 @@
-"""Export of captures as folders of images that `uwlts import` reads back, and of clouds in other formats."""
+"""Export of captures as folders of images for `uwlts import`, and of clouds in other formats."""
 
 import csv
 import os
@@ -55,7 +55,7 @@ def export(
     Parameters
     ----------
     file : str or Path
-        Capture (.h5) or cloud (.ply, .h5, .copc.laz; of other programs .xyz, .las, .e57).
+        Capture (.h5) or cloud (.ply, .h5, .copc.laz, or .xyz, .las, .e57 of other programs).
     out : str or Path
         New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
         .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).
@@ -64,11 +64,11 @@ def export(
     region_mm : pair of (3,), optional
         Only the points in a box: x y z of one corner, x y z of the other.
     at_most : int, optional
-        Only an even sample of about so many points.
+        Only an even sample of about this many points.
     overwrite : bool
         Replace an existing cloud.
     progress : callable, optional
-        Called with the number of images done and the number in all.
+        Called with the number of finished images and the total.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def export(
         refuse_unsuitable_cloud(out, overwrite=overwrite)
     if region_mm is not None or at_most is not None:
         if not is_cloud(file):
-            raise CaptureError(f"{file} is no cloud: only clouds have regions and points")
+            raise CaptureError(f"{file} is not a cloud: only clouds have regions and points")
         cloud = read_thinned_cloud(file, at_most)[0] if region_mm is None else read_region(file, *region_mm, at_most)
         _write(cloud, out, overwrite=overwrite)
         return len(cloud)
@@ -100,7 +100,7 @@ def export(
         return len(cloud)
     if Path(out).name.lower().endswith(CLOUD_FORMATS):
         raise OutputError(
-            f"{file} is a capture, which becomes a folder of images, and {out} is named like a cloud; "
+            f"{file} is a capture, which is exported to a folder of images, but {out} is named like a cloud; "
             "give the name of a new folder, or make a cloud of it first (uwlts reconstruct)"
         )
     with Capture(file) as capture:
@@ -121,13 +121,14 @@ def export_capture(
     image_format: Literal["png", "tiff"] = "png",
     progress: ProgressListener = unheard,
 ) -> None:
-    """Write a capture's frames as images of its own depth, without loss, into a new folder; whole or not at all.
+    """Write a capture's frames without loss as images of the same depth into a new folder, completely or not at all.
 
-    Centre lines become arrays (.npy) of a profile (1, 4, L): centre, amplitude, width and status of every line.
+    Centre lines become arrays (.npy) of a profile (1, 4, L): centre, amplitude, width and status of every line. The
+    folder also contains header.json, import.toml, and frames.csv with the columns file, light, stage_mm, exposure_ms,
+    time_s and, if any frame has one, the elements of the pose.
 
-    Beside them stand frames.csv (file, light, stage_mm, exposure_ms, time_s, and the pose's elements if any frame has
-    one), header.json and import.toml. OutputError where the folder exists, its parent is missing, or storage fails;
-    CaptureError where a frame's data are damaged.
+    Raises OutputError if the folder exists, its parent is missing, or writing fails; CaptureError if a frame is
+    damaged.
     """
     require_possible_name(folder)
     if folder.exists():
@@ -151,7 +152,7 @@ def export_capture(
             encoder = [] if not capture.holds_lines else ["" if frame.encoder is None else frame.encoder]
             rows.append([name, light, frame.stage_mm, frame.exposure_ms, frame.time_s, *encoder, *pose])
             progress(index + 1, len(capture))
-        # Only captures with a pose have its columns, which stand last.
+        # Only captures with a pose have its columns, which are the last ones.
         columns = (*_COLUMNS, "encoder") if capture.holds_lines else _COLUMNS
         width = max(map(len, rows), default=len(columns))
         with open(aside / TABLE, "w", newline="", encoding="utf-8") as file:

@@ -1,4 +1,4 @@
-"""Clouds for and of other programs and scanners: text, LAS, E57; LAZ, COPC and MCAP are written only here."""
+"""Clouds in formats of other programs and scanners: text, LAS, E57; LAZ, COPC and MCAP are only written here."""
 
 from pathlib import Path
 from typing import Literal
@@ -10,21 +10,21 @@ from uwlts.files.writing import written_aside
 from uwlts.storage.cloud import PointCloud, cloud_of
 from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
-from uwlts.storage.las_file import las_content, library, read_las
-from uwlts.storage.mcap_clouds import covariance_columns, mcap_of
+from uwlts.storage.las_file import las_content, load_library, read_las
+from uwlts.storage.mcap_clouds import covariance_columns, mcap_content
 from uwlts.storage.pose_files import read_columns
 
 TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
-"""Columns x, y, z by name, or the first three, in mm; and perhaps intensity."""
+"""Columns x, y, z by name, or the first three, in mm; and optionally intensity."""
 FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57")
 WRITTEN_FORMATS = (".xyz", ".laz", ".e57", ".las", ".mcap")
 
 
 def read_foreign(path: Path) -> PointCloud:
-    """All points of a file whose suffix is one of `FOREIGN_FORMATS`: text in mm; LAS and E57 in m, as they prescribe.
+    """Read all points of a file in one of `FOREIGN_FORMATS`: text in mm; LAS and E57 in m, as they prescribe.
 
-    Scans of an E57 file are taken together, each at its pose. Raises CaptureError where the file is damaged or foreign,
-    SetupError where the library of its format is not installed.
+    The scans of an E57 file are combined, each at its pose. Raises CaptureError if the file is damaged or foreign,
+    SetupError if the library for its format is not installed.
     """
     match path.suffix.lower():
         case ".las":
@@ -40,7 +40,7 @@ def _read_text(path: Path) -> PointCloud:
         columns = read_columns(path, {}, named=False)
     except DescriptionError as error:
         raise CaptureError(str(error)) from error
-    # CloudCompare's first line begins with two strokes.
+    # CloudCompare's first line begins with two slashes.
     columns = {name.lstrip("/").strip(): values for name, values in columns.items()}
     axes = [columns[axis] for axis in "xyz" if axis in columns]
     if len(axes) < 3:
@@ -54,10 +54,10 @@ def _read_text(path: Path) -> PointCloud:
 
 
 def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np.ndarray | None = None) -> None:
-    """Write a cloud in the format that the suffix names, one of `WRITTEN_FORMATS`, whole or not at all.
+    """Write a cloud in one of `WRITTEN_FORMATS`, by the path's suffix, completely or not at all.
 
-    OutputError where the file exists, the cloud is empty, too wide for LAS, or lacks intensities that E57 cannot leave
-    out, or storage fails; SetupError where the format's library is not installed.
+    Raises OutputError if the file exists, the cloud is empty, too wide for LAS, or lacks some intensities in E57, or
+    writing fails; SetupError if the format's library is not installed.
     """
     if len(cloud) == 0:
         raise OutputError(f"the cloud has no points, and {path.suffix} cannot hold none: write PLY or HDF5")
@@ -69,7 +69,7 @@ def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np
             case ".xyz":
                 rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
                 with open(aside, "w", encoding="utf-8") as file:
-                    # CloudCompare takes the names from a first line that begins so.
+                    # CloudCompare reads the names from a first line that begins with two slashes.
                     file.write("//X Y Z Intensity\n")
                     file.writelines(f"{x!r} {y!r} {z!r} {intensity!s}\n" for x, y, z, intensity in rows)
             case ".laz" | ".las" as suffix:
@@ -87,7 +87,7 @@ def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np
                 )
                 aside.write_bytes(content)
             case ".mcap":
-                aside.write_bytes(mcap_of(cloud, foxglove=path.name.lower().endswith(".foxglove.mcap")))
+                aside.write_bytes(mcap_content(cloud, foxglove=path.name.lower().endswith(".foxglove.mcap")))
             case _:
                 _write_e57(cloud, aside, path, colours)
 
@@ -101,17 +101,17 @@ _LIBRARIES: dict[str, tuple[Literal["laspy", "lazrs", "copclib", "pye57"], ...]]
 
 
 def require_libraries(path: Path) -> None:
-    """Raise SetupError where a library is not installed that writing a file of this ending needs."""
+    """Raise SetupError if a library for writing a file with this ending is not installed."""
     ending = next((each for each in _LIBRARIES if path.name.lower().endswith(each)), "")
     for name in _LIBRARIES.get(ending, ()):
-        library(name, ending.strip(".").upper())
+        load_library(name, ending.strip(".").upper())
 
 
 def _write_e57(cloud: PointCloud, aside: Path, path: Path, colours: np.ndarray | None) -> None:
     unknown = np.isnan(cloud.intensity)
     if unknown.any() and not unknown.all():
         raise OutputError(
-            f"{np.count_nonzero(unknown)} of {len(cloud)} points have no intensity, which E57 as written here cannot "
+            f"{np.count_nonzero(unknown)} of {len(cloud)} points have no intensity, which this program's E57 cannot "
             "mark: write PLY, XYZ or LAZ"
         )
     columns = {} if unknown.any() else {"intensity": cloud.intensity}

@@ -1,8 +1,7 @@
 """Label and arrays of the program's HDF5 files.
 
-The label is the attributes ``format``, ``version`` and ``header`` (JSON). They are stored as text of fixed length,
-which lies under HDF5's checksums. Text of variable length would not: where it is damaged, HDF5 may search for its end
-for ever.
+The label consists of the attributes ``format``, ``version`` and ``header`` (JSON). They are fixed-length text, which is
+protected by HDF5's checksums. Variable-length text is not: if it is damaged, HDF5 may search for its end forever.
 """
 
 import json
@@ -22,16 +21,16 @@ from uwlts.model.sensor import Description, Table
 AnyHeader = TypeVar("AnyHeader", bound=Description)
 
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
-"""What h5py raises on a damaged file, depending on where the damage is."""
+"""Exceptions of h5py for a damaged file, depending on the kind of damage."""
 
 _FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32, 32000, 32001, 32015}
-"""Of a dataset's stored pieces: those of the program, LZF and Zstandard, with which files may be packed again."""
+"""Filters of a dataset's chunks: those of the program, and LZF and Zstandard, for files repacked by other tools."""
 
 _MOST_SHRINKING = 1100
-"""Least size of an array's stored pieces is its size over this: deflate reaches 1032 (zlib.net/zlib_tech.html)."""
+"""Largest compression ratio that is accepted: deflate reaches 1032 (zlib.net/zlib_tech.html)."""
 
 _LARGEST_CHUNK = 2**23
-"""Bytes of a piece of an array that is read as a whole. HDF5 makes them of up to 1 MiB, the program less."""
+"""Largest chunk in bytes, which is read as a whole. HDF5 makes chunks of up to 1 MiB, the program smaller ones."""
 
 
 def write_label(file: h5py.File, *, format: str, version: int, header: Description) -> None:
@@ -42,7 +41,7 @@ def write_label(file: h5py.File, *, format: str, version: int, header: Descripti
 
 
 def read_label(file: h5py.File, model: type[AnyHeader], *, path: str | Path, format: str, version: int) -> AnyHeader:
-    """Header of a file; CaptureError where the file is foreign, newer or damaged."""
+    """Return the header of a file; raises CaptureError if the file is foreign, newer or damaged."""
     found = _text(file, "format")
     if found != format:
         called = "it has no format" if found is None else f"its format is {found!r}"
@@ -66,12 +65,12 @@ def read_label(file: h5py.File, model: type[AnyHeader], *, path: str | Path, for
 
 
 def write_plan(file: h5py.File, plan: Table) -> None:
-    """State in an unfinished file what it is to hold, as JSON."""
+    """Store the plan of an unfinished file as JSON."""
     file.attrs["plan"] = np.bytes_(json.dumps(plan).encode())
 
 
 def read_plan(file: h5py.File) -> Table | None:
-    """The plan of an unfinished file; None where there is none, CaptureError where it is damaged."""
+    """Return the plan of an unfinished file, or None; raises CaptureError if it is damaged."""
     if (text := _text(file, "plan")) is None:
         return None
     try:
@@ -79,24 +78,24 @@ def read_plan(file: h5py.File) -> Table | None:
     except ValueError as error:
         raise CaptureError(f"{file.filename} is damaged: its plan is not JSON: {error}") from error
     if not isinstance(plan, dict):
-        raise CaptureError(f"{file.filename} is damaged: its plan is no table")
+        raise CaptureError(f"{file.filename} is damaged: its plan is not a table")
     return plan
 
 
 def forget_plan(path: str | Path) -> None:
-    """Remove the plan from a file that is finished."""
+    """Remove the plan from a finished file."""
     with h5py.File(path, "r+", locking=False) as file:
-        # HDF5 leaves the bytes of what is removed in the file.
+        # Overwritten first, because HDF5 leaves the bytes of removed attributes in the file.
         file.attrs.modify("plan", np.bytes_(b" " * file.attrs.get_id("plan").dtype.itemsize))
         del file.attrs["plan"]
 
 
 def format_of(path: str | Path) -> str | None:
-    """Format of an HDF5 file by its label; None where it cannot be opened or has none."""
+    """Return the format in an HDF5 file's label; None if the file cannot be opened or has no label."""
     if not is_regular_file(path):
         return None
     try:
-        # Unlocked, as it may be a recording that goes on.
+        # Without a lock, because it may be a recording in progress.
         with h5py.File(path, "r", locking=False) as file:
             return _text(file, "format")
     except DAMAGE:
@@ -104,7 +103,7 @@ def format_of(path: str | Path) -> str | None:
 
 
 def _text(file: h5py.File, name: str) -> str | None:
-    """An attribute's text, None where it is missing or something else."""
+    """Return an attribute's text, or None if it is missing or of another kind."""
     if name not in file.attrs:
         return None
     known = file.attrs.get_id(name)
@@ -115,7 +114,7 @@ def _text(file: h5py.File, name: str) -> str | None:
 
 
 def _number(file: h5py.File, name: str) -> int | None:
-    """An attribute's whole number, None where it is missing or something else."""
+    """Return an attribute's integer, or None if it is missing or of another kind."""
     if name not in file.attrs:
         return None
     known = file.attrs.get_id(name)
@@ -123,10 +122,10 @@ def _number(file: h5py.File, name: str) -> int | None:
 
 
 def find_dataset(file: h5py.File, name: str, *, path: str | Path) -> h5py.Dataset | None:
-    """A dataset of plain numbers that lies in the file itself; None where there is none of this name.
+    """Return a dataset of plain numbers stored in the file itself, or None if the name is unknown.
 
-    CaptureError where the name is a link to another place or file, or the values are no numbers or booleans, lie in
-    other files, or are packed in another way than the program does.
+    Raises CaptureError if the name is a link, or the values are not numbers or booleans, are stored in other files, or
+    are compressed by an unknown filter.
     """
     if name not in file:
         return None
@@ -149,21 +148,21 @@ def find_dataset(file: h5py.File, name: str, *, path: str | Path) -> h5py.Datase
 def read_array(
     file: h5py.File, name: str, *, path: str | Path, selection: tuple[slice | EllipsisType, ...] = (...,)
 ) -> np.ndarray | None:
-    """Values of a dataset as from `find_dataset`; CaptureError also where the file cannot hold so many."""
+    """Read the values of `find_dataset`; also raises CaptureError if the file is too short to hold them."""
     dataset = find_dataset(file, name, path=path)
     if dataset is None:
         return None
     stored = dataset.id.get_storage_size()
     if dataset.nbytes > (stored if dataset.chunks is None else _MOST_SHRINKING * stored):
         raise CaptureError(
-            f"{path} is damaged: '{name}' has the shape {dataset.shape}, of which {stored:,} bytes are there"
+            f"{path} is damaged: '{name}' has the shape {dataset.shape}, but only {stored:,} bytes are stored"
         )
     require_small_chunks(dataset, name, path=path)
     return dataset[selection]
 
 
 def require_small_chunks(dataset: h5py.Dataset, name: str, *, path: str | Path) -> None:
-    """CaptureError where a piece of an array, which is unpacked as a whole, is larger than any that is written."""
+    """Raise CaptureError if a chunk, which is unpacked as a whole, is larger than any that is written."""
     piece = 0 if dataset.chunks is None else math.prod(dataset.chunks) * dataset.dtype.itemsize
     if piece > max(_LARGEST_CHUNK, 2 * dataset.nbytes):
-        raise CaptureError(f"{path} is damaged: '{name}' is stored in pieces of {piece:,} bytes")
+        raise CaptureError(f"{path} is damaged: '{name}' is stored in chunks of {piece:,} bytes")

@@ -1,7 +1,7 @@
-"""Reads image files as grey values and finds those that are damaged.
+"""Reading of image files as grey values, with detection of damaged files.
 
-libpng, libjpeg and libtiff fill in what they cannot decode, and report it on the process's standard error only. So that
-is read meanwhile: lines about damage are returned, everything else is passed on.
+libpng, libjpeg and libtiff fill in what they cannot decode, and report it only on the process's standard error.
+Therefore standard error is captured during decoding: lines about damage are returned, all others are passed on.
 """
 
 import os
@@ -19,15 +19,15 @@ from uwlts.storage.image_header import ImageHeader, png_damage, read_header, rea
 
 _STANDARD_ERROR = 2
 _DAMAGE = re.compile(rb"libpng error|Corrupt JPEG data|Premature end of JPEG|\[ERROR:")
-# Such as of tags that nobody knows.
+# For example about unknown tags.
 _WARNING = b"[ WARN:"
-# OpenCV puts time, file, line and function around what the decoder said.
+# OpenCV surrounds the decoder's message with time, file, line and function.
 _AROUND = re.compile(r"^libpng error: |^\[ERROR:\S+ global \S+ (TIFF_Error |.*error: \([^)]*\) )|in function '\w+'$")
 
 
 @contextmanager
-def _heard() -> Iterator[list[str]]:
-    """The lines about damage that are written to the standard error inside the ``with``, there after its end."""
+def _capture_damage() -> Iterator[list[str]]:
+    """Collect the lines about damage that are written to standard error within the context; complete at its end."""
     said: list[str] = []
     usual = os.dup(_STANDARD_ERROR)
     with tempfile.TemporaryFile() as listener:
@@ -46,10 +46,10 @@ def _heard() -> Iterator[list[str]]:
 
 
 def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda declared: None) -> np.ndarray:
-    """Image (H, W) or (H, W, 3) in blue, green, red, of uint8 or uint16, as stored: not turned by what EXIF says.
+    """Read an image (H, W), or (H, W, 3) in blue, green, red, of uint8 or uint16, without the rotation given by EXIF.
 
-    ``accept`` may refuse what the file says of itself, before it is decoded. ImageError where the file is missing,
-    foreign, truncated, has an alpha channel, several pages, or other than whole numbers of 8 or 16 bit.
+    ``accept`` may reject the declared header before the image is decoded. Raises ImageError if the file is missing,
+    foreign or truncated, or has an alpha channel, several pages, or values other than integers of 8 or 16 bit.
     """
     content = read_image_file(path)
     declared = read_header(content, path)
@@ -63,7 +63,7 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
             f"{declared.width_px} x {declared.height_px} pixels); copy it again"
         )
     try:
-        with _heard() as said:
+        with _capture_damage() as said:
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ImageError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
@@ -71,7 +71,7 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
     if image is None or damage:
         found = f"{len(content)} bytes" + (f", its decoder says: {damage}" if damage else "")
         raise ImageError(f"{path} is a {kind} file that is truncated or damaged ({found}); copy it again")
-    with _heard():
+    with _capture_damage():
         count = cv2.imcount(str(path)) if kind == "TIFF" else 1
     if count > 1:
         raise ImageError(f"{path} holds {count} pages; expected one image per file: split it")
@@ -79,7 +79,7 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
         raise ImageError(f"{path} holds values of {image.dtype}; expected whole numbers of 8 or 16 bit")
     if image.ndim == 3 and image.shape[2] not in (1, 3):
         raise ImageError(
-            f"{path} has {image.shape[2]} channels, that is with an alpha channel: grey values behind it have no "
-            "certain meaning; save it without transparency"
+            f"{path} has {image.shape[2]} channels, including an alpha channel: grey values under transparency are "
+            "undefined; save it without transparency"
         )
     return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image

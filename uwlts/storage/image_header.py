@@ -1,4 +1,4 @@
-"""Headers of image files: what is declared there is checked before a decoder makes room for it."""
+"""Headers of image files, checked before a decoder allocates memory."""
 
 import math
 import struct
@@ -13,11 +13,11 @@ from uwlts.files.reading import read_bytes
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
 MOST_PIXELS = 150_000_000
-"""Of an image: the largest single image sensors have that many pixels."""
+"""Largest number of pixels of an image, that of the largest single image sensors."""
 _MOST_BYTES = 2**27
-"""Of an image file: 60 million pixels of 16 bit that are not packed."""
+"""Largest image file: 60 million uncompressed pixels of 16 bit."""
 _MOST_SHRINKING = {"PNG": 1100}
-"""How much smaller a packed file is at most: deflate reaches 1032 (zlib.net/zlib_tech.html), others have no limit."""
+"""Largest compression ratio by format: deflate reaches 1032 (zlib.net/zlib_tech.html), others are unlimited."""
 _MOST_TAGS = 4096
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"BM": "BMP", b"\xff\xd8\xff": "JPEG"}
@@ -26,7 +26,7 @@ _SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What an image file says of itself before its pixels are decoded."""
+    """Declared properties of an image file, before its pixels are decoded."""
 
     kind: Literal["PNG", "BMP", "JPEG", "TIFF"]
     width_px: int
@@ -35,13 +35,13 @@ class ImageHeader:
     packed: bool
 
     def least_bytes(self) -> float:
-        """Bytes that a file of such an image has at least."""
+        """Return the smallest possible file size in bytes."""
         row = -(-self.width_px * self.bits_per_pixel // 8)
         return row * self.height_px / (_MOST_SHRINKING.get(self.kind, math.inf) if self.packed else 1)
 
 
 def read_image_file(path: str | Path) -> bytes:
-    """Content of an image file; ImageError where it is missing, no regular file, or too large."""
+    """Read an image file; raises ImageError if it is missing, not a regular file, or too large."""
     return read_bytes(path, most_bytes=_MOST_BYTES, error=ImageError, called="image")
 
 
@@ -54,7 +54,7 @@ def _kind_of(content: bytes, path: str | Path) -> str:
 
 
 def read_header(content: bytes, path: str | Path) -> ImageHeader:
-    """The header of an image; ImageError where it is foreign or damaged, or has more pixels than any camera."""
+    """Read the header of an image; raises ImageError if it is foreign, damaged, or declares too many pixels."""
     kind = _kind_of(content, path)
     readers = {"PNG": _png_header, "BMP": _bmp_header, "JPEG": _jpeg_header, "TIFF": _tiff_header}
     try:
@@ -66,20 +66,20 @@ def read_header(content: bytes, path: str | Path) -> ImageHeader:
         ) from error
     if found.width_px * found.height_px > MOST_PIXELS:
         raise ImageError(
-            f"{path} says that it has {found.width_px} x {found.height_px} pixels; this program reads images of up to "
+            f"{path} declares {found.width_px} x {found.height_px} pixels; this program reads images of up to "
             f"{MOST_PIXELS / 1e6:g} million"
         )
     return found
 
 
 def _png_header(content: bytes) -> ImageHeader:
-    """Portable Network Graphics (PNG) Specification, 11.2.1."""
+    """Read a PNG header: Portable Network Graphics (PNG) Specification, 11.2.1."""
     width, height, bits, colours = struct.unpack_from(">IIBB", content, 16)
     return ImageHeader("PNG", width, height, bits * {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[colours], packed=True)
 
 
 def png_damage(content: bytes) -> str | None:
-    """What is wrong with a PNG's pieces, each of which has a length and a checksum; None where they are whole."""
+    """Return the fault in a PNG's chunks, which have lengths and checksums, or None."""
     view, place = memoryview(content), 8
     while place + 12 <= len(content):
         (length,) = struct.unpack_from(">I", content, place)
@@ -95,17 +95,17 @@ def png_damage(content: bytes) -> str | None:
 
 
 def _bmp_header(content: bytes) -> ImageHeader:
-    """BITMAPINFOHEADER and its successors; of BITMAPCOREHEADER by its length of 12 bytes."""
+    """Read a header: BITMAPINFOHEADER and its successors, or BITMAPCOREHEADER, recognised by its 12 bytes."""
     if struct.unpack_from("<I", content, 14)[0] == 12:
         width, height, _, bits = struct.unpack_from("<HHHH", content, 18)
         return ImageHeader("BMP", width, height, bits, packed=False)
     width, height, _, bits, packing = struct.unpack_from("<iiHHI", content, 18)
-    # 1 and 2 are run lengths; heights below zero count from the top.
+    # 1 and 2 are run-length encodings; negative heights count from the top.
     return ImageHeader("BMP", abs(width), abs(height), bits, packed=packing in (1, 2))
 
 
 def _jpeg_header(content: bytes) -> ImageHeader:
-    """The frame header, ITU-T T.81, B.2.2, behind markers with their lengths."""
+    """Read the frame header, ITU-T T.81, B.2.2, which follows markers with their lengths."""
     place = 2
     while True:
         marker = content[place + 1]
@@ -124,7 +124,7 @@ _WIDTH, _HEIGHT, _BITS, _PACKING, _SAMPLES = 256, 257, 258, 259, 277
 
 
 def _tiff_header(content: bytes) -> ImageHeader:
-    """The first directory, TIFF 6.0, section 2, or of BigTIFF: entries of tag, type, count and value."""
+    """Read the first directory of TIFF 6.0, section 2, or of BigTIFF: entries of tag, type, count and value."""
     order = "<" if content.startswith(b"II") else ">"
     big = struct.unpack_from(order + "H", content, 2)[0] == 43
     (place,) = struct.unpack_from(order + ("Q" if big else "I"), content, 8 if big else 4)
@@ -134,7 +134,7 @@ def _tiff_header(content: bytes) -> ImageHeader:
     for entry in range(place, place + step * min(count, _MOST_TAGS), step):
         tag, kind = struct.unpack_from(order + "HH", content, entry)
         if tag in (_WIDTH, _HEIGHT, _BITS, _PACKING, _SAMPLES):
-            # Several values, such as the bits of each colour, stand elsewhere; the same holds for all of them.
+            # Several values, such as the bits of each colour, are stored elsewhere; the first applies to all.
             (several,) = struct.unpack_from(order + ("Q" if big else "I"), content, entry + 4)
             where, letter = entry + at, {1: "B", 3: "H", 4: "I", 16: "Q"}[kind]
             if several * struct.calcsize(order + letter) > (8 if big else 4):

@@ -1,6 +1,6 @@
-"""LAS and LAZ as other programs read them: points in m, in steps of 0.1 um, with fields of any name.
+"""LAS and LAZ for other programs: points in m, in steps of 0.1 um, with extra fields.
 
-LAZ is read as COPC only: the decompressor ends the process on some damaged files.
+LAZ is read as COPC only: the decompressor terminates the process on some damaged files.
 """
 
 import struct
@@ -17,14 +17,14 @@ from uwlts.runtime.optional_library import optional_library
 from uwlts.storage.cloud import PointCloud, cloud_of
 
 LAZ_STEP_M = 1e-7
-"""Coordinates in LAZ are whole multiples of it from the middle of the cloud: 0.1 um, over 214 m to either side."""
+"""Resolution of coordinates in LAZ, integers relative to the middle of the cloud: up to 214 m to either side."""
 
 _REACH_M = LAZ_STEP_M * (2**31 - 1)
 INTENSITY_LIMITS = 0, 2**16 - 1
 _START = 104
 """Bytes of a LAS header up to its number of variable length records (LAS 1.4, 2.4)."""
 _RECORD = 54
-"""Fewest bytes of such a record: its header (LAS 1.4, 2.5)."""
+"""Smallest size of such a record in bytes: its header (LAS 1.4, 2.5)."""
 
 
 def las_content(
@@ -36,11 +36,14 @@ def las_content(
     colours: np.ndarray | None = None,
     compressed: bool,
 ) -> bytes:
-    """Content of a LAS or LAZ file of points (N, 3), their intensity (N,), fields (N,) by name, times (N,), and
-    red, green and blue (N, 3) uint8."""
-    laspy = library("laspy", "LAZ" if compressed else "LAS")
+    """Return the content of a LAS or LAZ file.
+
+    ``points_mm`` is (N, 3), ``intensity``, the ``fields`` and ``time_s`` are (N,), and ``colours`` is red, green and
+    blue (N, 3) uint8.
+    """
+    laspy = load_library("laspy", "LAZ" if compressed else "LAS")
     if compressed:
-        library("lazrs", "LAZ")
+        load_library("lazrs", "LAZ")
     points = 1e-3 * points_mm
     middle = las_middle(points.min(axis=0), points.max(axis=0))
     header = laspy.LasHeader(version="1.4", point_format=6 if colours is None else 7)
@@ -52,18 +55,18 @@ def las_content(
     if time_s is not None:
         table.gps_time = time_s
     if colours is not None:
-        # 16 bits for each colour, all of them used, as the standard wants.
+        # The standard requires 16 bits per colour that use the full range.
         table.red, table.green, table.blue = 257 * colours.T.astype(np.uint16)
     for name, values in fields.items():
         table[name] = values
-    # In memory: the compressor has errors of its own where storage fails.
+    # In memory: the compressor raises errors of its own if writing fails.
     content = BytesIO()
     table.write(content, do_compress=compressed)
     return content.getvalue()
 
 
 def las_middle(low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
-    """Middle (3,) of a cloud, in m, from which coordinates are counted; OutputError where the cloud is too wide."""
+    """Return the middle (3,) of a cloud in m, the origin of its coordinates; raises OutputError if it is too wide."""
     middle = np.round((low_m + high_m) / 2, 3)
     reach = max(np.abs(low_m - middle).max(), np.abs(high_m - middle).max())
     if not reach <= _REACH_M:
@@ -75,12 +78,12 @@ def las_middle(low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
 
 
 def read_las(path: Path) -> PointCloud:
-    """All points of a LAS file; CaptureError if it is damaged or compressed, SetupError without laspy."""
-    laspy = library("laspy", "LAS")
+    """Read all points of a LAS file; raises CaptureError if it is damaged or compressed, SetupError without laspy."""
+    laspy = load_library("laspy", "LAS")
     with opened(path, called="cloud") as file:
         start = file.read(_START)
     try:
-        # The library reads as many records before the points as the header declares, however many.
+        # The library reads as many records before the points as the header declares, without a limit.
         points_begin, records = struct.unpack("<II", start[96:_START])
         if records * _RECORD > points_begin:
             raise ValueError(f"{records} records do not fit before its points")
@@ -103,17 +106,17 @@ def read_las(path: Path) -> PointCloud:
         struct.error,
         laspy.errors.LaspyException,
     ) as error:
-        raise CaptureError(f"{path} is not a complete LAS file: {brief(error)}") from error
+        raise CaptureError(f"{path} is not a complete LAS file: {shorten_error(error)}") from error
     times = column.pop("gps_time", None)
-    # Programs leave it 0 where they know no times.
+    # Programs write 0 if times are unknown.
     return cloud_of(points, intensity=intensity, time_s=None if times is None or not times.any() else times, **column)
 
 
-def library(name: Literal["laspy", "lazrs", "copclib", "pye57"], format: str) -> ModuleType:
-    """A library for clouds by its name; SetupError if it is not installed."""
+def load_library(name: Literal["laspy", "lazrs", "copclib", "pye57"], format: str) -> ModuleType:
+    """Import a library for clouds; raises SetupError if it is not installed."""
     return optional_library(name, needed_by=format, extra="clouds", instead=", or write PLY or XYZ")
 
 
-def brief(error: BaseException) -> str:
-    """The message of a library's error in one line of 200 characters at most."""
+def shorten_error(error: BaseException) -> str:
+    """Return a library's error message in one line of at most 200 characters."""
     return " ".join(str(error).split())[:200]

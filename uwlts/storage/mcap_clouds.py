@@ -19,7 +19,7 @@ _NANOSECONDS = 10**9
 
 
 def covariance_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
-    """Columns (N,) float32 ``cov_xx_mm2`` to ``cov_zz_mm2`` of the covariance of each point; none where not known."""
+    """Return the columns (N,) float32 ``cov_xx_mm2`` to ``cov_zz_mm2`` of each point's covariance; empty if unknown."""
     covariance = cloud.covariance_mm2
     if covariance is None:
         return {}
@@ -27,16 +27,16 @@ def covariance_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
     return {name: covariance[:, i, j].astype(np.float32) for name, (i, j) in zip(names, PAIRS, strict=True)}
 
 
-def mcap_of(cloud: PointCloud, *, foxglove: bool) -> bytes:
-    """A recording of a cloud on the topic ``/points``, one message for each moment where the points' times are known.
+def mcap_content(cloud: PointCloud, *, foxglove: bool) -> bytes:
+    """Return a recording of a cloud on the topic ``/points``, with one message per time if times are known.
 
-    Points have the fields x, y, z (m) and intensity as 32-bit floating point numbers, which viewers expect, frame and
-    line as 32-bit integers, time (s, 64 bits) where known, and the covariance in mm2 (`covariance_columns`).
+    Points have the fields x, y, z (m) and intensity as 32-bit floating point numbers, which viewers expect; frame and
+    line as 32-bit integers; time (s, 64 bits) if known; and the covariance in mm2 (`covariance_columns`).
 
     Raises
     ------
     OutputError
-        A time is negative: messages have none before the clock's zero.
+        A time is negative: messages cannot be earlier than the clock's zero.
     SetupError
         A library is not installed.
     """
@@ -46,7 +46,7 @@ def mcap_of(cloud: PointCloud, *, foxglove: bool) -> bytes:
 
 
 def _table(cloud: PointCloud) -> np.ndarray:
-    """Points as rows of packed numbers, little-endian."""
+    """Return the points as packed rows, little-endian."""
     columns: dict[str, np.ndarray] = dict(zip("xyz", (1e-3 * cloud.points_mm).astype(np.float32).T, strict=True))
     columns |= {"intensity": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
     if cloud.time_s is not None:
@@ -59,7 +59,7 @@ def _table(cloud: PointCloud) -> np.ndarray:
 
 
 def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
-    """Times in ns, and the numbers of the points of each."""
+    """Iterate over the times in ns, and the indices of the points of each."""
     if cloud.time_s is None:
         yield 0, np.arange(len(cloud))
         return
@@ -133,7 +133,7 @@ def _foxglove(cloud: PointCloud) -> bytes:
 
 
 def _layout(table: np.ndarray) -> dict[str, tuple[np.dtype, int]]:
-    """Type and offset of each field of a packed table."""
+    """Return type and offset of each field of a packed table."""
     return {name: (entry[0], entry[1]) for name, entry in (table.dtype.fields or {}).items()}
 
 

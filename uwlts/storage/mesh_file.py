@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import math
 import os
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from uwlts.errors import OutputError
+from uwlts.errors import CaptureError, OutputError
+from uwlts.files.reading import opened, require_regular_file
 from uwlts.files.writing import written_aside
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.storage.cloud_files import require_ply_size
 
 MESH_FORMATS = (".stl", ".ply", ".glb")
+READ_FORMATS = (".ply", ".stl", ".obj")
+"""Endings of the meshes that can be read."""
 
 _FARTHEST_SINGLE_MM = 16_000.0
-"""Numbers of 32 bits have steps of a micrometre there."""
+"""Beyond this distance 32-bit numbers are coarser than a micrometre."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,18 +34,18 @@ class SurfaceMesh(Brief):
     Attributes
     ----------
     vertices_mm, normals : (V, 3) float64
-        Vertices in the clouds' frame, and unit normals there, towards the sensor.
+        Vertices in the clouds' frame, and unit normals at them, towards the sensor.
     faces : (F, 3) int64
         Vertices of each triangle, anticlockwise from the sensor.
     noise_mm, shared_mm : (V,) float64
-        Standard uncertainty along the normal by noise and the positions of images, and by what all points of a scan
-        share; 0 where the clouds do not state it.
+        Standard uncertainty along the normal due to noise and the positions of images, and due to errors common to a
+        scan; 0 if the clouds do not state it.
     cube_mm, radius_mm : float
-        Edge of the cubes, and the radius of the patches.
+        Edge of the cubes, and radius of the patches; NaN for a mesh from a file.
     left_out : float
-        Share of the clouds' points that are farther from the mesh than the patches' radius.
+        Fraction of the clouds' points farther from the mesh than the patches' radius; NaN for a mesh from a file.
     metadata : dict
-        What the clouds are and come from.
+        Origin of the clouds; empty for a mesh from a file.
     """
 
     vertices_mm: np.ndarray
@@ -47,10 +53,10 @@ class SurfaceMesh(Brief):
     faces: np.ndarray
     noise_mm: np.ndarray
     shared_mm: np.ndarray
-    cube_mm: float
-    radius_mm: float
-    left_out: float
-    metadata: Table
+    cube_mm: float = math.nan
+    radius_mm: float = math.nan
+    left_out: float = math.nan
+    metadata: Table = field(default_factory=dict)
 
     @property
     def std_mm(self) -> np.ndarray:
@@ -58,23 +64,25 @@ class SurfaceMesh(Brief):
         return np.hypot(self.noise_mm, self.shared_mm)
 
     def area_mm2(self) -> float:
-        """Area of all triangles."""
+        """Return the area of all triangles."""
         a, b, c = (self.vertices_mm[self.faces[:, k]] for k in range(3))
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
     def lines(self) -> list[str]:
-        """The summary as text."""
+        """Return the summary as lines of text."""
         std = np.quantile(self.std_mm, [0.5, 0.95])
-        return [
+        lines = [
             f"mesh                      {len(self.vertices_mm)} vertices, {len(self.faces)} triangles, "
             f"{self.area_mm2():.5g} mm2",
-            f"cubes, patches            {self.cube_mm:.3g} mm, radius {self.radius_mm:.3g} mm",
             f"standard uncertainty, mm  {std[0]:.4f} (median), {std[1]:.4f} (95 % of the vertices)",
-            f"points without a surface  {100 * self.left_out:.2f} %",
         ]
+        if math.isfinite(self.cube_mm):
+            lines.insert(1, f"cubes, patches            {self.cube_mm:.3g} mm, radius {self.radius_mm:.3g} mm")
+            lines.append(f"points without a surface  {100 * self.left_out:.2f} %")
+        return lines
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the mesh in the format that the path's suffix names, whole or not at all.
+        """Write the mesh in the format of the path's ending, completely or not at all.
 
         - ``.ply``: binary, mm. Vertices have x, y, z (double), nx, ny, nz, and the standard uncertainty along the
           normal: uncertainty, and its parts uncertainty_noise and uncertainty_shared (float, mm).
@@ -85,8 +93,8 @@ class SurfaceMesh(Brief):
         Raises
         ------
         OutputError
-            The suffix is another one, the file exists and ``overwrite`` is not set, the mesh lies too far from the
-            origin for STL, or the file cannot be written.
+            The ending is unknown, the file exists and ``overwrite`` is not set, the mesh is too far from the origin for
+            STL, or the file cannot be written.
         """
         path = Path(path)
         match path.suffix.lower():
@@ -101,6 +109,58 @@ class SurfaceMesh(Brief):
                 raise OutputError(
                     f"{path} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh"
                 )
+
+
+def has_faces(path: Path) -> bool:
+    """Return whether a PLY file contains a mesh rather than a cloud, by its header."""
+    with opened(path, called="mesh or cloud") as file:
+        header = file.read(2**20).partition(b"end_header")[0]
+    found = re.search(rb"^element +face +0*[1-9]", header, flags=re.MULTILINE)
+    return header.startswith(b"ply") and found is not None
+
+
+def read_mesh(path: str | Path) -> SurfaceMesh:
+    """Read a mesh in mm from PLY, STL or OBJ.
+
+    The standard uncertainties are those of a PLY file written by `SurfaceMesh.save`, otherwise 0. Normals that are not
+    in the file are averages over the adjacent triangles.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, damaged or without triangles, or vertices are not finite.
+    """
+    import trimesh
+
+    path = Path(path)
+    is_ply = path.suffix.lower() == ".ply"
+    try:
+        if is_ply:
+            require_ply_size(path, called="mesh")
+        else:
+            require_regular_file(path, called="mesh")
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
+        if path.suffix.lower() == ".stl":
+            # STL repeats each vertex for every triangle.
+            loaded.merge_vertices()
+        vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64)
+        known = PlyData.read(str(path))["vertex"].data if is_ply else np.empty(len(vertices), [])
+    except CaptureError:
+        raise
+    except Exception as error:
+        # trimesh passes on all exceptions of its parsers.
+        raise CaptureError(f"{path} is not a complete mesh ({', '.join(READ_FORMATS)}): {error}") from error
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise CaptureError(f"{path} has no triangles, or vertices that are not finite")
+    names = known.dtype.names or ()
+    normals = np.asarray(loaded.vertex_normals, float)
+    if {"nx", "ny", "nz"} <= set(names):
+        normals = np.column_stack([known[name] for name in ("nx", "ny", "nz")]).astype(float)
+    noise, shared = (
+        known[name].astype(float) if name in names else np.zeros(len(vertices))
+        for name in ("uncertainty_noise", "uncertainty_shared")
+    )
+    return SurfaceMesh(vertices, normals, faces, noise, shared)
 
 
 def _ply(mesh: SurfaceMesh) -> PlyData:
@@ -123,7 +183,7 @@ def _stl(mesh: SurfaceMesh) -> bytes:
     farthest = float(np.abs(mesh.vertices_mm).max())
     if farthest > _FARTHEST_SINGLE_MM:
         raise OutputError(
-            f"the mesh reaches {farthest:.6g} mm from the origin, where the numbers of STL have steps of more than a "
+            f"the mesh reaches {farthest:.6g} mm from the origin, where the numbers of STL are coarser than a "
             "micrometre: write PLY or glTF"
         )
     content: Any = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(file_type="stl")
@@ -133,7 +193,7 @@ def _stl(mesh: SurfaceMesh) -> bytes:
 def _glb(mesh: SurfaceMesh) -> bytes:
     import trimesh
 
-    # Small numbers about the middle keep their digits in 32 bits.
+    # Coordinates about the middle keep their precision in 32 bits.
     middle = np.round(1e-3 * mesh.vertices_mm.mean(axis=0), 3)
     local = trimesh.Trimesh(1e-3 * mesh.vertices_mm - middle, mesh.faces, vertex_normals=mesh.normals, process=False)
     local.vertex_attributes["_uncertainty"] = mesh.std_mm.astype(np.float32)

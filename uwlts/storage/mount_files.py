@@ -1,4 +1,4 @@
-"""Files of a mount's calibration: profiles of any maker's scanner, and `mount.json`."""
+"""Files of a mount's calibration: profiles of scanners of any make, and `mount.json`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ from uwlts.storage.pose_files import (
 
 Artefact = Literal["sphere", "plane", "step", "ring"]
 _SIZES: dict[Artefact, str] = {"sphere": "radius", "step": "height", "ring": "radius"}
-"""Name of the size of an artefact, for those that have one."""
+"""Name of the size of each artefact that has one."""
 SensorAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 SENSOR_AXES: dict[SensorAxis, np.ndarray] = {
     sign + name: (-1.0 if sign else 1.0) * direction  # pyright: ignore[reportAssignmentType]
@@ -37,11 +37,11 @@ SENSOR_AXES: dict[SensorAxis, np.ndarray] = {
     for name, direction in zip("xyz", np.eye(3), strict=True)
 }
 _ON_AXIS = 1e-6
-"""By how much poses of a table may be off turns about its axis, mm and parts of one: printed with six decimals."""
+"""Tolerance for rotations about a table's axis, in mm and as a ratio, for numbers printed with six decimals."""
 
 
 class MountDescription(Description):
-    """Everything about a mount's calibration in a TOML file; files are sought beside it."""
+    """Description of a mount's calibration in a TOML file; paths are relative to its folder."""
 
     profiles: str
     poses: str
@@ -58,7 +58,7 @@ class MountDescription(Description):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MountEvidence:
-    """Profiles with NaN where nothing was seen, mm, and the platform's poses (M, 4, 4): one each, or a trajectory."""
+    """Profiles in mm, NaN for missing points, and the platform's poses (M, 4, 4): one per profile, or a trajectory."""
 
     profiles: list[np.ndarray]
     poses: np.ndarray
@@ -94,7 +94,7 @@ def read_mount_evidence(
     profile_times_s: np.ndarray | None,
     pose_times_s: np.ndarray | None,
 ) -> MountEvidence:
-    """Profiles and poses from arrays or files, checked; DescriptionError where they do not go together."""
+    """Read and check profiles and poses from arrays or files; raises DescriptionError if they do not match."""
     digests: dict[str, str] = {}
     names: list[str] | None = None
     if isinstance(profiles, str | Path) and Path(profiles).suffix == ".toml":
@@ -112,7 +112,7 @@ def read_mount_evidence(
     for name, size in (("radius", radius_mm), ("height", height_mm)):
         if size is not None and not (np.isfinite(size) and size > 0 and _SIZES.get(artefact) == name):
             kinds = " or ".join(kind for kind, own in _SIZES.items() if own == name)
-            raise DescriptionError(f"{name}_mm is {size:g} of a {artefact}; expected the positive {name} of a {kinds}")
+            raise DescriptionError(f"{name}_mm is {size:g} for a {artefact}; expected the positive {name} of a {kinds}")
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):
@@ -127,7 +127,7 @@ def read_mount_evidence(
     if axis is not None:
         if artefact != "sphere" or scale:
             raise DescriptionError(
-                "by profiles the axis of a rotary table follows from a sphere on it, which has no scale to find"
+                "from profiles, the axis of a rotary table is found with a sphere on it, without a scale"
             )
         require_table(matrices, axis=axis)
     if time and (profile_times_s is None or pose_times_s is None):
@@ -158,13 +158,13 @@ def read_mount_evidence(
 
 
 def require_table(poses: np.ndarray, *, axis: str) -> None:
-    """DescriptionError where poses (P, 4, 4) are not turns of a table about its z axis, or the axis is none."""
+    """Raise DescriptionError if poses (P, 4, 4) are not rotations about a table's z axis, or the axis is unknown."""
     if axis not in SENSOR_AXES:
         raise DescriptionError(f"the axis is {axis!r}; expected one of {', '.join(SENSOR_AXES)} of the sensor's frame")
     turns = np.linalg.inv(poses[0]) @ poses
     if max(np.abs(turns[:, 2] - (0, 0, 1, 0)).max(), np.abs(turns[:, :2, 3]).max()) > _ON_AXIS:
         raise DescriptionError(
-            "the poses are not turns about one z axis: give the angles of the rotary table (pose format angle-deg)"
+            "the poses are not rotations about one z axis: give the angles of the rotary table (pose format angle-deg)"
         )
 
 
@@ -189,7 +189,7 @@ def _checked_times(
             f"there are {wanted.size} times of {profiles} profiles and {times.size} of {poses} poses"
         )
     if not (np.isfinite(wanted).all() and np.isfinite(times).all() and (np.diff(times) > 0).all() and poses > 1):
-        raise DescriptionError("times must be finite, and those of the poses must grow")
+        raise DescriptionError("times must be finite, and those of the poses must increase")
     outside = int(np.count_nonzero((wanted < times[0]) | (wanted > times[-1])))
     if outside:
         raise DescriptionError(f"{outside} of {profiles} profiles were taken before the first or after the last pose")
@@ -199,12 +199,12 @@ def _checked_times(
 def read_profiles(
     path: str | Path, *, unit: Unit = "mm", digests: dict[str, str] | None = None
 ) -> tuple[list[str], list[np.ndarray], np.ndarray | None]:
-    """Names, profiles (N, 2) or (N, 3) and times of profiles (or None) from files, mm.
+    """Read names, profiles (N, 2) or (N, 3) in mm, and times of profiles (or None) from files.
 
-    A folder holds one CSV file for each pose, in the order of the numbers in their names. One CSV file holds all
-    profiles, with a column ``pose``. Columns are x and z, y where the points have it, and ``time_s``; without a line of
-    names two columns are x and z. Cells that are empty or NaN were not seen. A cloud of the project's own has the
-    points of pose n in frame n. DescriptionError for anything else.
+    A folder contains one CSV file for each pose, in the order of the numbers in their names. A single CSV file contains
+    all profiles, with a column ``pose``. Columns are x and z, y for 3D points, and ``time_s``; two columns without
+    names are x and z. Empty or NaN cells are missing points. In a cloud of the program, the points of pose n are in
+    frame n. Raises DescriptionError for anything else.
     """
     path, digests = Path(path), {} if digests is None else digests
     scale = MM_PER_UNIT[checked_unit(unit)]
@@ -228,10 +228,10 @@ def read_profiles(
     else:
         columns = read_columns(path, digests)
         if "pose" not in columns:
-            raise DescriptionError(f"{path} has no column 'pose', which says to which pose each of its points belongs")
+            raise DescriptionError(f"{path} has no column 'pose', the pose to which each point belongs")
         poses, points = columns["pose"], _points_of(columns, path) * scale
         if not np.isfinite(poses).all():
-            raise DescriptionError(f"{path}: some cells of the column 'pose' are empty or no number")
+            raise DescriptionError(f"{path}: some cells of the column 'pose' are empty or not a number")
         labels = list(dict.fromkeys(poses.tolist()))
         names = [f"{label:g}" for label in labels]
         profiles = [points[poses == label] for label in labels]
@@ -248,12 +248,10 @@ def _one_time(columns: dict[str, np.ndarray]) -> float:
 
 def _points_of(columns: dict[str, np.ndarray], path: Path) -> np.ndarray:
     if not {"x", "z"} <= columns.keys():
-        raise DescriptionError(
-            f"{path} has the columns {', '.join(columns)}; expected x and z, and y where there is one"
-        )
+        raise DescriptionError(f"{path} has the columns {', '.join(columns)}; expected x and z, and y for 3D points")
     return np.column_stack([columns[name] for name in ("x", "y", "z") if name in columns])
 
 
 def read_mount(path: str | Path) -> Mount:
-    """Read a mount; CaptureError where the file is missing, foreign, newer or damaged."""
+    """Read a mount; raises CaptureError if the file is missing, foreign, newer or damaged."""
     return read_model(path, Mount, format=FORMAT, version=VERSION, called="mount")

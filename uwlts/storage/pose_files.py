@@ -1,4 +1,4 @@
-"""Files of poses of any platform: tables of numbers, matrices, quaternions, rotation vectors and Euler angles."""
+"""Files of platform poses: matrices, quaternions, rotation vectors and Euler angles, in tables of numbers."""
 
 import re
 from io import BytesIO
@@ -26,7 +26,7 @@ FARTHEST_MM = 1e7
 
 _MOST_BYTES = 512 * 2**20
 _ROUNDED = 2e-3
-"""Departure from a rigid matrix or a unit quaternion by three printed decimals."""
+"""Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
 _EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
 _FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
 _MOST_POSES = 20_000
@@ -42,9 +42,10 @@ _COLUMN_NAMES = re.compile(r"(?:_| *[\[(])(?:mm|m)[\])]?$")
 
 
 def read_columns(path: Path, digests: dict[str, str], *, named: bool = True) -> dict[str, np.ndarray]:
-    """Columns of a CSV file, with commas, semicolons (then decimal commas), tabs or blanks; without lines of #.
+    """Read the columns of a CSV file with commas, semicolons (then decimal commas), tabs or blanks.
 
-    Names are as in the first line, in lower case and without unit, or x and z, or numbers where the file has no names.
+    Lines that begin with # are skipped. Names are those of the first line, in lower case and without unit. Without
+    names, two columns are x and z, and others are numbered.
     """
     content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
     digests[path.name] = sha256_of(path)
@@ -92,17 +93,17 @@ def _is_number(text: str) -> bool:
 def read_poses(
     path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit = "mm"
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """``T_base_platform`` (P, 4, 4), mm, and their times (P,) or None, from a CSV file with one pose a line.
+    """Read ``T_base_platform`` (P, 4, 4) in mm, and times (P,) or None, from a CSV file with one pose per line.
 
-    Columns ``pose`` and ``time_s``, recognised by name, come in addition. The others are, in this order, 12 or 16
-    elements of the matrix row by row; or the translation, then a quaternion (``quaternion-xyzw``, ``quaternion-wxyz``),
-    a rotation vector (``rotvec-rad``, ``rotvec-deg``) or three Euler angles: ``euler-ZYX-deg`` turns about the moved
-    axes (intrinsic), the first letter first; ``euler-zyx-deg`` about the fixed axes (extrinsic), as SciPy's
-    `Rotation.from_euler`. One column ``angle-deg`` or ``angle-rad`` is the angle of a rotary table that turns the
-    object about its z axis: the poses are then those of the sensor's side as seen from the object.
+    Columns ``pose`` and ``time_s`` are recognised by name. The others are, in this order, 12 or 16 elements of the
+    matrix row by row; or the translation, then a quaternion (``quaternion-xyzw``, ``quaternion-wxyz``), a rotation
+    vector (``rotvec-rad``, ``rotvec-deg``) or three Euler angles as in SciPy's `Rotation.from_euler`. ``euler-ZYX-deg``
+    rotates about the moved axes (intrinsic), first letter first; ``euler-zyx-deg`` about the fixed axes (extrinsic). A
+    single column ``angle-deg`` or ``angle-rad`` is the angle of a rotary table that turns the object about its z axis:
+    the poses are those of the sensor's side relative to the object.
 
-    DescriptionError for a wrong count, numbers that are not finite, matrices that are not rigid, quaternions without
-    unit length and angles that look like degrees where radians are stated.
+    Raises DescriptionError for a wrong number of columns, numbers that are not finite, matrices that are not rigid,
+    quaternions that are not of unit length, and angles in rad that look like degrees.
     """
     path = Path(path)
     rows, times = pose_rows(path, {})
@@ -110,14 +111,16 @@ def read_poses(
 
 
 def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit = "mm") -> Trajectory:
-    """The path of a platform from a file as for `read_poses` with a column ``time_s``.
+    """Read the trajectory of a platform from a file like that of `read_poses`, with a column ``time_s``.
 
-    With the format ``tum`` each line is the time in s, the position in m and the quaternion x y z w, separated by
-    blanks and without names, as the RGB-D benchmark of TU Munich has them. Columns ``cov_00`` to ``cov_55`` by name are
-    the upper triangles of the covariances (`Trajectory`), in the unit of the positions and rad. With the format ``ros``
-    the file is a bag of ROS 1 or ROS 2; ``ros:/TOPIC`` or ``ros:PARENT>CHILD`` names the poses or transforms in it
-    (`uwlts.storage.ros_bags`). DescriptionError as `read_poses` and `Trajectory`, and where there are no times;
-    SetupError where the library for bags is not installed.
+    With the format ``tum``, of the RGB-D benchmark of TU Munich, each line has the time in s, the position in m and the
+    quaternion x y z w, separated by blanks and without names. Columns named ``cov_00`` to ``cov_55`` are the upper
+    triangles of the covariances (`Trajectory`), in the unit of the positions and rad. With the format ``ros`` the file
+    is a bag of ROS 1 or ROS 2; ``ros:/TOPIC`` or ``ros:PARENT>CHILD`` names the poses or transforms in it
+    (`uwlts.storage.ros_bags`).
+
+    Raises the errors of `read_poses` and `Trajectory`, DescriptionError if there are no times, and SetupError if the
+    library for bags is not installed.
     """
     path = Path(path)
     if pose_format == "ros" or pose_format.startswith("ros:"):
@@ -139,9 +142,9 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
 
 
 def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False) -> None:
-    """Write poses (P, 4, 4), mm, as CSV with 12 elements of the matrix a line.
+    """Write poses (P, 4, 4) in mm as CSV with 12 elements of the matrix per line.
 
-    `read_poses` reads them back with the format ``matrix``. OutputError where the file exists and ``overwrite`` is not
+    `read_poses` reads them with the format ``matrix``. Raises OutputError if the file exists and ``overwrite`` is not
     set, or cannot be written.
     """
     names = [f"m{row}{column}" for row in range(3) for column in range(4)]
@@ -152,7 +155,7 @@ def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False)
 
 
 def _covariances(columns: dict[str, np.ndarray], path: Path, mm_per_unit: float) -> np.ndarray | None:
-    """Covariances (N, 6, 6), mm and rad, taken out of the columns of a file; None where it has none."""
+    """Remove the covariances (N, 6, 6) in mm and rad from the columns of a file, and return them; None without any."""
     found = {name: columns.pop(name) for name in [*columns] if name in COVARIANCE_COLUMNS}
     if not found:
         return None
@@ -166,7 +169,7 @@ def _covariances(columns: dict[str, np.ndarray], path: Path, mm_per_unit: float)
 
 
 def trajectory_path(capture: str | Path) -> Path:
-    """Path of the file of what the platform reported during a capture, beside it."""
+    """Return the path of the platform's reported trajectory, beside the capture."""
     path = Path(capture)
     return path.with_name(path.name.removesuffix(".h5") + ".trajectory.csv")
 
@@ -179,7 +182,7 @@ def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray, covariance: np
 
 
 def pose_rows(path: Path, digests: dict[str, str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Numbers (P, K) of the poses in a file, and their times (P,) or None."""
+    """Read the numbers (P, K) of the poses in a file, and their times (P,) or None."""
     return _rows_of(read_columns(path, digests, named=False), path)
 
 
@@ -225,7 +228,7 @@ def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
         result[:, : rows.shape[1] // 4] = rows.reshape(len(rows), -1, 4)
         return checked_matrices(result, path)
     if pose_format.startswith("angle"):
-        # The object turns with the table; seen from it, the sensor turns the other way round.
+        # The object turns with the table; relative to it, the sensor turns in the opposite direction.
         angles = rows[:, 0] if pose_format.endswith("rad") else np.radians(rows[:, 0])
         result[:, :3, :3] = Rotation.from_rotvec(np.outer(-angles, (0, 0, 1))).as_matrix()
         return result
@@ -237,7 +240,7 @@ def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
         if len(wrong):
             raise DescriptionError(
                 f"{path}: the quaternion of pose {wrong[0] + 1} has the length {lengths[wrong[0]]:.4g}; expected 1. "
-                "Come x, y, z of the position first, then the quaternion?"
+                "Are x, y, z of the position first, then the quaternion?"
             )
         rotations = Rotation.from_quat(turns, scalar_first=pose_format == "quaternion-wxyz")
     else:
@@ -250,20 +253,20 @@ def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
 
 
 def checked_matrices(matrices: np.ndarray, source: object) -> np.ndarray:
-    """Rigid matrices (P, 4, 4), their rotations freed from rounding; DescriptionError where they are not."""
+    """Return rigid matrices (P, 4, 4) with exact rotations; raises DescriptionError if they are not rigid."""
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
         raise DescriptionError(f"{source}: the poses have the shape {matrices.shape}; expected (P, 4, 4)")
     for number, matrix in enumerate(matrices):
         if not np.isfinite(matrix).all():
             raise DescriptionError(f"{source}: pose {number + 1} has a number that is not finite")
         if np.abs(matrix[:3, 3]).max() > FARTHEST_MM:
-            raise DescriptionError(f"{source}: pose {number + 1} lies beyond {FARTHEST_MM:g} mm: is its unit right?")
+            raise DescriptionError(f"{source}: pose {number + 1} is beyond {FARTHEST_MM:g} mm: is its unit right?")
         if not is_rigid(matrix, within=_ROUNDED):
             hint = ""
             if is_rigid(matrix.T, within=_ROUNDED):
                 hint = " It is given column by column: expected row by row"
             elif np.linalg.det(matrix[:3, :3]) < 0:
-                hint = " It mirrors"
+                hint = " It is a reflection"
             raise DescriptionError(
                 f"{source}: pose {number + 1} is not a rotation and a shift (with 0 0 0 1 as last row).{hint}"
             )

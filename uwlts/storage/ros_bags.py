@@ -17,15 +17,15 @@ _POSES = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
     "geometry_msgs/msg/TransformStamped": lambda message: message.transform,
 }
-# A message without covariance has zeros, as its definition says.
+# By definition, a message without covariance has zeros.
 _WITH_COVARIANCE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
 def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Times (N,) in s, as the messages' headers have them, N poses (N, 7): x, y, z in m and a quaternion x y z w.
+    """Read times (N,) in s of the messages' headers, and poses (N, 7): x, y, z in m and a quaternion x y z w.
 
-    And their covariances (N, 6, 6) in m and rad about fixed axes, where every message states one.
+    Also returns covariances (N, 6, 6) in m and rad about fixed axes if every message states one, else None.
 
     Parameters
     ----------
@@ -33,13 +33,13 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
         The bag.
     wanted : str
         Topic of messages Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped; or ``PARENT>CHILD`` for
-        the transforms of frame CHILD in frame PARENT among all messages of type TFMessage. Not needed in a bag with one
-        such topic, or without any and with the transforms of one pair of frames.
+        the transforms of frame CHILD in frame PARENT among all messages of type TFMessage. Optional if the bag has one
+        such topic, or none and the transforms of one pair of frames.
 
     Raises
     ------
     DescriptionError
-        The path is no bag, or does not hold what is wanted: the message names what it holds.
+        The path is not a bag, or the wanted poses are missing; the message names those in the bag.
     SetupError
         The library for bags is not installed.
     """
@@ -55,7 +55,7 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
     except DescriptionError:
         raise
     except Exception as error:
-        # The library raises errors of the formats, of compression, of SQLite and of the system.
+        # The library raises errors of file formats, compression, SQLite and the operating system.
         raise DescriptionError(
             f"{path} is no ROS bag (.bag, .mcap, .db3 or a bag's folder), or damaged: {error}"
         ) from error
@@ -80,7 +80,7 @@ def _poses(bag: Any, path: Path, wanted: str) -> tuple[np.ndarray, np.ndarray, n
                 "frames of a transform as PARENT>CHILD"
             )
         rows = []
-        for connection, message in _messages(bag, lambda connection: connection.topic == topic):
+        for connection, message in _read_messages(bag, lambda connection: connection.topic == topic):
             rows.append(_row(message.header.stamp, _POSES[connection.msgtype](message)))
             if connection.msgtype in _WITH_COVARIANCE:
                 covariances.append(np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6))
@@ -89,21 +89,21 @@ def _poses(bag: Any, path: Path, wanted: str) -> tuple[np.ndarray, np.ndarray, n
     return table[:, 0], table[:, 1:], known if stated else None
 
 
-def _messages(bag: Any, chosen: Any) -> Any:
+def _read_messages(bag: Any, chosen: Any) -> Any:
     connections = [connection for connection in bag.connections if chosen(connection)]
     for connection, _, data in bag.messages(connections=connections) if connections else ():
         yield connection, bag.deserialize(data, connection.msgtype)
 
 
 def _transforms(bag: Any) -> Any:
-    """Frames, parent and child, and row of every transform of the bag."""
-    for _, message in _messages(bag, lambda connection: connection.msgtype == _TRANSFORMS):
+    """Iterate over the frames (parent, child) and the row of every transform of the bag."""
+    for _, message in _read_messages(bag, lambda connection: connection.msgtype == _TRANSFORMS):
         for each in message.transforms:
             frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
             yield frames, _row(each.header.stamp, each.transform)
 
 
 def _row(stamp: Any, pose: Any) -> tuple[float, ...]:
-    """Time and pose of a message; a pose has a position and an orientation, a transform translation and rotation."""
+    """Return time and pose of a message with position and orientation, or translation and rotation."""
     place, turn = (pose.position, pose.orientation) if hasattr(pose, "position") else (pose.translation, pose.rotation)
     return stamp.sec + 1e-9 * stamp.nanosec, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w

@@ -1,4 +1,4 @@
-"""The ground-truth file that lies beside a rendered capture; nothing but the comparison with truth reads it."""
+"""Ground-truth file of a rendered capture, beside it; only the comparison with truth reads it."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -39,11 +39,11 @@ class TruthHeader(Description):
 class Truth(Brief):
     """True stripe of every profile line of every frame; F frames, L lines.
 
-    ``centre_px (F, L)`` is the image coordinate across the stripe where the line's centre sees the middle of the
-    sheet; ``point_mm (F, L, 3)`` and ``normal (F, L, 3)`` are the surface there in scene coordinates; ``status (F, L)``
-    is a `TruthStatus`; ``crossings (F, L)`` counts lit crossings of the sheet, of which the brightest is given.
-    ``depth_mm (H, W)`` is the camera-frame z of what every pixel sees in the first frame. NaN where nothing is.
-    ``pose (F, 4, 4)`` is ``T_scene_object`` of the sensor's OCS, mm; None in files of earlier versions.
+    ``centre_px (F, L)`` is the image coordinate across the stripe of the middle of the sheet, as seen by the line's
+    centre. ``point_mm (F, L, 3)`` and ``normal (F, L, 3)`` are the surface there in scene coordinates. ``status (F,
+    L)`` is a `TruthStatus`. ``crossings (F, L)`` counts the lit crossings of the sheet; the brightest one is stored.
+    ``depth_mm (H, W)`` is the camera-frame z of the surface at every pixel in the first frame. Missing values are NaN.
+    ``pose (F, 4, 4)`` is ``T_scene_object`` of the sensor's OCS in mm, or None in files of earlier versions.
     """
 
     centre_px: np.ndarray
@@ -56,14 +56,14 @@ class Truth(Brief):
 
 
 def truth_path(capture: str | Path) -> Path:
-    """Path of the truth file of a capture."""
+    """Return the path of a capture's truth file."""
     path = Path(capture)
     return path.with_name(path.name.removesuffix(".h5") + ".truth.h5")
 
 
 def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrite: bool = False) -> None:
-    """Write a truth file whole or not at all; OutputError where that fails."""
-    # HDF5's latest format has checksums over all that the file says of itself.
+    """Write a truth file completely or not at all; raises OutputError if that fails."""
+    # HDF5's latest format protects all its metadata by checksums.
     with written_aside(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
         write_label(file, format=FORMAT, version=VERSION, header=header)
         for name, values in vars(truth).items():
@@ -73,7 +73,7 @@ def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrit
 
 
 def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
-    """Read a truth file; CaptureError where it is missing, foreign, newer, damaged, or contradicts itself."""
+    """Read a truth file; raises CaptureError if it is missing, foreign, newer, damaged or inconsistent."""
     require_regular_file(path, called="truth file")
     try:
         with h5py.File(path, "r") as file:
@@ -92,7 +92,7 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
         raise CaptureError(f"{path} holds unknown statuses; known are {[int(status) for status in TruthStatus]}")
     visible = truth.status == TruthStatus.VISIBLE
     if not all(np.isfinite(values[visible]).all() for values in (truth.centre_px, truth.point_mm, truth.normal)):
-        raise CaptureError(f"{path} says that a stripe is visible where centre, point or normal are not finite")
+        raise CaptureError(f"{path} marks a stripe as visible where centre, point or normal are not finite")
     return header, truth
 
 

@@ -12,30 +12,30 @@ if TYPE_CHECKING:
     from typing_extensions import Buffer
 
 _SIGNATURE_AND_VERSION = b"\x89HDF\r\n\x1a\n\x03"
-# Superblock version 3 with 8-byte offsets (HDF5 File Format Specification 3.0, II.A): where its entries begin.
+# Superblock version 3 with 8-byte offsets (HDF5 File Format Specification 3.0, II.A): offsets of its entries.
 _FLAGS, _END_OF_FILE, _ROOT, _CHECKSUM, _SIZE = 11, 28, 36, 44, 48
 _ROOM = 2**28
-"""Bytes by which a file may grow while it is read."""
+"""Largest growth of a file in bytes while it is read."""
 
 
 def has_writer(path: str | Path) -> bool:
-    """Whether the file says that a writer has it open, or had when it was killed."""
+    """Return whether the file is marked as open for writing, now or when its writer was killed."""
     with open(path, "rb") as file:
         start = file.read(_SIZE)
     return len(start) == _SIZE and start.startswith(_SIGNATURE_AND_VERSION) and start[_FLAGS] != 0
 
 
 class UnfinishedFile(h5py.File):
-    """The file of a writer that was killed, or is still at work, as it was last flushed; errors as of ``h5py.File``.
+    """A file that is being written, or whose writer was killed, as last flushed; raises the errors of ``h5py.File``.
 
     HDF5's single-writer-multiple-reader mode hangs on a damaged file: it tries a hundred times and doubles the pause
-    each time. What keeps the file from being opened like any other are two entries of its superblock, the mark of the
-    writer and the end of the used space. HDF5 is shown them as in a closed file; the file itself is not changed.
+    each time. Two entries of the superblock prevent a normal opening: the writer's mark and the end of the used space.
+    This class presents them to HDF5 as in a closed file; the file itself is not changed.
     """
 
     def __init__(self, path: str | Path):
         with ExitStack() as opened:
-            self._view = opened.enter_context(_AsIfClosed(path))
+            self._view = opened.enter_context(_ClosedView(path))
             super().__init__(self._view, "r")
             opened.pop_all()
 
@@ -45,8 +45,8 @@ class UnfinishedFile(h5py.File):
         self._view.close()
 
 
-class _AsIfClosed(io.FileIO):
-    """The file with the superblock it would have if its writer had closed it, and room for what is still written."""
+class _ClosedView(io.FileIO):
+    """View of the file with the superblock that its writer would leave, and space for further data."""
 
     def __init__(self, path: str | Path):
         super().__init__(path, "r")
@@ -54,16 +54,16 @@ class _AsIfClosed(io.FileIO):
         self._end = os.fstat(self.fileno()).st_size + _ROOM
         settled = start[:_FLAGS] + b"\0" + start[_FLAGS + 1 : _END_OF_FILE] + self._end.to_bytes(8, "little")
         settled += start[_ROOT:_CHECKSUM]
-        # A superblock that is damaged stays so.
+        # A damaged superblock is not corrected.
         intact = lookup3(start[:_CHECKSUM]).to_bytes(4, "little") == start[_CHECKSUM:]
         self._start = settled + lookup3(settled).to_bytes(4, "little") if intact else start
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a place; the file ends where the settled superblock says."""
+        """Set the position; the end of the file is that of the corrected superblock."""
         return super().seek(offset + self._end) if whence == os.SEEK_END else super().seek(offset, whence)
 
     def readinto(self, buffer: "Buffer", /) -> int:
-        """Read as any file, with the settled superblock in place of the stored one and zeros where nothing is yet."""
+        """Read with the corrected superblock instead of the stored one, and zeros where nothing is written yet."""
         place, position = memoryview(buffer).cast("B"), self.tell()
         count = super().readinto(place)
         place[count:] = bytes(len(place) - count)
@@ -73,9 +73,9 @@ class _AsIfClosed(io.FileIO):
 
 
 def lookup3(data: bytes) -> int:
-    """Checksum of HDF5's metadata: ``hashlittle`` of Bob Jenkins' lookup3.c (2006, public domain), started with 0."""
+    """Return HDF5's metadata checksum: ``hashlittle`` of Bob Jenkins' lookup3.c (2006, public domain), seed 0."""
 
-    def turned(value: int, bits: int) -> int:
+    def rotate(value: int, bits: int) -> int:
         return ((value << bits) | (value >> (32 - bits))) & 0xFFFFFFFF
 
     a = b = c = (0xDEADBEEF + len(data)) & 0xFFFFFFFF
@@ -86,12 +86,12 @@ def lookup3(data: bytes) -> int:
         a, b, c = (a + x) & 0xFFFFFFFF, (b + y) & 0xFFFFFFFF, (c + z) & 0xFFFFFFFF
         if block < blocks - 1:
             for bits in (4, 6, 8, 16, 19, 4):
-                a = ((a - c) & 0xFFFFFFFF) ^ turned(c, bits)
+                a = ((a - c) & 0xFFFFFFFF) ^ rotate(c, bits)
                 c = (c + b) & 0xFFFFFFFF
                 a, b, c = b, c, a
         else:
             for bits in (14, 11, 25, 16, 4, 14, 24):
-                c = ((c ^ b) - turned(b, bits)) & 0xFFFFFFFF
+                c = ((c ^ b) - rotate(b, bits)) & 0xFFFFFFFF
                 a, b, c = b, c, a
-    # The last of the seven steps handed c on as b.
+    # The last of the seven steps stored c in b.
     return b

@@ -1,4 +1,4 @@
-"""The board that a page shows: its log, how far the work is, and the picture of an image."""
+"""The board of a page: its log, progress, and the picture of an image."""
 
 import threading
 import time
@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.desk.board import KEPT_LINES, Board, Picture, png_of
+from uwlts.desk.board import KEPT_LINES, Board, Picture, encode_png
 
 FULL = 255
 
@@ -40,7 +40,7 @@ def test_old_lines_are_forgotten_and_numbers_go_on():
     assert len(kept) == KEPT_LINES
     assert [line.number for line in kept] == list(range(50, KEPT_LINES + 50))
     assert all(line.text == str(line.number) for line in kept)
-    # Who looks too late sees what is left.
+    # A late reader sees the remaining lines.
     assert board.lines(10) == kept and len(board.lines(KEPT_LINES)) == 49
 
 
@@ -59,7 +59,7 @@ def test_lines_of_several_threads_have_numbers_of_their_own():
     assert [line.number for line in board.lines()] == list(range(500))
 
 
-# How far the work is
+# Progress
 
 
 def test_the_time_that_is_left_follows_from_what_was_done():
@@ -72,7 +72,7 @@ def test_the_time_that_is_left_follows_from_what_was_done():
     took = time.monotonic() - began
     progress = board.progress
     assert (progress.phase, progress.done, progress.total) == ("recording", 2, 10)
-    # 8 images more at the pace of 2 in at least 0.2 s.
+    # 8 further images at the rate of 2 in at least 0.2 s.
     assert 8 * 0.2 / 2 <= progress.left_s <= 8 * took / 2 + 1e-3
 
 
@@ -112,7 +112,7 @@ def shown(image: np.ndarray, **options: object) -> np.ndarray:
 def test_a_picture_raises_what_is_dark():
     image = np.repeat(np.array([0, 16, 64, 255], np.uint8), 40)[None].repeat(40, axis=0)
     grey = shown(image)[20, 20::40]
-    # The root of the share of the full scale; a JPEG is right to some grey values.
+    # The square root of the fraction of full scale; a JPEG is accurate to some grey values.
     np.testing.assert_allclose(grey, np.array([[0], [63.9], [127.7], [255]]).repeat(3, axis=1), atol=3)
 
 
@@ -138,7 +138,7 @@ def test_points_are_circled_where_they_lie():
     marked = shown(np.zeros((200, 300), np.uint8), points=np.array([[50.2, 60.0], [250.0, 140.3]]))
     green = marked[..., 1] - marked[..., 2] > 60
     for u, v in ((50, 60), (250, 140)):
-        # Some pixels around, not on the point itself.
+        # Pixels around the point, not the point itself.
         assert green[v - 5 : v + 6, u - 5 : u + 6].any() and not green[v, u]
         green[v - 8 : v + 9, u - 8 : u + 9] = False
     assert not green.any()
@@ -150,7 +150,7 @@ def test_large_images_are_shown_smaller_with_marks_in_their_places():
     marked = shown(image, stripe=edge, points=np.array([[2000.0, 800.0]]))
     assert marked.shape == (375, 1000, 3)
     lit = marked.max(axis=2) > 30
-    # What lies beyond the edge is marked at the edge.
+    # Points beyond the edge are marked at the edge.
     assert lit[370:, 995:].any() and lit[:5, :5].any() and lit[:5, 995:].any() and not lit[370:, :5].any()
     green = marked[..., 1] - marked[..., 2] > 60
     assert np.abs(np.argwhere(green).mean(axis=0) - [200, 500]).max() < 2
@@ -180,5 +180,5 @@ def test_showing_counts_pictures():
 
 def test_a_png_keeps_its_colours():
     colours = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    again = cv2.imdecode(np.frombuffer(png_of(colours), np.uint8), cv2.IMREAD_COLOR)
+    again = cv2.imdecode(np.frombuffer(encode_png(colours), np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(again[..., ::-1], colours)

@@ -1,4 +1,4 @@
-"""The desk's folder: what is listed as what, and names that lead elsewhere."""
+"""The desk's folder: kinds of the listed files, and names outside the folder."""
 
 import os
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwlts.desk.desk_files import file_in, interrupted, kind_of, listed, new_in
+from uwlts.desk.desk_files import find_file, guess_kind, is_interrupted, list_files, new_path
 from uwlts.errors import DescriptionError
 from uwlts.optics.nominal import nominal
 from uwlts.storage.cloud import PointCloud
@@ -43,7 +43,7 @@ def folder(tmp_path: Path) -> Path:
     ],
 )
 def test_files_are_known_by_their_names(name, kind):
-    assert kind_of(name) == kind
+    assert guess_kind(name) == kind
 
 
 def test_known_files_are_listed_the_latest_first(folder):
@@ -54,7 +54,7 @@ def test_known_files_are_listed_the_latest_first(folder):
     (folder / "notes.txt").write_text("mine", encoding="utf-8")
     (folder / ".hidden.h5").write_bytes(b"")
     (folder / "sub.h5").mkdir()
-    files = listed(folder)
+    files = list_files(folder)
     assert [file.name for file in files] == ["scan.h5", "wall.ply", "plan.toml", "calibration.json"]
     assert [(file.kind, file.size, file.time_s) for file in files[:2]] == [("capture", 7, 2e9), ("cloud", 0, 1e9)]
 
@@ -69,7 +69,7 @@ def test_labels_tell_what_names_do_not(folder):
         ("figures", '{"format": "uwlts-evaluation"}'),
     ):
         (folder / f"{name}.json").write_text(text, encoding="utf-8")
-    kinds = {file.name: file.kind for file in listed(folder)}
+    kinds = {file.name: file.kind for file in list_files(folder)}
     assert kinds.pop("scan.h5") in ("capture", "damaged file")
     assert kinds == {
         "wall.h5": "cloud",
@@ -77,10 +77,10 @@ def test_labels_tell_what_names_do_not(folder):
         "damaged.json": "damaged file",
         "figures.json": "evaluation",
     }
-    # A file of the same name that is written anew is another one.
+    # A rewritten file of the same name is a different file.
     (folder / "other.json").write_text('{"format": "uwlts-evaluation", "more": 1}', encoding="utf-8")
     os.utime(folder / "other.json", (1e9, 1e9))
-    assert {file.name: file.kind for file in listed(folder)}["other.json"] == "evaluation"
+    assert {file.name: file.kind for file in list_files(folder)}["other.json"] == "evaluation"
 
 
 def test_what_cannot_be_opened_is_not_listed(folder):
@@ -88,24 +88,24 @@ def test_what_cannot_be_opened_is_not_listed(folder):
     (folder / "gone.h5").symlink_to(folder / "nothing")
     (folder / "loop.h5").symlink_to(folder / "loop.h5")
     (folder / "up.h5").symlink_to(folder.parent)
-    assert [file.name for file in listed(folder)] == ["scan.h5"]
+    assert [file.name for file in list_files(folder)] == ["scan.h5"]
 
 
 def test_a_long_list_is_cut(folder):
     for number in range(600):
         (folder / f"{number}.ply").touch()
         os.utime(folder / f"{number}.ply", (number, number))
-    names = [file.name for file in listed(folder)]
+    names = [file.name for file in list_files(folder)]
     assert len(names) == 500 and names[:2] == ["scan.h5", "599.ply"]
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     with pytest.raises(DescriptionError, match="the folder .*nowhere cannot be read"):
-        listed(tmp_path / "nowhere")
+        list_files(tmp_path / "nowhere")
 
 
 def test_a_listed_file_is_found(folder):
-    assert file_in(folder, "scan.h5") == folder / "scan.h5"
+    assert find_file(folder, "scan.h5") == folder / "scan.h5"
 
 
 @pytest.mark.parametrize(
@@ -149,12 +149,12 @@ def test_names_that_lead_elsewhere_or_to_no_file_are_refused(folder, name):
     (folder / "loop.h5").symlink_to(folder / "loop.h5")
     (folder / "up.h5").symlink_to(folder.parent)
     with pytest.raises(DescriptionError, match="is not a file of the folder"):
-        file_in(folder, name.format(outside=folder.parent / "outside.h5"))
+        find_file(folder, name.format(outside=folder.parent / "outside.h5"))
 
 
 @pytest.mark.parametrize("name", ["wall", "wall.h5", " wall ", "wall-2_b", "größe", "wall.of.today"])
 def test_a_result_gets_its_ending_once(folder, name):
-    path = new_in(folder, name, suffix=".h5")
+    path = new_path(folder, name, suffix=".h5")
     assert path.parent == folder and path.suffix == ".h5" and not path.name.endswith(".h5.h5")
     assert path.name == path.name.strip()
 
@@ -164,11 +164,11 @@ def test_a_result_gets_its_ending_once(folder, name):
     ["", "  ", ".", "..", "/", "../wall", "a/b", "/tmp/wall", ".wall", " .wall", "wall/", "a\0b", "a\nb", "x" * 300],
 )
 def test_names_for_results_that_lead_elsewhere_are_refused(folder, name):
-    with pytest.raises(DescriptionError, match="no name for a file of the folder"):
-        new_in(folder, name, suffix=".h5")
+    with pytest.raises(DescriptionError, match="not a name for a file in the folder"):
+        new_path(folder, name, suffix=".h5")
 
 
 def test_an_interrupted_recording_is_noticed(folder):
-    assert not interrupted(folder / "scan.h5")
+    assert not is_interrupted(folder / "scan.h5")
     (folder / "scan.h5.part").touch()
-    assert interrupted(folder / "scan.h5")
+    assert is_interrupted(folder / "scan.h5")

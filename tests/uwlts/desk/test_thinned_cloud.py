@@ -1,4 +1,4 @@
-"""The cloud of bounded size: what is kept of points that come in pieces, whatever their sizes."""
+"""The cloud of bounded size: the points kept of pieces of any size."""
 
 import threading
 
@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from uwlts.desk.thinned_cloud import FIELDS, ThinnedCloud, packed
+from uwlts.desk.thinned_cloud import FIELDS, ThinnedCloud, pack
 
 PIECES = st.lists(st.integers(0, 60), max_size=30)
 
 
 def points(first: int, count: int) -> np.ndarray:
-    """Points that tell their number in the order of adding."""
+    """Points that contain their index in the order of adding."""
     number = np.arange(first, first + count, dtype=float)
     return np.column_stack([number, number + 0.25, -number])
 
@@ -21,7 +21,7 @@ def filled(at_most: int, sizes: list[int]) -> ThinnedCloud:
     cloud, total = ThinnedCloud(at_most), 0
     for size in sizes:
         piece = points(total, size)
-        # A field that is not known of every piece.
+        # A field that some pieces lack.
         known = None if size % 2 else piece[:, 0] + 0.5
         cloud.add(piece, intensity=2 * piece[:, 0], deviation=known)
         total += size
@@ -33,7 +33,7 @@ def test_every_nth_of_all_points_is_kept_in_order(at_most: int, sizes: list[int]
     cloud, total = filled(at_most, sizes), sum(sizes)
     kept = cloud.points()
     assert cloud.total == total and cloud.version == len(sizes) and len(kept) <= at_most
-    # The smallest power of two by which no more than wanted are kept, or the next when they are exactly as many.
+    # The smallest power of two that keeps at most the wanted number, or the next one if it keeps exactly that many.
     stride = 1
     while -(-total // stride) > at_most:
         stride *= 2
@@ -42,7 +42,7 @@ def test_every_nth_of_all_points_is_kept_in_order(at_most: int, sizes: list[int]
     expected = np.arange(0, total, strides[0] if strides else 1, dtype=float)
     np.testing.assert_array_equal(kept[:, 0], expected)
     np.testing.assert_array_equal(kept[:, :3], np.column_stack([expected, expected + 0.25, -expected]))
-    # It is no emptier than by half: what can be shown is shown.
+    # At least half of the capacity is used.
     assert len(kept) >= min(total, at_most // 2)
 
 
@@ -76,11 +76,11 @@ def test_what_is_packed_can_be_unpacked(at_most: int, sizes: list[int], far: flo
         piece = points(total, size) + [far, 0, -far]
         cloud.add(piece, uncertainty=np.full(size, 0.125))
         total += size
-    origin, data = packed(cloud.points())
+    origin, data = pack(cloud.points())
     kept, table = cloud.points(), np.frombuffer(data, "<f4").reshape(-1, 6)
     assert origin.shape == (3,) and (origin == np.round(origin)).all()
     assert len(table) == len(kept)
-    # From the origin points are near, so that a float32 keeps them to some um however far the cloud lies.
+    # Relative to the origin coordinates are small, so that a float32 keeps them to some um for distant clouds, too.
     np.testing.assert_allclose(table[:, :3] + origin, kept[:, :3], rtol=0, atol=2e-4)
     assert (table[:, 5] == 0.125).all() and np.isnan(table[:, 3:5]).all()
     if len(kept):
@@ -98,7 +98,7 @@ def test_points_that_stand_for_more_are_counted_as_what_they_stand_for(at_most: 
 
 
 def test_an_empty_cloud_is_packed_too():
-    origin, data = packed(ThinnedCloud().points())
+    origin, data = pack(ThinnedCloud().points())
     assert origin.tolist() == [0, 0, 0] and data == b""
 
 
@@ -107,7 +107,7 @@ def test_clearing_begins_anew():
     cloud.clear()
     assert (cloud.total, len(cloud.points()), cloud.version) == (0, 0, 2)
     cloud.add(points(0, 10))
-    # Every one again, but for the halving when it is full.
+    # Every point again, apart from the halving when it is full.
     assert cloud.points()[:, 0].tolist() in (list(range(10)), list(range(0, 10, 2)))
 
 

@@ -1,4 +1,4 @@
-"""What `uwlts doctor` finds, each time in a condition that really holds: nothing of the machine is replaced."""
+"""Findings of `uwlts doctor`, each in a condition that really exists: nothing of the machine is mocked."""
 
 import os
 import re
@@ -32,7 +32,7 @@ def doctor(*arguments: str, folder: Path, **environment: str) -> subprocess.Comp
 
 
 def as_nobody(program: str) -> str:
-    """What a program prints that gives up the rights of an administrator once it has imported what it needs."""
+    """Output of a program that gives up administrator rights after its imports."""
     start = f"""
         import os, tempfile
         from pathlib import Path
@@ -81,7 +81,7 @@ def test_a_broken_library_ends_in_exit_code_1_without_a_traceback(tmp_path):
     assert "Traceback" not in ended.stdout + ended.stderr
     said = re.sub(r"\s+", " ", ended.stdout)
     assert re.search(r"missing numpy \S+ does not load: ImportError: truncated on the way", said)
-    # The cameras cannot be examined without it; the ports below them are.
+    # Without it the cameras cannot be examined; the ports below them are.
     assert "a part was left out: truncated on the way" in said and "serial port" in said
     assert re.search(r"--force-reinstall --no-deps 'numpy>=.*'$", ended.stdout, re.M)
 
@@ -171,7 +171,7 @@ def test_a_folder_is_measured_and_left_as_it_was(tmp_path):
     finding = machine.examine_folder(tmp_path)
     assert list(tmp_path.iterdir()) == []
     frames, megabytes = map(int, re.match(r".* takes (\d+) frames/s .*\((\d+) MB/s\)", finding.found).groups())
-    # Both are rounded to whole numbers.
+    # Both are rounded to integers.
     assert abs(frames * 1.31072 - megabytes) <= 0.5 * 1.31072 + 0.5
     assert frames > 0 and (finding.status == "ok") == (finding.advice == "")
 
@@ -189,7 +189,7 @@ def test_a_folder_that_cannot_be_written_to_is_a_warning(tmp_path):
 
 def test_a_disk_that_takes_no_more_is_a_warning(tmp_path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    # The kernel's limit for one file stands for a quota: writing fails on the way.
+    # The kernel's file size limit simulates a quota: writing fails midway.
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000_000, before[1]))
     try:
         finding = machine.examine_folder(tmp_path)
@@ -261,17 +261,17 @@ def test_producers_that_are_not_there_or_for_another_machine_are_warnings(tmp_pa
     assert [each.status for each in found] == ["warning"] * 4
     said = [each.found.removeprefix(str(tmp_path)) for each in found]
     assert said == [
-        "/other.cti is no library for this machine",
-        "/text.cti is no library for this machine",
+        "/other.cti is not a library for this machine",
+        "/text.cti is not a library for this machine",
         "/empty holds no producer (*.cti)",
-        "/none is no folder",
+        "/none is not a folder",
     ]
     monkeypatch.delenv(devices.PRODUCERS, raising=False)
     assert "is not set" in devices.examine_producers()[0].found
 
 
 def test_a_port_that_this_user_may_not_open_is_a_warning_with_the_command():
-    # A terminal like the ports of a stage: root's, open to a group that nobody is in.
+    # A terminal like the port of a stage: owned by root, open to a group without members.
     program = """
         port = os.ttyname(os.openpty()[1])
         print(examine_ports([port])[0])
@@ -316,7 +316,7 @@ def test_a_camera_that_does_not_give_ten_frames_is_missing(tmp_path):
     (short,) = devices.try_camera(images(tmp_path / "few", 51, count=9))
     assert short.status == "missing" and "all 9 images" in short.found
     (unknown,) = devices.try_camera("webcam:0")
-    assert unknown.status == "missing" and "is not the address of a camera" in unknown.found
+    assert unknown.status == "missing" and "is not a camera address" in unknown.found
     assert "genicam:PRODUCER.cti" in unknown.advice
 
 
@@ -325,7 +325,7 @@ def test_a_camera_that_does_not_give_ten_frames_is_missing(tmp_path):
 
 @contextmanager
 def unmoved(**options: object) -> Iterator[GrblController]:
-    """A controller, of which it is seen that the stage stays where it was and the laser dark."""
+    """A controller whose log shows that the stage did not move and the laser stayed off."""
     with GrblController(position_mm=30.0, boot_s=0.1, **options) as controller:
         yield controller
         state = controller.state()
@@ -347,7 +347,7 @@ def test_a_stage_as_documented_is_in_order():
         build, settings, state, laser = devices.try_stage(controller.port)
     assert build.found == f"{controller.port}: Grbl 1.1h, options V"
     assert [each.status for each in (build, settings, state, laser)] == ["ok"] * 4
-    assert "NOT when program and guard are killed" in laser.found
+    assert "NOT if program and guard are killed" in laser.found
     assert state.found == "locked until it is homed, as after every start"
 
 

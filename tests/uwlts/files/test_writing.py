@@ -1,4 +1,4 @@
-"""Files of work that is not complete are removed wherever an interrupt falls."""
+"""Removal of incomplete files at an interrupt at any point."""
 
 import sys
 from pathlib import Path
@@ -13,7 +13,7 @@ from uwlts.files.writing import one_writer, remove_unfinished, written_aside
 
 
 def interrupted_at(step: int, target: Path) -> bool:
-    """Write a file with an interrupt before instruction number ``step`` of the module; False where there are fewer."""
+    """Write a file with an interrupt before instruction number ``step`` of the module; False if there are fewer."""
     left = step
 
     def trace(frame: FrameType, event: str, _: Any) -> Any:

@@ -46,7 +46,7 @@ def judged(frames: list[tuple[int, float | None, bool]], *, period_s: float | No
         ([(5, 0.5, True), (4, 0.4, True), (6, 0.6, True)], [OK, LATE, OK], FrameCounts(ok=2, late=1)),
         ([(1, 0.0, True), (2, 0.21, True)], [OK, LATE], FrameCounts(ok=1, late=1)),
         ([(1, 0.0, True), (2, 0.19, True)], [OK, OK], FrameCounts(ok=2)),
-        # Numbers of 16 bits begin anew, at 1 or at 0.
+        # Counters of 16 bits restart at 1 or at 0.
         ([(65535, 0.0, True), (1, 0.1, True), (2, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3)),
         ([(65535, 0.0, True), (0, 0.1, True), (1, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3)),
         ([(65534, 0.0, True), (2, 0.3, True)], [OK, DROPPED], FrameCounts(ok=1, dropped=2)),
@@ -62,22 +62,22 @@ def test_without_a_period_or_time_stamps_nothing_is_late_or_equal():
     assert judged([(1, None, True), (2, None, True)], period_s=0.1)[0] == [OK, OK]
 
 
-def test_after_an_unanswered_trigger_the_count_may_begin_anew():
+def test_after_an_unanswered_trigger_the_count_may_restart():
     check = FrameCheck()
     check.judge(frame_id=8, time_s=1.0, complete=True)
-    check.begin_anew("unanswered")
+    check.restart_comparison("unanswered")
     assert check.judge(frame_id=1, time_s=2.0, complete=True) is OK
     assert check.counts == FrameCounts(ok=2, unanswered=1)
 
 
 @pytest.mark.parametrize("address", ["", "gige", "usb:1", "genicam:", "replay:", "0"])
 def test_an_unknown_address_lists_the_known_ones(address):
-    with pytest.raises(HardwareError, match=r"(?s)not the address of a camera.*gige:NAME.*genicam:.*replay:PATH"):
+    with pytest.raises(HardwareError, match=r"(?s)not a camera address.*gige:NAME.*genicam:.*replay:PATH"):
         open_camera(address)
 
 
 def pictures(folder: Path, count: int, *, suffix: str = ".png", kind: type = np.uint8) -> Path:
-    """A folder of images that hold their number; sorted as texts 10 would come before 2."""
+    """A folder of images that contain their number; sorted as texts, 10 would precede 2."""
     folder.mkdir()
     for number in range(count):
         image = np.arange(24 * 32, dtype=kind).reshape(24, 32) % 251
@@ -136,7 +136,7 @@ def test_a_replay_keeps_its_frame_rate_and_drops_what_a_slow_program_leaves(tmp_
         camera.start(faults="skip")
         began = time.monotonic()
         frames = [camera.grab(1.0) for _ in range(20)]
-        # The first comes at once, the last 19 periods later.
+        # The first frame is due at once, the last one 19 periods later.
         assert time.monotonic() - began >= 19 / 200 - 1e-3
         assert np.allclose(np.diff([frame.time_s for frame in frames]), 1 / 200, atol=1e-9)
         assert camera.counts.dropped == 0
@@ -148,7 +148,7 @@ def test_a_replay_keeps_its_frame_rate_and_drops_what_a_slow_program_leaves(tmp_
         camera.start()
         camera.grab(1.0)
         time.sleep(0.5)
-        with pytest.raises(HardwareError, match="frames before it were dropped"):
+        with pytest.raises(HardwareError, match="preceded by dropped frames"):
             for _ in range(5):
                 camera.grab(1.0)
 
@@ -177,7 +177,7 @@ def test_a_capture_is_shown_with_its_exposures(tmp_path, thesis: Sensor):
 
 
 def test_what_cannot_be_replayed_is_said(tmp_path):
-    with pytest.raises(HardwareError, match="no folder of images and no capture"):
+    with pytest.raises(HardwareError, match="neither a folder of images nor a capture"):
         open_camera(f"replay:{tmp_path / 'missing'}")
     with pytest.raises(HardwareError, match="holds no image"):
         open_camera(f"replay:{tmp_path}")
@@ -188,7 +188,7 @@ def test_what_cannot_be_replayed_is_said(tmp_path):
             ({"trigger": "line"}, "no trigger input"),
             ({"bits": 12}, "images of 8 bits, not 12"),
             ({"gain_db": 3.0}, "has no gain"),
-            ({"exposure_ms": 0.0}, "exposure_ms is 0.0: it must be positive"),
+            ({"exposure_ms": 0.0}, "exposure_ms is 0.0: expected a positive number"),
             ({"region": Region(30, 0, 3, 3)}, "not within the image sensor of 32 x 24 px"),
         ):
             with pytest.raises(HardwareError, match=message):
@@ -255,7 +255,7 @@ def test_a_camera_by_a_gentl_producer():
             ({"exposure_ms": 1.0}, "no setting for exposure"),
             ({"gain_db": 1.0}, "no setting for gain"),
             ({"trigger": "software"}, "cannot be triggered by Software"),
-            ({"bits": 12}, "does not give Mono12, only RGBa8, Mono8"),
+            ({"bits": 12}, "does not offer Mono12, only RGBa8, Mono8"),
             ({"region": Region(1, 0, 320, 200)}, "has no OffsetX"),
         ):
             with pytest.raises(HardwareError, match=message):

@@ -1,4 +1,4 @@
-"""The Grbl driver against the twin's controller over a pseudo terminal: what works, faults, and the laser's end."""
+"""The Grbl driver and the twin's controller over a pseudo terminal: functions, faults, and switching the laser off."""
 
 import errno
 import os
@@ -44,7 +44,7 @@ def controller() -> Iterator[GrblController]:
 
 @pytest.fixture
 def stage(controller: GrblController) -> Iterator[GrblStage]:
-    """A homed stage. Faults are left to the test; whatever it leaves, the laser is off in the end."""
+    """A homed stage. Faults are left to the test; in the end the laser is off."""
     with GrblStage(controller.port) as opened:
         opened.home()
         yield opened
@@ -52,7 +52,7 @@ def stage(controller: GrblController) -> Iterator[GrblStage]:
 
 
 REAL = {"boot_s": 0.2, "position_mm": 30.0, "settings": {24: 600, 25: 7200, 110: 7200, 120: 2000}}
-"""For light on the way, whose parts the driver sends in real time: 120 mm/s, reached after 0.06 s."""
+"""Settings for light in motion, whose parts the driver sends in real time: 120 mm/s, reached after 0.06 s."""
 SWEEP = 4800.0
 
 
@@ -71,7 +71,7 @@ def sweeping(real: GrblController) -> Iterator[GrblStage]:
         opened._line.fault = opened._line.fault or "test over"
 
 
-# What is said
+# Messages
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_settings_that_cannot_work_are_refused():
         parse_settings(good | {100: 0.0})
 
 
-# How the twin's axis moves
+# Motion of the twin's axis
 
 
 @pytest.mark.parametrize("way_mm", [-200.0, 30.0, 0.5, STEP_MM])
@@ -149,7 +149,7 @@ def test_a_movement_keeps_to_speed_and_acceleration_and_arrives(way_mm):
     assert (positions[0], positions[-1]) == (5.0, 5.0 + way_mm)
     assert np.abs(speeds).max() <= 10 * (1 + 1e-12)
     assert np.abs(np.diff(speeds)).max() <= 50 * np.diff(times).max() * (1 + 1e-6)
-    # The trapezoidal rule errs by at most a dt^2 / 2 at each of the two kinks of the speed.
+    # The error of the trapezoidal rule is at most a dt^2 / 2 at each of the two kinks of the speed.
     way = np.sum((speeds[1:] + speeds[:-1]) / 2 * np.diff(times))
     assert way == pytest.approx(way_mm, abs=50 * np.diff(times).max() ** 2)
 
@@ -158,7 +158,7 @@ def test_a_hold_brakes_and_a_resumption_arrives():
     axis = Axis(acceleration=50.0)
     axis.add(100.0, speed=10.0, time_s=0.0)
     axis.hold(3.0)
-    # v^2 / 2a beyond the place where it was asked for.
+    # v^2 / 2a beyond the position at the command.
     held_mm = Ramp(0.0, (100.0,), 10.0, 50.0, 0.0).at(3.0)[0] + 10**2 / (2 * 50)
     assert axis.braking(3.1) and not axis.braking(3.3)
     assert axis.at(9.0) == (pytest.approx(held_mm), 0.0)
@@ -168,11 +168,11 @@ def test_a_hold_brakes_and_a_resumption_arrives():
 
 
 def test_blocks_of_one_direction_are_one_movement():
-    """As one block of the whole way, where each comes before the axis has to brake for the end of the one before."""
+    """Several blocks move like one, if each arrives before the axis must brake for the end of the previous one."""
     axis, whole = Axis(acceleration=50.0), Ramp(0.0, (100.0,), 10.0, 50.0, 0.0)
     axis.add(10.0, speed=10.0, time_s=0.0)
     for number in range(2, 11):
-        # 9 mm of the block before are left, and braking takes 1 mm.
+        # 9 mm of the previous block are left, and braking takes 1 mm.
         axis.add(10.0 * number, speed=10.0, time_s=number - 1.8)
         assert axis.pending == 2
     for time_s in np.linspace(8.3, whole.end_s, 50).tolist():
@@ -180,7 +180,7 @@ def test_blocks_of_one_direction_are_one_movement():
     # Rounding of the times.
     axis.advance(whole.end_s + 1e-9)
     assert not axis.pending and axis.at(20.0) == (100.0, 0.0)
-    # One that comes while it brakes has it gain speed again, and its places follow from its speed.
+    # A block that arrives during braking accelerates the axis again, and the positions follow from its speed.
     axis.add(110.0, speed=10.0, time_s=20.0)
     late_s = 20.0 + 1.1
     assert axis.at(late_s)[1] == pytest.approx(5.0)
@@ -193,7 +193,7 @@ def test_blocks_of_one_direction_are_one_movement():
     assert way == pytest.approx(120 - places[0], abs=50 * np.diff(times).max() ** 2)
 
 
-# The twin's controller, spoken to directly
+# The twin's controller, addressed directly
 
 
 class Terminal:
@@ -203,7 +203,7 @@ class Terminal:
         self.descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY)
 
     def read(self, quiet_s: float = 0.05, last: str = "") -> list[str]:
-        """Lines until one ends with ``last`` and then none comes for a while."""
+        """Lines until one ends with ``last`` and no other follows for a while."""
         data = b""
         while select.select([self.descriptor], [], [], quiet_s if data.endswith(last.encode() + b"\r\n") else 3.0)[0]:
             data += os.read(self.descriptor, 4096)
@@ -310,12 +310,12 @@ def test_opening_reads_version_settings_and_state(controller):
         assert not stage.position_known
         with pytest.raises(HardwareError, match="home it first"):
             stage.move_to(10.0, feed_mm_per_min=100.0)
-        # By it DTR drops when the port is closed, whoever closes it.
+        # With this flag DTR drops when any process closes the port.
         assert termios.tcgetattr(stage._line._serial.fd)[2] & termios.HUPCL
 
 
 def test_resets_of_the_program_before_are_no_fault(controller, monkeypatch):
-    """A program and its guard end with Ctrl-X; on a busy machine the board greets for it after the next opening."""
+    """A program and its guard end with Ctrl-X; on a busy machine the greeting follows the next opening."""
     say, greeted = controller._say, []
 
     def again(data: bytes) -> None:
@@ -342,7 +342,7 @@ def test_a_board_that_does_not_reset_is_woken_and_keeps_its_position():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"version": "0.9j"}, r"is not Grbl 1\.1, it says .*0\.9j"),
+        ({"version": "0.9j"}, r"is not Grbl 1\.1, it answers .*0\.9j"),
         ({"version": "3.7 [FluidNC"}, r"is not Grbl 1\.1"),
         ({"options": "MZ"}, "without V: the laser needs"),
         ({"settings": {13: 1}}, r"inches"),
@@ -362,7 +362,7 @@ def test_a_silent_port_and_a_foreign_device_are_distinguished():
         with pytest.raises(HardwareError, match="nothing answers"):
             GrblStage(os.ttyname(slave), boot_s=0.1)
         threading.Timer(0.05, os.write, (master, b"\x80\xff\x00~~")).start()
-        with pytest.raises(HardwareError, match="does not speak Grbl, it says .*baud"):
+        with pytest.raises(HardwareError, match="does not speak Grbl, it answers .*baud"):
             GrblStage(os.ttyname(slave), boot_s=0.1)
     finally:
         os.close(master)
@@ -389,7 +389,7 @@ def test_positions_count_from_the_lower_end_whatever_grbl_calls_them(settings, o
         GrblStage(controller.port) as stage,
     ):
         assert stage.home() == pytest.approx(home_mm, abs=1e-9)
-        # Where homing sets its zero after the pull-off, the controller's zero is not at the switch but beside it.
+        # Homing sets the zero after the pull-off, so the controller's zero is beside the switch.
         offset_mm = {"VZ": 2.0 if settings.get(23) else -2.0}.get(options, 0.0)
         stage._line.command("G92X5")
         for target_mm in (410.0, 400.0125):
@@ -440,7 +440,7 @@ def test_the_laser_follows_and_its_power_is_a_share(controller, stage):
     stage.laser(False)
     assert not controller.state().laser_on and stage.laser_power == 0.0
     assert stage.move_to(5.0, feed_mm_per_min=900.0) == 5.0
-    with pytest.raises(RangeError, match="power 1.5"):
+    with pytest.raises(RangeError, match="power is 1.5"):
         stage.laser(True, power=1.5)
 
 
@@ -455,7 +455,7 @@ def test_light_that_is_kept_lasts_and_its_controller_never_has_much_of_it(contro
     assert controller.state().laser_on
     assert wait_for(lambda: not controller.state().laser_on, 1.0)
     lit_s = sum(light.duration_s for light in controller.lights)
-    # Two dwells at most remained, in 8 steps of the controller's 0.05 s each; dark are some ms between two.
+    # At most two dwells remained, in 8 steps of the controller's 0.05 s each; between them it is dark for some ms.
     assert kept_s - began_s - 0.1 < lit_s < kept_s - began_s + 1.0
 
 
@@ -471,7 +471,7 @@ def test_the_laser_is_lit_on_the_way_alone(real, sweeping):
     assert sum(state.power == 0.5 and state.speed_mm_per_s == 80.0 for state in seen) > 10
     (light,) = real.lights
     assert light.duration_s == pytest.approx(298 / 80, abs=0.3)
-    # At a constant speed all the way, but for the ramps of 1.6 mm.
+    # At a constant speed, except for the ramps of 1.6 mm.
     fast = [each for each in reports if 10 < each.position_mm < 290]
     speeds = [
         (b.position_mm - a.position_mm) / (b.answered_s - a.answered_s)
@@ -479,9 +479,9 @@ def test_the_laser_is_lit_on_the_way_alone(real, sweeping):
         if b.answered_s - b.asked_s < 0.02 and a.answered_s - a.asked_s < 0.02
     ]
     assert np.median(speeds) == pytest.approx(80.0, rel=0.02)
-    # Back, and a way shorter than what is sent at once.
+    # Back, over a distance shorter than the part that is sent at once.
     assert sweeping.sweep(290.0, feed_mm_per_min=SWEEP) == 290.0
-    with pytest.raises(RangeError, match="too fast for a laser that is lit on the way: at most"):
+    with pytest.raises(RangeError, match="too fast for a moving stage with the laser on: at most"):
         sweeping._line.command("$120=100")
         sweeping.settings = replace(sweeping.settings, acceleration_mm_per_s2=100.0)
         sweeping.sweep(200.0, feed_mm_per_min=SWEEP)
@@ -505,7 +505,7 @@ def test_a_computer_that_is_too_late_for_a_constant_speed_is_an_error(real, swee
 
 
 def test_without_laser_mode_the_laser_is_not_lit():
-    """A hold would keep it lit."""
+    """Without laser mode a hold keeps the laser on."""
     with GrblController(**FAST, settings={32: 0}) as controller, GrblStage(controller.port) as stage:
         stage.home()
         with pytest.raises(HardwareError, match=r"laser mode is off .* send \$32=1"):
@@ -543,7 +543,7 @@ def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(cont
             stage.move_to(20.0, feed_mm_per_min=900.0)
         assert stage.unlock() == stopped_mm
     assert stage.move_to(stopped_mm + 1, feed_mm_per_min=900.0) == pytest.approx(stopped_mm + 1, abs=1e-9)
-    # A step, as the stop is not on one.
+    # Within a step, as the stop is between steps.
     assert controller.state().position_mm == pytest.approx(stopped_mm + 1, abs=STEP_MM)
 
 
@@ -554,12 +554,12 @@ def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(cont
     ("fault", "message", "recovers"),
     [
         (lambda c: c.disconnect(), "connection is lost.*CANNOT be switched", False),
-        (lambda c: c.inject("stall"), "stall: the stage has stood at", True),
+        (lambda c: c.inject("stall"), "stall: the stage has been at", True),
         (lambda c: c.inject("alarm", 1), "ALARM:1, hard limit.*home", True),
         (lambda c: c.inject("alarm", 3), "ALARM:3, reset while moving", True),
         (lambda c: c.inject("garbage"), "garbage on the line", True),
         (lambda c: c.inject("garbage", noise=b"x" * 300), "garbage on the line", True),
-        (lambda c: c.inject("garbage", noise=b"ok\r\nok\r\n"), "came although nothing was sent", True),
+        (lambda c: c.inject("garbage", noise=b"ok\r\nok\r\n"), "was received although nothing was sent", True),
         (lambda c: c.inject("restart"), "restarted by itself", True),
         (lambda c: c.inject("mute"), "silence: 3 status queries", False),
         (lambda c: c.inject("hold"), "feed hold", True),
@@ -589,7 +589,7 @@ def test_a_movement_that_ends_short_by_more_than_a_step_is_named(controller, sta
     controller.inject("stop-short", 1)
     assert stage.move_to(10.0, feed_mm_per_min=900.0) == pytest.approx(10.0 - STEP_MM, abs=1e-9)
     controller.inject("stop-short", 3)
-    with pytest.raises(HardwareError, match=r"missed steps: 19\.962 mm read back where 20\.000 mm .* -3 steps"):
+    with pytest.raises(HardwareError, match=r"missed steps: the position is 19\.962 mm where 20\.000 mm .* -3 steps"):
         stage.move_to(20.0, feed_mm_per_min=900.0)
     assert not controller.state().laser_on
 
@@ -610,17 +610,17 @@ def test_homing_that_fails_says_so():
         assert not stage.position_known
 
 
-# Darkness by hand, from another thread
+# Laser off by hand, from another thread
 
 
 def darkened(controller: GrblController, stage: GrblStage) -> None:
-    """Press the button and see that the laser is off within 0.2 s."""
+    """Press the button and check that the laser is off within 0.2 s."""
     stage.darken()
     assert wait_for(lambda: not controller.state().laser_on, 0.2)
 
 
 def later(seconds: float, work: Callable[[], None]) -> threading.Thread:
-    """Another thread that does something in a while."""
+    """Thread that acts after a delay."""
 
     def run() -> None:
         time.sleep(seconds)
@@ -676,7 +676,7 @@ def test_a_laser_that_is_lit_at_rest_goes_off_by_hand(controller, stage, at_most
     with pytest.raises(HardwareError, match=BY_HAND):
         stage.laser(False)
     assert stage.faulty and stage.laser_power == 0.0
-    # Nothing moved: the position is still right.
+    # Nothing moved: the position is still valid.
     assert stage.unlock() == 60.0
     stage.laser(True, at_most_s=at_most_s)
     assert controller.state().laser_on
@@ -695,9 +695,9 @@ def test_a_laser_that_is_lit_at_rest_goes_off_by_hand(controller, stage, at_most
 def test_darkness_by_hand_is_met_at_the_next_exchange(controller, stage, exchange):
     stage.darken()
     time.sleep(0.1)
-    # Twice is no more than once.
+    # A second press has no further effect.
     stage.darken()
-    # Nothing is lit, so that nothing is exchanged.
+    # The laser is off, so nothing is exchanged.
     stage.keep_lit()
     assert not stage.faulty
     with pytest.raises(HardwareError, match=BY_HAND):
@@ -717,7 +717,7 @@ def test_after_darkness_by_hand_the_stage_is_unlocked_or_homed_at_once(controlle
 
 @pytest.mark.parametrize("at_most_s", [None, 5.0])
 def test_whenever_darkness_is_asked_for_the_laser_is_off_and_stays_off(controller, stage, at_most_s):
-    """Also in the middle of lighting it, when the command that lights it is on its way already."""
+    """Also while it is being switched on, when the command is already in transmission."""
     stage.move_to(60.0, feed_mm_per_min=900.0)
     rng = np.random.default_rng(11)
 
@@ -730,7 +730,7 @@ def test_whenever_darkness_is_asked_for_the_laser_is_off_and_stays_off(controlle
 
     def press() -> None:
         stage.darken()
-        # Lines that were sent before are done with by then.
+        # Lines sent before are done by then.
         time.sleep(0.05)
         for _ in range(100):
             seen.append(controller.state().laser_on)
@@ -756,7 +756,7 @@ def test_a_stage_that_was_darkened_by_hand_closes_as_any_other(controller):
     assert not controller.state().laser_on
 
 
-# The laser's end, whatever ends the program
+# Laser off, however the program ends
 
 
 LIT = """
@@ -821,7 +821,7 @@ def test_without_the_guard_the_interlock_and_else_the_controller_end_the_light(g
 
 def test_the_laser_is_not_lit_without_its_guard(controller, stage):
     os.kill(stage._line._guard.pid, signal.SIGKILL)
-    with pytest.raises(HardwareError, match="switches the laser off after a crash is gone"):
+    with pytest.raises(HardwareError, match="switches the laser off after a crash, is gone"):
         stage.laser(True)
     assert not controller.state().laser_on
 
@@ -832,7 +832,7 @@ def test_a_program_that_stands_still_loses_its_laser_and_can_go_on_after_homing(
     time.sleep(1.2)
     assert controller.state().laser_on
     assert wait_for(lambda: not controller.state().laser_on, 1.0)
-    with pytest.raises(HardwareError, match="switched off by its guard.*stood still"):
+    with pytest.raises(HardwareError, match="guard switched the laser off.*stood still"):
         stage.laser(False)
     assert stage.faulty and stage.laser_power == 0.0
     stage.home()
@@ -854,7 +854,7 @@ def test_the_controller_ends_a_laser_with_a_time_by_itself(controller, stage):
     assert wait_for(lambda: not controller.state().laser_on, 0.5) and time.monotonic() > lit_until_s
     stage.laser(False)
     assert stage.position_known and stage.move_to(60.0, feed_mm_per_min=900.0) == 60.0
-    # Light that ends before its time is an error: what was exposed meanwhile may be dark.
+    # Light that ends early is an error: images exposed meanwhile may be dark.
     stage.laser(True, at_most_s=5.0)
     os.write(stage._line._serial.fileno(), b"\x18")
     with pytest.raises(HardwareError, match="does not follow|restarted"):

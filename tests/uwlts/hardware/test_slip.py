@@ -1,4 +1,4 @@
-"""A stage that stands beside its count, from the stripe's way through the image."""
+"""Detection of a stage whose position differs from its count, from the stripe's motion in the image."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def centres(position_mm: float, slope_px_per_mm: np.ndarray, rng: np.random.Gene
 def watched(slope: np.ndarray, rng: np.random.Generator, count: int = 6) -> SlipWatch:
     watch = SlipWatch()
     for k in range(count):
-        watch.see(Place(2.0 * k, 1.0, centres(2.0 * k, slope, rng)))
+        watch.add(Place(2.0 * k, 1.0, centres(2.0 * k, slope, rng)))
     return watch
 
 
@@ -28,8 +28,8 @@ def test_the_slip_is_found_to_its_standard_error(slip_mm):
     assert relief.place.position_mm == 2.0
     found = [relief.slip(centres(2.0 + slip_mm, slope, rng)) for _ in range(30)]
     slips, errors = np.array(found).T
-    # Noise of two centres over a root mean square way of 1.7 px/mm on 400 lines is 0.004 mm; twice is reported, as
-    # lines that share speckle would need. All draws share the place's own noise.
+    # Noise of two centres divided by a root mean square motion of 1.7 px/mm on 400 lines is 0.004 mm; twice that is
+    # reported, for lines that share speckle. All draws share the place's own noise.
     assert 0.006 < errors.mean() < 0.012
     assert abs(slips.mean() - slip_mm) < 0.02 and slips.std() < errors.mean()
     assert all(relief.is_significant(*each) == (abs(slip_mm) > 0.05) for each in found)
@@ -46,7 +46,7 @@ def test_the_earliest_place_with_relief_counts():
     rng, watch = np.random.default_rng(3), SlipWatch()
     for k in range(10):
         empty = np.full(LINES, np.nan)
-        watch.see(Place(float(k), 1.0, empty if k < 4 else centres(float(k), np.full(LINES, 2.0), rng)))
+        watch.add(Place(float(k), 1.0, empty if k < 4 else centres(float(k), np.full(LINES, 2.0), rng)))
     assert watch.relief.place.position_mm == 5.0
 
 
@@ -54,7 +54,7 @@ def test_an_object_that_is_gone_is_no_slip():
     rng = np.random.default_rng(4)
     relief = watched(np.full(LINES, 2.0), rng).relief
     assert not relief.is_significant(*relief.slip(np.full(LINES, np.nan)))
-    # A third of the lines now show something else.
+    # A third of the lines now shows another surface.
     again = centres(2.0, np.full(LINES, 2.0), rng)
     again[: LINES // 3] += 40
     assert not relief.is_significant(*relief.slip(again))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from uwlts.errors import DescriptionError
-from uwlts.runtime.command_line import settings_of, typed
+from uwlts.runtime.command_line import PathText, settings_of, typed
 
 Corner = tuple[float, float, float]
 
@@ -21,11 +21,12 @@ class Opened:
     ("parameter", "option"),
     [
         (int, int),
-        (str | Path | Opened, str),
+        (str | Path | Opened, PathText),
+        (str | Opened, str),
         (Path, Path),
-        (Opened | str | Path | None, str | None),
+        (Opened | str | Path | None, PathText | None),
         (Literal["a", "b"] | None, Literal["a", "b"] | None),
-        (Sequence[Opened | str | Path], tuple[str, ...]),
+        (Sequence[Opened | str | Path], tuple[PathText, ...]),
         (str | Sequence[str], tuple[str, ...]),
         (str | Sequence[tuple[str, float]], str),
         (Literal["auto"] | tuple[Literal["k1", "k2"], ...], tuple[Literal["auto", "k1", "k2"], ...]),

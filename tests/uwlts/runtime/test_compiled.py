@@ -1,4 +1,4 @@
-"""Compiled loops are kept on disk, and compiled anew when what they call has changed."""
+"""Compiled loops are cached on disk, and compiled again when a function that they call has changed."""
 
 import gc
 import subprocess
@@ -55,7 +55,7 @@ def test_a_change_in_another_file_that_is_called_is_noticed(tmp_path: Path, othe
 
 @pytest.mark.parametrize("collects", [True, False])
 def test_garbage_is_collected_after_compilation_as_before_it(collects):
-    """Also where a function cannot be compiled."""
+    """Also if a function cannot be compiled."""
     seen = []
 
     class Listener(event.Listener):

@@ -22,7 +22,7 @@ sys.exit(run(app))
 
 
 def test_a_command_that_was_started_with_interrupts_ignored_ends_by_one():
-    """As a shell starts what a script puts in the background."""
+    """As a shell starts a script's background commands."""
     with subprocess.Popen(
         [sys.executable, "-c", _PROGRAM],
         stdout=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""Interrupts that fall into callbacks and into libraries."""
+"""Interrupts in callbacks and in libraries."""
 
 import time
 import weakref
@@ -11,7 +11,7 @@ from uwlts.runtime.interrupts import interrupts_kept
 
 
 def test_an_interrupt_within_a_callback_is_not_lost(capsys: pytest.CaptureFixture):
-    """Python reports and drops what a weak reference's callback raises; Ctrl-C may fall into one at any time."""
+    """Python reports and drops exceptions of a weak reference's callback; Ctrl-C may come in one at any time."""
 
     def callback(_: object) -> None:
         raise KeyboardInterrupt
@@ -26,7 +26,7 @@ def test_an_interrupt_within_a_callback_is_not_lost(capsys: pytest.CaptureFixtur
 
 
 def test_an_interrupt_within_a_recorded_loop_is_not_lost():
-    """Dr.Jit raises a RuntimeError from whatever a loop's body raises."""
+    """Dr.Jit raises a RuntimeError for any exception in a loop's body."""
 
     def body(i: mi.UInt32) -> tuple[mi.UInt32]:
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Workers for several rounds of jobs: nothing is lost when processes die, and only the job that kills its process."""
+"""Workers for several rounds of jobs: if a process dies, only the job that killed it is lost."""
 
 import os
 import signal
@@ -50,7 +50,7 @@ def test_only_the_job_that_kills_its_process_is_lost(tmp_path):
         assert {k for k, result in done.items() if isinstance(result, Lost)} == {GUILTY}
         assert "ended unexpectedly" in done[GUILTY].reason
         assert {k: r for k, r in done.items() if k != GUILTY} == {k: k * k for k in range(20) if k != GUILTY}
-        # The workers go on afterwards.
+        # The workers continue afterwards.
         assert next(iter(pool.completed(squared, [(3, tmp_path)])))[1] == 9
 
 

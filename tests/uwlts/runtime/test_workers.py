@@ -1,4 +1,4 @@
-"""Working processes: results in order, errors that reach the command, and none left when the command ends."""
+"""Worker processes: results in order, errors that reach the command, and no process left when the command ends."""
 
 import multiprocessing
 import os
@@ -36,7 +36,7 @@ def end(how, job, send):
 
 
 def linger(folder, job, send):
-    """Say so and wait; leave a mark when stopped."""
+    """Send a message and wait; leave a mark when stopped."""
     try:
         (folder / f"{job}.begun").touch()
         send(job)
@@ -46,7 +46,7 @@ def linger(folder, job, send):
 
 
 def hold_on(job, send):
-    """Wait whatever anybody says."""
+    """Wait regardless of requests to stop."""
     send(job)
     while True:
         try:
@@ -125,7 +125,7 @@ def test_what_does_not_end_is_killed(monkeypatch):
 
 
 def write_and_hold_on(folder, job, send):
-    """Begin a file, then wait whatever anybody says."""
+    """Begin a file, then wait regardless of requests to stop."""
     with written_aside(folder / f"{job}.txt"):
         hold_on(job, send)
 
@@ -163,7 +163,7 @@ def test_processes_end_with_their_command(tmp_path: Path, how: str):
     )
     assert command.stdout.readline() == "ready\n"
     if how == "interrupt of all":
-        # While the processes are starting, which is when they know least of what to do.
+        # While the processes are starting, when they know least about their work.
         time.sleep(0.05)
         os.killpg(command.pid, signal.SIGINT)
     else:

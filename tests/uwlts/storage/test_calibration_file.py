@@ -1,4 +1,4 @@
-"""The calibration file: readable JSON that comes back exactly, and refuses what is no calibration."""
+"""The calibration file: readable JSON with exact numbers; other contents are refused."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The capture file: what is stored, what a killed or failing recording leaves, and what damaged files say."""
+"""The capture file: its content, the remains of killed or failing recordings, and messages about damaged files."""
 
 import errno
 import json
@@ -69,7 +69,7 @@ def record(path: Path, count: int, dtype=np.uint8, *, header: CaptureHeader | No
 
 
 def interrupted(path: Path, count: int, *, header: CaptureHeader | None = None, plan: dict | None = None) -> Path:
-    """A recording that an exception ended."""
+    """A recording ended by an exception."""
     writer = CaptureWriter(path, header or a_header(), dtype=np.uint8, plan=plan)
     with pytest.raises(KeyboardInterrupt), writer:
         for index in range(count):
@@ -114,7 +114,7 @@ def test_everything_comes_back(tmp_path: Path, dtype: type, with_pose: bool):
 
 
 def test_a_process_that_writes_no_capture_reads_one(tmp_path: Path):
-    """An even image, which is kept compressed; noise is not."""
+    """A uniform image, which is stored compressed; noise is not."""
     path = tmp_path / "a.h5"
     image = np.full((200, 300), 7, np.uint8)
     with CaptureWriter(path, a_header(sensor=small_sensor(300, 200)), dtype=np.uint8) as writer:
@@ -138,7 +138,7 @@ def test_frames_by_light(tmp_path: Path):
 
 
 def test_structure_is_as_documented(tmp_path: Path):
-    """Read with plain h5py only: names, shapes, chunks, filters, label; nothing that unpickles or points elsewhere."""
+    """Read with plain h5py only: names, shapes, chunks, filters, label; nothing is unpickled or linked."""
     path = record(tmp_path / "a.h5", 3, np.uint16)
     with h5py.File(path, "r") as file:
         assert set(file.attrs) == {"format", "version", "header"}
@@ -166,7 +166,7 @@ def test_structure_is_as_documented(tmp_path: Path):
 
 
 def test_header_of_any_length(tmp_path: Path):
-    """HDF5 keeps attributes beyond 64 KiB elsewhere."""
+    """HDF5 stores attributes beyond 64 KiB elsewhere."""
     notes = {"notes": ["ünusual " * 40] * 600}
     path = record(tmp_path / "a.h5", 1, header=a_header(provenance=notes))
     with Capture(path) as capture:
@@ -286,7 +286,7 @@ def test_resuming_nothing_starts(tmp_path: Path):
 
 
 def test_header_that_json_changes_can_be_resumed(tmp_path: Path):
-    """JSON has lists where Python has tuples."""
+    """JSON has lists instead of Python's tuples."""
     header, path = a_header(target={"corners": ((0.0, 1.0), (2.0, 3.0))}), tmp_path / "a.h5"
     interrupted(path, 1, header=header)
     with Capture(record(path, 2, header=header, resume=True)) as capture:
@@ -314,7 +314,7 @@ def test_another_recording_is_told_by_its_entries(tmp_path: Path):
     for header, plan, says in (
         (a_header(provenance={"seed": 5}), {}, "header.provenance.seed is 4 in it, 5 now"),
         (a_header(), {"laser_ms": 2.0}, r'plan.laser_ms is "auto" in it, 2.0 now'),
-        (a_header(), {"stage": {"start_mm": 0.0, "count": 9}}, "plan.stage.count is 4 in it, 9 now. Go on"),
+        (a_header(), {"stage": {"start_mm": 0.0, "count": 9}}, "plan.stage.count is 4 in it, 9 now. Continue"),
         (a_header(stage_direction=(0.0, 0.6, 0.8)), {}, "header.stage_direction[0] is 0.6 in it, 0.0 now"),
         (a_header(), {"background": True}, "plan.background is not stated in it, true now"),
         (a_header(name="x"), {"a": 1, "b": 2, "c": 3}, "plan.c is not stated in it, 3 now; and 1 more"),
@@ -339,7 +339,7 @@ def test_a_plan_is_kept_while_it_is_not_fulfilled(tmp_path: Path):
 
 
 def test_two_recordings_at_a_time_are_refused(tmp_path: Path):
-    """The second would take the part of the first for one that was interrupted."""
+    """Otherwise the second writer would mistake the part of the first for an interrupted one."""
     path = tmp_path / "a.h5"
     with CaptureWriter(path, a_header(), dtype=np.uint8) as writer:
         writer.append(a_frame(0))
@@ -399,7 +399,7 @@ def test_killed_recording_keeps_every_announced_frame_and_can_be_resumed(tmp_pat
         process.stderr.close()
         assert has_writer(part_path(path))
         with Capture(part_path(path)) as capture:
-            # The frame that was being announced when the signal came may be complete.
+            # The frame announced when the signal came may be complete.
             assert len(capture) in (seen[-1] + 1, seen[-1] + 2)
             for index, image in capture.frames():
                 assert np.array_equal(image, a_frame(index, shape=(200, 240)).image)
@@ -445,14 +445,14 @@ def test_finished_capture_has_many_readers(tmp_path: Path):
         assert_holds(one, 3)
         assert_holds(other, 3)
         assert plain["frames"].shape[0] == 3
-    # The recording may be replaced while somebody reads it; the reader keeps what it opened.
+    # The recording may be replaced during reading; the reader keeps the file that it opened.
     with Capture(path) as old:
         record(path, 1, overwrite=True)
         assert_holds(old, 3)
 
 
 def test_storage_that_ends_stops_the_recording_and_keeps_its_frames(tmp_path: Path):
-    """A file size limit stands for a full disk: the same system calls fail at the same places."""
+    """A file size limit simulates a full disk: the same system calls fail at the same places."""
     path, limit = tmp_path / "a.h5", 2**21
     before = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))\n"
     process = child(path, 1000, before=before)
@@ -465,7 +465,7 @@ def test_storage_that_ends_stops_the_recording_and_keeps_its_frames(tmp_path: Pa
     with Capture(part_path(path)) as capture:
         assert len(capture) == len(frames)
         assert all(np.array_equal(image, a_frame(index, shape=(200, 240)).image) for index, image in capture.frames())
-    # With room again, the same command goes on.
+    # With free space again, the same command continues.
     process = child(path, len(frames) + 2, "resume")
     output, errors = process.communicate(timeout=60)
     assert (process.returncode, output.split()) == (0, [str(len(frames)), str(len(frames) + 1)])
@@ -490,7 +490,7 @@ def test_failing_write_leaves_the_frames_before(tmp_path: Path, monkeypatch, nam
     assert caught.value.__cause__ is error
     monkeypatch.undo()
     with Capture(part_path(path)) as capture:
-        # What fails after the last array is stored has lost nothing.
+        # A failure after the last array is stored loses nothing.
         count = 3 if name == "time_s" else 2
         assert_holds(capture, count)
     with Capture(record(path, 5, resume=True)) as capture:
@@ -570,7 +570,7 @@ def test_truncated_capture(tmp_path: Path, valid: bytes, killed: bytes, share: f
     path = tmp_path / "a.h5"
     path.write_bytes(valid[: int(share * len(valid))])
     refused(path, "truncated")
-    # The part ends with space that was claimed for the next frame; cut inside what is used.
+    # The part ends with space claimed for the next frame; it is cut inside the used space.
     part, used = tmp_path / "a.h5.part", len(killed.rstrip(b"\0"))
     part.write_bytes(killed[: int(share * used)])
     refused(part, "truncated|damaged")
@@ -655,13 +655,13 @@ def test_contradictions(tmp_path: Path, valid: bytes, case: str):
 
 
 def test_label_of_variable_length_is_foreign(tmp_path: Path, valid: bytes):
-    """Such text lies outside HDF5's checksums, so a reader that follows it may never come back."""
+    """Such text is outside HDF5's checksums, so that a reader that follows it may never return."""
     path = changed(tmp_path / "a.h5", valid, set_attribute("format", "uwlts-capture"))
     refused(path, "no format")
 
 
 def test_shortest_array_counts(tmp_path: Path, valid: bytes):
-    """A recording that is killed between two arrays has one row more in the first."""
+    """A recording killed between two arrays has one more row in the first."""
     path = changed(tmp_path / "a.h5", valid, lambda file: file["time_s"].resize(3, axis=0))
     with Capture(path) as capture:
         assert_holds(capture, 3)
@@ -673,7 +673,7 @@ def test_damaged_image_is_noticed_and_the_others_are_fine(tmp_path: Path, valid:
     with h5py.File(path, "r") as file:
         chunk = file["frames"].id.get_chunk_info_by_coord((2, 0, 0))
     noticed = 0
-    # Every byte but the checksum's own belongs to the compressed image; each eighth will do.
+    # All bytes but the checksum's own belong to the compressed image; every eighth one suffices.
     for place in range(0, chunk.size, 8):
         damaged = bytearray(valid)
         damaged[chunk.byte_offset + place] ^= 0x10
@@ -701,7 +701,7 @@ def test_resuming_never_carries_a_damaged_image_over(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [part]
 
 
-# Seconds after which reading a damaged file of 50 kB counts as hanging; it takes milliseconds.
+# Time limit in s for reading a damaged file of 50 kB, which takes milliseconds.
 _HANGS_S = 10.0
 
 
@@ -730,7 +730,7 @@ def test_random_damage_gives_only_known_errors(tmp_path: Path, valid: bytes, kil
     assert time.monotonic() - start < _HANGS_S
 
 
-# --- helpers of their own
+# --- internal functions
 
 
 def test_checksum_is_the_one_of_lookup3():

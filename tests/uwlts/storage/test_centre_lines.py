@@ -1,4 +1,4 @@
-"""Captures of centre lines: kept, imported from tables, arrays and images, exported, measured, and refused."""
+"""Captures of centre lines: storage, import from tables, arrays and images, export, measurement, and refusals."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ SCALE, OFFSET = 1 / 16, -2.0
 
 
 def profiles(count: int = 4) -> np.ndarray:
-    """Places (count, WIDTH) in px on a grid of 1/16, NaN where there is none."""
+    """Positions (count, WIDTH) in px on a grid of 1/16, NaN without a stripe."""
     rng = np.random.default_rng(5)
     places = np.round(16 * (20 + 5 * np.sin(np.arange(WIDTH) / 9) + rng.normal(0, 1, (count, WIDTH)))) / 16
     places[rng.random((count, WIDTH)) < 0.1] = np.nan
@@ -28,7 +28,7 @@ def profiles(count: int = 4) -> np.ndarray:
 
 
 def raw(places: np.ndarray) -> np.ndarray:
-    """The camera's numbers of places; 0 is none."""
+    """The camera's numbers for positions; 0 means no stripe."""
     return np.nan_to_num(np.round((places - OFFSET) / SCALE), nan=0.0).astype(np.uint16)
 
 
@@ -106,7 +106,7 @@ def test_a_table_gives_encoder_and_time_of_every_profile(tmp_path: Path):
     ("numbers", "words"),
     [
         (np.zeros((2, WIDTH + 1)), "expected profiles in rows"),
-        (np.zeros((WIDTH, 3)), "it is turned"),
+        (np.zeros((WIDTH, 3)), "it may be transposed"),
         (np.full((2, WIDTH), 60_000), "run from 3748 to 3748 px.*check scale"),
         (np.zeros((1, 5, WIDTH)), "expected profiles in rows"),
         (np.array(["a"]), "no numbers"),
@@ -157,7 +157,7 @@ def test_the_ends_of_a_centre_line_are_left_out_as_those_of_an_image(tmp_path: P
     uwlts.import_images(folder, tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         left_out = set(range(WIDTH)) - set(find_stripes(capture).line.tolist())
-        # Two lines on either side of the gap, by StripeOptions; the image's border is no end.
+        # Two lines on either side of the gap, by StripeOptions; the image's border is not an end.
         assert left_out == set(range(28, 42)) and find_stripes(capture).lines_by_status["end"] == 4
 
 

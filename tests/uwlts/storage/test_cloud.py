@@ -1,4 +1,4 @@
-"""Clouds survive the disk bit by bit, outputs appear whole or not at all, damaged files are refused."""
+"""Cloud files keep all bits, outputs are written completely or not at all, and damaged files are refused."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""COPC files: all points come back, regions and levels, what other readers see, bounded memory."""
+"""COPC files: all points, regions and levels, other readers, and bounded memory."""
 
 import itertools
 import subprocess
@@ -41,13 +41,13 @@ def test_all_points_come_back(cloud, small_nodes, tmp_path):
     cloud.save(tmp_path / "pipe.ply")
     assert uwlts.export(tmp_path / "pipe.ply", tmp_path / "pipe.copc.laz") == len(cloud)
     back = uwlts.read(tmp_path / "pipe.copc.laz")
-    # Steps of 1e-4 mm; the amplitude and the deviation are stored as they are.
+    # Steps of 1e-4 mm; amplitude and deviation are stored exactly.
     np.testing.assert_allclose(sorted_rows(back), sorted_rows(cloud), atol=0.51e-4)
     with laspy.CopcReader.open(tmp_path / "pipe.copc.laz") as reader:
         np.testing.assert_allclose(1e3 * reader.header.mins, cloud.points_mm.min(axis=0), atol=1e-3)
         levels = [len(reader.query(level=level)) for level in range(4)]
         assert sum(levels) == len(cloud)
-        # Four times as many from level to level, by chance within five standard deviations.
+        # A factor of four from level to level, within five standard deviations.
         for upper, lower in itertools.pairwise(levels):
             assert abs(lower / upper - 4) < 5 * 4 * np.sqrt(1 / upper + 1 / lower)
         root = reader.query(level=0)
@@ -60,7 +60,7 @@ def test_a_region_and_a_level_are_read_alone(cloud, small_nodes, tmp_path):
     low, high = np.array([100.0, -20.0, 430.0]), np.array([150.0, 30.0, 520.0])
     inside = ((cloud.points_mm >= low) & (cloud.points_mm <= high)).all(axis=1)
     for name in ("pipe.copc.laz", "pipe.ply"):
-        # A point within a step of the box may fall on its other side.
+        # A point within a step of the box's face may be on its other side.
         assert abs(len(read_region(tmp_path / name, low, high)) - np.count_nonzero(inside)) <= 2
         few = read_region(tmp_path / name, low, high, 1000)
         assert 300 < len(few) <= 1000 and few.points_mm[:, 0].min() > 99.9
@@ -83,7 +83,7 @@ def test_the_command_cuts_out_a_region(cloud, tmp_path, monkeypatch):
     box = ["--region-mm", "0", "-100", "0", "40", "100", "1000"]
     app(["export", "pipe.copc.laz", "--out", "end.ply", *box, "--at-most", "500"], result_action="return_value")
     assert 100 < len(uwlts.read("end.ply")) <= 500
-    with pytest.raises(CaptureError, match="is no cloud"):
+    with pytest.raises(CaptureError, match="is not a cloud"):
         uwlts.export(tmp_path / "scan.h5", tmp_path / "part.ply", at_most=5)
 
 
@@ -106,7 +106,7 @@ def test_damaged_and_empty_clouds_are_refused(cloud, tmp_path):
 
 
 def test_memory_is_that_of_a_part(tmp_path):
-    """Eight parts take hardly more memory than two; all points and their sorted copies would take 1.2 GB more."""
+    """Eight parts take almost no more memory than two; all points and their sorted copies would take 1.2 GB more."""
     script = (
         "import resource, sys\nimport numpy as np\nfrom uwlts.storage.cloud import PointCloud\n"
         "from uwlts.storage.copc_file import write_copc\n"
@@ -121,5 +121,5 @@ def test_memory_is_that_of_a_part(tmp_path):
     for parts in (2, 8):
         words = [sys.executable, "-c", script, str(tmp_path / f"{parts}.copc.laz"), str(parts)]
         peaks.append(int(subprocess.run(words, capture_output=True, text=True, check=True).stdout))
-    # Six parts more of 400,000 points take 110 MB as records alone.
+    # The records of six further parts of 400,000 points take 110 MB.
     assert peaks[1] - peaks[0] < 60_000

@@ -39,7 +39,7 @@ def a_cloud(count: int = 500, *, reach_mm: float = 300.0, **changes) -> PointClo
 
 
 def assert_same(first: Path, second: Path) -> None:
-    """Two captures that hold the same to the last bit."""
+    """Check that two captures have identical content."""
     with Capture(first) as a, Capture(second) as b:
         assert a.header.model_dump_json() == b.header.model_dump_json()
         assert a.dtype == b.dtype and len(a) == len(b) > 0
@@ -52,7 +52,7 @@ def assert_same(first: Path, second: Path) -> None:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("image_format", ["png", "tiff"])
 def test_an_exported_capture_comes_back(tmp_path: Path, dtype: type, image_format: str):
-    # What import says of images without a stripe or with odd headers does not matter to a capture of its own.
+    # Warnings about images without a stripe or unusual headers are irrelevant for a capture of the program.
     header = a_header(saturation_dn=int(np.iinfo(dtype).max), artefact={"kind": "plane", "flatness_mm": None})
     record(tmp_path / "a.h5", 7, dtype, header=header)
     with Capture(tmp_path / "a.h5") as capture:

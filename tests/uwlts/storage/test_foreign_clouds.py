@@ -1,4 +1,4 @@
-"""Clouds of other programs: exported ones come back, those of other programs are read, damaged ones refused."""
+"""Clouds of other programs: exported ones are read back, foreign ones are read, damaged ones are refused."""
 
 from pathlib import Path
 

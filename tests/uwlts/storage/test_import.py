@@ -1,4 +1,4 @@
-"""Images of others become a capture: formats, channels, bits, positions, and refusals that name the cause."""
+"""Import of foreign images as a capture: formats, channels, bits, positions, and refusals with their cause."""
 
 import contextlib
 from pathlib import Path
@@ -65,7 +65,7 @@ def without(*keys: str, **changes) -> dict:
     return {key: value for key, value in GIVEN.items() if key not in keys} | changes
 
 
-# --- what comes in
+# --- accepted inputs
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -137,7 +137,7 @@ def test_the_laser_s_light_is_separated_by_a_difference_of_colours(tmp_path: Pat
     assert (found.laser, found.lamp) == (2, 2)
     with Capture(tmp_path / "out.h5") as capture:
         assert capture.laser_on.tolist() == [False, True, False, True]
-        # No light of the laser is 256, so that the sign of what is left is kept.
+        # Zero laser light is 256, so that the sign of the remaining noise is kept.
         wanted = 256 + red.astype(int) - np.maximum(green, blue)
         np.testing.assert_array_equal(capture.image(1), wanted)
         np.testing.assert_array_equal(capture.image(0), green)
@@ -314,11 +314,11 @@ def test_intrinsics_fill_the_sensor(tmp_path: Path):
     assert tuple(camera.distortion.used().values()) == tuple(coefficients)
 
 
-# --- what is refused
+# --- refusals
 
 
 def refused(folder: Path, tmp_path: Path, error: type[Exception], words: str) -> None:
-    """An import that fails with the words and leaves nothing behind."""
+    """Check that an import fails with these words and leaves no files."""
     out = tmp_path / "refused.h5"
     with pytest.raises(error, match=words):
         import_images(folder, out)
@@ -355,9 +355,9 @@ def test_wrong_size_from_the_start(tmp_path: Path):
 
 def test_rotated(tmp_path: Path):
     folder = folder_of(tmp_path, {"l1.png": stripe_image().T})
-    refused(folder, tmp_path, ImageError, "64 x 96 pixels; .* turned by a quarter turn: turn them back, or exchange")
+    refused(folder, tmp_path, ImageError, "64 x 96 pixels; .* rotated by 90 deg: rotate them back, or exchange")
     folder = three(tmp_path, l2=stripe_image().T)
-    refused(folder, tmp_path, ImageError, "l2.png has 64 x 96 .*it is turned by a quarter turn")
+    refused(folder, tmp_path, ImageError, "l2.png has 64 x 96 .*it is rotated by 90 deg")
 
 
 def test_another_depth_in_the_middle(tmp_path: Path):
@@ -413,12 +413,12 @@ def test_a_stripe_across_is_reported(tmp_path: Path):
     image = stripe_image()[:, :80].T
     folder = folder_of(tmp_path, {"l1.png": np.pad(image, ((0, 0), (8, 8)), "reflect")}, GIVEN | {"sensor": sensor})
     warnings = import_images(folder, tmp_path / "a.h5").warnings
-    assert "one runs across: the images are turned, or the sensor's stripe_along" in warnings[0]
+    assert "one runs across: the images are rotated, or the sensor's stripe_along" in warnings[0]
 
 
 def test_alpha(tmp_path: Path):
     folder = three(tmp_path, l2=np.dstack([stripe_image()] * 4))
-    refused(folder, tmp_path, ImageError, "l2.png has 4 channels, that is with an alpha channel")
+    refused(folder, tmp_path, ImageError, "l2.png has 4 channels, including an alpha channel")
 
 
 def test_colour_without_a_channel(tmp_path: Path):
@@ -428,9 +428,9 @@ def test_colour_without_a_channel(tmp_path: Path):
 
 def test_sixteen_bits_of_unknown_use(tmp_path: Path):
     image = stripe_image().astype(np.uint16)
-    refused(folder_of(tmp_path, {"l.png": image}), tmp_path, ImageError, "16 bit: say how many the camera used")
+    refused(folder_of(tmp_path, {"l.png": image}), tmp_path, ImageError, "16 bit: give the number that the camera used")
     given = GIVEN | {"bits": 10}
-    refused(folder_of(tmp_path, {"l.png": image * 16}, given), tmp_path, ImageError, "more than 10 bits have: .*'high'")
+    refused(folder_of(tmp_path, {"l.png": image * 16}, given), tmp_path, ImageError, "exceeds 10 bits: .*'high'")
     refused(
         folder_of(tmp_path, {"l.png": stripe_image()}, given), tmp_path, ImageError, "a file of 8 bit, but bits = 10"
     )
@@ -475,7 +475,7 @@ def test_empty_folder(tmp_path: Path):
         (GIVEN | {"lamp": "l2*"}, "l2.png would be both laser and lamp image"),
         (GIVEN | {"background": "l2*"}, "l2.png would be both laser and background image"),
         (GIVEN | {"laser": "l1*", "background": "l[23]*"}, "2 background images for 1 laser images"),
-        (GIVEN | {"laser": "l[12]*", "lamp": "l3*"}, "2 laser and 1 lamp images: it is open"),
+        (GIVEN | {"laser": "l[12]*", "lamp": "l3*"}, "2 laser and 1 lamp images: it is unknown"),
         (GIVEN | {"header": "header.json"}, "the header gives sensor, medium, stage.direction already"),
         (GIVEN | {"saturation_dn": 1000}, "saturation_dn is 1000; images of uint8"),
     ],
@@ -503,8 +503,8 @@ def test_sixteen_bits_leave_no_room_for_a_sign(tmp_path: Path):
         ("file,stage_mm\nl1.png,3\nl2.png\n", "line 3: there are more or fewer cells"),
         ("file;stage_mm\nl1.png;3,5\n", "stage_mm is '3,5'; expected a number with a decimal point"),
         ("file,stage_mm\nl1.png,nan\n", "expected a finite number"),
-        ("file,stage_mm\n../l1.png,1\n", "line 2: ../l1.png lies outside the folder"),
-        ("file,stage_mm,background\nl1.png,1,/l2.png\n", "line 2: /l2.png lies outside the folder"),
+        ("file,stage_mm\n../l1.png,1\n", "line 2: ../l1.png is outside the folder"),
+        ("file,stage_mm,background\nl1.png,1,/l2.png\n", "line 2: /l2.png is outside the folder"),
         ("file,stage_mm\n,1\n", "line 2: the file's name is missing"),
         ("file,stage_mm,background\nl1.png,1,l2.png\nl3.png,2,\n", "a background for 1 of 2 laser images"),
         ("file,pose_00\nl1.png,1\n", "only 1 of the 16 elements"),

@@ -1,4 +1,4 @@
-"""Cameras that OpenCV and ROS calibrated, in every writing that is about; those that are no such camera are refused."""
+"""Camera calibrations of OpenCV and ROS in all common notations; other files are refused."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -95,7 +95,7 @@ def test_point_cloud_of_foxglove(cloud, tmp_path):
             assert message.log_time == round(1e9 * cloud.time_s[50 * len(parts)])
             parts.append(message.data)
     assert len(parts) == 12
-    # The library reads no protobuf: the packed points stand in the message as they are.
+    # The library cannot read protobuf: the packed points are in the message unchanged.
     first = cloud.points_mm[0].astype(np.float64) * 1e-3
     assert first.astype("<f4").tobytes() in parts[0] and b"cov_xx_mm2" in parts[0]
     assert Message.get_schema().name == "foxglove.PointCloud"

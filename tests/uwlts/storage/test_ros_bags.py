@@ -1,4 +1,4 @@
-"""Poses from bags of ROS 1 and ROS 2, written by the library that others write them with."""
+"""Poses from bags of ROS 1 and ROS 2, written by the usual library."""
 
 import sys
 
@@ -18,7 +18,7 @@ TURNS = Rotation.from_euler("z", 5.0 * np.arange(6)[:, None], degrees=True)
 
 
 def messages(types, kind):
-    """The path as messages of a kind, with what else they hold at zero."""
+    """The path as messages of a type, with zeros in all other fields."""
     held = types.types
     for time, place, turn in zip(TIMES, PLACES_M, TURNS.as_quat(), strict=True):
         seconds = int(time)

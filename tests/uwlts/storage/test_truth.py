@@ -1,4 +1,4 @@
-"""The ground-truth file: everything comes back, and what contradicts itself is refused."""
+"""The ground-truth file: complete content, and refusal of inconsistent files."""
 
 from dataclasses import fields
 from pathlib import Path

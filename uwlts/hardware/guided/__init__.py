@@ -1,1 +1,1 @@
-"""A guided calibration with camera and stage: what is planned, asked for, judged, shown and recorded."""
+"""Guided calibration with camera and stage: plan, requests to the operator, judgement, display and recording."""

@@ -1,4 +1,4 @@
-"""The operator of a guided calibration: lines of text, answers by Enter, words or buttons, and what is shown."""
+"""Dialogue with the operator of a guided calibration: text, answers by Enter, words or buttons, and a screen."""
 
 import os
 import select
@@ -14,38 +14,38 @@ from uwlts.hardware.rig import LaserStage
 
 _LOOK_S = 0.1
 ANSWERS = ("take", "skip", "done")
-"""Take what stands there now; ask for something else; end this part with what there is."""
+"""Take the target as it is now; ask for another pose; end this phase with what is recorded."""
 
 
 class Screen(Protocol):
-    """Where a guided calibration is shown, and where buttons answer."""
+    """Display of a guided calibration, with buttons for the answers."""
 
     def answer(self) -> str | None:
-        """One of `ANSWERS` that was given since the last call; None where there is none."""
+        """Return the answer given since the last call, one of `ANSWERS`, or None."""
 
     def request(self, text: str) -> None:
-        """Show what the operator is asked to do."""
+        """Show what the operator should do."""
 
     def live(
         self, image: np.ndarray, *, full_dn: int, points: np.ndarray | None, stripe: np.ndarray | None, remark: str
     ) -> None:
-        """Show an image (H, W) with the points (N, 2) of the target and the stripe's pixels (N, 2) found in it."""
+        """Show an image (H, W) with the target's points (N, 2) and the stripe's pixels (N, 2) found in it."""
 
     def recorded(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
-        """Show the coverage, with the points (N, 2) of every image."""
+        """Show the coverage, with the points (N, 2) of each image."""
 
     def add(self, line: str) -> None:
         """Add a line to the list of images."""
 
     def connected(self, stage: LaserStage | None) -> None:
-        """The stage that switches the laser from now on; None once it is closed."""
+        """Set the stage that now switches the laser, or None once it is closed."""
 
 
 class Operator:
-    """Says lines and reads answers, without stopping what goes on meanwhile.
+    """Output of lines and input of answers without blocking.
 
-    ``say`` is called with every line. Answers come from the ``screen`` and, a line each, from the file descriptor
-    ``answers``, standard input unless given: Enter alone for "take", or one of `ANSWERS`.
+    ``say`` is called with every line. Answers come from the ``screen`` and, one per line, from the file descriptor
+    ``answers``, by default standard input: an empty line for "take", or one of `ANSWERS`.
     """
 
     def __init__(self, say: Callable[[str], None], screen: Screen, *, answers: int | None = None):
@@ -55,20 +55,20 @@ class Operator:
         self._last = ""
 
     def hint(self, line: str) -> None:
-        """Say a line, unless it was the hint before."""
+        """Output a line unless it repeats the previous hint."""
         if line != self._last:
             self._last = line
             self.say(line)
 
     def answer(self) -> str | None:
-        """The answer given since the last call, one of `ANSWERS`; None where there is none."""
+        """Return the answer given since the last call, one of `ANSWERS`, or None."""
         if (pressed := self._screen.answer()) is not None:
             return pressed
-        # Not sys.stdin's own reading: it would wait, and a waiting thread would keep the program from ending.
+        # sys.stdin would block, and a blocked thread would keep the program from ending.
         while self._answers is not None and select.select([self._answers], [], [], 0)[0]:
             piece = os.read(self._answers, 4096)
             if not piece:
-                # Nobody is at the terminal; the buttons are left.
+                # No terminal: only the buttons remain.
                 self._answers = None
             self._typed += piece
         line, end, rest = self._typed.partition(b"\n")
@@ -82,7 +82,7 @@ class Operator:
         return word
 
     def wait(self, request: str, meanwhile: Callable[[], None] = lambda: time.sleep(_LOOK_S)) -> str:
-        """Say what is to be done and wait for the answer."""
+        """Output a request and wait for the answer."""
         self.say(f"{request}; then press Enter")
         while (answer := self.answer()) is None:
             meanwhile()

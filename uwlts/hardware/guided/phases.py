@@ -1,6 +1,6 @@
-"""Guided calibration: images and attempts at poses of the target, and its phases.
+"""Phases of a guided calibration: attempts at poses of the target, then images of the step standard.
 
-The target is shown at the stage's positions or held by hand; then comes the step standard.
+The target is shown at the stage's positions or held by hand.
 """
 
 import time
@@ -52,22 +52,22 @@ from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.targets import TargetView
 
 _TRIES = 3
-# A target held by hand stands still while its points move by no more than this.
+# Largest motion of the points of a hand-held target that counts as standing still.
 _STILL_PX = 0.5
-# Free poses have no stage position; this numbers their images without looking like a motion of the stage.
+# Free poses have no stage position; they are numbered in this unit, which does not look like a motion of the stage.
 _NUMBER_MM = 1e-3
-# A pose is taken without being asked for if it helps this much of what the best one would.
+# A pose that was not requested is taken if its gain is at least this fraction of the best pose's gain.
 _USEFUL = 0.25
 _RESETTLE_S = 2.0
-# The stage's steps may be small; the poses are distinguished by its position.
+# The stage's steps may be small: its position distinguishes the poses.
 _STAGE_CHANGE_PX = 0.5
 
 
 class Session:
-    """A recording with camera and stage open: takes images, talks to the operator, and writes the capture.
+    """Recording in progress: takes images with the open camera and stage, and writes the capture.
 
-    Images are taken at the exposure of their light. ``known_ms`` are exposures already settled, and ``before_s`` the
-    time of the last image, of an interrupted recording.
+    Images are taken at the exposure of their light. ``known_ms`` are the settled exposures, and ``before_s`` the time
+    of the last image, of an interrupted recording.
     """
 
     def __init__(
@@ -88,21 +88,21 @@ class Session:
         self._start_s = time.monotonic() - before_s
 
     def take(self, light: Light) -> tuple[np.ndarray, float]:
-        """Image (H, W) in a light, and its exposure in ms."""
+        """Take an image (H, W) in a light; return it with its exposure in ms."""
         if light not in self._exposure_ms:
             self.settle(light)
         image, exposure_ms = self.rig.image(light, self._exposure_ms.get(light, START_MS))
         return image.astype(self._dtype, copy=False), exposure_ms
 
-    def unlit(self) -> np.ndarray:
-        """A short image (H, W) without laser, in whatever light there is."""
+    def take_unlit(self) -> np.ndarray:
+        """Take a short image (H, W) without laser, in the ambient light."""
         return self.rig.image("lamp", START_MS)[0]
 
     def settle(self, light: Light) -> bool:
-        """Find the exposure for what is seen now; whether there is one that was not planned: in the dark is none."""
+        """Find the exposure for the present scene; return False if it is planned, or the scene is too dark."""
         if light in self._plan.planned_ms():
             return False
-        found = self.rig.settled_exposure(light, start_ms=self._exposure_ms.get(light, START_MS))
+        found = self.rig.find_exposure(light, start_ms=self._exposure_ms.get(light, START_MS))
         if found is not None:
             self._exposure_ms[light] = found
         return found is not None
@@ -115,7 +115,7 @@ class Session:
         self.screen.live(image, full_dn=full, points=points, stripe=stripe, remark=remark)
 
     def report(self, line: str) -> None:
-        """Say a line, and add it to the screen's list of images."""
+        """Output a line, and add it to the screen's list of images."""
         self.operator.say(line)
         self.screen.add(line)
 
@@ -126,7 +126,7 @@ class Session:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A lamp image (H, W) with the target in it, None where there is none, and the reasons why it is of no use."""
+    """Target found in a lamp image (H, W), or None, with the reasons that make it unusable."""
 
     image: np.ndarray
     view: TargetView | None
@@ -135,20 +135,20 @@ class Found:
 
     @property
     def usable(self) -> TargetView | None:
-        """The target, None where there is a reason against it."""
+        """The target, or None if there is a reason against it."""
         return None if self.reasons else self.view
 
     def line(self) -> str:
-        """The reasons in a line."""
+        """Return the reasons as a line of text."""
         return f"refused: {'; '.join(self.reasons)}"
 
 
 @dataclass(frozen=True, eq=False)
 class Accepted(Found):
-    """A pose to be recorded, and the ``state`` of the calibration with it.
+    """A pose to be recorded, and the calibration ``state`` that includes it.
 
-    ``lamp_ms`` is the exposure of the image; ``laser`` is the image (H, W) with the laser line, if that was on the
-    target, with its exposure in ms.
+    ``lamp_ms`` is the exposure of the image. ``laser`` is the image (H, W) with the laser line and its exposure in ms,
+    if the line was on the target.
     """
 
     quality: TargetQuality
@@ -158,7 +158,7 @@ class Accepted(Found):
     state: State
 
     def line(self) -> str:
-        """Quality in a line."""
+        """Return the quality as a line of text."""
         quality, state = self.quality, self.state
         stripe = f"stripe on {len(self.pose.stripe)} lines" if self.laser else "no stripe on the target"
         residual = "not yet" if state.solution is None else f"{state.solution.image_rms_px()[-1]:.2f} px"
@@ -169,7 +169,7 @@ class Accepted(Found):
 
 
 class PoseJudge:
-    """Judges images of the target, taken now or read from a recording; pixels clip at the grey value ``full_dn``."""
+    """Judgement of target images, new or recorded; ``full_dn`` is the saturation grey value."""
 
     def __init__(self, setting: Setting, wanted: Wanted, *, full_dn: int):
         self._setting, self._wanted, self._full = setting, wanted, full_dn
@@ -177,7 +177,7 @@ class PoseJudge:
         self.limits = limits if setting.poses == "free" else replace(limits, smallest_change_px=_STAGE_CHANGE_PX)
 
     def find(self, image: np.ndarray) -> Found:
-        """The target in a lamp image (H, W), judged."""
+        """Find and judge the target in a lamp image (H, W)."""
         try:
             view = self._setting.target.detect(image)
         except TargetError as error:
@@ -186,7 +186,7 @@ class PoseJudge:
         return Found(image, view, quality, quality.reasons)
 
     def stripe(self, image: np.ndarray, view: TargetView) -> StripeQuality:
-        """The stripe in a laser image (H, W) on the target where a view shows it."""
+        """Judge the stripe in a laser image (H, W) on the target in a view."""
         return judge_stripe(
             image,
             view,
@@ -197,11 +197,11 @@ class PoseJudge:
         )
 
     def state(self, recorded: Sequence[RecordedPose]) -> State:
-        """State that recorded poses lead to; errors as `state_of`."""
+        """Return the state that recorded poses lead to; raises the errors of `state_of`."""
         return state_of(recorded, self._setting, self._wanted)
 
     def recorded(self, path: Path) -> list[RecordedPose]:
-        """The poses that a capture of the target holds, judged as when they were taken."""
+        """Read the poses in a capture of the target, judged like new ones."""
         with Capture(path) as capture:
             stripes = {float(capture.stage_mm[k]): image for k, image in capture.frames(laser_on=True)}
             poses = []
@@ -214,7 +214,7 @@ class PoseJudge:
         return poses
 
     def attempt(self, session: Session, before: State, stage_mm: float) -> Found:
-        """Take the target as it stands, to be the next pose after those of ``before``; `Accepted`, or the reasons."""
+        """Try to take the target as the next pose after those of ``before``; return `Accepted`, or the reasons."""
         lamp, lamp_ms = session.take("lamp")
         found = self.find(lamp)
         view, quality = found.usable, found.quality
@@ -246,13 +246,13 @@ class PoseJudge:
         return Accepted(lamp, view, quality, (), pose, lamp_ms, laser if shown else None, state)
 
 
-def still_missing(state: State) -> list[str]:
-    """Evidence that camera and laser sheet still need."""
+def list_missing(state: State) -> list[str]:
+    """List the evidence that is still missing for camera and laser sheet."""
     return [*missing(state), *missing_sheet(state)]
 
 
 class TargetPhase:
-    """Records poses of the target until what is wanted is reached."""
+    """Recording of target poses until the goal is reached."""
 
     def __init__(self, plan: GuidedPlan, session: Session, judge: PoseJudge):
         self._plan, self._session, self._judge = plan, session, judge
@@ -260,9 +260,9 @@ class TargetPhase:
         self._settled_s = -np.inf
 
     def run(self, state: State) -> State:
-        """Go on from a state; how far it came.
+        """Continue from a state, and return the final state.
 
-        HardwareError where camera, stage or laser fail; OutputError where the capture cannot be written.
+        Raises HardwareError if camera, stage or laser fail, and OutputError if the capture cannot be written.
         """
         self._show_state(state)
         return self._free(state) if self._plan.poses == "free" else self._by_stage(state)
@@ -280,7 +280,7 @@ class TargetPhase:
             for _ in range(_TRIES):
                 found = self._judge.attempt(self._session, state, position)
                 state = self._done(found, state, f"{position:.2f} mm")
-                # Another attempt may be better once the target has come to rest, or with another exposure.
+                # Another attempt may succeed once the target is at rest, or with another exposure.
                 moved = any(isinstance(reason, MotionFault) for reason in found.reasons)
                 if not (moved or self._improve_light(found.reasons)):
                     break
@@ -291,9 +291,9 @@ class TargetPhase:
         refused: list[TargetView] = []
         still: TargetView | None = None
         since_s, skipped = time.monotonic(), 0
-        while still_missing(state) and len(state.recorded) < self._plan.most_images:
+        while list_missing(state) and len(state.recorded) < self._plan.most_images:
             found = self._judge.find(self._session.take("lamp")[0])
-            advice = advice or best_pose(state, spin_rad=_spin(found.usable, state), skipped=skipped)
+            advice = advice or best_pose(state, spin_rad=_estimate_spin(found.usable, state), skipped=skipped)
             answer = self._operator.answer()
             if answer == "done":
                 break
@@ -321,7 +321,7 @@ class TargetPhase:
     def _why_wait(
         self, found: Found, state: State, advice: PoseAdvice | None, known: list[TargetView]
     ) -> tuple[str, ...]:
-        """Reason why the target as it stands is not recorded."""
+        """Return the reasons not to record the target as it is."""
         view = found.usable
         if view is None:
             return found.reasons
@@ -332,7 +332,7 @@ class TargetPhase:
         return () if gain >= _USEFUL * advice.gain else ("adds little to what there is",)
 
     def _lead(self, found: Found, state: State, advice: PoseAdvice | None, reasons: tuple[str, ...]) -> None:
-        """Show the image, and say what to do next."""
+        """Show the image and the next request to the operator."""
         pose = None if found.usable is None else pose_of(found.usable, state.camera)
         sheet = missing_sheet(state)
         request = "move the target" if advice is None else format_pose_advice(advice, state, pose)
@@ -344,7 +344,7 @@ class TargetPhase:
         self._session.show(found.image, "; ".join(reasons) or "good", points=points)
 
     def _improve_light(self, reasons: tuple[str, ...]) -> bool:
-        """Settle the lamp's exposure again where an image was too bright or too dark, but not all the time."""
+        """Settle the lamp's exposure again if an image was too bright or dark; return whether it was changed."""
         light = any(isinstance(reason, LampFault) for reason in reasons)
         if not light or time.monotonic() - self._settled_s < _RESETTLE_S:
             return False
@@ -353,7 +353,7 @@ class TargetPhase:
         return changed
 
     def _done(self, found: Found, state: State, name: str) -> State:
-        """Record what was accepted, and say what became of it; the state after it."""
+        """Record an accepted pose, report the result, and return the state after it."""
         stripe = None
         if isinstance(found, Accepted):
             state, stripe, stage_mm = found.state, found.pose.stripe, found.pose.stage_mm
@@ -371,15 +371,15 @@ class TargetPhase:
         self._screen.recorded(state.coverage, [pose.view.pixels for pose in state.recorded])
 
 
-def _spin(view: TargetView | None, state: State) -> float:
-    """Orientation of the target in the image, as it was last seen."""
+def _estimate_spin(view: TargetView | None, state: State) -> float:
+    """Return the latest orientation of the target in the image, in rad."""
     poses = [pose_of(view, state.camera)] if view is not None else state.poses[-1:]
     return float(np.arctan2(poses[0][1, 0], poses[0][0, 0])) if len(poses) else 0.0
 
 
 @dataclass(frozen=True)
 class StepJudge:
-    """Judges laser images of the standard by the calibration in air and the nominal window."""
+    """Judgement of laser images of the standard, with the calibration in air and the nominal window."""
 
     step: GuidedStep
     sensor: Sensor
@@ -387,7 +387,7 @@ class StepJudge:
     window: WindowModel
 
     def judge(self, image: np.ndarray) -> StepQuality:
-        """Quality of the step standard's stripe in an image (H, W)."""
+        """Judge the step standard's stripe in an image (H, W)."""
         return judge_step(
             image,
             self.calibration,
@@ -398,27 +398,27 @@ class StepJudge:
         )
 
     def depths_mm(self, path: Path) -> list[float]:
-        """Depths outside the window at which a recording shows the standard."""
+        """Return the standard's depths outside the window in a recording."""
         with Capture(path) as capture:
             qualities = [self.judge(image) for _, image in capture.frames(laser_on=True)]
         return [each.depth_mm for each in qualities if each.depth_mm is not None and not each.reasons]
 
 
 class StepPhase:
-    """Records images of the standard until it was seen near, in the middle and far."""
+    """Recording of the standard near, in the middle and far."""
 
     def __init__(self, judge: StepJudge, session: Session):
         self._judge, self._session = judge, session
 
     def run(self, seen_mm: Sequence[float]) -> list[float]:
-        """Go on after the depths that are recorded; all depths then. Errors as `TargetPhase.run`."""
+        """Continue after the recorded depths; return all depths. Raises the errors of `TargetPhase.run`."""
         seen, session, skipped = list(seen_mm), self._session, 0
         while (wanted := next_depth_mm(seen, self._judge.sensor, skipped=skipped)) is not None:
             request = (
                 f"put the step standard about {wanted:.0f} mm outside the window, with the laser line across its step"
             )
             session.screen.request(request)
-            answer = session.operator.wait(request, lambda: session.show(session.unlit(), "the laser is off"))
+            answer = session.operator.wait(request, lambda: session.show(session.take_unlit(), "the laser is off"))
             if answer == "done":
                 break
             if answer == "skip":
@@ -432,7 +432,7 @@ class StepPhase:
         return seen
 
     def _take(self, position: float | None, before_mm: Sequence[float]) -> float | None:
-        """Take the standard as it stands; at which depth it was recorded, None if it was refused."""
+        """Take the standard as it is; return the recorded depth in mm, or None if it was refused."""
         session = self._session
         stage_mm = 0.0 if position is None else session.rig.move_to(position)
         image, exposure_ms = session.take("laser")
@@ -440,8 +440,8 @@ class StepPhase:
         if any(isinstance(reason, LaserFault) for reason in quality.reasons) and session.settle("laser"):
             image, exposure_ms = session.take("laser")
             quality = self._judge.judge(image)
-        # Nobody moves the standard while the laser is on.
-        session.unlit()
+        # The laser must be off while the standard is moved.
+        session.take_unlit()
         depth_mm, reasons, sensor = quality.depth_mm, quality.reasons, self._judge.sensor
         if depth_mm is not None and not reasons and not is_new(depth_mm, before_mm, sensor):
             nearest = min(before_mm, key=lambda other: abs(other - depth_mm))

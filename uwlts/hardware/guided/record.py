@@ -1,7 +1,7 @@
-"""A guided calibration: leads through the poses of the target, then of the step standard, and records what is good.
+"""Guided calibration: leads through poses of the target and of the step standard, and records accepted images.
 
-The captures are ordinary ones, from which the calibration can be repeated. Whatever ends the recording, they keep what
-was accepted, and the laser goes off.
+The captures are ordinary ones, so that the calibration can be repeated. However the recording ends, accepted images
+are kept and the laser goes off.
 """
 
 import os
@@ -21,10 +21,10 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.operator import Operator, Screen
-from uwlts.hardware.guided.phases import PoseJudge, Session, StepJudge, StepPhase, TargetPhase, still_missing
+from uwlts.hardware.guided.phases import PoseJudge, Session, StepJudge, StepPhase, TargetPhase, list_missing
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStage, GuidedStep
-from uwlts.hardware.rig import HandSwitchedLaser, LaserStage, Rig, with_provenance
-from uwlts.hardware.scanning import check_camera, left_over
+from uwlts.hardware.rig import HandSwitchedLaser, LaserStage, Rig, add_provenance
+from uwlts.hardware.scanning import check_camera, read_unfinished
 from uwlts.model.calibration import WindowModel
 from uwlts.storage.capture import Capture, CaptureHeader, part_path
 from uwlts.storage.capture_writer import CaptureWriter
@@ -32,7 +32,7 @@ from uwlts.storage.capture_writer import CaptureWriter
 
 @dataclass(frozen=True)
 class GuidedRecording:
-    """Captures of the target in air or in water and of the step standard, how the poses are tied, what is missing."""
+    """Captures of target and step standard, the kind of poses, and the missing evidence."""
 
     air: tuple[Path, ...]
     water: tuple[Path, ...]
@@ -53,10 +53,10 @@ def guide(
     report: Callable[[str], None] = print,
     answers: int | None = None,
 ) -> GuidedRecording:
-    """Lead through the images of a calibration on a screen; parameters and errors as of `uwlts.record_guided`.
+    """Lead through the images of a calibration on a screen; parameters and errors are those of `uwlts.record_guided`.
 
-    Camera and stage are the plan's. ``answers`` is a file descriptor with the operator's words, standard input unless
-    given.
+    Camera and stage are the plan's. ``answers`` is a file descriptor for the operator's answers, by default standard
+    input.
     """
     camera = plan.camera_address()
     options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=CameraOptions(distortion=distortion))
@@ -64,7 +64,7 @@ def guide(
     operator = Operator(report, screen, answers=answers)
     phases = _Phases(plan, setting, camera, screen, operator, resume, overwrite and not resume)
     target, step = (out.with_name(f"{out.stem}-{shown}.h5") for shown in ("target", "step"))
-    missing = still_missing(phases.target(target))
+    missing = list_missing(phases.target(target))
     if plan.step is not None:
         with Capture(target) as capture:
             known = calibrate_sequentially([capture], (), options=options).calibration
@@ -82,7 +82,7 @@ def guide(
 
 @dataclass(frozen=True)
 class _Phases:
-    """Both parts of the recording, each with camera and stage opened for it: between them the tank is worked at."""
+    """Both phases of the recording; each opens camera and stage, because in between the tank is worked at."""
 
     plan: GuidedPlan
     setting: Setting
@@ -92,19 +92,19 @@ class _Phases:
     resume: bool
     overwrite: bool
 
-    def _left(self, path: Path) -> Path | None:
-        """Recording to go on with: interrupted, or finished but perhaps not enough."""
+    def _find_unfinished(self, path: Path) -> Path | None:
+        """Return the recording to continue: an interrupted one, or a finished one that may not suffice."""
         return next((each for each in (part_path(path), path) if each.is_file()), None) if self.resume else None
 
     def target(self, path: Path) -> State:
-        """Record the target; how far that leads."""
+        """Record the target, and return the final state."""
         plan = self.plan
         judge = PoseJudge(self.setting, plan.goal(), full_dn=self.setting.sensor.detector.full_scale_dn())
-        left = self._left(path)
+        left = self._find_unfinished(path)
         state = judge.state([] if left is None else judge.recorded(left))
         if left == path:
             if plan.poses == "free":
-                more = bool(still_missing(state)) and len(state.recorded) < plan.most_images
+                more = bool(list_missing(state)) and len(state.recorded) < plan.most_images
             else:
                 more = bool(plan.places_left(state.recorded))
             if not more:
@@ -116,8 +116,8 @@ class _Phases:
             return TargetPhase(plan, session, judge).run(state)
 
     def step(self, path: Path, step: GuidedStep, judge: StepJudge) -> list[str]:
-        """Record the step standard; what is missing of it."""
-        left = self._left(path)
+        """Record the step standard, and return the missing evidence."""
+        left = self._find_unfinished(path)
         seen = [] if left is None else judge.depths_mm(left)
         if left == path:
             if next_depth_mm(seen, judge.sensor) is None:
@@ -130,20 +130,20 @@ class _Phases:
         with self._session(path, list(step.positions_mm), self.plan.step_header(path.stem, step)) as session:
             seen = StepPhase(judge, session).run(seen)
         count = len(apart_mm(seen, judge.sensor))
-        return [] if count >= PLACES else [f"the step standard was seen at {count} depths apart, {PLACES} are wanted"]
+        return [] if count >= PLACES else [f"the step standard was seen at {count} depths, expected {PLACES}"]
 
     @contextmanager
     def _session(self, path: Path, positions_mm: list[float], header: CaptureHeader) -> Iterator[Session]:
-        """Camera and stage, ready to record a capture."""
+        """Open camera and stage for the recording of a capture."""
         sensor = self.setting.sensor
         with self._stage(positions_mm) as stage, open_camera(self.camera) as camera:
             check_camera(camera, sensor)
             version = f"Grbl {stage.version}" if isinstance(stage, GrblStage) else "none"
-            header = with_provenance(header, self.plan, camera, source="guided calibration", stage=version)
+            header = add_provenance(header, self.plan, camera, source="guided calibration", stage=version)
             dtype = np.dtype(np.uint16 if camera.info.bits > 8 else np.uint8)
             ahead = positions_mm[-1] - positions_mm[0] if positions_mm else 1.0
             rig = Rig(self.plan, self.plan.stage or GuidedStage(), sensor, camera, stage, ahead=ahead)
-            known, before_s = left_over(path) if self.resume else ({}, 0.0)
+            known, before_s = read_unfinished(path) if self.resume else ({}, 0.0)
             with CaptureWriter(path, header, dtype=dtype, overwrite=self.overwrite, resume=self.resume) as writer:
                 yield Session(
                     rig, self.plan, writer, self.operator, self.screen, dtype=dtype, known_ms=known, before_s=before_s

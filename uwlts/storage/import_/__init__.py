@@ -1,4 +1,4 @@
-"""Images of any camera and program turned into a capture."""
+"""Import of images of any camera and program as a capture."""
 
 from uwlts.storage.import_.camera_files import KnownCamera, read_intrinsics, with_intrinsics
 from uwlts.storage.import_.folder import Imported, import_images

@@ -1,4 +1,4 @@
-"""Cameras that other programs calibrated: OpenCV's files and ROS CameraInfo."""
+"""Camera calibrations of other programs: OpenCV's files and ROS CameraInfo."""
 
 import io
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from uwlts.files.reading import MOST_DEPTH, read_text, require_plain, shortened
 from uwlts.model.library import merged, validated
 from uwlts.model.sensor import Distortion, Sensor
 
-# Names in use for the same thing; compared without case and underscores.
+# Alternative names, compared without case and underscores.
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "m1")
 _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoef", "d", "d1")
 _BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
@@ -22,7 +22,7 @@ _BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
 
 _MOST_BYTES = 2**20
 _LARGEST = 1e9
-"""Focal lengths in px and coefficients are far below it; their products stay in the range of numbers."""
+"""Focal lengths in px and coefficients are far below this value; their products do not overflow."""
 _SQUARE = 0.005  # calibrations of square pixels find focal lengths that differ by less
 
 
@@ -30,7 +30,7 @@ _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_SafeLoader):
-    """Plain YAML, in which a matrix of OpenCV is a table."""
+    """Plain YAML with OpenCV's matrices as tables."""
 
 
 _Loader.add_multi_constructor(
@@ -40,7 +40,7 @@ _Loader.add_multi_constructor(
 
 @dataclass(frozen=True)
 class KnownCamera:
-    """Focal lengths and principal point in px, distortion, and the image size (width, height) where it is given."""
+    """Focal lengths and principal point in px, distortion, and the image size (width, height) if given."""
 
     fx_px: float
     fy_px: float
@@ -51,15 +51,15 @@ class KnownCamera:
 
 
 def read_intrinsics(path: Path) -> KnownCamera:
-    """Camera from an OpenCV file (YAML, XML or JSON) or a ROS CameraInfo (YAML).
+    """Read a camera from an OpenCV file (YAML, XML or JSON) or a ROS CameraInfo (YAML).
 
-    DescriptionError where the file is missing or damaged, has no camera matrix or distortion, or the camera is another
-    than a pinhole with Brown-Conrady or rational distortion.
+    Raises DescriptionError if the file is missing or damaged, lacks camera matrix or distortion, or the camera is not a
+    pinhole with Brown-Conrady or rational distortion.
     """
     text = read_text(
         path, most_bytes=_MOST_BYTES, error=DescriptionError, called="intrinsics", foreign="is not a file of intrinsics"
     )
-    # OpenCV's own parser hangs or ends the process with some damaged files.
+    # OpenCV's own parser hangs or terminates the process on some damaged files.
     entries = _xml(text, path) if text.lstrip().startswith("<?xml") else _yaml(text, path)
     known = {key.lower().replace("_", ""): value for key, value in entries.items()}
     model = str(known.get("distortionmodel") or "").lower()
@@ -80,9 +80,9 @@ def read_intrinsics(path: Path) -> KnownCamera:
 
 
 def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor:
-    """The sensor with focal lengths, principal point and distortion of a known camera.
+    """Return the sensor with focal lengths, principal point and distortion of a known camera.
 
-    DescriptionError where the camera has another image size, or focal lengths that differ by more than pixels do.
+    Raises DescriptionError if the image size differs.
     """
     camera = sensor.camera
     if known.size_px is not None and known.size_px != (camera.width_px, camera.height_px):
@@ -103,7 +103,7 @@ def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Senso
 
 
 def _xml(text: str, path: Path) -> dict[str, object]:
-    """Top entries of an XML file of OpenCV; what is plain text there are its words."""
+    """Return the top-level entries of an OpenCV XML file; text becomes a list of words."""
     if "<!" in text.replace("<!--", ""):
         raise DescriptionError(f"{path} declares a type of document or entities, which no file of OpenCV does")
     depth, root = 0, None
@@ -128,15 +128,15 @@ def _value(element: ElementTree.Element) -> object:
 
 
 def _yaml(text: str, path: Path) -> dict[str, object]:
-    """Entries of a file of YAML, or of JSON, which is YAML but for its tabs."""
+    """Return the entries of a YAML or JSON file; JSON is YAML except for tabs."""
     if text.startswith("%YAML"):
-        # OpenCV writes "%YAML:1.0", which YAML does not know.
+        # OpenCV writes "%YAML:1.0", which is not valid YAML.
         text = text.partition("\n")[2]
     if text.lstrip().startswith("{"):
         text = text.expandtabs(1)
     try:
         _refuse_references(text)
-        # What `rostopic echo` prints ends with the mark of a next document.
+        # The output of `rostopic echo` ends with a separator of documents.
         entries = next(iter(yaml.load_all(text, _Loader)), None)
         require_plain(entries)
     except RecursionError as error:
@@ -149,7 +149,7 @@ def _yaml(text: str, path: Path) -> dict[str, object]:
 
 
 def _refuse_references(text: str) -> None:
-    """ValueError where values refer to others, of which a short file makes any number, or are nested too deep."""
+    """Raise ValueError if values are aliases, which a short file can multiply without limit, or nested too deep."""
     depth = 0
     for event in yaml.parse(text, _Loader):
         if isinstance(event, yaml.AliasEvent):
@@ -164,7 +164,7 @@ def _first(known: dict[str, object], names: tuple[str, ...]) -> object:
 
 
 def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np.ndarray:
-    """Finite numbers (N,) of a matrix in any of its writings."""
+    """Return the finite numbers (N,) of a matrix in any of its notations."""
     value = _first(known, names)
     value = value.get("data") if isinstance(value, dict) else value
     if value is None:
@@ -183,7 +183,7 @@ def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np
 
 
 def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
-    """k1, k2, p1, p2, k3, k4, k5, k6; further ones of OpenCV's longer models must be zero."""
+    """Return k1, k2, p1, p2, k3, k4, k5, k6; further coefficients of OpenCV's longer models must be zero."""
     if len(coefficients) not in (0, 4, 5, 8, 12, 14):
         raise DescriptionError(f"{path}: there are {len(coefficients)} distortion coefficients; expected 4, 5 or 8")
     known = dict(zip(Distortion.model_fields, coefficients.tolist(), strict=False))

@@ -1,4 +1,4 @@
-"""Files of a 3D camera's centre lines: tables (CSV), arrays (NPY) and images of 16 bit (PNG, TIFF), a profile a row."""
+"""Files of centre lines of a 3D camera: tables (CSV), arrays (NPY), images (PNG, TIFF); one row per profile."""
 
 import csv
 import io
@@ -20,9 +20,9 @@ _OF_PROFILES = ("stage_mm", "exposure_ms", "time_s", "encoder")
 
 
 def read_profiles(path: Path, lines: int) -> np.ndarray:
-    """Numbers (K, C, L) of K profiles of L lines, C of them of each line (`ROWS`); ImageError where there are others.
+    """Read K profiles of L lines as numbers (K, C, L) with the first C of `ROWS`; raises ImageError for other contents.
 
-    A CSV file and an image have K rows of L numbers, in a CSV file nothing or nan where there is no stripe; an array is
+    A CSV file or an image has K rows of L numbers; in a CSV file, an empty cell or nan means no stripe. An array is
     (L,), (K, L) or (K, C, L).
     """
     match path.suffix.lower():
@@ -55,7 +55,7 @@ def read_profiles(path: Path, lines: int) -> np.ndarray:
     numbers = np.atleast_2d(numbers)
     numbers = numbers[:, None] if numbers.ndim == 2 else numbers
     if numbers.ndim != 3 or numbers.shape[2] != lines or not 1 <= numbers.shape[1] <= len(ROWS):
-        turned = "; it is turned: its columns seem to be the profiles" if numbers.shape[0] == lines else ""
+        turned = "; it may be transposed: its first axis has the number of lines" if numbers.shape[0] == lines else ""
         raise ImageError(
             f"{path} has the shape {numbers.shape}; expected profiles in rows, with {lines} lines as the sensor "
             f"has{turned}"
@@ -64,10 +64,10 @@ def read_profiles(path: Path, lines: int) -> np.ndarray:
 
 
 def profile_rows(rows: list[ImageRow], given: CentreLines, camera: Camera, *, folder: Path) -> list[ImageRow]:
-    """A row for each profile in the laser files, in order; stage positions by the encoder where it gives them.
+    """Return one row for each profile in the laser files, in order, with stage positions from the encoder if given.
 
-    ImageError where a file or a centre line is not as the sensor is described; DescriptionError where the table of
-    profiles has another length, or wrong columns.
+    Raises ImageError if a file or centre line does not match the sensor's description, and DescriptionError if the
+    table of profiles has another length or wrong columns.
     """
     meant = Coordinates(given.scale, given.offset, given.invalid)
     length = camera.height_px if camera.stripe_along == "width" else camera.width_px

@@ -25,27 +25,28 @@ from uwlts.storage.import_.folder_description import (
     described_sensor,
     read_description,
 )
-from uwlts.storage.import_.grey_values import bits_of, grey_values, is_formula, one_channel, without_background
+from uwlts.storage.import_.grey_values import bits_of, grey_values, is_formula, one_channel, subtract_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe import Stripe
 from uwlts.stripe.capture_stripes import BLACK, FEWEST_LINES, WHITE, is_black, shown_stripe, white_share
 
 _SIZE_ADVICE = {
-    (True, True): "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of the "
-    "sensor and see to stripe_along",
+    (True, True): "the images are rotated by 90 deg: rotate them back, or exchange width_px and height_px of the "
+    "sensor and check stripe_along",
     (True, False): "give the description of the sensor that took the images, or correct its width_px and height_px",
-    (False, True): "it is turned by a quarter turn: turn it back",
+    (False, True): "it is rotated by 90 deg: rotate it back",
     (False, False): "leave it out (ignore), or import it on its own",
 }
-"""Advice on an image of another size than the sensor's, by whether it is the first, and turned."""
+"""Advice on an image of another size than the sensor's, by whether it is the first, and whether it is rotated."""
 
 
 @dataclass(eq=False)
 class _Content:
-    """Account of the images of one import; ``saturation_dn`` is that of the files, ``target``: one is given.
+    """Statistics of the images of one import.
 
-    ``black`` has the names of the dark images and ``seen`` the number of all, by whether the laser was on;
-    ``with_stripe`` counts the images with a stripe, ``sideways`` those with one across.
+    ``saturation_dn`` is that of the files; ``target``: the description has a target. ``black`` has the names of the
+    dark images and ``seen`` the number of all, by whether the laser was on. ``with_stripe`` counts the images with a
+    stripe, ``sideways`` those with a stripe across the expected direction.
     """
 
     stripe_along: str
@@ -56,31 +57,31 @@ class _Content:
     with_stripe: int = 0
     sideways: int = 0
 
-    def look(self, image: np.ndarray, *, laser_on: bool, name: str) -> None:
-        """Take an image (H, W) as the camera gave it into account; ImageError where most of it is saturated."""
+    def add_image(self, image: np.ndarray, *, laser_on: bool, name: str) -> None:
+        """Count an image (H, W) from the camera; raises ImageError if most of it is saturated."""
         self.seen[laser_on] += 1
         white = white_share(image, self.saturation_dn)
         if white > WHITE:
             raise ImageError(
-                f"{name} is white: {100 * white:.0f} % of its pixels are saturated ({self.saturation_dn} DN): expose "
-                "shorter, or leave it out (ignore)"
+                f"{name} is white: {100 * white:.0f} % of its pixels are saturated ({self.saturation_dn} DN): shorten "
+                "the exposure, or leave it out (ignore)"
             )
         if is_black(image, self.saturation_dn):
             self.black[laser_on].append(name)
 
-    def look_for_stripe(self, image: np.ndarray) -> None:
-        """Take a laser image (H, W) into account, from which its background is subtracted if there is one."""
+    def find_stripe(self, image: np.ndarray) -> None:
+        """Look for a stripe in a laser image (H, W) after background subtraction, if any."""
         direction = shown_stripe(image, stripe_along=self.stripe_along)
         self.with_stripe += direction == "along"
         self.sideways += direction == "across"
 
-    def look_at_line(self, stripe: Stripe) -> None:
-        """Take a centre line into account."""
+    def add_line(self, stripe: Stripe) -> None:
+        """Count a centre line."""
         self.seen[True] += 1
         self.with_stripe += len(stripe.lines) >= FEWEST_LINES
 
     def refuse_black(self) -> None:
-        """Raise ImageError where all laser images are black, or all lamp images that should show a target."""
+        """Raise ImageError if all laser images are black, or all lamp images although there is a target."""
         for laser_on, light, colour in ((True, "laser", " the channel that of its colour,"), (False, "lamp", "")):
             seen = self.seen[laser_on] if laser_on or self.target else 0
             if seen and len(self.black[laser_on]) == seen:
@@ -90,7 +91,7 @@ class _Content:
                 )
 
     def warnings(self) -> list[str]:
-        """Warnings, once all images were seen."""
+        """Return the warnings after all images were counted."""
         warnings = [
             f"{len(self.black[on])} of {self.seen[on]} {light} images are black, such as {self.black[on][0]}"
             for on, light in ((True, "laser"), (False, "lamp"))
@@ -100,7 +101,7 @@ class _Content:
         if lasers and not self.with_stripe:
             advice = "check which images are laser images, the channel, and the exposure"
             if self.sideways:
-                advice = f"in {self.sideways} of them one runs across: the images are turned, or the sensor's "
+                advice = f"in {self.sideways} of them one runs across: the images are rotated, or the sensor's "
                 advice += f"stripe_along ('{self.stripe_along}') is wrong"
             warnings.append(f"no stripe in any of the {lasers} laser images: {advice}")
         elif self.with_stripe < lasers:
@@ -126,31 +127,31 @@ def import_images(
     overwrite: bool = False,
     progress: ProgressListener = unheard,
 ) -> Imported:
-    """Turn a folder of images of any camera into a capture, written whole or not at all.
+    """Convert a folder of images of any camera to a capture, written completely or not at all.
 
-    Where laser images have a background, all images are stored with 16 bit, the laser images as the difference plus
-    2^bits: the sign of the noise about zero is part of the evidence.
+    If laser images have a background, all images are stored with 16 bit. The laser images are then the difference plus
+    2^bits, which keeps the sign of the noise about zero.
 
     Parameters
     ----------
     folder : str or Path
-        Folder of PNG, TIFF, BMP or JPEG images, in it or in folders below it.
+        Folder of PNG, TIFF, BMP or JPEG images; subfolders are included.
     out : str or Path
         Capture to write.
     description : str or Path, optional
-        TOML file with sensor, medium, positions, and which image is what; import.toml in the folder unless given.
+        TOML file with sensor, medium, positions and the role of each image; by default import.toml in the folder.
     overwrite : bool
         Replace an existing capture.
     progress : callable
-        Called with the number of images done and of all.
+        Called with the number of finished images and the total.
 
     Raises
     ------
     DescriptionError
-        The description, or a file it names, is missing, wrong or contradictory.
+        The description, or a file that it names, is missing, wrong or contradictory.
     ImageError
-        The folder holds no image; an image is foreign, truncated, of another size or depth than the others, has an
-        alpha channel, is of several colours without a chosen one, is saturated all over; or all are black.
+        The folder contains no image; an image is foreign, truncated or saturated, differs from the others in size or
+        depth, has an alpha channel, or has several colours without a selected channel; or all images are black.
     OutputError
         The capture cannot be written.
     """
@@ -184,7 +185,7 @@ def import_images(
     saturation = header.saturation_dn - zero
     if images and saturation > np.iinfo(reader.dtype).max:
         raise DescriptionError(f"saturation_dn is {saturation}; images of {reader.dtype} have no such value")
-    in_time = _in_time(frames)
+    in_time = _in_order(frames)
     content = _Content(header.sensor.camera.stripe_along, saturation, header.target is not None)
     held = reader.dtype if images else np.dtype(np.uint8)
     dtype = np.dtype(np.uint16) if zero else held
@@ -194,48 +195,50 @@ def import_images(
         with writer:
             for number, row in enumerate(frames):
                 laser_on = row.light == "laser"
-                # An unknown exposure or time is stored as 0; the provenance says so.
+                # An unknown exposure or time is stored as 0, as stated in the provenance.
                 exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s if in_time else 0.0]).tolist()
                 if row.profile is not None:
-                    content.look_at_line(row.profile)
+                    content.add_line(row.profile)
                     encoder = None if math.isnan(row.encoder) else row.encoder
                     writer.append(Frame(row.profile, row.stage_mm, True, exposure_ms, time_s, row.pose, encoder))
                     progress(number + 1, len(frames))
                     continue
                 image, _ = reader.image(row.file, laser_on=laser_on)
                 unsigned = np.maximum(image, 0).astype(reader.dtype, copy=False)
-                content.look(unsigned, laser_on=laser_on, name=Path(row.file).name)
+                content.add_image(unsigned, laser_on=laser_on, name=Path(row.file).name)
                 if laser_on and zero:
                     unlit = np.zeros_like(image) if row.background is None else reader.background(row.background)
-                    image = without_background(image, unlit, zero_dn=zero)
+                    image = subtract_background(image, unlit, zero_dn=zero)
                 else:
                     image = unsigned
                 if laser_on:
-                    content.look_for_stripe(image)
+                    content.find_stripe(image)
                 image = image.astype(dtype, copy=False)
                 writer.append(Frame(image, row.stage_mm, laser_on, exposure_ms, time_s, row.pose))
                 progress(number + 1, len(frames))
             content.refuse_black()
     except BaseException:
-        # Unlike a recording an import can be made again: half of one is of no use.
+        # Unlike a recording, an import can be repeated: a partial one is useless.
         part_path(out).unlink(missing_ok=True)
         raise
     warnings = content.warnings()
     if not in_time:
-        warnings.append("the images are not in the order of their times, which are left out: the table's lines give it")
+        warnings.append(
+            "the images are not in the order of their times, so times are left out; the table's order is kept"
+        )
     if unmatched := matched.unmatched:
         few = ", ".join(unmatched[:3])
-        warnings.append(f"{len(unmatched)} images of the folder are left out, as nothing says what they are: {few}")
+        warnings.append(f"{len(unmatched)} images of the folder are left out because nothing describes them: {few}")
     return Imported(len(matched.laser), len(matched.lamp), tuple(warnings))
 
 
-def _in_time(frames: list[ImageRow]) -> bool:
-    """Whether the images are in the order in which they were taken; those whose time is not known count as at 0 s."""
+def _in_order(frames: list[ImageRow]) -> bool:
+    """Return whether the times of the images do not decrease; an unknown time counts as 0 s."""
     return bool((np.diff(np.nan_to_num([row.time_s for row in frames])) >= 0).all())
 
 
 def _zero_dn(given: ImportDescription, frames: list[ImageRow], bits: int) -> int:
-    """Grey value that stands for no light of the laser; 0 where nothing is subtracted from what the camera gave."""
+    """Return the grey value of zero laser light; 0 if nothing is subtracted from the images."""
     if all(row.background is None for row in frames) and not is_formula(given.channel):
         return 0
     if given.header is None and bits < 16:
@@ -247,7 +250,7 @@ def _zero_dn(given: ImportDescription, frames: list[ImageRow], bits: int) -> int
 
 
 class _Reader:
-    """Reads images as grey values that all have the size and depth of the first; keeps the last background."""
+    """Reader of grey images that must have the size and depth of the first; keeps the last background."""
 
     def __init__(self, given: ImportDescription, sensor: Sensor, folder: Path):
         self._given, self._sensor, self._folder = given, sensor, folder
@@ -255,13 +258,13 @@ class _Reader:
         self._kept: tuple[str, np.ndarray] | None = None
 
     def image(self, name: str, *, laser_on: bool) -> tuple[np.ndarray, int]:
-        """Grey image (H, W), signed where the channel is a formula, and its bits; ImageError if not like the others."""
+        """Read a grey image (H, W), signed for a formula, and its bits; raises ImageError if sizes or depths differ."""
         given = self._given
         raw = read_image(self._folder / name, accept=partial(self._require_size, name))
         if self.dtype not in (np.void, raw.dtype):
             raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self.dtype}")
         channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
-        # A header has no bits, and grey values that a capture held fit in it.
+        # A header does not state the bits, and the grey values of an exported capture fit in it.
         bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
         self.dtype = raw.dtype
         values = grey_values(raw, bits=bits, aligned=given.aligned, name=name)
@@ -278,14 +281,14 @@ class _Reader:
             )
 
     def background(self, name: str) -> np.ndarray:
-        """Grey image (H, W) without laser, in the laser's channel."""
+        """Read the grey image (H, W) without laser, in the laser's channel."""
         if self._kept is None or self._kept[0] != name:
             self._kept = name, self.image(name, laser_on=True)[0]
         return self._kept[1]
 
 
 def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, bits: int, zero_dn: int) -> Table:
-    """Provenance of the capture."""
+    """Return the provenance of the capture."""
     remarks: Table = {"source": "imported images", "uwlts": __version__, "folder": folder.resolve().name}
     remarks |= {"bits": bits, "stage": stage_remark(given)}
     remarks |= {key: getattr(given, key) for key in ("channel", "lamp_channel", "intrinsics") if getattr(given, key)}
@@ -293,7 +296,7 @@ def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, 
         background = any(row.background is not None for row in frames)
         name, done = ("background", "subtracted from the laser images, ") if background else ("laser_images", "")
         remarks[name] = f"{done}{zero_dn} added"
-    if not _in_time(frames):
+    if not _in_order(frames):
         remarks["time"] = "not known of all images in their order, stored as 0"
     for name, values in (("exposure", [row.exposure_ms for row in frames]), ("time", [row.time_s for row in frames])):
         if any(map(math.isnan, values)) and name not in remarks:

@@ -1,4 +1,4 @@
-"""Description of a folder of images: a TOML file with the sensor, the medium, what each image is, and the stage."""
+"""Description of a folder of images: a TOML file with sensor, medium, the role of each image, and the stage."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,7 +16,7 @@ from uwlts.storage.import_.grey_values import Channel
 from uwlts.targets import parse_target
 
 NAME = "import.toml"
-"""File of this name in the folder of the images is read unless another is given."""
+"""Name of the description in the folder of the images, unless another path is given."""
 
 Patterns = str | tuple[str, ...]
 
@@ -25,9 +25,9 @@ _OF_THE_HEADER += ("provenance", "bits", "aligned")
 
 
 class StageMotion(Description):
-    """Positions of the stage: by start and step, by a list, or nowhere, when every image has a pose of its own (free).
+    """Positions of the stage: by start and step, by a list, or none if every image has its own pose (free).
 
-    ``direction`` is the unit direction in which growing positions move the sensor, in the OCS.
+    ``direction`` is the sensor's motion for growing positions, a unit vector in the OCS.
     """
 
     start_mm: float | None = None
@@ -37,19 +37,19 @@ class StageMotion(Description):
     direction: Vector | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> "StageMotion":
+    def _exclusive_positions(self) -> "StageMotion":
         if (self.start_mm is None) != (self.step_mm is None):
             raise ValueError("start_mm and step_mm belong together: give both, or positions_mm")
-        ways = [self.start_mm is not None, self.positions_mm is not None, self.free]
-        if sum(ways) > 1:
+        given = [self.start_mm is not None, self.positions_mm is not None, self.free]
+        if sum(given) > 1:
             raise ValueError("give the positions once: start_mm and step_mm, or positions_mm, or free = true")
         return self
 
 
 class CentreLines(Description):
-    """Laser files that hold the centre lines of a 3D camera, one number per profile line, in place of images.
+    """Laser files with the centre lines of a 3D camera, one number per profile line, instead of images.
 
-    A place in px is ``scale`` times the number plus ``offset``; ``invalid`` is the number of lines without a stripe.
+    A position in px is ``scale`` times the number plus ``offset``; the number ``invalid`` marks lines without a stripe.
     ``table`` is a CSV file with a row for each profile: any of stage_mm, exposure_ms, time_s and encoder. With
     ``mm_per_count`` the encoder gives the stage's positions.
     """
@@ -62,13 +62,13 @@ class CentreLines(Description):
 
 
 class ImportDescription(Description):
-    """Everything that is known about a folder of images.
+    """Description of a folder of images.
 
-    ``header`` names a capture's header as JSON, in place of everything it holds. Other files are sought beside the
-    description, images in their folder. ``sensor`` is a name, the path of a description, or a table of one, which may
-    name a ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; images that are both
-    ``laser`` and ``lamp`` show the laser on the lit target. ``table`` is a CSV file with each image's values. With
-    ``centre_lines`` the laser files hold centre lines, with one profile or many.
+    ``header`` names a capture's header as JSON, which replaces all fields that it contains. Other files are relative to
+    the description, images to their folder. ``sensor`` is a name, the path of a description, or a table with an
+    optional ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; images that are
+    both ``laser`` and ``lamp`` show the laser on the lit target. ``table`` is a CSV file with the values of each image.
+    With ``centre_lines`` the laser files contain centre lines of one or more profiles.
     """
 
     header: str | None = None
@@ -99,7 +99,7 @@ class ImportDescription(Description):
     def _given_once(self) -> "ImportDescription":
         missing = [name for name in ("sensor", "medium") if getattr(self, name) is None]
         if self.header is None and missing:
-            raise ValueError(f"{' and '.join(missing)} missing: a capture says which sensor saw it, in what")
+            raise ValueError(f"{' and '.join(missing)} missing: a capture states its sensor and its medium")
         twice = [name for name in _OF_THE_HEADER if name in self.model_fields_set]
         twice += ["stage.direction"] if self.stage.direction is not None else []
         if self.header is not None and twice:
@@ -110,10 +110,10 @@ class ImportDescription(Description):
 
 
 def read_description(path: Path) -> ImportDescription:
-    """Description in a TOML file; DescriptionError where it is missing, no TOML, or holds an unknown or wrong key."""
+    """Read a TOML file; raises DescriptionError if it is missing, not TOML, or has an unknown or wrong key."""
     if not is_regular_file(path):
         raise DescriptionError(
-            f"no description at {path}: write one with sensor, medium, and which image is what "
+            f"no description at {path}: write one with sensor, medium, and the role of each image "
             "(docs/how-to/import-images.md)"
         )
     return validated(ImportDescription, read_table(path), path)
@@ -122,16 +122,16 @@ def read_description(path: Path) -> ImportDescription:
 def capture_header(
     given: ImportDescription, sensor: Sensor, *, beside: Path, name: str, saturation_dn: int, remarks: Table
 ) -> CaptureHeader:
-    """Header of the capture; ``name`` and ``remarks`` (as provenance) serve where the description gives none.
+    """Return the capture's header; ``name`` and ``remarks`` (provenance) are defaults.
 
-    ``beside`` is the folder in which files that the description names are sought. DescriptionError where medium,
-    target, direction or header are missing, unknown or not valid, EvaluationError where the artefact is not.
+    Files named in the description are relative to the folder ``beside``. Raises DescriptionError if medium, target,
+    direction or header are missing, unknown or not valid, and EvaluationError if the artefact is not valid.
     """
     if given.header is not None:
         return read_header(beside / given.header)
     if given.stage.direction is None and not given.stage.free:
         raise DescriptionError(
-            "stage.direction is missing: give the unit direction in which the stage moves the sensor, in the OCS, "
+            "stage.direction is missing: give the unit vector in which the stage moves the sensor, in the OCS, "
             "such as [1, 0, 0] across the sheet, or stage.free = true for images without a stage"
         )
     if given.target is not None:
@@ -146,7 +146,7 @@ def capture_header(
 
 
 def read_header(path: Path) -> CaptureHeader:
-    """A capture's header from JSON; DescriptionError where it is missing, no JSON or not valid."""
+    """Read a capture's header from JSON; raises DescriptionError if it is missing, not JSON or not valid."""
     text = read_text(path, most_bytes=MOST_JSON_BYTES, error=DescriptionError, called="header in JSON")
     try:
         content = parsed_json(text)
@@ -156,7 +156,7 @@ def read_header(path: Path) -> CaptureHeader:
 
 
 def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:
-    """The sensor that took the images, with the intrinsics of another program's calibration where given."""
+    """Return the sensor that took the images, with the intrinsics of another program's calibration if given."""
     if given.header is not None:
         return read_header(beside / given.header).sensor
     if isinstance(given.sensor, dict):
@@ -172,7 +172,7 @@ def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:
 
 
 def _beside(folder: Path, name: object) -> str:
-    """A sensor's name as it is, the path of a description sought beside the one that names it."""
+    """Return a sensor's name unchanged, or the path of a description relative to the one that names it."""
     if not isinstance(name, str):
         raise DescriptionError(f"sensor is based on {name!r}; expected the name or path of a description")
     return str(folder / name) if name.endswith(".toml") else name

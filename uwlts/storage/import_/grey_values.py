@@ -1,4 +1,4 @@
-"""Grey values of a camera from the pixels of image files: bits, channels and formulas of them, and backgrounds."""
+"""Grey values from the pixels of image files: bit depths, channels and formulas of channels, and backgrounds."""
 
 import ast
 from functools import reduce
@@ -16,7 +16,7 @@ _NAMES = (*_COLOURS, "grey")
 _OPERATORS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}
 _FUNCTIONS = {"max": np.maximum, "min": np.minimum}
 _LONGEST = 500
-"""Characters of a formula: four colours and a few numbers take a hundred."""
+"""Longest formula in characters: four colours and a few numbers take a hundred."""
 _EXPECTED = (
     "expected red, green, blue, grey, max (the brightest), or a formula of them with + - * /, numbers, max(...) and "
     "min(...), such as 'red - max(green, blue)'"
@@ -24,9 +24,9 @@ _EXPECTED = (
 
 
 def checked_channel(text: str) -> str:
-    """The name or formula of a channel; ValueError where it is none."""
+    """Return the name or formula of a channel unchanged; raises ValueError if it is not valid."""
     if text != "max":
-        _evaluated(text, dict.fromkeys(_NAMES, np.ones(1, np.float32)))
+        _evaluate(text, dict.fromkeys(_NAMES, np.ones(1, np.float32)))
     return text
 
 
@@ -35,15 +35,15 @@ Channel = Annotated[str, AfterValidator(checked_channel)]
 
 
 def is_formula(channel: str | None) -> bool:
-    """Whether a channel is calculated from others, so that its values may be below zero and none of the camera's."""
+    """Return whether a channel is calculated from others, so that its values may be negative."""
     return channel is not None and channel not in (*_NAMES, "max")
 
 
 def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
-    """Grey image (H, W): a colour of an image, its luminance (grey), the brightest (max), or what a formula gives.
+    """Return a grey image (H, W): a colour channel, the luminance (grey), the maximum (max), or a formula's result.
 
-    Of the image's type, or int32 for a formula. ImageError for a colour image where no channel is chosen, and for a
-    formula of colours where the image has none.
+    It has the image's type, or int32 for a formula. Raises ImageError for a colour image without a selected channel,
+    and for a formula of colours if the image has no colours.
     """
     if image.ndim == 2:
         if is_formula(channel):
@@ -65,12 +65,12 @@ def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndar
         return image.max(axis=2)
     values = {colour: image[:, :, place].astype(np.float32) for colour, place in _COLOURS.items()}
     most = np.iinfo(image.dtype).max
-    mixed = _evaluated(channel, values | {"grey": grey.astype(np.float32)})
+    mixed = _evaluate(channel, values | {"grey": grey.astype(np.float32)})
     return np.rint(np.clip(np.nan_to_num(mixed), -most, most)).astype(np.int32)
 
 
-def _evaluated(text: str, values: dict[str, np.ndarray]) -> np.ndarray:
-    """What a formula gives; ValueError where it is none of the channels."""
+def _evaluate(text: str, values: dict[str, np.ndarray]) -> np.ndarray:
+    """Evaluate a formula of channels; raises ValueError if it is not valid."""
 
     def value(node: ast.AST) -> np.ndarray | float:
         match node:
@@ -99,20 +99,20 @@ def _evaluated(text: str, values: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def bits_of(image: np.ndarray, bits: int | None, *, name: str) -> int:
-    """Bits of the grey values: 8 for a file of 8 bit, else as given; ImageError where that is contradictory or open."""
+    """Return the bit depth: 8 for a file of 8 bit, else ``bits``; raises ImageError if that is wrong or missing."""
     if image.dtype == np.uint8:
         if bits not in (None, 8):
             raise ImageError(f"{name} is a file of 8 bit, but bits = {bits}: save it with 16 bit, or leave out bits")
         return 8
     if bits is None:
-        raise ImageError(f"{name} is a file of 16 bit: say how many the camera used, bits = 10, 12 or 16")
+        raise ImageError(f"{name} is a file of 16 bit: give the number that the camera used, bits = 10, 12 or 16")
     return bits
 
 
 def grey_values(image: np.ndarray, *, bits: int, aligned: str, name: str) -> np.ndarray:
-    """Values from 0 to 2^bits - 1 of an image whose camera put them into the lower or upper bits.
+    """Return values from 0 to 2^bits - 1, from the lower or upper bits of an image.
 
-    ImageError where there are larger values, or bits below the upper ones are used.
+    Raises ImageError if values are too large, or bits below the upper ones are used.
     """
     if image.dtype == np.uint8:
         return image
@@ -124,12 +124,12 @@ def grey_values(image: np.ndarray, *, bits: int, aligned: str, name: str) -> np.
     largest = int(image.max())
     if largest >= 2**bits:
         raise ImageError(
-            f"{name} holds the grey value {largest}, more than {bits} bits have: check bits, or give aligned = 'high' "
+            f"{name} has the grey value {largest}, which exceeds {bits} bits: check bits, or give aligned = 'high' "
             "if the camera uses the upper bits"
         )
     return image
 
 
-def without_background(image: np.ndarray, background: np.ndarray, *, zero_dn: int) -> np.ndarray:
-    """Image minus background (H, W) of one type, as uint16: ``zero_dn`` stands for no difference; saturates."""
+def subtract_background(image: np.ndarray, background: np.ndarray, *, zero_dn: int) -> np.ndarray:
+    """Return image minus background (H, W) of the same type as uint16, plus ``zero_dn``, saturated."""
     return cv2.addWeighted(image, 1.0, background, -1.0, zero_dn, dtype=cv2.CV_16U)

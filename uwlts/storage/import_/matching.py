@@ -1,4 +1,4 @@
-"""Which image of a folder is what: by patterns of names, or by the columns of a table."""
+"""Role of each image of a folder, by patterns of names or by the columns of a table."""
 
 import csv
 import math
@@ -27,13 +27,13 @@ _NUMBERS = ("stage_mm", "exposure_ms", "time_s", "encoder")
 _COLUMNS = ("file", "light", "background", *_NUMBERS, *POSE_COLUMNS)
 _MOST_TABLE_BYTES = 8 * 2**20
 _LONGEST_LINE = 10_000
-"""Characters of a line; 23 columns have a few hundred."""
+"""Longest line in characters; 23 columns take a few hundred."""
 _LIGHTS = ("laser", "lamp", "both", "ignore")
 
 
 @dataclass(frozen=True, eq=False)
 class ImageRow:
-    """One image or ``profile``: paths below the folder, NaN and None for what is not known; ``number`` is the order."""
+    """One image or ``profile``: paths relative to the folder, NaN and None if unknown; ``number`` is the order."""
 
     file: str
     number: int = 0
@@ -49,7 +49,7 @@ class ImageRow:
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """Images in order by what they are; ``unmatched`` are images of the folder that nothing describes."""
+    """Images in order by their role; ``unmatched`` are images of the folder that nothing describes."""
 
     laser: list[ImageRow]
     lamp: list[ImageRow]
@@ -57,16 +57,16 @@ class Matched:
 
 
 def natural_key(name: str) -> list[str | int]:
-    """Key by which image9 comes before image10."""
+    """Return a sort key that orders image9 before image10."""
     return [int(part) if part.isascii() and part.isdigit() else part.casefold() for part in re.split(r"([0-9]+)", name)]
 
 
 def read_rows(path: Path) -> list[ImageRow]:
-    """Rows of a CSV table with the column ``file`` and any of light, background, stage_mm, exposure_ms, time_s,
-    encoder, pose_00 to pose_33; separated by commas or semicolons.
+    """Read a CSV table with the column ``file``, separated by commas or semicolons.
 
-    DescriptionError where the table is missing, empty, has an unknown column, a file twice, an unknown light, or a cell
-    that is no number.
+    Further columns are any of light, background, stage_mm, exposure_ms, time_s, encoder, pose_00 to pose_33. Raises
+    DescriptionError if the table is missing or empty, or has an unknown column, a repeated file, an unknown light, or a
+    cell that is not a number.
     """
     text = read_text(path, most_bytes=_MOST_TABLE_BYTES, error=DescriptionError, called="table")
     lines = text.splitlines()
@@ -98,7 +98,7 @@ def _row(number: int, cells: dict[str, str], place: str) -> ImageRow:
         raise DescriptionError(f"{place}: the file's name is missing")
     for file in (PurePosixPath(texts["file"]), PurePosixPath(texts["background"])):
         if file.is_absolute() or ".." in file.parts:
-            raise DescriptionError(f"{place}: {file} lies outside the folder; name it by its path below the folder")
+            raise DescriptionError(f"{place}: {file} is outside the folder; give its path relative to the folder")
     light = texts["light"].lower() or None
     if light is not None and light not in _LIGHTS:
         raise DescriptionError(f"{place}: the light is {light!r}; expected {', '.join(_LIGHTS)}")
@@ -111,7 +111,7 @@ def _row(number: int, cells: dict[str, str], place: str) -> ImageRow:
         raise DescriptionError(f"{place}: exposure_ms is {numbers['exposure_ms']:g}; expected a time of 0 or more")
     if given and not is_rigid(pose, within=POSE_ROUNDED):
         raise DescriptionError(
-            f"{place}: the pose is no rotation with a shift: its columns must be unit vectors at right angles, given "
+            f"{place}: the pose is not a rotation with a shift: its columns must be orthogonal unit vectors, given "
             f"with four decimals or more, its last row 0 0 0 1"
         )
     stage_mm, exposure_ms, time_s, encoder = (numbers[name] for name in _NUMBERS)
@@ -120,7 +120,7 @@ def _row(number: int, cells: dict[str, str], place: str) -> ImageRow:
 
 
 def _number(text: str, place: str) -> float:
-    """Finite number of a cell, NaN where it is empty."""
+    """Return the finite number of a cell, NaN if it is empty."""
     try:
         value = float(text) if text else 0.0
     except ValueError as error:
@@ -131,15 +131,15 @@ def _number(text: str, place: str) -> float:
 
 
 def _refuse_any(names: list[str], before: str, after: str) -> None:
-    """DescriptionError that names the first three, if there are any."""
+    """Raise a DescriptionError with the first three names, if there are any."""
     if names:
         raise DescriptionError(f"{before}{', '.join(names[:3])}{after}")
 
 
 def image_files(folder: Path, *, more: tuple[str, ...] = ()) -> list[str]:
-    """Paths of the images in a folder and below it, in natural order; ImageError where there are none.
+    """Return the paths of the images in a folder and its subfolders, in natural order.
 
-    Files with ``more`` endings count as well.
+    Files with ``more`` endings count as well. Raises ImageError if there is no image.
     """
     wanted = (*SUFFIXES, *more)
     found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in wanted]
@@ -152,10 +152,10 @@ def image_files(folder: Path, *, more: tuple[str, ...] = ()) -> list[str]:
 
 
 def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -> Matched:
-    """Sort a folder's images by what they are; ``rows`` are those of a table.
+    """Assign roles to a folder's images, by patterns or by the ``rows`` of a table.
 
-    ImageError where the folder holds no image. DescriptionError where no image is known to be anything, one is two
-    things, a named file is missing, or it is open which background belongs to which image.
+    Raises ImageError if the folder contains no image, and DescriptionError if no image has a role, an image has two, a
+    named file is missing, or the background of an image is ambiguous.
     """
     files = image_files(folder, more=(".csv", ".npy") if given.centre_lines else ())
     known = [ImageRow(name) for name in files] if rows is None else rows
@@ -186,7 +186,7 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
             f"none of the {len(files)} images of {folder} is a laser or a lamp image: give patterns such as laser = "
             "'laser*.png' and lamp = 'lamp*.png', or a table with a column light"
         )
-    laser = _with_backgrounds(
+    laser = _add_backgrounds(
         folder,
         [name for name in files if _matches(name, given.background) and not _matches(name, given.ignore)],
         given,
@@ -199,15 +199,13 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
 
 
 def _matches(name: str, patterns: Patterns) -> bool:
-    """Whether a path below the folder, or its last part, matches a pattern."""
+    """Return whether a path relative to the folder, or its last part, matches a pattern."""
     wanted = (patterns,) if isinstance(patterns, str) else patterns
     return any(fnmatch(name, pattern) or fnmatch(PurePosixPath(name).name, pattern) for pattern in wanted)
 
 
-def _with_backgrounds(
-    folder: Path, found: list[str], given: ImportDescription, laser: list[ImageRow]
-) -> list[ImageRow]:
-    """The laser images, all with a background or none; ``found`` are the images that its pattern names."""
+def _add_backgrounds(folder: Path, found: list[str], given: ImportDescription, laser: list[ImageRow]) -> list[ImageRow]:
+    """Return the laser images, either all with a background or none; ``found`` match the background's pattern."""
     named = [row.background for row in laser if row.background is not None]
     if named and (given.background or len(named) < len(laser)):
         advice = ", and there is a pattern as well: give one" if given.background else ": name it for all or none"
@@ -228,10 +226,10 @@ def _with_backgrounds(
 
 
 def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool) -> list[ImageRow]:
-    """All images in the order of the table, or of their positions, at each the lamp image before the laser image.
+    """Return all images in the order of the table, or of their positions, lamp images before laser images.
 
-    Each has its position and its light, laser or lamp. DescriptionError where positions are missing, given twice, or
-    the same for two images of one light.
+    Each has its position and its light, laser or lamp. Raises DescriptionError if positions are missing, given twice,
+    or equal for two images of one light.
     """
     positions = _positions(given, matched)
     lamp_ms = given.exposure_ms if given.lamp_exposure_ms is None else given.lamp_exposure_ms
@@ -252,7 +250,7 @@ def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool
 
 
 def stage_remark(given: ImportDescription) -> str:
-    """Source of the positions, for the capture's provenance."""
+    """Return the source of the positions, for the capture's provenance."""
     if given.stage.free:
         return "none: stage_mm counts the poses"
     if given.stage.start_mm is not None:
@@ -261,7 +259,7 @@ def stage_remark(given: ImportDescription) -> str:
 
 
 def _positions(given: ImportDescription, matched: Matched) -> list[float] | None:
-    """Position for each place in the natural order; None where the table gives them."""
+    """Return the position of each image in natural order; None if the table gives them."""
     stage = given.stage
     in_column = any(math.isfinite(row.stage_mm) for row in (*matched.laser, *matched.lamp))
     elsewhere = stage.free or stage.start_mm is not None or stage.positions_mm is not None
@@ -277,7 +275,7 @@ def _positions(given: ImportDescription, matched: Matched) -> list[float] | None
     count, *other = (len(rows) for rows in (matched.laser, matched.lamp) if rows)
     if other not in ([], [count]):
         raise DescriptionError(
-            f"there are {count} laser and {other[0]} lamp images: it is open which were taken at the same "
+            f"there are {count} laser and {other[0]} lamp images: it is unknown which share a "
             "position; give a table with a column stage_mm"
         )
     if stage.positions_mm is not None:
@@ -293,7 +291,7 @@ def _positions(given: ImportDescription, matched: Matched) -> list[float] | None
 
 
 def _refuse_repeated(frames: Iterable[ImageRow]) -> None:
-    """DescriptionError for two images of one light at one place, as from a step of zero or a line given twice."""
+    """Raise DescriptionError for two images of one light at one position, as from a step of zero or a repeated line."""
     seen: dict[tuple[str | None, float], ImageRow] = {}
     for row in frames:
         other = seen.setdefault((row.light, row.stage_mm), row)

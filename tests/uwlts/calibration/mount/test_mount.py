@@ -378,7 +378,7 @@ def test_poses_of_every_format(tmp_path, format, numbers):
 @pytest.mark.parametrize(
     ("format", "row", "says"),
     [
-        ("matrix", "1,0,0,0,0,1,0,0,0,0,-1,0", "It mirrors"),
+        ("matrix", "1,0,0,0,0,1,0,0,0,0,-1,0", "It is a reflection"),
         ("matrix", "1,0,0,0,0,1,0,0,0,0,1,0,5,6,7,1", "column by column"),
         ("matrix", "1,0,0,0", "4 columns of numbers"),
         ("quaternion-xyzw", "1,2,3,0.5,0.5,0.5,0.9", "length"),
@@ -459,5 +459,5 @@ def test_the_axis_of_a_rotary_table_is_found(tmp_path, rng):
 
 def test_poses_that_are_no_turns_of_a_table_are_refused(rng):
     campaign = sphere_campaign(rng, poses=6)
-    with pytest.raises(DescriptionError, match="not turns about one z axis"):
+    with pytest.raises(DescriptionError, match="not rotations about one z axis"):
         uwlts.calibrate_mount(campaign.profiles, campaign.poses, radius_mm=RADIUS_MM, axis="z")

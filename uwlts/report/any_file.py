@@ -1,8 +1,9 @@
-"""Reading of any file of the program: what it holds decides what is returned."""
+"""Reading of any file of the program; the content determines the type of the result."""
 
 from pathlib import Path
 
 from uwlts.errors import CaptureError
+from uwlts.evaluation.evaluate import FORMAT as EVALUATION, EvaluationRecord, read_evaluation
 from uwlts.files.json_files import read_json
 from uwlts.files.reading import require_regular_file
 from uwlts.model.any_calibration import AnyCalibration
@@ -13,24 +14,26 @@ from uwlts.storage.capture import FORMAT as CAPTURE, Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import CLOUD_ENDINGS, is_cloud, read_cloud
 from uwlts.storage.hdf5_file import format_of
+from uwlts.storage.mesh_file import READ_FORMATS as MESH_FORMATS, SurfaceMesh, has_faces, read_mesh
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
 from uwlts.storage.truth import FORMAT as TRUTH, Truth, read_truth
 
 _READABLE = (
-    f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), calibrations and mounts (.json), "
-    "trajectories (.csv, .tum, ROS bags)"
+    f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
+    "calibrations, mounts and evaluations (.json), trajectories (.csv, .tum, ROS bags)"
 )
 
 
 def read(
     path: str | Path, *, pose_format: PoseFormat = "quaternion-xyzw", pose_unit: Unit = "mm"
-) -> Capture | PointCloud | Truth | AnyCalibration | Mount | Trajectory:
-    """Read a file: an opened capture, a cloud, ground truth, a calibration, a mount or a trajectory, by what it is.
+) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Trajectory:
+    """Read a file of the program, whose content determines the type of the result.
 
-    Values per frame of a capture are read at once, images when they are asked for: ``capture[12]`` is a `Frame`. A
-    recording that is still being written can be opened by its name ``NAME.part``. Close a capture, or use it in a
-    ``with``.
+    The result is an opened capture, a cloud, a mesh, ground truth, a calibration, a mount, the record of an evaluation,
+    or a trajectory. A PLY file with faces is a mesh. The metadata of a capture's frames are read at once, and images on
+    demand: ``capture[12]`` is a `Frame`. A recording in progress can be opened by its name ``NAME.part``. Close a
+    capture, or use it as a context manager.
 
     Parameters
     ----------
@@ -44,9 +47,9 @@ def read(
     Raises
     ------
     CaptureError
-        The file is missing, damaged, of a newer version, or none that can be read.
+        The file is missing, damaged, of a newer version, or of an unknown kind.
     DescriptionError
-        A trajectory is not of the format.
+        A trajectory does not have the format.
 
     Examples
     --------
@@ -65,9 +68,13 @@ def read(
             return load_calibration(path)
         if found == MOUNT:
             return read_mount(path)
+        if found == EVALUATION:
+            return read_evaluation(path)
         raise CaptureError(f"{path} is JSON of the format {found!r}; this reads {_READABLE}")
     if ending == ".csv":
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
+    if ending.lower() in MESH_FORMATS and (ending.lower() != ".ply" or has_faces(path)):
+        return read_mesh(path)
     if is_cloud(path):
         return read_cloud(path)
     if ending == ".h5":

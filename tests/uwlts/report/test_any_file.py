@@ -1,0 +1,135 @@
+"""Reading of any file of the program with one function, and saving of results."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+
+import uwlts
+from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.evaluation.evaluate import EvaluationRecord
+from uwlts.model.trajectory import Trajectory
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.mesh_file import SurfaceMesh
+
+
+def cloud_of(count: int) -> PointCloud:
+    rng = np.random.default_rng(1)
+    return PointCloud(rng.normal(size=(count, 3)), np.ones(count), np.zeros(count), np.arange(count))
+
+
+def test_results_are_saved_and_read_back(tmp_path: Path):
+    cloud, calibration = cloud_of(7), uwlts.nominal("thesis", medium="water")
+    path = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    for result, name in ((cloud, "a.ply"), (cloud, "a.h5"), (calibration, "a.json"), (path, "a.csv")):
+        result.save(tmp_path / name)
+        found = uwlts.read(tmp_path / name)
+        assert type(found) is type(result)
+        with pytest.raises(OutputError, match="`overwrite`"):
+            result.save(tmp_path / name)
+        result.save(tmp_path / name, overwrite=True)
+    np.testing.assert_array_equal(uwlts.read(tmp_path / "a.ply").points_mm, cloud.points_mm)
+    assert uwlts.read(tmp_path / "a.json") == calibration
+    np.testing.assert_array_equal(uwlts.read(tmp_path / "a.csv").times_s, path.times_s)
+
+
+def tetrahedron() -> SurfaceMesh:
+    """A mesh with every attribute that a PLY file has."""
+    vertices = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    normals = vertices - vertices.mean(axis=0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return SurfaceMesh(vertices, normals, faces, np.arange(4.0), np.arange(4.0)[::-1].copy(), 1.0, 2.0, 0.1, {"a": 1})
+
+
+def test_a_saved_mesh_is_read_with_its_uncertainty(tmp_path: Path):
+    mesh = tetrahedron()
+    mesh.save(tmp_path / "a.ply")
+    found = uwlts.read(tmp_path / "a.ply")
+    assert isinstance(found, SurfaceMesh)
+    for name in ("vertices_mm", "faces", "noise_mm", "shared_mm"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(mesh, name))
+    # Normals are stored with 32 bits: half a step below 1 is 2^-25.
+    np.testing.assert_allclose(found.normals, mesh.normals, rtol=0, atol=2**-25)
+    assert found.lines()[0] == mesh.lines()[0] and len(found.lines()) == 2
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.obj", "a.ply"])
+def test_meshes_of_other_programs_have_normals_of_their_faces(tmp_path: Path, name: str):
+    mesh = tetrahedron()
+    trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(tmp_path / name)
+    found = uwlts.read(tmp_path / name)
+    assert isinstance(found, SurfaceMesh)
+    assert found.vertices_mm.shape == (4, 3) and found.faces.shape == (4, 3) and not found.std_mm.any()
+    assert found.area_mm2() == pytest.approx(mesh.area_mm2(), rel=1e-6), "STL has 32 bits"
+    # The faces are anticlockwise from outside.
+    assert (np.einsum("vi,vi->v", found.normals, found.vertices_mm - found.vertices_mm.mean(axis=0)) > 0).all()
+
+
+def test_damaged_meshes_are_refused(tmp_path: Path):
+    tetrahedron().save(tmp_path / "a.ply")
+    whole = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(whole[:-20])
+    with pytest.raises(CaptureError, match=r"a\.ply is not a complete"):
+        uwlts.read(tmp_path / "a.ply")
+    (tmp_path / "a.obj").write_text("v 0 0 0\n")
+    with pytest.raises(CaptureError, match=r"a\.obj"):
+        uwlts.read(tmp_path / "a.obj")
+    with pytest.raises(CaptureError, match="no file at"):
+        uwlts.read(tmp_path / "missing.stl")
+
+
+def test_a_saved_evaluation_is_read_as_its_record(tmp_path: Path):
+    points = np.random.default_rng(2).uniform(-20, 20, (500, 3)) * [1, 1, 0]
+    cloud = PointCloud(points, np.ones(500), np.zeros(500), np.arange(500), metadata={"artefact": {"kind": "plane"}})
+    evaluation = uwlts.evaluate(cloud)
+    evaluation.save(tmp_path / "a.json")
+    record = uwlts.read(tmp_path / "a.json")
+    assert isinstance(record, EvaluationRecord) and record == evaluation.record()
+
+
+def test_what_cannot_be_read_is_said_with_what_can(tmp_path: Path):
+    (tmp_path / "a.json").write_text('{"format": "uwlts-unknown", "version": 1}')
+    (tmp_path / "a.txt").write_text("words")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["format"] = np.bytes_("another")
+    for name, found in (("a.json", "uwlts-unknown"), ("a.txt", ".txt"), ("a.h5", "another")):
+        with pytest.raises(
+            CaptureError,
+            match=f"{found}.*this reads captures and ground truth .* meshes .* evaluations .* trajectories",
+        ):
+            uwlts.read(tmp_path / name)
+    with pytest.raises(CaptureError, match=r"missing\.h5"):
+        uwlts.read(tmp_path / "missing.h5")
+    (tmp_path / "a.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(DescriptionError):
+        uwlts.read(tmp_path / "a.csv")
+
+
+def test_results_are_short_texts():
+    """Sizes in place of arrays: a screen has some 40 lines of 100 characters."""
+    for result in (cloud_of(100_000), uwlts.nominal("thesis", medium="water")):
+        lines = repr(result).splitlines()
+        assert len(lines) < 40 and max(map(len, lines)) <= 100
+    assert "points_mm: 100000 x 3 float64" in repr(cloud_of(100_000))
+    assert "<td>100000 x 3 float64</td>" in cloud_of(100_000)._repr_html_()
+
+
+def test_a_nominal_calibration_reports_its_medium(tmp_path):
+    """The name is the one that was asked for, as in captures; the kind is that of the medium's description."""
+    sensor = uwlts.load_sensor("thesis")
+    media = {"air": sensor.media["air"], "water": sensor.media["water"], "fresh": sensor.media["water"]}
+    media["sea"] = sensor.media["water"].model_copy(update={"kind": "sea", "salinity_g_kg": 35.0})
+    sensor = sensor.model_copy(update={"media": media})
+    kinds = {"air": "air", "water": "fresh", "fresh": "fresh", "sea": "sea"}
+    for name, kind in kinds.items():
+        calibration = uwlts.nominal(sensor, medium=name)
+        assert (calibration.medium_name, calibration.medium_kind) == (name, kind)
+        assert f"medium_name: {name}" in repr(calibration)
+        calibration.save(tmp_path / f"{name}.json")
+        assert uwlts.read(tmp_path / f"{name}.json") == calibration
+    # Without a name, files are as before, so that the digests in older clouds stay valid.
+    assert "medium_name" not in nominal_calibration(sensor).model_dump_json()
