@@ -20,6 +20,8 @@ from scipy.spatial.transform import Rotation
 from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nodes, refit, solve
+from uwlts.fitting.least_squares import rms_distance
+from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair
 from uwlts.runtime.progress import ProgressListener, unheard
 
@@ -130,16 +132,13 @@ def _hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[H
     # By its steady rate and by its random walk a piece is bent as long as the drift is unknown.
     bent = float(np.max(drift.std[:3] * np.sqrt(part**2 + drift.walk[:3] * part)))
     middle = own.places_mm.mean(axis=0)
-    size = float(np.sqrt(np.mean(np.sum((own.places_mm - middle) ** 2, axis=1))))
     # A pose is as good as two bent pieces determine it, and a search within a patch radius.
-    std = max(bent, own.radius_mm) * np.repeat([1.0, 1 / size], 3)
+    std = max(bent, own.radius_mm) * np.repeat([1.0, 1 / rms_distance(own.places_mm, middle)], 3)
     found = []
     for shift in correlate_heights(
         clouds[0], clouds[1], options, pixel_mm=_PIXEL * own.radius_mm, reach_mm=np.abs(frame) @ reach
     ):
-        start = np.eye(4)
-        start[:3, 3] = shift @ frame
-        if (refined := fit_pair(own, other, start)) is None:
+        if (refined := fit_pair(own, other, rigid_transform(np.eye(3), shift @ frame))) is None:
             continue
         pose, apart = refined
         fits = np.abs(apart.distance_mm) < np.maximum(options.agreeing_sigmas * apart.std_mm, bent)

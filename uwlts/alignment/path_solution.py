@@ -15,7 +15,7 @@ from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.pieces import Survey, fit_piece
-from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
 from uwlts.fitting.patches import (
     LEAST_INFORMATION,
     PatchDistances,
@@ -202,8 +202,8 @@ def _observable(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middl
     The ways are distances, their weights (Q,), and their derivatives (Q, 6) by shift and turn about the middle.
     """
     normal, feigned = np.zeros((6, 6)), np.zeros((6, 6))
-    places = np.vstack([used.places_mm for used, *_ in ways]) - middle
-    scale = np.repeat([1.0, 1 / float(np.sqrt(np.mean(np.sum(places**2, axis=1))))], 3)
+    places = np.vstack([used.places_mm for used, *_ in ways])
+    scale = np.repeat([1.0, 1 / rms_distance(places, middle)], 3)
     for used, weight, twist in ways:
         by = twist * scale
         normal += by.T @ (weight[:, None] * by)

@@ -11,8 +11,9 @@ from uwlts.errors import EvaluationError, problems_of
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
 from uwlts.evaluation.figures import ArtefactEvaluation, Figure, FigureKey, Quantity, figure_keys
-from uwlts.evaluation.truth_comparison import TruthComparison, best_fit_motion, compare_with_truth
+from uwlts.evaluation.truth_comparison import TruthComparison, compare_with_truth
 from uwlts.files.json_files import read_model, write_model
+from uwlts.fitting.least_squares import fit_rigid_transform
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
 from uwlts.model.brief import Brief
 from uwlts.storage.cloud import PointCloud
@@ -261,8 +262,10 @@ def evaluate(
     compared = fitted = None
     if truth is not None:
         compared = compared_with_truth(cloud, truth)
-        # Takes out the difference of the coordinate systems.
-        motion = best_fit_motion(compared, cloud.points_mm)
+        # A calibrated sensor's frame has its own origin and axes. After the best-fit motion, errors of form and size
+        # remain.
+        measured = cloud.points_mm[compared.matched]
+        motion = fit_rigid_transform(measured, measured - compared.error_mm[compared.matched])
         moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
         fitted = compared_with_truth(replace(cloud, points_mm=moved), truth)
     found = None if artefact is None else evaluate_cloud(cloud, artefact)

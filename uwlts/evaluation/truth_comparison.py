@@ -126,19 +126,3 @@ def compare_with_truth(
         false_points=int(np.count_nonzero(~matched)),
         missed=int(np.count_nonzero(visible & ~found)),
     )
-
-
-def best_fit_motion(comparison: TruthComparison, points: np.ndarray) -> np.ndarray:
-    """Rigid motion (4, 4) that brings matched points (N, 3) closest to their true points, by least squares.
-
-    A calibrated sensor's coordinate system has its own origin and directions. What is left after this motion is the
-    error of form and size; the motion itself is the datum's. Kabsch 1976, Acta Crystallographica A32:922.
-    """
-    measured = points[comparison.matched]
-    true = measured - comparison.error_mm[comparison.matched]
-    middle_measured, middle_true = measured.mean(axis=0), true.mean(axis=0)
-    u, _, vt = np.linalg.svd((true - middle_true).T @ (measured - middle_measured))
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = rotation, middle_true - rotation @ middle_measured
-    return motion

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from uwlts.errors import EvaluationError
+from uwlts.model.calibration import rigid_transform
 
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -193,10 +194,26 @@ def normalised(points: Any, *, least: int, what: str, dimensions: tuple[int, ...
     points = accepted_points(points, least=least, what=what, dimensions=dimensions)
     centroid = points.mean(axis=0)
     centred = points - centroid
-    scale = float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
+    scale = rms_distance(points, centroid)
     if scale <= 1e-12 * float(np.abs(centroid).max()):
         raise EvaluationError(f"{what}: all {len(points)} points lie in one place")
     return Normalised(points, centred / scale, centroid, scale, *principal_axes(centred / scale))
+
+
+def rms_distance(points: np.ndarray, centre: np.ndarray) -> float:
+    """Return the root-mean-square distance of points (N, D) from a centre (D,)."""
+    return float(np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1))))
+
+
+def fit_rigid_transform(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Fit the rigid transform (4, 4) that moves points (N, 3) closest to others in the same order, by least squares.
+
+    Singular value decomposition of the cross-covariance (Kabsch, Acta Crystallographica A32, 1976).
+    """
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    left, _, right = np.linalg.svd((target - target_mean).T @ (source - source_mean))
+    rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    return rigid_transform(rotation, target_mean - rotation @ source_mean)
 
 
 def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

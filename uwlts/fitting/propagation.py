@@ -99,9 +99,8 @@ class PointErrors:
         much as the residuals show in groups (the sandwich estimator of Liang and Zeger, Biometrika 73, 1986):
         neighbours err together, and roughness is noise.
         """
-        noise = (weights * self.single_mm**2) @ weights.T
-        noise = noise + sum(covariance_of_groups(weights * part, self.image) for part in self.image_mm)
-        seen = covariance_of_groups(weights * residuals, groups)
+        noise = (weights * self.single_mm**2) @ weights.T + covariance_of_groups(weights, self.image_mm, self.image)
+        seen = covariance_of_groups(weights, residuals[None], groups)
         size = np.maximum(np.diag(seen), 1e-300) / np.maximum(np.diag(noise), 1e-300)
         # As a whole, so that what is left stays a covariance.
         random = seen if np.median(size) > 1 else noise
@@ -118,11 +117,17 @@ def neighbours_in_order(count: int) -> np.ndarray:
     return np.arange(count) // 8
 
 
-def covariance_of_groups(along: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return the covariance (K, K) of sums of columns (K, N) that are one in each group, independent between groups."""
-    number = _numbered(group)
-    together = np.stack([np.bincount(number, row) for row in along])
-    return together @ together.T
+def covariance_of_groups(weights: np.ndarray, parts_mm: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Return the covariance (K, K) of sums of errors with weights (K, N).
+
+    ``parts_mm`` (P, N) are standard deviations of independent parts of the errors. Each part is fully correlated within
+    a group (N,) and independent between groups.
+    """
+    number, covariance = _numbered(group), np.zeros((len(weights),) * 2)
+    for part in parts_mm:
+        sums = np.stack([np.bincount(number, row) for row in weights * part])
+        covariance += sums @ sums.T
+    return covariance
 
 
 def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from uwlts.errors import EvaluationError, SetupError
 from uwlts.fitting.patches import Patches
+from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair
 from uwlts.registration.marker_spheres import MarkerSphere, movement_by_markers
 
@@ -97,8 +98,7 @@ def _by_features(
     found = matcher.estimate(source, target)
     if not found.valid:
         return None
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = np.asarray(found.rotation), np.asarray(found.translation) * voxel / _VOXEL_UNITS
+    result = rigid_transform(np.asarray(found.rotation), np.asarray(found.translation) * voxel / _VOXEL_UNITS)
     return result if np.isfinite(result).all() else None
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
 from uwlts.fitting.patches import (
     LEAST_INFORMATION,
     PatchDistances,
@@ -103,7 +103,7 @@ class JointRegistration:
         self.start_std, self.sphere_mm = start_std, sphere_mm
         self.local_middles = np.array([each.places_mm.mean(axis=0) for each in patches])
         self._start_middles_mm = self.middles_mm
-        self.sizes = np.array([_usual_distance(p.places_mm) for p in patches])
+        self.sizes = np.array([rms_distance(each.places_mm, each.places_mm.mean(axis=0)) for each in patches])
         ends = 6 * (len(patches) - 1) + np.cumsum([0, *map(len, self.patterns)])
         self.pattern_columns = [np.arange(a, b) for a, b in pairwise(ends)]
         self.pose_columns = [np.arange(6 * (n - 1), 6 * n) if n else np.arange(0) for n in range(len(patches))]
@@ -346,8 +346,3 @@ def _alike(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray
     # What rounds wrong, or contradicts itself, counts as apart.
     least = float(np.linalg.eigvalsh(covariance)[0]) if len(covariance) else 1.0
     return np.linalg.inv(covariance + max(_OWN_PART - least, 0.0) * np.eye(ends[-1]))
-
-
-def _usual_distance(points: np.ndarray) -> float:
-    """Root mean square distance of points (N, 3) from their middle."""
-    return float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))))

@@ -9,6 +9,7 @@ from itertools import permutations
 import numpy as np
 
 from uwlts.evaluation.spheres import find_sphere
+from uwlts.fitting.least_squares import fit_rigid_transform
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.storage.cloud import PointCloud
 
@@ -78,23 +79,13 @@ def movement_by_markers(
                 (np.abs(sides_b[p] - sides_a[i, k]) < limit) & (np.abs(sides_b[q] - sides_a[j, k]) < limit)
             )
             for r in last[(last != p) & (last != q)]:
-                movement = movement_of(a[[i, j, k]], b[[p, q, r]])
+                movement = fit_rigid_transform(a[[i, j, k]], b[[p, q, r]])
                 off = np.linalg.norm((a @ movement[:3, :3].T + movement[:3, 3])[:, None] - b[None], axis=2)
                 fits = off.min(axis=1) < limit
                 if best is None or np.count_nonzero(fits) > best[1]:
-                    best = movement_of(a[fits], b[off.argmin(axis=1)[fits]]), int(np.count_nonzero(fits))
+                    best = fit_rigid_transform(a[fits], b[off.argmin(axis=1)[fits]]), int(np.count_nonzero(fits))
     return best if best is not None and best[1] >= 3 else None
 
 
 def _from_middle(marker: MarkerSphere, group: dict[int, MarkerSphere]) -> float:
     return float(np.linalg.norm(np.mean([each.centre_mm for each in group.values()], axis=0) - marker.centre_mm))
-
-
-def movement_of(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Rigid movement (4, 4) of points (N, 3) onto others in the same order (Arun, Huang and Blostein, 1987)."""
-    middle = source.mean(axis=0), target.mean(axis=0)
-    left, _, right = np.linalg.svd((target - middle[1]).T @ (source - middle[0]))
-    rotation = left @ np.diag([1, 1, np.sign(np.linalg.det(left @ right))]) @ right
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, middle[1] - rotation @ middle[0]
-    return result

@@ -14,9 +14,10 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
 from uwlts.fitting.patches import rigid_derivatives
 from uwlts.fitting.propagation import covariance_of_groups
+from uwlts.model.calibration import rigid_transform
 from uwlts.storage.cloud import PointUncertainty, images_along, variance_along
 
 _ROUNDS = 40
@@ -165,9 +166,8 @@ def register_to_surface(
         variance = _variance_along(known, near.normals @ rotation)[used]
         by = _by_movement(moved[used], near.normals[used], middle)
         found = _estimate(by, near.distance_mm[used], variance, size=_size(moved, middle))
-        change = np.eye(4)
-        change[:3, :3] = Rotation.from_rotvec(found.step[3:]).as_matrix()
-        change[:3, 3] = middle + found.step[:3] - change[:3, :3] @ middle
+        turn = Rotation.from_rotvec(found.step[3:]).as_matrix()
+        change = rigid_transform(turn, middle + found.step[:3] - turn @ middle)
         transform, moved = change @ transform, moved @ change[:3, :3].T + change[:3, 3]
         rounds += 1
         largest = max(np.abs(found.step[:3]).max(), np.abs(found.step[3:]).max() * _size(moved, middle))
@@ -228,7 +228,7 @@ def _within(points: np.ndarray, datums: np.ndarray, margin: float) -> np.ndarray
 
 
 def _size(points: np.ndarray, middle: np.ndarray) -> float:
-    return max(float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1)))), 1e-9)
+    return max(rms_distance(points, middle), 1e-9)
 
 
 def _by_movement(points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool = False) -> np.ndarray:
@@ -299,14 +299,13 @@ class _Shared:
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
         image = np.arange(answer.shape[1]) if self._frame is None else self._frame
-        parts = images_along(self._known, self._normals)
-        return np.sum([covariance_of_groups(answer * part, image) for part in parts], axis=0)
+        return covariance_of_groups(answer, images_along(self._known, self._normals), image)
 
     def noise(self, answer: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Covariance (K, K) of the answer by the noise of points that are used several times, by index (N,)."""
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
-        return covariance_of_groups(answer * np.sqrt(variance_along(self._known.random_mm2, self._normals)), index)
+        return covariance_of_groups(answer, np.sqrt(variance_along(self._known.random_mm2, self._normals))[None], index)
 
 
 def _words(direction: np.ndarray) -> str:
