@@ -15,7 +15,7 @@ from uwlts.files.reading import MOST_TOML_BYTES, parsed_toml, read_text
 from uwlts.fitting.least_squares import evenly_thinned, fit_robustly
 from uwlts.fitting.shapes import fit_cylinder, fit_plane, fit_sphere
 from uwlts.model.sensor import Description, Positive, Vector
-from uwlts.registration.surface_registration import Nearest, Registration, fitted_shape
+from uwlts.registration.surface_registration import Nearest, Registration, shape_registration
 from uwlts.storage.cloud import PointUncertainty
 
 _MOST_FITTED = 50_000
@@ -169,7 +169,7 @@ def place_shape(
         case _:
             assert_never(shape)
     used = chosen[robust.inliers]
-    registration = fitted_shape(
+    registration = shape_registration(
         points_mm[used],
         placed.nearest(points_mm[used]),
         sized=not isinstance(shape, IdealPlane) and shape.diameter_mm is None,

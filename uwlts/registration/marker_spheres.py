@@ -1,4 +1,4 @@
-"""Spheres as markers: their centres in each scan, and which centres in several scans are those of one sphere."""
+"""Marker spheres: detection in each scan and correspondence between scans."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from uwlts.fitting.shapes import fit_sphere
 from uwlts.storage.cloud import PointCloud
 
 _AGREE = 0.05
-"""Difference of distances between centres, relative to the diameter, within which they agree before registration."""
+"""Tolerance of centre distances before registration, relative to the sphere diameter."""
 _TRIPLES = 200
-"""Triples of spheres that are tried, spread evenly over all; all of up to six spheres."""
+"""Number of sphere triples that are tried, spread evenly over all; up to six spheres give fewer."""
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerSphere:
-    """A sphere's centre (3,), its covariance (3, 3) by noise, and how patterns move it (M, 3), mm."""
+    """Centre (3,) of a sphere, its noise covariance (3, 3), and its shift (M, 3) by each systematic pattern, in mm."""
 
     centre_mm: np.ndarray
     covariance: np.ndarray
@@ -29,17 +29,17 @@ class MarkerSphere:
 
 
 def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
-    """Find all spheres of a diameter in a cloud."""
+    """Find all spheres of the given diameter in a cloud."""
     usable, found = np.ones(len(cloud), bool), []
     rng = np.random.default_rng(0)
     while (sphere := find_sphere(cloud.points_mm, diameter_mm / 2, usable=usable, rng=rng)) is not None:
         members = sphere.members[sphere.robust.inliers]
         usable[sphere.near] = False
-        # Of a cap, centre and radius are known together only; the diameter is given.
+        # On a cap, centre and radius are strongly correlated. The known diameter removes this correlation.
         fit = fit_sphere(cloud.points_mm[members], diameter_mm / 2)
         outwards = cloud.points_mm[members] - fit.centre_mm
         outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-        # A displacement moves the centre of the fit by least squares.
+        # Shift of the least-squares centre for a displacement along the normals.
         solve = np.linalg.pinv(outwards)
         patterns = np.zeros((0, 3))
         if cloud.uncertainty is not None:
@@ -49,12 +49,15 @@ def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
     return found
 
 
-def common_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> list[dict[int, MarkerSphere]]:
-    """Spheres of different scans within a reach of each other in the common frame, by the number of the scan."""
+def group_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> list[dict[int, MarkerSphere]]:
+    """Group spheres of different scans that lie within ``reach_mm`` of each other in the common frame.
+
+    Each group maps scan numbers to spheres. Spheres seen in one scan only are omitted.
+    """
     groups: list[dict[int, MarkerSphere]] = []
     for number, markers in enumerate(scans):
         for marker in markers:
-            away = [np.inf if number in group else _from_middle(marker, group) for group in groups]
+            away = [np.inf if number in group else _distance_from_mean(marker, group) for group in groups]
             if away and min(away) < reach_mm:
                 groups[int(np.argmin(away))][number] = marker
             else:
@@ -62,10 +65,13 @@ def common_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> 
     return [group for group in groups if len(group) > 1]
 
 
-def movement_by_markers(
+def match_markers(
     source: Sequence[MarkerSphere], target: Sequence[MarkerSphere], diameter_mm: float
 ) -> tuple[np.ndarray, int] | None:
-    """Movement (4, 4) of most spheres of one scan onto those of another, and their number; None below three."""
+    """Find the transform (4, 4) that matches the most spheres of two scans; return it with their number.
+
+    Return None if fewer than three spheres match.
+    """
     a, b = (np.array([each.centre_mm for each in markers]).reshape(-1, 3) for markers in (source, target))
     if min(len(a), len(b)) < 3:
         return None
@@ -87,5 +93,5 @@ def movement_by_markers(
     return best if best is not None and best[1] >= 3 else None
 
 
-def _from_middle(marker: MarkerSphere, group: dict[int, MarkerSphere]) -> float:
+def _distance_from_mean(marker: MarkerSphere, group: dict[int, MarkerSphere]) -> float:
     return float(np.linalg.norm(np.mean([each.centre_mm for each in group.values()], axis=0) - marker.centre_mm))

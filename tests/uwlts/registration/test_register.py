@@ -74,9 +74,9 @@ def test_overlaps_of_few_patches_are_named_and_do_not_count():
         patches.append(surface_patches(points + [0, 0, 300] + 0.02 * rng.standard_normal(points.shape), None))
     start = np.tile(np.eye(4), (3, 1, 1))
     joint = JointRegistration(patches, [[], [], []], start, start_std=None, sphere_mm=None)
-    ((first, third, count),) = joint.narrow_overlaps(joint.distances(1.0))
+    ((first, third, count),) = joint.find_narrow_overlaps(joint.measure_distances(1.0))
     assert (first, third) == (0, 2) and 0 < count < FEWEST_OF_PAIR
-    assert set(joint.evidence(joint.distances(1.0))) == {(0, 1), (1, 2)}
+    assert set(joint.collect_evidence(joint.measure_distances(1.0))) == {(0, 1), (1, 2)}
 
 
 def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):
@@ -180,7 +180,7 @@ def test_a_start_is_found_by_the_shape():
 
 def test_no_start_is_invented_on_a_plain_pipe():
     scans, _, _ = views(np.random.default_rng(SEED), count=5, radius=plain)
-    with pytest.raises(uwlts.Error, match="no start was found by the shape.*spheres"):
+    with pytest.raises(uwlts.Error, match="no initial pose was found from the surfaces.*spheres"):
         uwlts.register(scans[:2], search=True)
 
 
@@ -215,7 +215,7 @@ def test_wrong_input_is_refused(pits):
     scans = pits[0]
     with pytest.raises(uwlts.Error, match="found 1 cloud; two or more"):
         uwlts.register(scans[:1])
-    with pytest.raises(uwlts.Error, match="scan 2: no overlap with scan 1.*better poses"):
+    with pytest.raises(uwlts.Error, match="scan 2: not connected with scan 1.*better initial poses"):
         uwlts.register([scans[0], PointCloud(scans[1].points_mm + [0, 0, 500], *(np.zeros(len(scans[1])),) * 3)])
     with pytest.raises(uwlts.Error, match=r"shape \(2, 3, 4\); expected \(2, 4, 4\)"):
         uwlts.register(scans[:2], poses=np.zeros((2, 3, 4)))
