@@ -73,11 +73,11 @@ class PairEvidence:
     spheres: int
 
     def normal(self) -> np.ndarray:
-        """Normal matrix (U, U)."""
+        """Return the normal matrix (U, U)."""
         return self.derivatives.T @ (self.weights[:, None] * self.derivatives)
 
     def gradient(self) -> np.ndarray:
-        """Gradient (U,) of half the sum of squares."""
+        """Return the gradient (U,) of half the sum of squares."""
         return self.derivatives.T @ (self.weights * self.residuals)
 
     @property
@@ -263,8 +263,8 @@ class JointRegistration:
         spurious = np.zeros((self.unknown_poses, self.unknown_poses))
         for source, target, found in ways:
             std = found.std_mm * spread
-            # Each pair is measured in both directions. K scans of one place form K (K - 1) / 2 pairs, of which only
-            # K - 1 differences are independent.
+            # Each pair is measured in both directions. K scans of one place form K (K - 1) / 2 pairs, but only K - 1
+            # independent differences.
             each = 1 / (others[source][found.source] * self.patches[source].alike(len(found.source)))
             weight = biweight(found.distance_mm / std) / std**2 * each
             by_poses = partial(self._derivatives_by_poses, source, target, found.places_mm)

@@ -27,7 +27,7 @@ _NAMES = "shift along x", "shift along y", "shift along z", "turn about x", "tur
 class SurfaceRegistrationOptions:
     """Settings of `register_to_surface`.
 
-    No record states a scan on which the values were tuned. The reason beside each value follows from the method.
+    The history of the values names no data. The reason beside each value follows from the method.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Nearest:
 
 
 class ReferenceSurface(Protocol):
-    """Surface to which a cloud can be registered; `Nearest.index` refers to the points of ``uncertainty``."""
+    """Reference surface of a registration; `Nearest.index` refers to the points of ``uncertainty``."""
 
     @property
     def uncertainty(self) -> PointUncertainty | None: ...
@@ -167,7 +167,9 @@ def register_to_surface(
     Parameters
     ----------
     points_mm : (N, 3)
+        Points of the cloud.
     surface
+        Reference surface.
     reach_mm
         Points farther than this from the surface are ignored.
     uncertainty, frame
@@ -175,6 +177,7 @@ def register_to_surface(
     datums : (K, 4), optional
         Centres and radii, mm, of spheres: points outside all of them are ignored.
     options
+        Settings of the iteration.
 
     Raises
     ------
