@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.comparison.change_reference import (
     Reference,
     ReferencePoints,
-    local_normals,
+    fit_local_normals,
     read_datums,
     read_reference,
     require_enough,
@@ -24,7 +24,7 @@ from uwlts.comparison.ideal_shapes import IdealShape, place_shape
 from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, average_locally
 from uwlts.comparison.options import OPTIONS
 from uwlts.errors import EvaluationError
-from uwlts.fitting.point_spacing import disc_of
+from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface
@@ -256,13 +256,13 @@ def compare_clouds(
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
-    disc = disc_mm or disc_of(require_enough(new.points_mm, "cloud"), new.frame)
+    disc = disc_mm or choose_disc_diameter(require_enough(new.points_mm, "cloud"), new.frame)
     surface = read_reference(reference, unit=unit, disc_mm=disc)
     fixed = None if datums is None else read_datums(datums)
     if isinstance(surface, ReferencePoints):
         require_same_unit(new.points_mm, require_enough(surface.points_mm, "reference"))
         if disc_mm is None and not surface.meshed:
-            disc = max(disc, disc_of(surface.points_mm, surface.frame))
+            disc = max(disc, choose_disc_diameter(surface.points_mm, surface.frame))
         if fixed is not None and not register:
             raise EvaluationError("datums were given without a registration; set `register`")
     deep = deep_mm or OPTIONS.depth_per_disc * disc
@@ -325,7 +325,7 @@ def _compare_with_points(
     points, known, other, found = new.points_mm, new.uncertainty, surface.uncertainty, None
     if register:
         target = surface.points_mm
-        normals = local_normals(target, target, disc_mm=disc) if surface.normals is None else surface.normals
+        normals = fit_local_normals(target, target, disc_mm=disc) if surface.normals is None else surface.normals
         sampled = SampledSurface(target, normals, uncertainty=other, frame=surface.frame)
         found = register_to_surface(points, sampled, reach_mm=deep, uncertainty=known, frame=new.frame, datums=datums)
         points, known = _move_points(points, known, found)
@@ -335,7 +335,7 @@ def _compare_with_points(
             other = replace(other, patterns_mm=other.patterns_mm - np.array(followed, np.float32))
     chosen, apart = _thin_points(points, disc / 2)
     places = points[chosen]
-    normals = local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
+    normals = fit_local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
     here = average_locally(places, normals, points, uncertainty=known, frame=new.frame, disc_mm=disc, deep_mm=deep)
     there = average_locally(
         places, normals, surface.points_mm, uncertainty=other, frame=surface.frame, disc_mm=disc, deep_mm=deep

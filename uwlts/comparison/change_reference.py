@@ -170,7 +170,7 @@ def require_same_unit(cloud: np.ndarray, reference: np.ndarray) -> None:
         )
 
 
-def local_normals(
+def fit_local_normals(
     places: np.ndarray, surface: np.ndarray, *, disc_mm: float, given: np.ndarray | None = None
 ) -> np.ndarray:
     """Return unit normals (P, 3) of a surface near places.

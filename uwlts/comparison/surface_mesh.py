@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.fitting.local_surface import LocalSurface, SurfacePoints, surface_normals
-from uwlts.fitting.point_spacing import disc_of
+from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud, images_along, variance_along
 from uwlts.storage.cloud_files import loaded_cloud
@@ -103,7 +103,7 @@ def mesh(
     ]
     if small := [len(cloud) for cloud, _ in scans if len(cloud) < _FEWEST]:
         raise EvaluationError(f"a cloud or scan has {small[0]} points; at least {_FEWEST} are needed")
-    radius = radius_mm or max(0.65 * disc_of(cloud.points_mm, cloud.frame) for cloud, _ in scans)
+    radius = radius_mm or max(0.65 * choose_disc_diameter(cloud.points_mm, cloud.frame) for cloud, _ in scans)
     if cube_mm is not None and cube_mm > radius:
         raise EvaluationError(f"cube_mm is {cube_mm:g}; expected at most the patches' radius, {radius:g} mm")
     points = _collect_points(scans, radius)

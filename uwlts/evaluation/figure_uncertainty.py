@@ -7,7 +7,7 @@ import numpy as np
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, spread_mm
 from uwlts.evaluation.spheres import SphereEvaluation
-from uwlts.fitting.propagation import PointErrors, noise_mm
+from uwlts.fitting.propagation import PointErrors, noise_shifts
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.storage.cloud import PointCloud
 
@@ -56,7 +56,7 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     by_image = [
         np.stack([np.bincount(image, moves) for moves in part[used].T], axis=1) for part in uncertainty.by_image_mm()
     ]
-    moved = np.vstack([together, *by_image, noise_mm(uncertainty)[used]])
+    moved = np.vstack([together, *by_image, noise_shifts(uncertainty)[used]])
     return np.sqrt(np.sum(moved**2, axis=0)) / count
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import DEFAULT_K, accepted_points, evenly_thinned, principal_axes, robust_std
+from uwlts.fitting.least_squares import DEFAULT_K, check_points, evenly_thinned, principal_axes, robust_std
 from uwlts.fitting.shapes import fit_line, fit_plane
 from uwlts.runtime.compiled import compiled
 
@@ -66,7 +66,7 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
     edges and the riser stay out. ``height_mm`` is approximate. EvaluationError, which says what was found, for too few
     points or no two such faces.
     """
-    points = accepted_points(points, least=20, what="a step", dimensions=(2, 3))
+    points = check_points(points, least=20, what="a step", dimensions=(2, 3))
     least = 10 if points.shape[1] == 2 else 40
     proposal = _best_proposal(evenly_thinned(points, _THINNED), height_mm, np.random.default_rng(seed))
     if proposal is None:
@@ -109,7 +109,7 @@ def step_height(
     base = StepFace[reference.upper()]
     points = np.asarray(points, dtype=np.float64)
     surface = (fit_line if points.shape[1] == 2 else fit_plane)(points[labels == base])
-    across = accepted_points(points[labels == base.other], least=2, what="a step face", dimensions=(2, 3))
+    across = check_points(points[labels == base.other], least=2, what="a step face", dimensions=(2, 3))
     distances = surface.distances_mm(across)
     lever = np.array([1.0, *(surface.axes @ (across.mean(axis=0) - surface.point_mm))])
     variance = lever @ surface.covariance @ lever + distances.var(ddof=1) / len(distances)

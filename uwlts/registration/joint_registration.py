@@ -21,10 +21,10 @@ from uwlts.fitting.patches import (
     LEAST_INFORMATION,
     PatchDistances,
     Patches,
+    decompose_motions,
     distances_between,
-    information_of_slopes,
     rigid_derivatives,
-    ways_of_moving,
+    slope_information,
 )
 from uwlts.registration.marker_spheres import MarkerSphere, group_markers
 
@@ -178,7 +178,7 @@ class JointRegistration:
         within = np.linalg.solve(beside, normal[count:, :count])
         reduced = normal[:count, :count] - normal[:count, count:] @ within
         reduced = (reduced + reduced.T) / 2
-        values, vectors, metric = ways_of_moving(reduced, spurious)
+        values, vectors, metric = decompose_motions(reduced, spurious)
         known = values > LEAST_INFORMATION
         ways, strengths = vectors[:, known], values[known]
         down = gradient[:count] - within.T @ gradient[count:]
@@ -265,7 +265,7 @@ class JointRegistration:
             std = found.std_mm * spread
             # Each pair is measured in both directions. K scans of one place form K (K - 1) / 2 pairs, but only K - 1
             # independent differences.
-            each = 1 / (others[source][found.source] * self.patches[source].alike(len(found.source)))
+            each = 1 / (others[source][found.source] * self.patches[source].correlated_count(len(found.source)))
             weight = biweight(found.distance_mm / std) / std**2 * each
             by_poses = partial(self._derivatives_by_poses, source, target, found.places_mm)
             block = np.zeros((len(weight), unknown))
@@ -277,7 +277,7 @@ class JointRegistration:
             residuals.append(found.distance_mm)
             weights.append(weight)
             deviations.append(found.std_mm)
-            spurious += information_of_slopes(found.normals, weight * found.slope_variance, by_poses)
+            spurious += slope_information(found.normals, weight * found.slope_variance, by_poses)
         for first, second, views in spheres:
             covariance = first.covariance + second.covariance
             root = np.linalg.cholesky(np.linalg.inv(covariance)).T

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
 from uwlts.fitting.patches import rigid_derivatives
-from uwlts.fitting.propagation import covariance_of_groups
+from uwlts.fitting.propagation import grouped_covariance
 from uwlts.model.calibration import rigid_transform
 from uwlts.storage.cloud import PointUncertainty, images_along, variance_along
 
@@ -350,13 +350,13 @@ class _CorrelatedErrors:
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
         image = np.arange(answer.shape[1]) if self._frame is None else self._frame
-        return covariance_of_groups(answer, images_along(self._known, self._normals), image)
+        return grouped_covariance(answer, images_along(self._known, self._normals), image)
 
     def noise_covariance(self, answer: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Return the covariance (K, K) of the step by noise of points that are used repeatedly, by index (N,)."""
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
-        return covariance_of_groups(answer, np.sqrt(variance_along(self._known.random_mm2, self._normals))[None], index)
+        return grouped_covariance(answer, np.sqrt(variance_along(self._known.random_mm2, self._normals))[None], index)
 
 
 def _name_motion(direction: np.ndarray) -> str:
