@@ -14,7 +14,7 @@ from uwlts.calibration.joint.stored_estimate import stored_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.figure_uncertainty import MovedSpheres, figure_uncertainties, shift_std_mm
+from uwlts.evaluation.figure_uncertainty import LinearisedSpheres, figure_uncertainties, shift_std_mm
 from uwlts.fitting.propagation import noise_shifts
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.artefacts import PlaneStandard, SphereStandard
@@ -259,7 +259,7 @@ def spheres():
 def test_spheres_follow_their_points_as_when_searched_for_again(spheres):
     """To the second order of moves by 0.05 mm and residuals by 0.05 mm over the radius of 25 mm."""
     evaluation = evaluate_cloud(spheres, DUMBBELL)
-    moved = MovedSpheres(spheres.points_mm, evaluation)
+    moved = LinearisedSpheres(spheres.points_mm, evaluation)
     for move in spheres.uncertainty.patterns_mm[:2].astype(float):
         again = evaluate_cloud(replace(spheres, points_mm=spheres.points_mm + move), DUMBBELL).figures_mm
         change = np.array(list(again.values())) - list(evaluation.figures_mm.values())
