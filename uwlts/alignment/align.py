@@ -27,7 +27,7 @@ from uwlts.fitting.least_squares import noise_factor
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
-from uwlts.reconstruction.path_uncertainty import along_corrected_path
+from uwlts.reconstruction.path_uncertainty import correct_path_uncertainty
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import loaded_cloud
@@ -234,7 +234,7 @@ def _make_result(
         basis, by_image = estimate.prior.basis(survey.moments_s), estimate.covariance_at(survey.moments_s)
         of_nodes = estimate.covariance.reshape(6, -1, 6, estimate.prior.count).transpose(1, 0, 3, 2)
         of_nodes = of_nodes.reshape(estimate.covariance.shape)
-        known = along_corrected_path(known, by_point[:, 3:], levers, image, basis, of_nodes, by_image)
+        known = correct_path_uncertainty(known, by_point[:, 3:], levers, image, basis, of_nodes, by_image)
     return AlignedTrajectory(
         Trajectory(trajectory.times_s, poses, covariance),
         correction,

@@ -22,7 +22,7 @@ from uwlts.model.calibration import KnownMedium, KnownStage
 from uwlts.model.parameter_keys import MediumIndex, StageParameter
 from uwlts.model.sensor import Medium
 from uwlts.optics.triangulation import reconstruct_pixels
-from uwlts.reconstruction.point_uncertainty import point_uncertainty, stage_root, stripe_noise_px
+from uwlts.reconstruction.point_uncertainty import point_uncertainty, stage_components, stripe_noise_px
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, source_of
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
@@ -316,7 +316,7 @@ def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, th
     known = replace(stored, parameters=parameters, values=np.append(stored.values, [0.0, 0.0]), covariance=covariance)
     stages = (KnownStage(described=(1.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0)),) if calibrated else ()
     header = header_of(thesis, MEDIUM).model_copy(update={"stage_direction": (way, 0.0, 0.0)})
-    found = stage_root(
+    found = stage_components(
         known,
         calibration.model_copy(update={"stages": stages}),
         header,
