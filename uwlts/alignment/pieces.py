@@ -128,8 +128,8 @@ class Piece:
     def around(self, corrections: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """Return the derivatives (P, 3, 3) of corrected positions by navigated positions around patches.
 
-        These are the derivatives of p' = R(t) (p - X(t)) + X(t) + s(t) by p, with the time t(p), the rotation R, the
-        translation s, and the platform's position X.
+        The corrected position is p' = R(t) (p - X(t)) + X(t) + s(t), with the time t(p). R is the rotation, s the
+        translation, and X the platform's position.
         """
         turn = Rotation.from_rotvec(corrections[:, 3:])
         drifting = np.cross(rates[:, 3:], turn.apply(self.places_mm - self.platform_mm)) + rates[:, :3]

@@ -74,11 +74,11 @@ class GaugeStudy(Brief, RecordFile):
     tolerance: float | None
 
     def record(self) -> Table:
-        """The study as JSON."""
+        """Return the study as JSON."""
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """The study as text."""
+        """Return the study as text."""
         lines = [f"{self.parts} parts, {self.operators} operators, {self.repeats} repeats"]
         lines += ["source                    degrees  mean square        F  probability"]
         for row in self.variances:
@@ -110,11 +110,11 @@ class RepeatedReference(Brief, RecordFile):
     cgk: float | None
 
     def record(self) -> Table:
-        """The study as JSON."""
+        """Return the study as JSON."""
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """The study as text."""
+        """Return the study as text."""
         said = "significant" if abs(self.bias) > self.bias_half_interval else "not significant"
         lines = [
             f"{self.count} repeats               mean {self.mean:.6g}, std {self.std:.4g}",

@@ -78,8 +78,8 @@ def find_sphere(
     best centres are refined. A sphere is accepted if a free fit to its points gives the known radius within 10 %.
 
     Points belong to the sphere if they are within three limits of it. A limit is five robust standard deviations, at
-    most a tenth of the radius. A patch of about 0.12 radii is excluded if at least two of its points, and more than
-    10 %, exceed one limit, since another surface crosses the sphere there.
+    most a tenth of the radius. Another surface crosses the sphere in a patch of about 0.12 radii if at least two of its
+    points, and more than 10 %, exceed one limit. Such a patch is excluded.
     """
     usable = usable.copy()
     for _ in range(_ATTEMPTS):

@@ -172,8 +172,8 @@ def with_platform(
 def _mount_errors(poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return errors (F, 6, 6) of poses (F, 4, 4) that are equivalent to independent components of the mount's error.
 
-    A translation d and a rotation w of the mount, both in the platform's frame, move a point p of the platform by
-    d + w x (p - t), where t is the sensor's position ``place_mm`` (3,).
+    A translation d and a rotation w of the mount move a point p by d + w x (p - t), all in the platform's frame. The
+    sensor's position t is ``place_mm`` (3,).
     """
     root = covariance_root(covariance)
     turns, shifts = poses[:, :3, :3] @ root[3:], poses[:, :3, :3] @ root[:3]
