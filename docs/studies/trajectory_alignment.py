@@ -24,11 +24,11 @@ import uwlts
 from tests.uwlts.alignment.test_align import LOOP_MM
 from tests.uwlts.path_views import ALTITUDE_MM, STEP_MM, bed, ride, scan
 from twin.scene.vehicle import Vehicle
-from uwlts.alignment.crossing_search import add_overlaps, close_hypothesis
-from uwlts.alignment.drift_model import DriftModel, drift_of
+from uwlts.alignment.crossing_search import accept_hypothesis, add_overlaps
+from uwlts.alignment.drift_model import DriftModel, choose_drift_model
 from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_prior import PathPrior
-from uwlts.alignment.path_solution import Hypothesis, settle, uncorrected
+from uwlts.alignment.path_solution import Hypothesis, initial_estimate, settle
 from uwlts.alignment.pieces import Survey, moved
 from uwlts.storage.cloud import PointCloud
 
@@ -154,10 +154,10 @@ def given_crossings(
     """
     assert cloud.time_s is not None
     options = AlignmentOptions(intervals=50, most_nodes=120)
-    model = drift_of(reported, drift.get("drift_mm"), drift.get("drift_deg"))
+    model = choose_drift_model(reported, drift.get("drift_mm"), drift.get("drift_deg"))
     prior = PathPrior.over(cloud.time_s, model, reported, intervals=options.intervals)
     survey = Survey.along(cloud, cloud.time_s, reported)
-    estimate = uncorrected(survey, prior, options)
+    estimate = initial_estimate(survey, prior, options)
 
     def correction(times_s: np.ndarray) -> np.ndarray:
         was, now = reported.poses_at(times_s), true.poses_at(times_s)
@@ -169,7 +169,7 @@ def given_crossings(
         middle = own.mean(axis=0)
         relative = estimate.relative_movement(pair, middle) @ correction(estimate.prior.nodes_s).T.ravel()
         std = survey.radius_mm * np.repeat([1.0, 1 / float(np.sqrt(np.mean(np.sum((own - middle) ** 2, axis=1))))], 3)
-        closed = close_hypothesis(estimate, Hypothesis(pair, middle, relative, std, len(own)))
+        closed = accept_hypothesis(estimate, Hypothesis(pair, middle, relative, std, len(own)))
         if closed is not None:
             estimate = add_overlaps(closed, pair[1] + 1)
     estimate = settle(add_overlaps(estimate, len(estimate.pieces)))

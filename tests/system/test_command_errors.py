@@ -530,7 +530,7 @@ def test_artefact_that_is_wrong(fails, folder: Path, tmp_path: Path, table: str,
 
 def test_nothing_to_judge_by(fails, folder: Path, tmp_path: Path):
     out = ["--out", tmp_path / "x.json"]
-    fails("uwlts", "evaluate", folder / "plain.ply", *out, says="nothing to judge by")
+    fails("uwlts", "evaluate", folder / "plain.ply", *out, says="there is no reference for the evaluation")
     fails("uwlts", "evaluate", folder / "few.ply", *out, says="error: ")
     fails("uwlts", "evaluate", folder / "plain.ply", "--artefact", folder / "artefact.toml", *out, says="error: ")
 

@@ -335,7 +335,7 @@ def test_a_scan_upside_down_gives_hollow_spheres(says, scan_images, calibration,
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 0
-    says(f"evaluate {cloud} --out {tmp_path / 'x.json'}", "hollow: .* turned by 180 deg or mirrored")
+    says(f"evaluate {cloud} --out {tmp_path / 'x.json'}", "hollow: .* rotated by 180 deg or mirrored")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])

@@ -1,7 +1,7 @@
-"""Self-consistency of a scan along a path: a correction of the path, by surfaces that it shows more than once.
+"""Trajectory correction from surfaces that a scan shows more than once.
 
-`drift_model` describes how the navigation drifts, `path_prior` makes it the prior of the correction, `crossing_search`
-finds the crossings, and `path_estimate` the correction by them.
+`drift_model` describes the drift of the navigation, and `path_prior` converts it into a prior of the correction.
+`crossing_search` finds the crossings, and `path_estimate` holds the correction that they determine.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
-from uwlts.alignment.crossing_search import Search, close_crossings
-from uwlts.alignment.drift_model import drift_of
+from uwlts.alignment.crossing_search import Search, accept_crossings
+from uwlts.alignment.drift_model import choose_drift_model
 from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
-from uwlts.alignment.path_solution import settle, uncorrected
+from uwlts.alignment.path_solution import initial_estimate, settle
 from uwlts.alignment.pieces import Survey
 from uwlts.errors import EvaluationError
 from uwlts.files.json_files import write_record
@@ -27,7 +27,7 @@ from uwlts.fitting.least_squares import noise_factor
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
-from uwlts.reconstruction.path_uncertainty import along_corrected_path
+from uwlts.reconstruction.path_uncertainty import correct_path_uncertainty
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import loaded_cloud
@@ -36,11 +36,20 @@ from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where a path shows a surface again: times of both passes, patches, and distances in mm.
+    """Crossing of the path, where it shows a surface again.
 
-    ``before_mm`` and ``after_mm`` are root mean square distances of the patches near each other by the path as it was
-    and as it is. ``held_out_before_mm`` and ``held_out_after_mm`` are of patches that the estimate has not used.
-    ``missed_mm`` is the shift by which the navigation missed here.
+    Attributes
+    ----------
+    times_s : (float, float)
+        Times of both passes.
+    patches : int
+        Number of agreeing patches used by the estimate.
+    before_mm, after_mm : float
+        Root-mean-square distance of these patches along the original and the corrected path.
+    held_out_before_mm, held_out_after_mm : float
+        The same for patches that the estimate does not use.
+    missed_mm : float
+        Relative position error of the navigation between both passes.
     """
 
     times_s: tuple[float, float]
@@ -54,20 +63,20 @@ class Crossing:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AlignedTrajectory(Brief):
-    """A path that agrees with the surfaces that it shows.
+    """Trajectory corrected to agree with the scanned surfaces.
 
     Attributes
     ----------
     trajectory : Trajectory
-        Corrected poses at the times of the given ones, with the covariance of each.
+        Corrected poses at the given times, with the covariance of each.
     correction : (N, 6) float64
-        Shift (mm) and turn (rad) that each pose was given.
+        Translation (mm) and rotation vector (rad) of each pose.
     crossings : tuple of Crossing
     doubtful_s : tuple of (float, float)
-        Times of both passes where the surface fits in several places as well as the drift allows: left out.
+        Times of both passes of ambiguous crossings, which were not used: several positions within the drift fit.
     cloud : PointCloud
-        The cloud along the corrected path. Its uncertainty is that of the corrected path, and what the given cloud's
-        holds of the calibrations of sensor and mount.
+        Cloud along the corrected path. Its uncertainty combines that of the corrected path with that of the
+        calibrations of sensor and mount.
     """
 
     trajectory: Trajectory
@@ -77,7 +86,7 @@ class AlignedTrajectory(Brief):
     cloud: PointCloud
 
     def record(self) -> Table:
-        """Crossings and size of the correction as JSON."""
+        """Return crossings and size of the correction as JSON."""
         shift, turn = (np.linalg.norm(part, axis=1) for part in (self.correction[:, :3], self.correction[:, 3:]))
         return {
             "largest_shift_mm": float(shift.max()),
@@ -95,7 +104,7 @@ class AlignedTrajectory(Brief):
         write_record(Path(path).with_suffix(".json"), self.record(), overwrite=overwrite)
 
     def lines(self) -> list[str]:
-        """The summary as text."""
+        """Return a summary as text."""
         known = self.record()
         lines = [
             f"path corrected by up to {known['largest_shift_mm']:.3f} mm and {known['largest_turn_deg']:.4f} deg, "
@@ -109,7 +118,7 @@ class AlignedTrajectory(Brief):
                 f"{each.held_out_after_mm:.4f} mm"
             )
         for first, second in self.doubtful_s:
-            lines.append(f"  {first:.1f} s and {second:.1f} s: left out, the surface fits in several places")
+            lines.append(f"  {first:.1f} s and {second:.1f} s: not used, the surface fits in several positions")
         return lines
 
 
@@ -125,29 +134,29 @@ def align_trajectory(
     drift_deg: float | None = None,
     progress: ProgressListener = unheard,
 ) -> AlignedTrajectory:
-    """Correct a trajectory so that surfaces which the scan shows twice agree, and move the cloud with it.
+    """Correct a trajectory so that surfaces scanned twice agree, and move the cloud accordingly.
 
-    Reconstruct the scan along the corrected trajectory afterwards: its points then have the uncertainty that is left.
+    Reconstruct the scan along the corrected trajectory afterwards: its points then have the remaining uncertainty.
 
     Parameters
     ----------
     cloud
         Cloud along the trajectory with the time of each point (uwlts reconstruct --trajectory).
     trajectory
-        CSV file or ROS bag with times and poses of the platform, as the cloud was reconstructed with.
+        CSV file or ROS bag with times and poses of the platform, the same as for the reconstruction.
     pose_format, pose_unit
         As for `reconstruct`.
     clock_offset_s
-        What to add to the times of the points for those of the trajectory.
+        Offset from the times of the points to those of the trajectory.
     clock_drift_ppm
-        By how many parts in a million the trajectory's clock runs faster, as for `reconstruct`.
+        Rate difference of the trajectory's clock, positive if it runs faster, as for `reconstruct`.
     drift_mm
-        Standard uncertainty that the navigation has gathered at the end, along each axis. The share of a random walk is
-        estimated then. Unless given the covariance of the trajectory states both.
+        Standard uncertainty of the navigation's position at the end of the path, along each axis. The fraction of a
+        random walk is then estimated. By default the covariance of the trajectory states both.
     drift_deg
-        The same of its turns.
+        Standard uncertainty of the navigation's rotation at the end of the path, about each axis.
     progress
-        Called with the number of steps done and the number in all.
+        Called with the number of steps done and the total number.
 
     Raises
     ------
@@ -156,7 +165,7 @@ def align_trajectory(
     DescriptionError
         Points were measured before or after the trajectory.
     EvaluationError
-        Points have no times, the drift is not known, or no crossing determines the correction.
+        Points have no times, the drift is unknown, or no crossing determines the correction.
     """
     cloud = loaded_cloud(cloud)
     if not isinstance(trajectory, Trajectory):
@@ -164,38 +173,38 @@ def align_trajectory(
     if cloud.time_s is None:
         raise EvaluationError("the cloud has no times of its points: reconstruct it with a trajectory")
     times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
-    drift = drift_of(trajectory, drift_mm, drift_deg)
+    drift = choose_drift_model(trajectory, drift_mm, drift_deg)
     options = AlignmentOptions()
     prior = PathPrior.over(times, drift, trajectory, intervals=options.intervals)
-    search = close_crossings(uncorrected(Survey.along(cloud, times, trajectory), prior, options), progress)
+    search = accept_crossings(initial_estimate(Survey.along(cloud, times, trajectory), prior, options), progress)
     estimate = settle(search.estimate) if search.estimate.pairs else search.estimate
-    left_out = tuple(_times(estimate, pair) for pair in search.doubtful)
+    left_out = tuple(_pair_times(estimate, pair) for pair in search.doubtful)
     if not estimate.pairs:
-        raise EvaluationError(_no_crossing(search, left_out))
+        raise EvaluationError(_explain_no_crossing(search, left_out))
     _require_gain(estimate)
-    return _result(estimate, trajectory, left_out)
+    return _make_result(estimate, trajectory, left_out)
 
 
-def _no_crossing(search: Search, left_out: tuple[tuple[float, float], ...]) -> str:
-    """The reason why no crossing was closed, and what to do."""
+def _explain_no_crossing(search: Search, left_out: tuple[tuple[float, float], ...]) -> str:
+    """Explain why no crossing was accepted, and what to do."""
     within = f"within {search.estimate.options.search_sigmas:g} standard deviations of its drift"
     if not search.within_reach:
-        found = f"no part of the path is {within} above an earlier one: let it cross itself, or state a larger drift"
+        found = f"no part of it is {within} above an earlier part. Let the path cross itself, or state a larger drift"
     elif left_out:
         at = ", ".join(f"{first:.1f} s and {second:.1f} s" for first, second in left_out)
-        found = f"at {at} it fits in several places: cross over a surface with features that differ"
+        found = f"at {at}, the surface fits in several positions. Cross over a surface with distinct features"
     elif not search.hypotheses:
-        found = f"the surfaces coincide nowhere {within}: cross over a surface with features, or state a larger drift"
+        found = f"no surfaces coincide {within}. Cross over a surface with features, or state a larger drift"
     else:
         found = (
-            f"{search.hypotheses} places {within} fit roughly, none within the noise of the points: cross at a smaller "
-            "distance of the images, over a surface with features"
+            f"{search.hypotheses} positions {within} fit roughly, but none within the noise of the points. Cross over "
+            "a surface with features, with a smaller spacing of the images"
         )
-    return f"the path shows no surface twice that determines its correction; {found}"
+    return f"no crossing of the path determines its correction: {found}"
 
 
 def _require_gain(estimate: PathEstimate) -> None:
-    """EvaluationError unless a shift at a crossing is known ``least_gain`` times as well as by the navigation."""
+    """Raise EvaluationError unless some crossing reduces the position uncertainty by the factor ``least_gain``."""
     navigation = replace(estimate, factor=np.eye(len(estimate.factor)))
     for pair in estimate.pairs:
         middle = estimate.surfaces[pair[1]].places_mm.mean(axis=0)
@@ -203,12 +212,12 @@ def _require_gain(estimate: PathEstimate) -> None:
         if eigh(after, before, eigvals_only=True)[0] < 1 / estimate.options.least_gain**2:
             return
     raise EvaluationError(
-        f"the {len(estimate.pairs)} crossings do not determine a correction: the navigation is known about as well as "
-        "they are; use the trajectory as it is"
+        f"the {len(estimate.pairs)} crossings do not determine a correction: the navigation is about as accurate as "
+        "they are. Use the trajectory without correction"
     )
 
 
-def _result(
+def _make_result(
     estimate: PathEstimate, trajectory: Trajectory, doubtful: tuple[tuple[float, float], ...]
 ) -> AlignedTrajectory:
     cloud = estimate.survey.cloud
@@ -225,19 +234,19 @@ def _result(
         basis, by_image = estimate.prior.basis(survey.moments_s), estimate.covariance_at(survey.moments_s)
         of_nodes = estimate.covariance.reshape(6, -1, 6, estimate.prior.count).transpose(1, 0, 3, 2)
         of_nodes = of_nodes.reshape(estimate.covariance.shape)
-        known = along_corrected_path(known, by_point[:, 3:], levers, image, basis, of_nodes, by_image)
+        known = correct_path_uncertainty(known, by_point[:, 3:], levers, image, basis, of_nodes, by_image)
     return AlignedTrajectory(
         Trajectory(trajectory.times_s, poses, covariance),
         correction,
-        tuple(_crossing(estimate, pair) for pair in estimate.pairs),
+        tuple(_make_crossing(estimate, pair) for pair in estimate.pairs),
         doubtful,
         replace(cloud, points_mm=levers + platform + by_point[:, :3], uncertainty=known),
     )
 
 
-def _crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
+def _make_crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
     now, held = estimate.compared(pair)
-    # The same patches, as they lay by the path as it was.
+    # Distances of the same patches along the original path.
     shift = np.zeros_like(now.places_mm)
     for number, rows, sign in zip(pair, (now.target, now.source), (-1.0, 1.0), strict=True):
         shift += sign * (estimate.surfaces[number].places_mm - estimate.pieces[number].places_mm)[rows]
@@ -250,7 +259,7 @@ def _crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
         return float(np.sqrt(np.mean(values[which] ** 2))) if which.any() else 0.0
 
     return Crossing(
-        times_s=_times(estimate, pair),
+        times_s=_pair_times(estimate, pair),
         patches=int(np.count_nonzero(inside & ~held)),
         before_mm=rms(before, inside & ~held),
         after_mm=rms(now.distance_mm, inside & ~held),
@@ -260,7 +269,7 @@ def _crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
     )
 
 
-def _times(estimate: PathEstimate, pair: Pair) -> tuple[float, float]:
-    """Times of both passes, s."""
+def _pair_times(estimate: PathEstimate, pair: Pair) -> tuple[float, float]:
+    """Return the times of both passes, s."""
     earlier, later = (estimate.pieces[number].middle_s for number in pair)
     return earlier, later

@@ -1,9 +1,9 @@
-"""Search of the crossings of a path: hypotheses with their scores, and the closing of those that hold.
+"""Search for the crossings of a path: hypotheses, their scores, and the acceptance of consistent ones.
 
-A hypothesis is a pose in which a piece of the path coincides with an earlier one, found by correlation of height maps.
-It is tested by the drift that the navigation may have gathered, given all crossings that were closed before (chi-square
-of shift and turn), and by an estimate of the path with it. Within a few pieces the hypothesis with the most agreeing
-patches is tested first. None is closed where another place fits nearly as well.
+A hypothesis is a pose in which a piece of the path coincides with an earlier one. It is found by correlation of height
+maps. Two tests follow: the chi-square of its shift and rotation under the possible drift, given all accepted crossings,
+and an estimate of the path with it. Among neighbouring pieces, the hypothesis with the most agreeing patches is tested
+first. It is rejected as ambiguous if another position fits nearly as well.
 """
 
 from __future__ import annotations
@@ -20,18 +20,15 @@ from scipy.spatial.transform import Rotation
 from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nodes, refit, solve
+from uwlts.fitting.least_squares import rms_distance
+from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair
 from uwlts.runtime.progress import ProgressListener, unheard
-
-_PIXEL = 0.5
-"""Pixel of height maps in patch radii: patches resolve no more."""
-_LEAST_SPREAD = 1e-3
-"""Product of both maps' variances in an overlap, relative to the usual one: with less there is no structure."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """Outcome of the search: the estimate with its crossings, doubtful pairs, and the number of hypotheses."""
+    """Estimate with its crossings, ambiguous pairs, and numbers of tested pairs and hypotheses."""
 
     estimate: PathEstimate
     doubtful: tuple[Pair, ...]
@@ -39,8 +36,8 @@ class Search:
     hypotheses: int
 
 
-def close_crossings(estimate: PathEstimate, progress: ProgressListener = unheard) -> Search:
-    """Find and close the crossings of a path, in the order of time."""
+def accept_crossings(estimate: PathEstimate, progress: ProgressListener = unheard) -> Search:
+    """Find and accept the crossings of a path, in chronological order."""
     waiting: list[Hypothesis] = []
     doubtful: list[Pair] = []
     count, ahead = len(estimate.pieces), estimate.options.decided_after
@@ -51,15 +48,15 @@ def close_crossings(estimate: PathEstimate, progress: ProgressListener = unheard
 
     for number in range(count):
         for pair in ((earlier, number) for earlier in range(number - 2)):
-            if pair in estimate.pairs or (reach := _reach(estimate, pair)) is None:
+            if pair in estimate.pairs or (reach := _search_range(estimate, pair)) is None:
                 continue
-            found = _hypotheses(estimate, pair, reach)
+            found = _find_hypotheses(estimate, pair, reach)
             within_reach, hypotheses = within_reach + 1, hypotheses + len(found)
             waiting += [] if beside(pair, doubtful) else found
         while waiting and (number - min(each.pair[1] for each in waiting) >= ahead or number == count - 1):
             best = max(waiting, key=lambda each: each.patches)
             waiting.remove(best)
-            closed = close_hypothesis(estimate, best)
+            closed = accept_hypothesis(estimate, best)
             if closed is None:
                 continue
             if _has_rival(estimate, closed, best, [each for each in waiting if beside(each.pair, [best.pair])]):
@@ -74,15 +71,15 @@ def close_crossings(estimate: PathEstimate, progress: ProgressListener = unheard
     return Search(estimate, left_out, within_reach, hypotheses)
 
 
-def close_hypothesis(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstimate | None:
-    """Estimate the path with a hypothesis; None if the surfaces do not agree then."""
+def accept_hypothesis(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstimate | None:
+    """Estimate the path with a hypothesis; return None if the surfaces then disagree."""
     closed = solve(refine_nodes(solve(bring_together(estimate, hypothesis))))
     closed = solve(refit(closed, hypothesis.pair))
     return closed if closed.agrees(hypothesis.pair) else None
 
 
 def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
-    """Add all pairs of the first pieces that overlap by the path as it is known now, and whose surfaces agree."""
+    """Add all pairs of the first pieces that overlap along the current path and whose surfaces agree."""
     closed = estimate.pairs
     places = [surface.places_mm for surface in estimate.surfaces[:count]]
     low, high = (np.array([of(each, axis=0) for each in places]) for of in (np.min, np.max))
@@ -91,7 +88,7 @@ def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
         near = np.all((low[later] < high + estimate.reach_mm) & (low < high[later] + estimate.reach_mm), axis=1)
         for earlier in np.flatnonzero(near[: max(later - 2, 0)]).tolist():
             pair = earlier, later
-            reach = None if pair in closed else _reach(estimate, pair)
+            reach = None if pair in closed else _search_range(estimate, pair)
             if reach is not None and reach.max() < estimate.reach_mm:
                 found, _ = estimate.compared(pair)
                 new += [pair] if len(found.source) >= estimate.options.fewest_patches else []
@@ -103,8 +100,8 @@ def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
     return estimate if len(agreeing) == len(estimate.pairs) else solve(replace(estimate, pairs=agreeing))
 
 
-def _reach(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:
-    """How far (3,) the later piece may be from where it is now; None where it reaches the earlier nowhere."""
+def _search_range(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:
+    """Return the search range (3,) of the later piece; None if it cannot reach the earlier one."""
     other, own = (estimate.surfaces[number].places_mm for number in pair)
     low, high = own.min(axis=0), own.max(axis=0)
     std = np.sqrt(np.diag(estimate.relative_covariance(pair, (low + high) / 2)))
@@ -114,10 +111,10 @@ def _reach(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:
     return None if (apart > 0).any() else reach
 
 
-def _hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[Hypothesis]:
-    """Poses in which the later piece coincides with the earlier, within reach (3,).
+def _find_hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[Hypothesis]:
+    """Find poses in which the later piece coincides with the earlier one, within the search range (3,).
 
-    Height maps of both, with their neighbours on the path, are correlated for all shifts.
+    The height maps of both, including their neighbours on the path, are correlated for all shifts.
     """
     other, own = (estimate.surfaces[number] for number in pair)
     normal = np.linalg.eigh(other.normals.T @ other.normals)[1][:, 2]
@@ -127,19 +124,16 @@ def _hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[H
     near = [range(max(0, k - 1), min(len(estimate.pieces), k + 2)) for k in pair[::-1]]
     clouds = [np.vstack([estimate.points(k) for k in numbers]) @ frame.T for numbers in near]
     options, drift, part = estimate.options, estimate.prior.drift, 1 / len(estimate.pieces)
-    # By its steady rate and by its random walk a piece is bent as long as the drift is unknown.
+    # Deformation of a piece by the unknown drift, through its constant rate and its random walk.
     bent = float(np.max(drift.std[:3] * np.sqrt(part**2 + drift.walk[:3] * part)))
     middle = own.places_mm.mean(axis=0)
-    size = float(np.sqrt(np.mean(np.sum((own.places_mm - middle) ** 2, axis=1))))
-    # A pose is as good as two bent pieces determine it, and a search within a patch radius.
-    std = max(bent, own.radius_mm) * np.repeat([1.0, 1 / size], 3)
+    # The accuracy of a pose is limited by the deformation of both pieces and by the patch radius.
+    std = max(bent, own.radius_mm) * np.repeat([1.0, 1 / rms_distance(own.places_mm, middle)], 3)
     found = []
     for shift in correlate_heights(
-        clouds[0], clouds[1], options, pixel_mm=_PIXEL * own.radius_mm, reach_mm=np.abs(frame) @ reach
+        clouds[0], clouds[1], options, pixel_mm=options.pixel * own.radius_mm, reach_mm=np.abs(frame) @ reach
     ):
-        start = np.eye(4)
-        start[:3, 3] = shift @ frame
-        if (refined := fit_pair(own, other, start)) is None:
+        if (refined := fit_pair(own, other, rigid_transform(np.eye(3), shift @ frame))) is None:
             continue
         pose, apart = refined
         fits = np.abs(apart.distance_mm) < np.maximum(options.agreeing_sigmas * apart.std_mm, bent)
@@ -152,20 +146,20 @@ def _hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[H
 
 
 def _is_likely(estimate: PathEstimate, seen: Hypothesis) -> bool:
-    """Check whether the navigation may have drifted by a hypothesis, given the crossings that are closed."""
+    """Check whether a hypothesis is consistent with the drift, given the accepted crossings."""
     off = seen.relative - estimate.relative_movement(seen.pair, seen.at_mm) @ estimate.values
     covariance = estimate.relative_covariance(seen.pair, seen.at_mm) + np.diag(seen.std**2)
     return float(off @ np.linalg.solve(covariance, off)) < estimate.options.gate
 
 
 def _has_rival(before: PathEstimate, closed: PathEstimate, best: Hypothesis, beside: list[Hypothesis]) -> bool:
-    """Check whether another hypothesis contradicts the closed one, and holds as well from the estimate before."""
+    """Check whether another hypothesis contradicts the accepted one and fits the previous estimate as well."""
     for rival in beside:
         if rival.patches < before.options.rival_share * best.patches or _is_likely(closed, rival):
             continue
-        other = close_hypothesis(before, rival)
+        other = accept_hypothesis(before, rival)
         if other is not None:
-            # A pose that was found badly may lead to the same place.
+            # An inaccurate rival pose may converge to the same position.
             apart = (each.relative_movement(best.pair, best.at_mm) @ each.values for each in (other, closed))
             if np.linalg.norm(np.subtract(*apart)[:3]) > before.reach_mm:
                 return True
@@ -175,17 +169,17 @@ def _has_rival(before: PathEstimate, closed: PathEstimate, best: Hypothesis, bes
 def correlate_heights(
     source_mm: np.ndarray, target_mm: np.ndarray, options: AlignmentOptions, *, pixel_mm: float, reach_mm: np.ndarray
 ) -> list[np.ndarray]:
-    """Return the likeliest shifts (3,) of points (N, 3) onto others (M, 3), both with heights along z, the best first.
+    """Return the most likely shifts (3,) of points (N, 3) onto others (M, 3) with heights along z, the best first.
 
-    Shifts are within ``reach_mm`` (3,). The correlation is normalised within the overlap (Padfield, IEEE Transactions
-    on Image Processing 21, 2012) and counts by the root of its area.
+    Shifts are within ``reach_mm`` (3,). The correlation is normalised in the overlap (Padfield, IEEE Transactions on
+    Image Processing 21, 2012) and weighted by the square root of its area.
     """
     low = np.minimum(source_mm[:, :2].min(axis=0), target_mm[:, :2].min(axis=0))
     maps = [_height_map(points, low, pixel_mm) for points in (source_mm, target_mm)]
     sizes: list[Any] = [
         next_fast_len(a + b - 1, real=True) for a, b in zip(maps[0][0].shape, maps[1][0].shape, strict=True)
     ]
-    details = [_detail(*each, options) for each in maps]
+    details = [_extract_detail(*each, options) for each in maps]
     masks = [mask for _, mask in maps]
     of_mask, of_height, of_detail, of_square = (
         [rfft2(values * mask, sizes) for values, mask in zip(each, masks, strict=True)]
@@ -200,16 +194,16 @@ def correlate_heights(
     both = correlated(of_detail[1], of_detail[0]) - of_target * of_source / count
     spread = correlated(of_square[1], of_mask[0]) - of_target**2 / count
     spread *= correlated(of_mask[1], of_square[0]) - of_source**2 / count
-    # The area of the fewest patches, one in each square of a radius, in pixels.
-    enough = count > options.fewest_patches / _PIXEL**2
+    # Area of the fewest patches in pixels, with one patch in each square of one radius.
+    enough = count > options.fewest_patches / options.pixel**2
     usual = max(float(np.median(spread[enough])), 0.0) if enough.any() else 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
-        alike = np.where(enough & (spread > _LEAST_SPREAD * usual), both / np.sqrt(spread), 0.0)
-    score = np.where(alike > options.least_correlation, alike * np.sqrt(count), -np.inf)
+        similarity = np.where(enough & (spread > options.least_spread * usual), both / np.sqrt(spread), 0.0)
+    score = np.where(similarity > options.least_correlation, similarity * np.sqrt(count), -np.inf)
     steps = [np.where(np.arange(n) > n // 2, np.arange(n) - n, np.arange(n)) for n in sizes]
     outside = [np.abs(each * pixel_mm) > reach + pixel_mm for each, reach in zip(steps, reach_mm[:2], strict=True)]
     score[outside[0][:, None] | outside[1]] = -np.inf
-    # Peaks are as wide as the structures that are compared.
+    # The width of a peak is that of the compared structures.
     apart = 1 + 2 * int(options.coarsest_px / 4)
     peaks = np.argwhere((score == maximum_filter(score, apart, mode="wrap")) & np.isfinite(score))
     order = np.argsort(-score[tuple(peaks.T)])[: options.proposals]
@@ -219,7 +213,7 @@ def correlate_heights(
 
 
 def _height_map(points: np.ndarray, low: np.ndarray, pixel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean heights (H, W), and a mask (H, W) of 1 where there are points."""
+    """Return mean heights (H, W), and a mask (H, W) of pixels with points."""
     cells = np.floor((points[:, :2] - low) / pixel).astype(np.int64)
     shape = tuple(cells.max(axis=0) + 1)
     flat = np.ravel_multi_index(tuple(cells.T), shape)
@@ -228,8 +222,8 @@ def _height_map(points: np.ndarray, low: np.ndarray, pixel: float) -> tuple[np.n
     return total / np.maximum(count, 1), (count > 0).astype(float)
 
 
-def _detail(height: np.ndarray, mask: np.ndarray, options: AlignmentOptions) -> np.ndarray:
-    """Structures (H, W) of the compared sizes."""
+def _extract_detail(height: np.ndarray, mask: np.ndarray, options: AlignmentOptions) -> np.ndarray:
+    """Return the structures (H, W) of the compared sizes (difference of Gaussians)."""
     smooth, coarse = (
         gaussian_filter(height * mask, size) / np.maximum(gaussian_filter(mask, size), 1e-3)
         for size in (options.finest_px, options.coarsest_px)

@@ -1,8 +1,8 @@
-"""Model of a navigation's drift: each component is the integral of a rate, plus a random walk.
+"""Drift model of a navigation: each component is the integral of a rate error, plus a random walk.
 
-These are the two errors that a navigation filter itself carries for a velocity or a gyroscope: a bias, and white noise
-(Farrell, Aided Navigation, 2008, sections 4.6 and 4.9). Where positions are dead-reckoned from velocities v, a heading
-error e adds the integral of e z x v to the error of the position (ibid., chapter 12).
+A navigation filter models the same two errors for a velocity sensor or a gyroscope: bias and white noise (Farrell,
+Aided Navigation, 2008, sections 4.6 and 4.9). If positions are dead-reckoned from velocities v, a heading error e adds
+the integral of e z x v to the position error (ibid., chapter 12).
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ from uwlts.errors import EvaluationError
 from uwlts.model.trajectory import Trajectory
 
 _EXACT = np.repeat([1e-3, 1e-7], 3)
-"""The least drift at the end, mm and rad: navigation is not better."""
+"""Lower bound of the drift at the end, mm and rad; no navigation is more accurate."""
 _START = 1e-7
-"""Variance relative to that at the end that counts as none: 0.1 mm of 0.3 m."""
+"""Variance relative to that at the end, below which it counts as zero: 0.1 mm of 0.3 m."""
 _AS_DEAD_RECKONED = 0.5
-"""Of the covariance of shift and heading by dead reckoning: positions with more are taken as dead-reckoned."""
+"""Least ratio of the position-heading covariance to that of dead reckoning, for positions to count as dead-reckoned."""
 _WALKS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
-"""Shares of a walk in the variance at the end that are compared where none is stated."""
+"""Candidate fractions of a random walk in the variance at the end, if none is stated."""
 _CORRELATION = 0.3
-"""Correlation time of rates, relative to the pass, where none is stated: they change several times at most. Chosen on
-simulated loops 0 and 1 of 4 m: gains and coverage hardly differ from 0.2 to 0.5, and a steady rate states too little.
+"""Default correlation time of rates, relative to the pass: they change several times at most. Chosen on simulated loops
+0 and 1 of 4 m. Gains and coverage differ little from 0.2 to 0.5; a constant rate underestimates the uncertainty.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class DriftModel:
-    """Drift of a navigation from an exact start.
+    """Drift of a navigation that starts without error.
 
     Attributes
     ----------
     std : (6,) float64
-        Standard deviation of shift (mm) and turn (rad) at the end, along and about each axis, without what the
-        heading causes.
+        Standard deviation of position (mm) and rotation (rad) at the end, for each axis, without the effect of heading
+        errors on position.
     walk : (6,) float64
-        Share of the random walk in this variance; the rest is by the rates.
+        Fraction of the random walk in this variance; the rest is due to the rates.
     correlation : float
-        Correlation time of the rates, relative to the duration of the path; inf if they are steady.
+        Correlation time of the rates, relative to the duration of the path; inf for constant rates.
     dead_reckoned : bool
-        Whether a wrong heading turns the way travelled.
+        Whether heading errors rotate the direction of travel.
     stated : bool
-        Whether a covariance says all this; else the share of the walk is estimated.
+        Whether a covariance states these values; otherwise the fraction of the walk is estimated.
     """
 
     std: np.ndarray
@@ -57,58 +57,60 @@ class DriftModel:
 
     @classmethod
     def of_size(cls, drift_mm: float, drift_deg: float) -> DriftModel:
-        """Return the model of a drift whose size (standard deviation at the end) is all that is known."""
+        """Return the default model for a given standard deviation at the end."""
         if not (0 < drift_mm < np.inf and 0 < drift_deg < 90):
-            raise EvaluationError(f"the drift is {drift_mm:g} mm and {drift_deg:g} deg; expected positive numbers")
+            raise EvaluationError(
+                f"the drift is {drift_mm:g} mm and {drift_deg:g} deg; expected positive numbers, below 90 deg"
+            )
         std = np.repeat([drift_mm, float(np.radians(drift_deg))], 3)
         return cls(std, np.full(6, 0.01), _CORRELATION, False, False)
 
     def covariance(self, earlier_s: np.ndarray, later_s: np.ndarray, lasting_s: float) -> np.ndarray:
-        """Return the covariances (6, ...) of each component between times since the start, of so many at the end."""
+        """Return the covariances (6, ...) of each component between times since the start, for a given duration."""
         t, u = earlier_s / lasting_s, later_s / lasting_s
         variance, walk = (each.reshape(6, *np.ones(np.ndim(t - u), int)) for each in (self.std**2, self.walk))
         if np.isinf(self.correlation):
             by_rates = t * u
         else:
-            # Increments of a stationary rate are stationary: their variance gives the covariance.
+            # A stationary rate has stationary increments, whose variance determines the covariance.
             of_t, of_u, of_both, of_end = map(self._increment, (t, u, np.abs(t - u), 1.0))
             by_rates = (of_t + of_u - of_both) / (2 * of_end)
         return variance * ((1 - walk) * by_rates + walk * np.minimum(t, u))
 
     def _increment(self, t: np.ndarray | float) -> np.ndarray:
-        """Variance of the integral over a time t of a rate with Matern's correlation (1 + a) exp(-a).
+        """Return the variance of the integral over a time t of a rate with the Matern correlation (1 + a) exp(-a).
 
-        It changes smoothly (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 4.2).
+        Such a rate is smooth (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 4.2).
         """
         a = np.asarray(t) / self.correlation
         return 2 * a - 3 + (3 + a) * np.exp(-a)
 
     def with_walks(self) -> list[DriftModel]:
-        """Return the same drift with each share of a walk that is compared."""
+        """Return the drift with each candidate fraction of a random walk."""
         return [replace(self, walk=np.full(6, share)) for share in _WALKS]
 
 
-def drift_of(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> DriftModel:
-    """Return the drift by the covariance of a trajectory, or by a size along each axis.
+def choose_drift_model(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> DriftModel:
+    """Return the drift model from the covariance of a trajectory, or from given standard deviations.
 
     Raises
     ------
     EvaluationError
-        The size is wrong, or not known.
+        The given values are not valid, or no covariance is stated.
     """
     if drift_mm is not None and drift_deg is not None:
         return DriftModel.of_size(drift_mm, drift_deg)
     if drift_mm is not None or drift_deg is not None:
-        raise EvaluationError("the drift needs both parts: drift_mm and drift_deg")
+        raise EvaluationError("only one of drift_mm and drift_deg was given; give both")
     if trajectory.covariance is None:
         raise EvaluationError("the trajectory states no covariance: give drift_mm and drift_deg")
     variance = np.einsum("nii->ni", trajectory.covariance).copy()
     dead_reckoned = _is_dead_reckoned(trajectory)
     if dead_reckoned:
-        # The prior adds the part that the heading causes.
+        # The prior adds the effect of heading errors.
         variance[:, :2] -= trajectory.covariance[:, :2, 5] ** 2 / np.maximum(variance[:, 5:], _EXACT[5] ** 2)
     grown = np.maximum(variance.max(axis=0) - variance[0], _EXACT**2)
-    # What is measured all along differs from its start by up to twice its variance.
+    # The difference between two absolute measurements has up to twice the variance of one.
     measured = (grown < variance[0]) & (2 * variance[0] < np.repeat(grown.reshape(2, 3).max(axis=1), 3))
     parts = np.array([_rate_and_walk(trajectory.times_s, each) for each in (variance / grown).T])
     parts *= grown[:, None]
@@ -118,12 +120,12 @@ def drift_of(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | 
 
 
 def _rate_and_walk(times_s: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Parts (2,) of a variance (N,) at the end that a steady rate and a random walk have made since the start.
+    """Split a variance (N,) into contributions (2,) of a constant rate and a random walk at the end of the path.
 
-    The drift began before the first pose, as long before as explains the variance best, relative to its size.
+    The drift may begin before the first pose. The best such time is found by least squares of relative errors.
     """
     t = ((times_s - times_s[0]) / (times_s[-1] - times_s[0]))[:, None]
-    # Only the first poses tell a walk from a rate that began before them: errors count by their size.
+    # Errors are relative, since only the first poses discriminate between a walk and an earlier start of a rate.
     size = np.maximum(variance[:, None], _START)
 
     fits = [nnls((t + before) ** (2, 1) / size, np.ones(len(t))) for before in (0.0, *np.logspace(-4, 1, 201))]
@@ -131,9 +133,9 @@ def _rate_and_walk(times_s: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _is_dead_reckoned(trajectory: Trajectory) -> bool:
-    """Check whether the covariance of shift and heading is that of positions dead-reckoned from velocities v.
+    """Check whether the covariance of position and heading corresponds to dead reckoning from velocities v.
 
-    A heading whose error grows steadily to a variance V gives sqrt(V(t)) times the integral of sqrt(V) z x v until t.
+    For a heading error of variance V from a constant rate, it is sqrt(V(t)) times the integral of sqrt(V) z x v.
     """
     assert trajectory.covariance is not None
     heading = np.sqrt(trajectory.covariance[:, 5, 5])

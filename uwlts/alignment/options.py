@@ -7,60 +7,72 @@ from scipy.stats import chi2
 
 @dataclass(frozen=True)
 class AlignmentOptions:
-    """Settings of `align_trajectory`, which follow from the method, or were chosen on a simulated or rendered pass.
+    """Settings of `align_trajectory`.
+
+    Values without a data set follow from the method.
 
     Attributes
     ----------
     search_sigmas : float
         Search range in standard deviations of the drift: 99.7 % of normal errors.
+    pixel : float
+        Pixel of height maps (unit: patch radius): patches resolve no finer structures.
     finest_px, coarsest_px : float
-        Sizes of the structures that height maps are compared by, in pixels of half a patch radius. Coarser slopes are
-        those of a tilted path. Chosen on a simulated loop of 4 m.
+        Sizes of compared structures in height maps (unit: pixel). Coarser slopes are those of a tilted path. Chosen on
+        a simulated loop of 4 m.
+    least_spread : float
+        Least product of both variances in an overlap, relative to the median; with less, the maps show no structure.
     least_correlation : float
-        Correlation of two height maps that may show one surface: noise, tilts and gaps lower it. Chosen on that loop.
+        Least correlation of two height maps of one surface; noise, tilts and gaps reduce it. Chosen on the same loop.
     proposals : int
-        Places that are tried for each pair of pieces: the true one and its likeliest doubles.
+        Number of positions tried for each pair of pieces: the true one and its most similar alternatives.
     least_lying : float
-        Share of the patches that coincide after a rigid fit of two pieces, which the drift still bends. Chosen on that
-        loop.
+        Least fraction of coinciding patches after a rigid fit of two pieces, which the drift still deforms. Chosen on
+        the same loop.
     decided_after : int
-        Pieces after which a hypothesis is decided: a crossing and its doubles are seen within as many swath widths.
+        Number of pieces after which a hypothesis is decided: a crossing and its alternatives appear within this number
+        of swath widths.
     rival_share : float
-        Patches of another place, relative to the best one, that make a crossing doubtful if it holds too.
+        Number of patches of another position, relative to the best one, from which a consistent rival makes a crossing
+        ambiguous.
     least_gain : float
-        Standard deviation of a shift at some crossing by the navigation, relative to that after the alignment: with
-        less the trajectory is used as it is.
+        Least ratio of the navigation's position uncertainty at a crossing to that after the alignment; with less, the
+        trajectory is not corrected.
     fewest_patches : int
-        Patches of a crossing: five for each parameter of a rigid movement.
+        Least number of patches of a crossing: five for each parameter of a rigid motion.
     least_agreeing, least_held_out : float
-        Share of all patches of a crossing, and of its held-out patches, that agree within ``agreeing_sigmas``. Wrong
-        places reach 0.8 of all, since the path bends, but few of the held-out ones. Chosen on rendered passes.
+        Least fraction of all patches of a crossing, and of its held-out patches, that agree within
+        ``agreeing_sigmas``. Wrong positions reach 0.8 of all patches, since the path adapts, but few held-out ones.
+        Chosen on rendered passes.
     fewest_held_out : int
-        Held-out patches of a crossing whose share is judged: that of fewer says little.
+        Least number of held-out patches for which their fraction is tested.
     agreeing_sigmas : float
-        Standard deviations of a distance, by the noise of the points alone, within which a patch agrees.
+        Largest distance of an agreeing patch in standard deviations of the noise of the points.
     held_out_every : int
-        One of so many cubes is held out of the estimate and judges it.
+        One cube in this number is held out of the estimate for validation.
     held_out_cube : float
-        Side of these cubes in patch radii: neighbouring patches share points.
+        Side of these cubes (unit: patch radius), large because neighbouring patches share points.
     intervals : int
-        Intervals between even nodes of the path: a random walk moves by a tenth of its whole within one.
+        Number of intervals between regular nodes of the path: within one, a random walk moves by a tenth of its total.
     most_nodes : int
-        Nodes within crossings at most: normal matrices of 3000 unknowns take 72 MB.
+        Largest number of nodes in crossings: normal matrices of 3000 unknowns take 72 MB.
     node_spacing : float
-        Distance of nodes within crossings in patch radii: with half of one the walk between nodes stays below the
-        scatter of patches. Chosen on simulated passes with a walk of 30 mm.
+        Spacing of nodes in crossings (unit: patch radius), at which the walk between nodes stays below the scatter of
+        patches. Chosen on simulated passes with a walk of 30 mm.
     rounds : int
-        Rounds of least squares at most.
+        Largest number of least-squares rounds.
     still : float
-        Root mean square step, in standard deviations, that ends the rounds: changing matches make smaller steps.
+        Root-mean-square step, in standard deviations, that ends the rounds; changes of correspondences cause smaller
+        steps.
     refits : int
-        Times at most that patches are fitted anew to the corrected path in the end: the drift within them tilts them.
+        Largest number of times that patches are refitted along the corrected path, because drift tilts them.
     settled : float
-        Root mean square step, in standard deviations, that ends these.
+        Root-mean-square step, in standard deviations, that ends the refits.
     """
 
     search_sigmas: float = 3.0
+    pixel: float = 0.5
+    least_spread: float = 1e-3
     finest_px: float = 1.0
     coarsest_px: float = 12.0
     least_correlation: float = 0.35
@@ -86,5 +98,5 @@ class AlignmentOptions:
 
     @property
     def gate(self) -> float:
-        """Squared Mahalanobis distance of a shift and a turn that is as likely as ``search_sigmas`` of one number."""
+        """Squared Mahalanobis distance in six dimensions with the same probability as ``search_sigmas`` in one."""
         return float(chi2.ppf(chi2.cdf(self.search_sigmas**2, 1), 6))

@@ -1,7 +1,7 @@
-"""Smooth correction of a path by the surfaces that it shows more than once.
+"""Smooth correction of a path from surfaces that it shows more than once.
 
-The unknowns are a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, with
-the prior of `path_prior`. `path_solution` finds it.
+The unknowns are a translation (mm) and a rotation vector (rad) of each pose, in the base frame about the platform. The
+prior is that of `path_prior`. `path_solution` solves for them.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from uwlts.alignment.pieces import Piece, Survey
 from uwlts.fitting.patches import PatchDistances, Patches, distances_between, rigid_derivatives
 
 Pair = tuple[int, int]
-"""Numbers of two pieces that show the same surface, the earlier first."""
+"""Numbers of two pieces that show the same surface, in chronological order."""
 
 
 @dataclass(frozen=True, eq=False)
 class PathEstimate:
-    """Correction of a path by the pairs of its pieces that cross.
+    """Correction of a path by its pairs of crossing pieces.
 
     Attributes
     ----------
@@ -34,11 +34,11 @@ class PathEstimate:
     pieces : tuple of Piece
     pairs : tuple of Pair
     values : (6 C,)
-        Shift and turn at the nodes of the prior.
+        Translations and rotations at the nodes of the prior.
     numbers : (6 C,)
-        The same as independent numbers of the prior.
+        The same in whitened coordinates, which have a unit covariance in the prior.
     factor : (6 C, 6 C)
-        Lower root of the normal matrix of these numbers.
+        Lower Cholesky factor of the normal matrix of the whitened coordinates.
     """
 
     survey: Survey
@@ -51,17 +51,17 @@ class PathEstimate:
     factor: np.ndarray
 
     def corrections(self, times_s: np.ndarray) -> np.ndarray:
-        """Return shift and turn (N, 6) at times (N,)."""
+        """Return translations and rotations (N, 6) at times (N,)."""
         return self.prior.evaluate(self.values, times_s)
 
     def rates(self, times_s: np.ndarray) -> np.ndarray:
-        """Return the growth of shift and turn (N, 6) per second over a patch about times (N,)."""
+        """Return the time derivative (N, 6) of translation and rotation, averaged over a patch at times (N,)."""
         half = self.survey.radius_mm / self.survey.speed_mm_s
         return (self.corrections(times_s + half) - self.corrections(times_s - half)) / (2 * half)
 
     @cached_property
     def image_corrections(self) -> np.ndarray:
-        """Shift and turn (M, 6) of each image."""
+        """Translation and rotation (M, 6) of each image."""
         return self.corrections(self.survey.moments_s)
 
     @cached_property
@@ -71,7 +71,7 @@ class PathEstimate:
 
     @property
     def reach_mm(self) -> float:
-        """Distance within which patches are matched."""
+        """Largest distance of matched patches, mm."""
         return 2 * self.survey.radius_mm
 
     def points(self, number: int) -> np.ndarray:
@@ -79,16 +79,16 @@ class PathEstimate:
         return self.survey.points_along(self.pieces[number].part, self.image_corrections)
 
     def distances(self, source: int, target: int, *, reach_mm: float) -> tuple[PatchDistances, np.ndarray]:
-        """Return the distances (Q,) of one piece from another, and a mask (Q,) of those held out of the estimate."""
+        """Measure the distances (Q,) of one piece from another; return them with a mask (Q,) of held-out ones."""
         found = distances_between(self.surfaces[source], np.eye(4), self.surfaces[target], np.eye(4), reach_mm=reach_mm)
         return found, self.pieces[source].held_out[found.source] | self.pieces[target].held_out[found.target]
 
     def compared(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
-        """Return the `distances` of the later piece of a pair from the earlier one, within twice the reach."""
+        """Measure the distances of the later piece of a pair from the earlier one, within twice the reach."""
         return self.distances(pair[1], pair[0], reach_mm=2 * self.reach_mm)
 
     def agrees(self, pair: Pair) -> bool:
-        """Check whether the surfaces of a pair agree, also where they were held out."""
+        """Check whether the surfaces of a pair agree, including held-out patches."""
         found, held_out = self.compared(pair)
         options = self.options
         fits = np.abs(found.distance_mm) < options.agreeing_sigmas * found.std_mm
@@ -98,7 +98,7 @@ class PathEstimate:
         return bool(not judged or np.mean(fits[held_out]) >= options.least_held_out)
 
     def relative_movement(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
-        """Return the derivatives (6, 6 C) of shift and turn of the later piece against the earlier, at a place (3,)."""
+        """Return the derivatives (6, 6 C) of the later piece's motion relative to the earlier one at a place (3,)."""
         result = np.zeros((6, 6, self.prior.count))
         for number, sign in zip(pair, (-1.0, 1.0), strict=True):
             piece = self.pieces[number]
@@ -111,7 +111,7 @@ class PathEstimate:
         return result.reshape(6, -1)
 
     def relative_covariance(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
-        """Return the covariance (6, 6) of shift and turn of the later piece against the earlier, at a place (3,)."""
+        """Return the covariance (6, 6) of the later piece's motion relative to the earlier one at a place (3,)."""
         by = self.relative_movement(pair, at_mm)
         used = np.flatnonzero(by.any(axis=0))
         return by[:, used] @ self.covariance[np.ix_(used, used)] @ by[:, used].T

@@ -1,6 +1,6 @@
-"""Prior distribution of the correction of a path: its values at nodes, linear in time between them.
+"""Prior distribution of a path correction, given by values at nodes with linear interpolation in time.
 
-Unknowns are ordered by component: the shift along X at all C nodes, then Y and Z, then the turns about them.
+Unknowns are ordered by component: translation along X at all C nodes, then Y and Z, then the rotations about them.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from uwlts.alignment.drift_model import DriftModel
 from uwlts.model.trajectory import Trajectory
 
 _EXACT = 1e-10
-"""Variance of the start of the path, relative to that at its end: the start defines the frame."""
+"""Variance at the start of the path, relative to that at its end; the start defines the frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class PathPrior:
-    """Normal distribution of the values at nodes (C,) by the drift of the navigation along a trajectory.
+    """Normal distribution of the values at nodes (C,) that follows from the drift along a trajectory.
 
-    The values are a root R (6 C, 6 C) times as many independent numbers of variance one. R is not formed: components
-    are independent, except for the way that a wrong heading turns.
+    The values are a root R (6 C, 6 C) times whitened coordinates. R is not formed explicitly, since the components are
+    independent except for the effect of heading errors on position.
     """
 
     nodes_s: np.ndarray
@@ -31,11 +31,14 @@ class PathPrior:
 
     @classmethod
     def over(cls, times_s: np.ndarray, drift: DriftModel, trajectory: Trajectory, *, intervals: int) -> PathPrior:
-        """Return the prior with even nodes over the times (N,) of the points."""
+        """Return the prior with regular nodes over the times (N,) of the points."""
         return cls(np.linspace(times_s.min(), times_s.max(), intervals + 1), drift, trajectory)
 
     def with_nodes(self, times_s: np.ndarray, step_s: float, *, most: int) -> PathPrior:
-        """Return the prior with nodes every ``step_s`` about times (N,), or farther apart where that takes too many."""
+        """Return the prior with additional nodes around times (N,).
+
+        Their spacing is ``step_s``, or larger if more than ``most`` nodes would be needed.
+        """
         first, last = self.nodes_s[[0, -1]]
         while True:
             cells = np.unique(np.floor((times_s - first) / step_s))
@@ -43,7 +46,7 @@ class PathPrior:
             if len(closer) <= most:
                 break
             step_s *= 2
-        # Even nodes among closer ones would only make short intervals.
+        # Drop regular nodes between dense ones, which would create short intervals.
         apart = np.min(np.abs(self.nodes_s[:, None] - closer), axis=1, initial=np.inf) > step_s
         apart[[0, -1]] = True
         inner = closer[(closer > first + step_s / 2) & (closer < last - step_s / 2)]
@@ -55,7 +58,7 @@ class PathPrior:
         return len(self.nodes_s)
 
     def weights(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the number (N,) of the node before each time (N,), and the weight (N,) of the node after it."""
+        """Return the index (N,) of the node before each time (N,), and the weight (N,) of the next node."""
         before = np.clip(np.searchsorted(self.nodes_s, times_s, side="right") - 1, 0, self.count - 2)
         after = (times_s - self.nodes_s[before]) / np.diff(self.nodes_s)[before]
         return before, np.clip(after, 0.0, 1.0)
@@ -68,7 +71,7 @@ class PathPrior:
         return result
 
     def evaluate(self, values: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-        """Return shift and turn (N, 6) at times (N,) by the values (6 C,) at the nodes."""
+        """Interpolate translations and rotations (N, 6) at times (N,) from the values (6 C,) at the nodes."""
         return np.stack([np.interp(times_s, self.nodes_s, each) for each in values.reshape(6, -1)], axis=1)
 
     def times_root(self, matrix: np.ndarray) -> np.ndarray:
@@ -87,7 +90,7 @@ class PathPrior:
         return (self._roots.transpose(0, 2, 1) @ parts).reshape(matrix.shape)
 
     def with_evidence(self, normal: np.ndarray) -> np.ndarray:
-        """Return the normal matrix (6 C, 6 C) of the independent numbers, by that of the values without prior."""
+        """Return the normal matrix (6 C, 6 C) of the whitened coordinates from that of the values without prior."""
         half = self.times_transposed_root(normal)
         return np.eye(len(normal)) + self.times_transposed_root(half.T)
 
@@ -100,7 +103,7 @@ class PathPrior:
 
     @cached_property
     def _turned(self) -> np.ndarray:
-        """Ways (2, C, C) along X and Y, mm, by which a unit of turn at each node turns the path until each."""
+        """Position changes (2, C, C) along X and Y, mm, at each node per unit of rotation at each node."""
         steps = np.diff(self.trajectory.poses_at(self.nodes_s)[:, :2, 3], axis=0)
         mean = (np.eye(self.count)[1:] + np.eye(self.count)[:-1]) / 2
         until = np.tri(self.count, self.count - 1, -1)

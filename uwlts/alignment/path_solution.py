@@ -1,6 +1,6 @@
-"""Least squares for the correction of a path: distances between its pieces, and the drift of its navigation.
+"""Least-squares solution of a path correction from distances between pieces and the drift of the navigation.
 
-Movements that the surface leaves open, as along a plain pipe, keep their prior.
+Motions that the surface does not determine, for example along a plain pipe, keep their prior.
 """
 
 from __future__ import annotations
@@ -15,29 +15,30 @@ from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.pieces import Survey, fit_piece
-from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
 from uwlts.fitting.patches import (
     LEAST_INFORMATION,
     PatchDistances,
-    information_of_slopes,
+    decompose_motions,
     rigid_derivatives,
-    ways_of_moving,
+    slope_information,
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A place where the later piece of a pair coincides with the earlier.
+    """Pose in which the later piece of a pair may coincide with the earlier one.
 
     Attributes
     ----------
     pair : Pair
     at_mm : (3,)
+        Reference point of the rotation.
     relative, std : (6,)
-        Correction of the later piece against the earlier, a shift (mm) and a turn (rad) at ``at_mm``, and its standard
-        deviation.
+        Translation (mm) and rotation (rad) of the later piece relative to the earlier one at ``at_mm``, and its
+        standard deviation.
     patches : int
-        Number of patches that agree there.
+        Number of agreeing patches.
     """
 
     pair: Pair
@@ -47,8 +48,8 @@ class Hypothesis:
     patches: int
 
 
-def uncorrected(survey: Survey, prior: PathPrior, options: AlignmentOptions) -> PathEstimate:
-    """Return the estimate before any crossing: no correction."""
+def initial_estimate(survey: Survey, prior: PathPrior, options: AlignmentOptions) -> PathEstimate:
+    """Return the initial estimate, without correction."""
     still, zeros = np.zeros((len(survey.moments_s), 6)), np.zeros(6 * prior.count)
     laid = (fit_piece(survey, part, still, still, options) for part in survey.parts)
     pieces = tuple(piece for piece in laid if piece is not None)
@@ -56,24 +57,24 @@ def uncorrected(survey: Survey, prior: PathPrior, options: AlignmentOptions) -> 
 
 
 def solve(estimate: PathEstimate) -> PathEstimate:
-    """Estimate until nothing moves any more."""
+    """Iterate the least-squares steps until they are negligible."""
     for _ in range(estimate.options.rounds):
-        before, estimate = estimate.numbers, _step(estimate, *_evidence(estimate))
-        if _moved(estimate, before) < estimate.options.still:
+        before, estimate = estimate.numbers, _solve_step(estimate, *_normal_equations(estimate))
+        if _step_size(estimate, before) < estimate.options.still:
             break
     return estimate
 
 
 def bring_together(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstimate:
     """Move the path by a hypothesis, so that the surfaces of its pair match, and add the pair."""
-    by, (normal, right) = estimate.relative_movement(hypothesis.pair, hypothesis.at_mm), _evidence(estimate)
+    by, (normal, right) = estimate.relative_movement(hypothesis.pair, hypothesis.at_mm), _normal_equations(estimate)
     weighted = by.T / hypothesis.std**2
-    moved = _step(estimate, normal + weighted @ by, right + weighted @ hypothesis.relative[:, None])
+    moved = _solve_step(estimate, normal + weighted @ by, right + weighted @ hypothesis.relative[:, None])
     return replace(moved, pairs=(*moved.pairs, hypothesis.pair))
 
 
 def refine_nodes(estimate: PathEstimate) -> PathEstimate:
-    """Return the same correction with nodes as close as patches require where pairs overlap; `solve` goes on."""
+    """Return the same correction with dense nodes where pairs overlap; `solve` continues from it."""
     survey, options, times = estimate.survey, estimate.options, []
     for earlier, later in estimate.pairs:
         found, _ = estimate.compared((earlier, later))
@@ -82,11 +83,11 @@ def refine_nodes(estimate: PathEstimate) -> PathEstimate:
     even = PathPrior.over(
         survey.moments_s, estimate.prior.drift, estimate.prior.trajectory, intervals=options.intervals
     )
-    return _restarted(estimate, even.with_nodes(np.concatenate([[], *times]), step, most=options.most_nodes))
+    return _change_prior(estimate, even.with_nodes(np.concatenate([[], *times]), step, most=options.most_nodes))
 
 
 def refit(estimate: PathEstimate, numbers: Iterable[int]) -> PathEstimate:
-    """Fit the patches of some pieces to their points along the corrected path."""
+    """Refit the patches of some pieces to their points along the corrected path."""
     pieces, survey = list(estimate.pieces), estimate.survey
     rates = estimate.rates(survey.moments_s)
     for number in numbers:
@@ -96,28 +97,28 @@ def refit(estimate: PathEstimate, numbers: Iterable[int]) -> PathEstimate:
 
 
 def settle(estimate: PathEstimate) -> PathEstimate:
-    """Estimate path and patches in turn, with the walk that is likeliest where none is stated.
+    """Estimate path and patches alternately; drop pairs that then disagree.
 
-    Pairs that do not agree afterwards are dropped.
+    If no random walk is stated, the most likely one is used.
     """
     estimate = solve(refine_nodes(estimate))
     crossing = {number for pair in estimate.pairs for number in pair}
     for _ in range(estimate.options.refits):
-        before, estimate = estimate.numbers, solve(refit(_with_likeliest_walk(estimate), crossing))
-        if _moved(estimate, before) < estimate.options.settled:
+        before, estimate = estimate.numbers, solve(refit(_select_walk(estimate), crossing))
+        if _step_size(estimate, before) < estimate.options.settled:
             break
     agreeing = tuple(pair for pair in estimate.pairs if estimate.agrees(pair))
     return estimate if len(agreeing) == len(estimate.pairs) else settle(replace(estimate, pairs=agreeing))
 
 
-def _with_likeliest_walk(estimate: PathEstimate) -> PathEstimate:
-    """Take the random walk of maximum marginal likelihood; a stated one stays.
+def _select_walk(estimate: PathEstimate) -> PathEstimate:
+    """Select the random walk of maximum marginal likelihood, unless one is stated.
 
-    The path is integrated out (empirical Bayes: MacKay, Neural Computation 4, 1992).
+    The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992).
     """
     if estimate.prior.drift.stated:
         return estimate
-    normal, right = _evidence(estimate)
+    normal, right = _normal_equations(estimate)
 
     def twice_log_likelihood(prior: PathPrior) -> float:
         factor = np.linalg.cholesky(prior.with_evidence(normal))
@@ -126,31 +127,31 @@ def _with_likeliest_walk(estimate: PathEstimate) -> PathEstimate:
 
     priors = [replace(estimate.prior, drift=drift) for drift in estimate.prior.drift.with_walks()]
     best = max(priors, key=twice_log_likelihood)
-    return estimate if (best.drift.walk == estimate.prior.drift.walk).all() else _restarted(estimate, best)
+    return estimate if (best.drift.walk == estimate.prior.drift.walk).all() else _change_prior(estimate, best)
 
 
-def _restarted(estimate: PathEstimate, prior: PathPrior) -> PathEstimate:
-    """The same correction with another prior, before the next step."""
+def _change_prior(estimate: PathEstimate, prior: PathPrior) -> PathEstimate:
+    """Return the same correction with another prior."""
     values = estimate.corrections(prior.nodes_s).T.ravel()
     zeros = np.zeros(len(values))
     return replace(estimate, prior=prior, values=values, numbers=zeros, factor=np.eye(len(zeros)))
 
 
-def _moved(estimate: PathEstimate, before: np.ndarray) -> float:
-    """Root mean square step since other numbers (6 C,) of the same prior, in standard deviations of the estimate."""
+def _step_size(estimate: PathEstimate, before: np.ndarray) -> float:
+    """Return the rms step from earlier whitened coordinates (6 C,), in standard deviations of the estimate."""
     return float(np.sqrt(np.mean((estimate.factor.T @ (estimate.numbers - before)) ** 2)))
 
 
-def _step(estimate: PathEstimate, normal: np.ndarray, right: np.ndarray) -> PathEstimate:
-    """One step of least squares."""
+def _solve_step(estimate: PathEstimate, normal: np.ndarray, right: np.ndarray) -> PathEstimate:
+    """Perform one least-squares step."""
     prior = estimate.prior
     factor = np.linalg.cholesky(prior.with_evidence(normal))
     numbers = cho_solve((factor, True), prior.times_transposed_root(right))
     return replace(estimate, values=prior.times_root(numbers)[:, 0], numbers=numbers[:, 0], factor=factor)
 
 
-def _evidence(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
-    """Normal matrix (6 C, 6 C) and right-hand side (6 C, 1) for the values by all pairs, without the prior."""
+def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal matrix (6 C, 6 C) and right-hand side (6 C, 1) of the values from all pairs, without prior."""
     count = len(estimate.values)
     normal, gradient = np.zeros((count, count)), np.zeros(count)
     for pair in estimate.pairs:
@@ -159,7 +160,7 @@ def _evidence(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: np.ndarray) -> None:
-    """Add the distances of both pieces, each from the other, to the normal matrix and the gradient."""
+    """Add the distances of a pair, measured in both directions, to the normal matrix and the gradient."""
     ways = []
     for source, target in (pair[::-1], pair):
         found, held_out = estimate.distances(source, target, reach_mm=estimate.reach_mm)
@@ -168,24 +169,24 @@ def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: 
             continue
         relative = used.distance_mm / used.std_mm
         spread = noise_factor(relative)
-        # Both directions count by half, and neighbouring patches share points.
+        # Each direction has half the weight, and overlapping patches share points.
         shared = 2 * estimate.pieces[source].patches.shared
         ways.append((source, target, used, biweight(relative / spread) / (used.std_mm * spread) ** 2 / shared))
     if not ways:
         return
     middle = np.vstack([used.places_mm for _, _, used, _ in ways]).mean(axis=0)
     twists = [rigid_derivatives(used.places_mm, used.normals, middle) for _, _, used, _ in ways]
-    observable = _observable([(*way[2:], twist) for way, twist in zip(ways, twists, strict=True)], middle)
+    observable = _observable_projection([(*way[2:], twist) for way, twist in zip(ways, twists, strict=True)], middle)
     for (source, target, used, weight), twist in zip(ways, twists, strict=True):
         seen = twist @ observable
         derivatives = np.zeros((len(weight), 6, estimate.prior.count))
         for number, at, sign in ((source, used.source, 1.0), (target, used.target, -1.0)):
             piece, by = estimate.pieces[number], seen.copy()
-            # Beside the middle of a patch the surface was seen a little earlier or later.
+            # Points off the centre of a patch were measured slightly earlier or later.
             off = used.places_mm - estimate.surfaces[number].places_mm[at]
             later = np.einsum("qi,qi->q", piece.slopes_s_mm[at], off)
             times = piece.times_s[at] + later
-            # Turns of the path are about the platform.
+            # Rotations of the path are about the platform.
             platform = piece.platform_mm[at] + later[:, None] * piece.velocity_mm_s[at]
             by[:, 3:] += np.cross(middle - platform - estimate.corrections(times)[:, :3], by[:, :3])
             derivatives += sign * by[:, :, None] * estimate.prior.basis(times)[:, None]
@@ -196,14 +197,15 @@ def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: 
         gradient[near] += derivatives.T @ (weight * used.distance_mm)
 
 
-def _observable(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:
-    """Projection (6, 6) of shift and turn to the part that the surfaces determine.
+def _observable_projection(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:
+    """Return the projection (6, 6) of a motion onto the part that the surfaces determine.
 
-    The ways are distances, their weights (Q,), and their derivatives (Q, 6) by shift and turn about the middle.
+    ``ways`` are distances, their weights (Q,), and their derivatives (Q, 6) by translation and rotation about
+    ``middle`` (3,).
     """
     normal, feigned = np.zeros((6, 6)), np.zeros((6, 6))
-    places = np.vstack([used.places_mm for used, *_ in ways]) - middle
-    scale = np.repeat([1.0, 1 / float(np.sqrt(np.mean(np.sum(places**2, axis=1))))], 3)
+    places = np.vstack([used.places_mm for used, *_ in ways])
+    scale = np.repeat([1.0, 1 / rms_distance(places, middle)], 3)
     for used, weight, twist in ways:
         by = twist * scale
         normal += by.T @ (weight[:, None] * by)
@@ -211,7 +213,7 @@ def _observable(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middl
         def scaled_twists(directions: np.ndarray, places: np.ndarray = used.places_mm) -> np.ndarray:
             return rigid_derivatives(places, directions, middle) * scale
 
-        feigned += information_of_slopes(used.normals, weight * used.slope_variance, scaled_twists)
-    information, movements, metric = ways_of_moving(normal, feigned)
+        feigned += slope_information(used.normals, weight * used.slope_variance, scaled_twists)
+    information, movements, metric = decompose_motions(normal, feigned)
     open_ = movements[:, information <= LEAST_INFORMATION]
     return scale[:, None] * (np.eye(6) - open_ @ open_.T @ metric) / scale

@@ -1,4 +1,4 @@
-"""Pieces of a path, each about as long as the stripe is wide, and the patches of the surface that each shows."""
+"""Pieces of a path, each about as long as the stripe is wide, and their surface patches."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.alignment.options import AlignmentOptions
 from uwlts.errors import EvaluationError
-from uwlts.fitting.patches import Patches, disc_radius, surface_patches
+from uwlts.fitting.patches import Patches, find_disc_radius, surface_patches
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.cloud import PointCloud
 
 _FEWEST_POINTS = 200
-"""Points of a piece: fewer hold no patches."""
+"""Least number of points of a piece with patches."""
 _ACROSS = 1e-6
-"""Ridge relative to the extent of the neighbours of a patch: across a surface times do not grow."""
+"""Ridge relative to the extent of a patch's neighbours, which sets the time gradient along the normal to zero."""
 _ALONE_MM2 = 1e-9
-"""Ridge of a patch without neighbours, about which times do not grow."""
+"""Ridge of a patch without neighbours, which sets its time gradient to zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Points of a scan, with the platform's places when they were measured, by its navigation.
+    """Points of a scan, with the platform's positions from its navigation.
 
     Attributes
     ----------
@@ -34,12 +34,13 @@ class Survey:
     image : (N,) int
         Image of each point.
     platform_mm, velocity_mm_s : (M, 3)
+        Position and velocity of the platform at each image.
     parts : tuple of (K,) int
-        Numbers of the points of each piece.
+        Indices of the points of each piece.
     radius_mm : float
         Radius of patches.
     speed_mm_s : float
-        Speed of the stripe over the surface.
+        Speed of the stripe on the surface.
     """
 
     cloud: PointCloud
@@ -53,7 +54,7 @@ class Survey:
 
     @classmethod
     def along(cls, cloud: PointCloud, times_s: np.ndarray, trajectory: Trajectory) -> Survey:
-        """Divide a cloud, with times (N,) of its points by the trajectory's clock, into pieces."""
+        """Divide a cloud into pieces, given the times (N,) of its points on the trajectory's clock."""
         moments, image = np.unique(times_s, return_inverse=True)
         order = np.argsort(image, kind="stable")
         by_image = np.split(cloud.points_mm[order], np.searchsorted(image[order], np.arange(1, len(moments))))
@@ -63,37 +64,37 @@ class Survey:
         count = max(2, round(way[-1] / swath))
         number = np.minimum((way / way[-1] * count).astype(int), count - 1)[image]
         parts = tuple(np.flatnonzero(number == each) for each in range(count))
-        radius = disc_radius(cloud.points_mm[parts[count // 2]])
+        radius = find_disc_radius(cloud.points_mm[parts[count // 2]])
         platform, velocity = trajectory.poses_at(moments)[:, :3, 3], trajectory.rates_at(moments)[:, :3]
         long_enough = tuple(part for part in parts if len(part) >= _FEWEST_POINTS)
         return cls(cloud, moments, image, platform, velocity, long_enough, radius, way[-1] / float(np.ptp(moments)))
 
     def points_along(self, part: np.ndarray, corrections: np.ndarray) -> np.ndarray:
-        """Return points (K, 3), by their numbers, along the path with corrections (M, 6) of the images."""
+        """Return the points (K, 3) with given indices, along the path with corrections (M, 6) of the images."""
         image = self.image[part]
-        return moved(corrections[image], self.platform_mm[image], self.cloud.points_mm[part])
+        return correct_places(corrections[image], self.platform_mm[image], self.cloud.points_mm[part])
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the path, and P patches of its surface.
+    """Piece of a path with P surface patches.
 
     Attributes
     ----------
     part : (K,) int
-        Numbers of its points.
+        Indices of its points.
     patches : Patches
-        Along the corrected path when they were fitted.
+        Patches along the path that was current when they were fitted.
     back : (P, 3, 3)
-        From the surface around each patch then to that by the navigation.
+        Linear map from the surface around each patch to that along the navigated path.
     places_mm : (P, 3)
-        Of the patches by the navigation.
+        Positions of the patches along the navigated path.
     times_s, slopes_s_mm : (P,) and (P, 3)
-        Times of the patches, and how they grow over the surface.
+        Times of the patches, and the gradient of time over the surface.
     platform_mm, velocity_mm_s : (P, 3)
-        Place and velocity of the platform at these times.
+        Position and velocity of the platform at these times.
     held_out : (P,) bool
-        Patches that judge the estimate.
+        Patches that validate the estimate.
     """
 
     part: np.ndarray
@@ -108,15 +109,15 @@ class Piece:
 
     @property
     def middle_s(self) -> float:
-        """Time in the middle of the piece."""
+        """Median time of the piece, s."""
         return float(np.median(self.times_s))
 
     def along(self, corrections: np.ndarray, rates: np.ndarray) -> Patches:
-        """Return the patches along the path with corrections and their rates per second (P, 6) at their times.
+        """Return the patches along the path with corrections (P, 6) and their rates per second (P, 6).
 
-        Images move one by one: a surface along the path is not turned with them, but sheared by their drift.
+        Drift between images shears the surface in addition to its rotation.
         """
-        places = moved(corrections, self.platform_mm, self.places_mm)
+        places = correct_places(corrections, self.platform_mm, self.places_mm)
         tangents = np.einsum("pij,pkj->pki", self.around(corrections, rates) @ self.back, self.patches.axes[:, :2])
         first = tangents[:, 0] / np.linalg.norm(tangents[:, 0], axis=1, keepdims=True)
         normal = np.cross(first, tangents[:, 1])
@@ -125,10 +126,10 @@ class Piece:
         return replace(self.patches, places_mm=places, axes=axes, one_sided=False)
 
     def around(self, corrections: np.ndarray, rates: np.ndarray) -> np.ndarray:
-        """Return the derivatives (P, 3, 3) of the corrected surface around patches, by that of the navigation.
+        """Return the derivatives (P, 3, 3) of corrected positions by navigated positions around patches.
 
-        Of p' = R(t) (p - X(t)) + X(t) + s(t) by p, with the time t that grows over the surface, the turn R, the shift
-        s, and the platform's place X.
+        The corrected position is p' = R(t) (p - X(t)) + X(t) + s(t), with the time t(p). R is the rotation, s the
+        translation, and X the platform's position.
         """
         turn = Rotation.from_rotvec(corrections[:, 3:])
         drifting = np.cross(rates[:, 3:], turn.apply(self.places_mm - self.platform_mm)) + rates[:, :3]
@@ -139,12 +140,12 @@ class Piece:
 def fit_piece(
     survey: Survey, part: np.ndarray, corrections: np.ndarray, rates: np.ndarray, options: AlignmentOptions
 ) -> Piece | None:
-    """Fit patches to points, by their numbers, along the path with corrections and rates (M, 6) of the images.
+    """Fit patches to the points with given indices, along the path with corrections and rates (M, 6) of the images.
 
-    Return None where the points are on no surface.
+    Return None if the points form no surface.
     """
     known = None if survey.cloud.uncertainty is None else survey.cloud.uncertainty[part]
-    # Errors that all points share do not discriminate between the passes of a path.
+    # Errors common to all points do not affect differences between passes.
     known = None if known is None else replace(known, patterns_mm=known.patterns_mm[:0], poses_mm=None)
     try:
         points = survey.points_along(part, corrections)
@@ -157,13 +158,13 @@ def fit_piece(
     places = turned_back.apply(patches.places_mm - platform - corrections[image, :3]) + platform
     cubes = np.floor(places / (options.held_out_cube * survey.radius_mm)).astype(np.int64)
     held_out = (cubes @ np.array([1, 2, 3])) % options.held_out_every == 0
-    slopes = _slopes(places, times, 2 * survey.radius_mm)
+    slopes = _time_gradients(places, times, 2 * survey.radius_mm)
     piece = Piece(part, patches, np.empty(0), places, times, slopes, platform, survey.velocity_mm_s[image], held_out)
     return replace(piece, back=np.linalg.inv(piece.around(corrections[image], rates[image])))
 
 
-def _slopes(places: np.ndarray, times: np.ndarray, reach_mm: float) -> np.ndarray:
-    """How times (P,) grow over places (P, 3), s/mm, by their neighbours."""
+def _time_gradients(places: np.ndarray, times: np.ndarray, reach_mm: float) -> np.ndarray:
+    """Return the gradients (P, 3), s/mm, of times (P,) over places (P, 3), from their neighbours."""
     pairs = KDTree(places).query_pairs(reach_mm, output_type="ndarray")
     first, second = np.vstack([pairs, pairs[:, ::-1]]).T
     about, later = places[second] - places[first], times[second] - times[first]
@@ -175,7 +176,7 @@ def _slopes(places: np.ndarray, times: np.ndarray, reach_mm: float) -> np.ndarra
     return np.linalg.solve(normal, right[:, :, None])[:, :, 0]
 
 
-def moved(corrections: np.ndarray, platform_mm: np.ndarray, places_mm: np.ndarray) -> np.ndarray:
-    """Return places (N, 3) after corrections (N, 6) about the platform's places (N, 3)."""
+def correct_places(corrections: np.ndarray, platform_mm: np.ndarray, places_mm: np.ndarray) -> np.ndarray:
+    """Apply corrections (N, 6) about the platform's positions (N, 3) to places (N, 3)."""
     turned = Rotation.from_rotvec(corrections[:, 3:]).apply(places_mm - platform_mm)
     return turned + platform_mm + corrections[:, :3]

@@ -1,4 +1,4 @@
-"""Change of a surface against an earlier cloud, a mesh or an ideal shape, and where it is more than the uncertainty."""
+"""Change of a surface relative to an earlier cloud, a mesh or an ideal shape, with its level of detection."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from scipy.spatial.transform import Rotation
 from uwlts.comparison.change_reference import (
     Reference,
     ReferencePoints,
-    local_normals,
+    fit_local_normals,
     read_datums,
     read_reference,
     require_enough,
     require_same_unit,
 )
 from uwlts.comparison.ideal_shapes import IdealShape, place_shape
-from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, local_means
+from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, average_locally
+from uwlts.comparison.options import OPTIONS
 from uwlts.errors import EvaluationError
-from uwlts.fitting.point_spacing import disc_of
+from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface
@@ -31,19 +32,12 @@ from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, turned_pair
 from uwlts.storage.cloud_files import loaded_cloud
 from uwlts.storage.pose_files import Unit
 
-_MOST_PLACES = 20_000
-_DEEP = 3.0
-"""Times the disc's diameter: how far along the normal the other surface is looked for unless that is given."""
-_AREA_NEIGHBOURS = 12
-_FEWEST_OF_REGION = 4
-"""Places of a region that is listed; discs of neighbouring places overlap, so that chance also makes pairs."""
-
 
 @dataclass(frozen=True)
 class ChangedRegion:
-    """Neighbouring places that all rose or all sank significantly.
+    """Neighbouring places with a significant change of the same sign.
 
-    Distances are signed, the level of detection is the median of the places', the extent the longest.
+    Distances are signed. ``level_mm`` is the median level of detection, ``extent_mm`` the longest extent.
     """
 
     centre_mm: tuple[float, float, float]
@@ -56,7 +50,7 @@ class ChangedRegion:
     extent_mm: float
 
     def record(self) -> Table:
-        """As JSON."""
+        """Return the region as JSON."""
         return {**asdict(self), "centre_mm": list(self.centre_mm)}
 
 
@@ -67,21 +61,23 @@ class SurfaceChange(Brief):
     Attributes
     ----------
     points_mm, normals : (P, 3) float64
-        Places in the reference's frame, and unit normals of the reference there, towards the sensor (-Z), or outwards
-        of a mesh, a sphere or a cylinder.
+        Places in the reference's frame and unit normals of the reference there. Normals point to the sensor (-Z), or
+        outwards for a mesh, a sphere or a cylinder.
     distance_mm : (P,) float64
-        Mean of the cloud less that of the reference along the normal; NaN where either has fewer than five points.
+        Local mean of the cloud minus that of the reference, along the normal; NaN where either has fewer than five
+        points.
     level_mm : (P,) float64
         Level of detection: 1.96 times the standard uncertainty of the distance.
     area_mm2 : (P,) float64
-        Area of the surface that each place stands for.
+        Surface area that each place represents.
     apart_mm : float
-        Distance of the places from each other, about.
+        Approximate spacing of the places.
     disc_mm, deep_mm : float
-        Diameter of the disc of which points are averaged, and how far along the normal they are looked for.
+        Diameter of the averaging disc and search depth along the normal.
     registration : Registration or None
+        Registration that moved the cloud; None without.
     reference : str
-        What the cloud was compared with, in words.
+        Description of the reference.
     """
 
     points_mm: np.ndarray
@@ -97,26 +93,26 @@ class SurfaceChange(Brief):
 
     @property
     def compared(self) -> np.ndarray:
-        """(P,) bool: where both surfaces were seen."""
+        """Mask (P,) of places where both surfaces have enough points."""
         return np.isfinite(self.distance_mm)
 
     @property
     def significant(self) -> np.ndarray:
-        """(P,) bool: where the distance exceeds its level of detection."""
+        """Mask (P,) of places where the distance exceeds its level of detection."""
         return np.abs(self.distance_mm) > self.level_mm
 
     def regions(self) -> list[ChangedRegion]:
-        """Regions of significant change of at least four places, the largest volumes first."""
+        """Find regions of significant change with at least four places, in descending order of volume."""
         found = []
         for sign in (-1, 1):
             chosen = np.flatnonzero(self.significant & (np.sign(self.distance_mm) == sign))
             if not len(chosen):
                 continue
-            # One place in each cube: those of neighbouring cubes are up to about two sides apart.
+            # Each cube holds one place, so the distance between places of adjacent cubes is up to about two cube sides.
             pairs = KDTree(self.points_mm[chosen]).query_pairs(2 * self.apart_mm, output_type="ndarray")
             links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(chosen),) * 2)
             owner = connected_components(links, directed=False)[1]
-            for number in np.flatnonzero(np.bincount(owner) >= _FEWEST_OF_REGION):
+            for number in np.flatnonzero(np.bincount(owner) >= OPTIONS.fewest_of_region):
                 found.append(self._region(chosen[owner == number]))
         return sorted(found, key=lambda region: -abs(region.volume_mm3))
 
@@ -136,7 +132,7 @@ class SurfaceChange(Brief):
         )
 
     def record(self) -> Table:
-        """All but the places as JSON."""
+        """Return everything except the places as JSON."""
         distance, level = self.distance_mm[self.compared], self.level_mm[self.compared]
         area = self.area_mm2[self.compared]
         changed = distance[np.abs(distance) > level]
@@ -169,7 +165,7 @@ class SurfaceChange(Brief):
         }
 
     def lines(self) -> list[str]:
-        """The summary as text."""
+        """Return a summary as text."""
         known, regions = self.record(), self.regions()
         if not known["compared"]:
             return ["the cloud and the reference do not overlap anywhere"]
@@ -180,8 +176,9 @@ class SurfaceChange(Brief):
             f"level of detection, mm    {known['level_median_mm']:.4f} (median; 95 %)",
             f"significant change        {100 * float(str(known['significant_share'])):.1f} % of the area, "
             f"{known['largest_loss_mm']:+.3f} to {known['largest_rise_mm']:+.3f} mm",
-            f"regions of change          {len(regions)}, of {_FEWEST_OF_REGION} places or more, {self.apart_mm:.3g} mm "
-            f"apart; {np.count_nonzero(self.significant) - sum(each.places for each in regions)} places are in none",
+            f"regions of change         {len(regions)} with at least {OPTIONS.fewest_of_region} places, "
+            f"spacing {self.apart_mm:.3g} mm; "
+            f"{np.count_nonzero(self.significant) - sum(each.places for each in regions)} places are in no region",
         ]
         if (found := self.registration) is not None:
             before = np.linalg.inv(found.transform) @ np.append(found.middle_mm, 1)
@@ -190,7 +187,7 @@ class SurfaceChange(Brief):
             lines.append(
                 f"registration              moved by {shift:.3f} mm and {turn:.4f} deg, rms {found.rms_mm:.4f} mm"
             )
-            lines += [f"  open, left as it was: {name}" for name in found.open_directions]
+            lines += [f"  undetermined, not moved: {name}" for name in found.open_directions]
         return lines
 
 
@@ -207,36 +204,36 @@ def compare_clouds(
 ) -> SurfaceChange:
     """Find where a surface differs from an earlier cloud, a mesh or an ideal shape by more than the uncertainty.
 
-    At each place the points of both within a disc across the reference's normal are averaged (M3C2: Lague, Brodu and
-    Leroux, ISPRS J. 82, 2013). The variance of the distance is that of M3C2-EP (Winiwarter, Anders and Höfle, ISPRS J.
-    178, 2021) with the parts that this sensor's points have: noise of single points, or their roughness where that is
-    larger, over their number; the stage's position of each image; and what all points share by calibration, which no
-    averaging lowers. Of two clouds of one calibration, medium and direction of the stage, what both share of
-    calibration, stage and sheet cancels in the difference. The water's index, which may have drifted between them,
-    does not, unless ``same_water`` says so. A registration, or the fit of an ideal shape, adds its own, and takes up
-    what of the shared errors looks like a movement.
+    At each place, the points of both surfaces in a disc perpendicular to the reference's normal are averaged (M3C2:
+    Lague, Brodu and Leroux, ISPRS J. 82, 2013). The variance of the distance follows M3C2-EP (Winiwarter, Anders and
+    Höfle, ISPRS J. 178, 2021). It has three parts: noise or roughness divided by the number of points, stage position
+    errors of each image, and systematic calibration errors. Averaging does not reduce the latter.
+
+    Clouds of one calibration, medium and stage direction share errors of calibration, stage and sheet. These errors
+    cancel in the difference. The water's refractive index may drift between the scans and does not cancel, unless
+    ``same_water`` is set. A registration or the fit of an ideal shape adds its own uncertainty. It also absorbs
+    systematic errors that resemble a rigid motion.
 
     Parameters
     ----------
     cloud
-        Cloud of the surface, or its file (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
+        Cloud of the surface, or its file (.ply, .h5, .copc.laz; from other programs .las, .e57, or text in mm).
     reference
-        Earlier cloud; the file of a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: "plane",
-        "sphere" or "cylinder" to fit one, or a TOML file with its kind and what is known of it
-        (docs/how-to/compare-scans.md).
+        Earlier cloud; mesh file (.stl, .obj, .off, or .ply with faces); or ideal shape. "plane", "sphere" or "cylinder"
+        fits a shape. A TOML file states its kind and known sizes (docs/how-to/compare-scans.md).
     register
-        Move the cloud onto the reference first; else both have one frame. An ideal shape without a place is fitted
-        anyway.
+        Register the cloud to the reference first; by default both have the same frame. An ideal shape without a
+        position is always fitted.
     datums
-        TOML file with spheres that hold what has not changed (tables [[datum]] with centre_mm and radius_mm), or these
-        as (K, 4) centre and radius in mm: only points in them count for the registration or fit.
+        Spheres around unchanged areas: a TOML file (tables [[datum]] with centre_mm and radius_mm), or an array (K, 4)
+        of centres and radii, mm. Only points in these spheres are used for the registration or fit.
     disc_mm
-        Diameter of the disc; about 30 points of the sparser side unless given.
+        Disc diameter; by default the disc holds about 30 points of the sparser surface.
     deep_mm
-        Largest distance that is looked for; three diameters unless given.
+        Search depth along the normal; by default three disc diameters.
     same_water
-        Both clouds were scanned in water of the same temperature and salinity, so that of one calibration its index is
-        off by the same.
+        Both clouds were scanned in water of the same temperature and salinity. The error of its refractive index then
+        cancels for clouds of one calibration.
     unit
         Unit of the reference, mm or m.
 
@@ -247,7 +244,7 @@ def compare_clouds(
     DescriptionError
         A description of an ideal shape or of datums is not valid.
     EvaluationError
-        Clouds do not overlap, are too small, have sizes as of other units, or do not determine the ideal shape.
+        Clouds do not overlap, are too small, seem to have different units, or do not determine the ideal shape.
 
     Examples
     --------
@@ -259,29 +256,31 @@ def compare_clouds(
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
-    disc = disc_mm or disc_of(require_enough(new.points_mm, "cloud"), new.frame)
+    disc = disc_mm or choose_disc_diameter(require_enough(new.points_mm, "cloud"), new.frame)
     surface = read_reference(reference, unit=unit, disc_mm=disc)
     fixed = None if datums is None else read_datums(datums)
     if isinstance(surface, ReferencePoints):
         require_same_unit(new.points_mm, require_enough(surface.points_mm, "reference"))
         if disc_mm is None and not surface.meshed:
-            disc = max(disc, disc_of(surface.points_mm, surface.frame))
+            disc = max(disc, choose_disc_diameter(surface.points_mm, surface.frame))
         if fixed is not None and not register:
-            raise EvaluationError("datums hold a registration: ask for that, too (`register`)")
-        deep = deep_mm or _DEEP * disc
-        sides = _against_points(new, surface, fixed, register=register, disc=disc, deep=deep, same_water=same_water)
+            raise EvaluationError("datums were given without a registration; set `register`")
+    deep = deep_mm or OPTIONS.depth_per_disc * disc
+    if isinstance(surface, ReferencePoints):
+        sides = _compare_with_points(
+            new, surface, fixed, register=register, disc=disc, deep=deep, same_water=same_water
+        )
     else:
-        sides = _against_shape(new, surface, fixed, register=register, disc=disc, deep=deep_mm or _DEEP * disc)
-    deep = deep_mm or _DEEP * disc
+        sides = _compare_with_shape(new, surface, fixed, register=register, disc=disc, deep=deep)
     variance, found = sides.variance_mm2, sides.registration
     if found is not None:
         variance = variance + found.std_along(sides.places, sides.normals) ** 2
     if not np.isfinite(sides.distance_mm).any():
         raise EvaluationError(
-            f"the cloud and the reference do not overlap within {deep:g} mm: do both have the same frame and unit? "
-            "Give a larger deep_mm, or register them"
+            f"the cloud and the reference do not overlap within {deep:g} mm. Check that both have the same frame and "
+            "unit, give a larger deep_mm, or register them"
         )
-    level, area = TWO_SIDED * np.sqrt(variance), _areas(sides.places)
+    level, area = TWO_SIDED * np.sqrt(variance), _estimate_areas(sides.places)
     return SurfaceChange(
         sides.places,
         sides.normals,
@@ -297,10 +296,10 @@ def compare_clouds(
 
 
 @dataclass(frozen=True, eq=False)
-class _Sides:
-    """Distances (P,) at places that are ``apart_mm``, and their variance without that of the estimate.
+class _Distances:
+    """Distances (P,) at places with a spacing ``apart_mm``, and their variance without that of the registration.
 
-    ``moved`` is the registration if it moved the cloud.
+    ``registration`` is that of a cloud or a fitted shape; ``moved`` is the one that moved the cloud, if any.
     """
 
     places: np.ndarray
@@ -313,7 +312,7 @@ class _Sides:
     reference: str
 
 
-def _against_points(
+def _compare_with_points(
     new: PointCloud,
     surface: ReferencePoints,
     datums: np.ndarray | None,
@@ -322,41 +321,43 @@ def _against_points(
     disc: float,
     deep: float,
     same_water: bool,
-) -> _Sides:
+) -> _Distances:
     points, known, other, found = new.points_mm, new.uncertainty, surface.uncertainty, None
     if register:
         target = surface.points_mm
-        normals = local_normals(target, target, disc_mm=disc) if surface.normals is None else surface.normals
+        normals = fit_local_normals(target, target, disc_mm=disc) if surface.normals is None else surface.normals
         sampled = SampledSurface(target, normals, uncertainty=other, frame=surface.frame)
         found = register_to_surface(points, sampled, reach_mm=deep, uncertainty=known, frame=new.frame, datums=datums)
-        points, known = _moved(points, known, found)
+        points, known = _move_points(points, known, found)
         if other is not None:
-            # The cloud follows what the reference's points share.
+            # The registration follows systematic errors of the reference.
             followed = [found.moves_mm(step, target) for step in found.by_reference]
             other = replace(other, patterns_mm=other.patterns_mm - np.array(followed, np.float32))
-    chosen, apart = _spread(points, disc / 2)
+    chosen, apart = _thin_points(points, disc / 2)
     places = points[chosen]
-    normals = local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
-    here = local_means(places, normals, points, uncertainty=known, frame=new.frame, disc_mm=disc, deep_mm=deep)
-    there = local_means(
+    normals = fit_local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
+    here = average_locally(places, normals, points, uncertainty=known, frame=new.frame, disc_mm=disc, deep_mm=deep)
+    there = average_locally(
         places, normals, surface.points_mm, uncertainty=other, frame=surface.frame, disc_mm=disc, deep_mm=deep
     )
-    # A mesh is what it is: between its samples nothing scatters.
+    # The samples of a mesh are exact, so their scatter is no noise.
     variance = here.variance_mm2 + (0.0 if surface.meshed else there.variance_mm2)
     variance += np.sum(here.patterns_mm**2, axis=1) + np.sum(there.patterns_mm**2, axis=1)
     if known is not None and other is not None:
-        variance -= 2 * _common(here.patterns_mm, known, there.patterns_mm, other, same_water=same_water)
+        variance -= 2 * _shared_covariance(here.patterns_mm, known, there.patterns_mm, other, same_water=same_water)
     words = "mesh" if surface.meshed else "cloud"
-    return _Sides(places, apart, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
+    return _Distances(places, apart, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
 
 
-def _against_shape(
+def _compare_with_shape(
     new: PointCloud, shape: IdealShape, datums: np.ndarray | None, *, register: bool, disc: float, deep: float
-) -> _Sides:
+) -> _Distances:
     points, known, chosen = new.points_mm, new.uncertainty, slice(None)
     if datums is not None:
         if not (register or shape.fitted):
-            raise EvaluationError("datums hold a registration or a fit, and this shape has a place: add `register`")
+            raise EvaluationError(
+                "datums were given without a registration, and this shape has a given position; set `register`"
+            )
         away = np.linalg.norm(points[:, None] - datums[:, :3], axis=2)
         if shape.fitted:
             chosen = np.flatnonzero(np.any(away <= datums[:, 3], axis=1))
@@ -372,10 +373,10 @@ def _against_shape(
         found = moved = register_to_surface(
             points, placed, reach_mm=deep, uncertainty=known, frame=new.frame, datums=datums
         )
-        points, known = _moved(points, known, found)
-    spread, apart = _spread(points, disc / 2)
+        points, known = _move_points(points, known, found)
+    spread, apart = _thin_points(points, disc / 2)
     places = points[spread]
-    here: LocalMeans = local_means(
+    here: LocalMeans = average_locally(
         places,
         normals := placed.nearest(places).normals,
         points,
@@ -386,13 +387,13 @@ def _against_shape(
         deep_mm=deep,
     )
     variance = here.variance_mm2 + np.sum(here.patterns_mm**2, axis=1)
-    return _Sides(places, apart, normals, here.mean_mm, variance, found, moved, placed.words())
+    return _Distances(places, apart, normals, here.mean_mm, variance, found, moved, placed.describe())
 
 
-def _common(
+def _shared_covariance(
     here: np.ndarray, known: PointUncertainty, there: np.ndarray, other: PointUncertainty, *, same_water: bool
 ) -> np.ndarray:
-    """Covariance (P,) of the means of two clouds by what both share, from the moves (P, M) by the patterns of each."""
+    """Return the covariance (P,) of the local means of two clouds by shared errors, from the shifts (P, M) of each."""
     result = np.zeros(len(here))
     for name in known.shared.keys() & other.shared.keys():
         if same_water or not name.startswith(WATER):
@@ -400,30 +401,33 @@ def _common(
     return result
 
 
-def _areas(places: np.ndarray) -> np.ndarray:
-    """Area (P,) that each place stands for, from the disc about it that holds a dozen others."""
-    count = min(_AREA_NEIGHBOURS, len(places) - 1)
+def _estimate_areas(places: np.ndarray) -> np.ndarray:
+    """Return the area (P,) that each place represents, from the disc that holds its nearest neighbours."""
+    count = min(OPTIONS.area_neighbours, len(places) - 1)
     if count < 1:
         return np.zeros(len(places))
     away = np.asarray(KDTree(places).query(places, k=count + 1, workers=-1)[0])[:, -1]
     return np.pi * away**2 / (count + 0.5)
 
 
-def _spread(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
-    """Indices of one point in each cube of a size, and that size, larger where there would be too many places."""
+def _thin_points(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
+    """Select one point in each cube of side ``apart``; return the indices and the side.
+
+    The side grows if there would be too many places.
+    """
     while True:
         cells = np.floor((points - points.min(axis=0)) / apart).astype(np.int64)
         first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-        if len(first) <= _MOST_PLACES:
+        if len(first) <= OPTIONS.most_places:
             return first, apart
-        # The number of cubes that a surface meets goes with the square of their size.
-        apart *= max(np.sqrt(len(first) / _MOST_PLACES), 1.02)
+        # The number of cubes on a surface is inversely proportional to the square of their side.
+        apart *= max(np.sqrt(len(first) / OPTIONS.most_places), 1.02)
 
 
-def _moved(
+def _move_points(
     points: np.ndarray, known: PointUncertainty | None, found: Registration
 ) -> tuple[np.ndarray, PointUncertainty | None]:
-    """Points after a registration, and their uncertainty with what of the shared errors it takes up."""
+    """Move points by a registration; its response to systematic errors is added to their patterns."""
     rotation = found.transform[:3, :3]
     points = points @ rotation.T + found.transform[:3, 3]
     if known is None:

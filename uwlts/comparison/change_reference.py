@@ -1,4 +1,4 @@
-"""References of a comparison: an earlier cloud, a mesh or an ideal shape; and the datums of a registration."""
+"""References of a comparison (earlier cloud, mesh or ideal shape), and datums of a registration."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from scipy.spatial import KDTree
 
 from uwlts.comparison.ideal_shapes import KINDS, IdealShape, read_shape
+from uwlts.comparison.options import OPTIONS
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, problems_of
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.files.reading import MOST_TOML_BYTES, parsed_toml, read_text, require_regular_file
@@ -22,17 +23,17 @@ from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.pose_files import MM_PER_UNIT, Unit, checked_unit
 
 _SAMPLES_PER_DISC = 60
+"""Samples of a mesh in a disc: twice the points of a cloud, so that the cloud's noise dominates."""
 _MOST_SAMPLES = 3_000_000
+"""Limit of memory for samples of a mesh."""
 _AT_A_TIME = 20_000
-_OTHER_UNIT = 50.0
-"""Ratio of sizes from which two things are given in other units; a metre is a thousand millimetres."""
 
 Reference = PointCloud | IdealShape | str | os.PathLike[str]
 
 
 @dataclass(frozen=True, eq=False)
 class ReferencePoints:
-    """Points (M, 3) of a cloud, or samples of a mesh with its normals, and how well they are known."""
+    """Points (M, 3) of a cloud with their uncertainty, or samples of a mesh with its normals (M, 3)."""
 
     points_mm: np.ndarray
     normals: np.ndarray | None = None
@@ -41,12 +42,12 @@ class ReferencePoints:
 
     @property
     def meshed(self) -> bool:
-        """Whether these are samples of a mesh, between which nothing scatters."""
+        """True for samples of a mesh, which are free of noise."""
         return self.normals is not None
 
 
 class Datum(Description):
-    """A sphere in the reference's frame: what lies in it has not changed, and holds the registration."""
+    """Sphere around an unchanged area in the reference's frame. Points in it are used for a registration."""
 
     centre_mm: Vector
     radius_mm: Positive
@@ -57,16 +58,21 @@ class _Datums(Description):
 
 
 def read_datums(datums: np.ndarray | str | os.PathLike[str]) -> np.ndarray:
-    """Centres and radii (K, 4), mm, from a TOML file with tables [[datum]] (centre_mm, radius_mm), or an array of them.
+    """Read or check centres and radii (K, 4), mm, from a TOML file with tables [[datum]] or from an array.
 
-    CaptureError, DescriptionError or EvaluationError where it cannot be read or is none.
+    Raises
+    ------
+    CaptureError, DescriptionError
+        The file cannot be read or is not valid.
+    EvaluationError
+        The array has another shape, is not finite, or has a radius that is not positive.
     """
     if isinstance(datums, str | os.PathLike):
         text = read_text(Path(datums), most_bytes=MOST_TOML_BYTES, called="datums", foreign="is not valid TOML")
         try:
             known = _Datums.model_validate(parsed_toml(text)).datum
         except ValidationError as error:
-            raise DescriptionError(f"{datums} holds no datums: {problems_of(error)}") from error
+            raise DescriptionError(f"{datums} contains no valid datums: {problems_of(error)}") from error
         except ValueError as error:
             raise DescriptionError(f"{datums} is not valid TOML: {error}") from error
         datums = np.array([(*each.centre_mm, each.radius_mm) for each in known]).reshape(-1, 4)
@@ -82,7 +88,7 @@ def read_datums(datums: np.ndarray | str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_reference(reference: Reference, *, unit: Unit, disc_mm: float) -> ReferencePoints | IdealShape:
-    """The reference as points in mm, or an ideal shape by its name (plane, sphere, cylinder) or TOML file."""
+    """Read a reference as points in mm, or as an ideal shape from its name (plane, sphere, cylinder) or TOML file."""
     scale = MM_PER_UNIT[checked_unit(unit)]
     if isinstance(reference, str) and reference in KINDS:
         reference = KINDS[reference]
@@ -90,19 +96,19 @@ def read_reference(reference: Reference, *, unit: Unit, disc_mm: float) -> Refer
         path = Path(reference)
         if path.suffix.lower() == ".toml":
             reference = read_shape(path)
-        elif (mesh := _mesh(path)) is not None:
-            return sampled(scale * mesh[0], mesh[1], disc_mm=disc_mm)
+        elif (mesh := _read_mesh(path)) is not None:
+            return sample_mesh(scale * mesh[0], mesh[1], disc_mm=disc_mm)
         else:
             reference = read_cloud(path)
     if not isinstance(reference, PointCloud):
         return reference
     if scale != 1.0 and reference.uncertainty is not None:
-        raise EvaluationError("a cloud with uncertainties is in mm: its unit cannot be m")
+        raise EvaluationError("the unit is m, but clouds with uncertainty are always in mm; omit the unit")
     return ReferencePoints(scale * reference.points_mm, None, reference.uncertainty, reference.frame)
 
 
-def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices (V, 3) and triangles (F, 3) of a file; None where it is a cloud."""
+def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Read vertices (V, 3) and triangles (F, 3) of a mesh file; None if the file is a cloud."""
     if path.suffix.lower() == ".h5":
         return None
     import trimesh
@@ -116,25 +122,25 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
     try:
         loaded: Any = trimesh.load(path, force="mesh", process=False)
     except Exception as error:
-        # Trimesh raises whatever its parsers do.
-        raise CaptureError(f"{path} is no mesh (.stl, .obj, .off, .ply) and no cloud: {error}") from error
+        # Trimesh passes on any exception of its parsers.
+        raise CaptureError(f"{path} is neither a mesh (.stl, .obj, .off, .ply) nor a cloud: {error}") from error
     vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces)
     if not len(faces) or not np.isfinite(vertices).all():
-        raise CaptureError(f"{path} has no triangles, or vertices that are not finite")
+        raise CaptureError(f"{path} has no triangles, or has vertices that are not finite")
     return vertices, faces
 
 
-def sampled(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> ReferencePoints:
-    """Points spread evenly over a mesh, with the normals of their triangles."""
+def sample_mesh(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> ReferencePoints:
+    """Sample points evenly over a mesh, with the normals of their triangles."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(across, axis=1) / 2
     total = float(area.sum())
     if total <= 0:
-        raise EvaluationError("the mesh has no area")
+        raise EvaluationError("the total area of the mesh is zero")
     count = int(np.clip(total / (np.pi / 4 * disc_mm**2) * _SAMPLES_PER_DISC, 1000, _MOST_SAMPLES))
     rng = np.random.default_rng(0)
-    # Equal shares of the area, so that no triangle is forgotten by chance.
+    # Stratified sampling over equal parts of the area, so that chance does not omit a triangle.
     chosen = np.searchsorted(np.cumsum(area) / total, (np.arange(count) + rng.random(count)) / count)
     chosen = np.minimum(chosen, len(faces) - 1)
     u, v = rng.random((2, count))
@@ -153,26 +159,30 @@ def require_enough(points: np.ndarray, name: str) -> np.ndarray:
 
 def require_same_unit(cloud: np.ndarray, reference: np.ndarray) -> None:
     sizes = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (cloud, reference)]
-    if sizes[0] > _OTHER_UNIT * sizes[1]:
+    if sizes[0] > OPTIONS.other_unit_ratio * sizes[1]:
         raise EvaluationError(
-            f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g}: is that in metres? Give `unit` m"
+            f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g} mm. If the latter is in metres, "
+            "give `unit` m"
         )
-    if sizes[1] > 1000 * _OTHER_UNIT * sizes[0]:
-        raise EvaluationError(f"the cloud is {sizes[0]:.4g} mm across, the reference {sizes[1]:.4g} mm: is it in mm?")
+    if sizes[1] > 1000 * OPTIONS.other_unit_ratio * sizes[0]:
+        raise EvaluationError(
+            f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g} mm. Check that the cloud is in mm"
+        )
 
 
-def local_normals(
+def fit_local_normals(
     places: np.ndarray, surface: np.ndarray, *, disc_mm: float, given: np.ndarray | None = None
 ) -> np.ndarray:
-    """Unit normals (P, 3) of a surface near places: of the nearest sample of a mesh, or of the plane through points.
+    """Return unit normals (P, 3) of a surface near places.
 
-    Those of clouds look towards the sensor, to -Z. Points within one disc's diameter are taken, at least eight.
+    Normals are ``given`` (M, 3), for the nearest point, or fitted as planes. A plane is fitted to the points within one
+    disc diameter, at least eight, and its normal points to the sensor (-Z).
     """
     tree = KDTree(surface)
     if given is not None:
         return given[tree.query(places, workers=-1)[1]]
     result = np.empty_like(places)
-    # About the nearest point: of a place beside the surface the nearest points would lie on a line, its border.
+    # Neighbours are those of the nearest point. Beside the surface, those of the place itself would form a line.
     middles = surface[tree.query(places, workers=-1)[1]]
     for start in range(0, len(places), _AT_A_TIME):
         here = slice(start, start + _AT_A_TIME)

@@ -1,4 +1,4 @@
-"""Planes, spheres and cylinders that a cloud is compared with: given by a description, or fitted to the cloud."""
+"""Planes, spheres and cylinders as references of a comparison, given by a description or fitted to the cloud."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from uwlts.files.reading import MOST_TOML_BYTES, parsed_toml, read_text
 from uwlts.fitting.least_squares import evenly_thinned, fit_robustly
 from uwlts.fitting.shapes import fit_cylinder, fit_plane, fit_sphere
 from uwlts.model.sensor import Description, Positive, Vector
-from uwlts.registration.surface_registration import Nearest, Registration, fitted_shape
+from uwlts.registration.surface_registration import Nearest, Registration, shape_registration
 from uwlts.storage.cloud import PointUncertainty
 
 _MOST_FITTED = 50_000
-"""Points of a fit; more add nothing but time."""
+"""Number of points above which a cloud is thinned for a fit; more take longer without a benefit."""
 
 
 class _Shape(Description):
-    """Base of ideal shapes; one without a place is fitted to the cloud."""
+    """Base of ideal shapes; a shape without a position is fitted to the cloud."""
 
     @property
     def fitted(self) -> bool:
@@ -31,7 +31,7 @@ class _Shape(Description):
 
 
 class IdealPlane(_Shape):
-    """A plane through a point with a normal; distances are positive where the normal points."""
+    """Plane through a point; distances are positive on the side of the normal."""
 
     kind: Literal["plane"] = "plane"
     point_mm: Vector | None = None
@@ -40,14 +40,14 @@ class IdealPlane(_Shape):
     @model_validator(mode="after")
     def _placed_or_not(self) -> IdealPlane:
         if (self.point_mm is None) != (self.normal is None):
-            raise ValueError("a plane has point_mm and normal, or neither and is fitted")
+            raise ValueError("give both point_mm and normal of the plane, or neither to fit it")
         if self.normal is not None and not any(self.normal):
-            raise ValueError("the normal is a direction, not (0, 0, 0)")
+            raise ValueError("the normal is (0, 0, 0); expected a direction")
         return self
 
 
 class IdealSphere(_Shape):
-    """A sphere; fitted with a free or known diameter unless its centre ``point_mm`` is given, too."""
+    """Sphere; fitted with a free or known diameter unless its centre ``point_mm`` is given."""
 
     kind: Literal["sphere"] = "sphere"
     diameter_mm: Positive | None = None
@@ -56,12 +56,12 @@ class IdealSphere(_Shape):
     @model_validator(mode="after")
     def _placed_with_a_size(self) -> IdealSphere:
         if self.point_mm is not None and self.diameter_mm is None:
-            raise ValueError("a sphere with a given centre needs its diameter_mm")
+            raise ValueError("a sphere with a given centre also needs diameter_mm")
         return self
 
 
 class IdealCylinder(_Shape):
-    """A cylinder; fitted with a free or known diameter unless ``point_mm`` on its axis and ``axis`` are given, too."""
+    """Cylinder; fitted with a free or known diameter unless ``point_mm`` on its axis and ``axis`` are given."""
 
     kind: Literal["cylinder"] = "cylinder"
     diameter_mm: Positive | None = None
@@ -71,36 +71,46 @@ class IdealCylinder(_Shape):
     @model_validator(mode="after")
     def _placed_with_a_size(self) -> IdealCylinder:
         if (self.point_mm is None) != (self.axis is None):
-            raise ValueError("a cylinder has point_mm and axis, or neither and is fitted")
+            raise ValueError("give both point_mm and axis of the cylinder, or neither to fit it")
         if self.point_mm is not None and self.diameter_mm is None:
-            raise ValueError("a cylinder with a given axis needs its diameter_mm")
+            raise ValueError("a cylinder with a given axis also needs diameter_mm")
         if self.axis is not None and not any(self.axis):
-            raise ValueError("the axis is a direction, not (0, 0, 0)")
+            raise ValueError("the axis is (0, 0, 0); expected a direction")
         return self
 
 
 IdealShape = IdealPlane | IdealSphere | IdealCylinder
 
 KINDS: dict[str, IdealShape] = {"plane": IdealPlane(), "sphere": IdealSphere(), "cylinder": IdealCylinder()}
-"""Shapes that are fitted with all their sizes, by name."""
+"""Shapes of free size and position, by name."""
 
 
 def read_shape(path: Path) -> IdealShape:
-    """An ideal shape from a TOML file; CaptureError or DescriptionError where it cannot be read or is none."""
+    """Read an ideal shape from a TOML file; CaptureError or DescriptionError if this fails."""
     text = read_text(path, most_bytes=MOST_TOML_BYTES, called="ideal shape", foreign="is not valid TOML")
     try:
         return TypeAdapter(Annotated[IdealShape, Field(discriminator="kind")]).validate_python(parsed_toml(text))
     except ValidationError as error:
-        raise DescriptionError(f"{path} describes no ideal shape: {problems_of(error)}") from error
+        raise DescriptionError(f"{path} contains no valid ideal shape: {problems_of(error)}") from error
     except ValueError as error:
         raise DescriptionError(f"{path} is not valid TOML: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedShape:
-    """A shape with its place: a point, a unit direction (normal or axis; None of a sphere), a radius (0 of a plane).
+    """Shape at a position.
 
-    `registration` tells how well a fitted shape is known; None for one that was given.
+    Attributes
+    ----------
+    kind : {"plane", "sphere", "cylinder"}
+    point_mm : (3,) float64
+        Point of the plane, centre of the sphere, or point on the axis.
+    direction : (3,) float64 or None
+        Unit normal or axis; None for a sphere.
+    radius_mm : float
+        Radius; 0 for a plane.
+    registration : Registration or None
+        Uncertainty of a fitted shape; None for a given one.
     """
 
     kind: Literal["plane", "sphere", "cylinder"]
@@ -111,14 +121,14 @@ class PlacedShape:
 
     @property
     def uncertainty(self) -> None:
-        """A shape has no points of its own."""
+        """Return None, because a shape has no points."""
 
     @property
     def frame(self) -> None:
-        """A shape has no images."""
+        """Return None, because a shape has no images."""
 
     def nearest(self, points_mm: np.ndarray, *, reach_mm: float = np.inf) -> Nearest:
-        """Signed distances of points (N, 3), outwards or where the normal points, and normals; see `Nearest`."""
+        """Return signed distances and normals of points (N, 3), positive outwards or along a plane's normal."""
         away, direction = points_mm - self.point_mm, self.direction
         if self.kind == "plane" and direction is not None:
             normals, distance = np.broadcast_to(direction, away.shape), away @ direction
@@ -130,8 +140,8 @@ class PlacedShape:
         distance = np.where(np.abs(distance) <= reach_mm, distance, np.nan)
         return Nearest(distance, normals, np.zeros(len(distance), np.intp))
 
-    def words(self) -> str:
-        """Kind, size and place as text."""
+    def describe(self) -> str:
+        """Describe kind, size and position as text."""
         size = f" of {2 * self.radius_mm:.4f} mm diameter" if self.radius_mm else ""
         place = ", ".join(f"{value:.3f}" for value in self.point_mm)
         way = "" if self.direction is None else f", direction ({', '.join(f'{v:.5f}' for v in self.direction)})"
@@ -145,12 +155,12 @@ def place_shape(
     uncertainty: PointUncertainty | None = None,
     frame: np.ndarray | None = None,
 ) -> PlacedShape:
-    """The shape where it is given, or fitted to points (N, 3), the few that lie off it left out.
+    """Return a given shape, or fit it robustly to points (N, 3).
 
-    EvaluationError where the points do not determine it.
+    EvaluationError if the points do not determine the shape.
     """
     if not shape.fitted:
-        return _given(shape)
+        return _place_given_shape(shape)
     chosen = np.arange(len(points_mm))[:: -(-len(points_mm) // _MOST_FITTED)]
     points = points_mm[chosen]
     match shape:
@@ -169,7 +179,7 @@ def place_shape(
         case _:
             assert_never(shape)
     used = chosen[robust.inliers]
-    registration = fitted_shape(
+    registration = shape_registration(
         points_mm[used],
         placed.nearest(points_mm[used]),
         sized=not isinstance(shape, IdealPlane) and shape.diameter_mm is None,
@@ -179,7 +189,7 @@ def place_shape(
     return PlacedShape(placed.kind, placed.point_mm, placed.direction, placed.radius_mm, registration)
 
 
-def _given(shape: IdealShape) -> PlacedShape:
+def _place_given_shape(shape: IdealShape) -> PlacedShape:
     point = np.array(shape.point_mm, float)
     match shape:
         case IdealPlane():

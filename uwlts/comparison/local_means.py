@@ -1,4 +1,4 @@
-"""Means of a surface's points within discs across its normals, and their variance: the two sides of M3C2."""
+"""Local means of points along surface normals, and their variance (M3C2)."""
 
 from __future__ import annotations
 
@@ -9,23 +9,21 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import t as t_distribution
 
+from uwlts.comparison.options import OPTIONS
 from uwlts.storage.cloud import PointUncertainty, variance_along
 
 TWO_SIDED = 1.96
 """Standard normal quantile of 97.5 %."""
-FEWEST = 5
-"""Points in a disc; with fewer the roughness is not known."""
 _NEARLY_NORMAL = 200
-"""Points from which Student's quantile is within 1 % of the normal one."""
-_WITHOUT_EDGES = 0.8
-"""Share of the places from which the noise that neighbours share is taken: the others scatter more than noise does."""
+"""Number of points from which Student's quantile is within 1 % of the normal one."""
 _PAIRS_AT_A_TIME = 2_000_000
 
 
 class LocalMeans(NamedTuple):
-    """Mean (P,) of the points at P places along the normal, NaN where there are too few, and its variance (P,).
+    """Mean (P,) along the normal of the points at P places, and its variance (P,); NaN with too few points.
 
-    The variance is without that by the patterns that all points share, which move the mean by ``patterns_mm`` (P, M).
+    The variance excludes the systematic patterns. One standard deviation of each shifts the mean by ``patterns_mm``
+    (P, M).
     """
 
     mean_mm: np.ndarray
@@ -33,7 +31,7 @@ class LocalMeans(NamedTuple):
     patterns_mm: np.ndarray
 
 
-def local_means(
+def average_locally(
     places: np.ndarray,
     normals: np.ndarray,
     points: np.ndarray,
@@ -44,19 +42,29 @@ def local_means(
     disc_mm: float,
     deep_mm: float,
 ) -> LocalMeans:
-    """Average points (N, 3) within discs across normals (P, 3) at places (P, 3).
+    """Average the signed distances of points in discs perpendicular to the normals at P places.
 
-    What is averaged are the points' distances from the place along its normal, or ``distance_mm`` (N,) from a reference
-    that is known everywhere. The variance is by the points' noise and the position of each image, or by the points'
-    scatter, more where those of an image err together, where that is larger.
-    A scatter from n points counts as much more as Student's t of n - 1 degrees of freedom is wider than the normal
-    distribution.
+    The variance is the larger of the propagated variance (noise of points, position of images) and the empirical
+    scatter. The scatter is corrected for correlation within an image, and by Student's t for the number of points.
+
+    Parameters
+    ----------
+    places, normals : (P, 3)
+        Centres of the discs, mm, and unit normals there.
+    points : (N, 3)
+        Points, mm.
+    distance_mm : (N,), optional
+        Distances of the points from the reference; by default from each place along its normal.
+    uncertainty, frame
+        Uncertainty of the points, and the image (N,) of each point.
+    disc_mm, deep_mm
+        Diameter of the discs, and largest distance along the normal.
     """
     count, mean, rough, stated, other = (np.zeros(len(places)) for _ in range(5))
     together, alone = np.zeros(len(places)), np.zeros(len(places))
     patterns = np.zeros((len(places), 0 if uncertainty is None else len(uncertainty.patterns_mm)))
     radius = float(np.hypot(disc_mm / 2, deep_mm))
-    for place, point in _neighbours(KDTree(points), places, radius):
+    for place, point in _nearby_pairs(KDTree(points), places, radius):
         away = points[point] - places[place]
         along = np.einsum("ni,ni->n", away, normals[place])
         across = np.einsum("ni,ni->n", away, away) - along**2
@@ -71,28 +79,28 @@ def local_means(
         off = along - centre[place]
         scatter = np.bincount(place, off**2, minlength=len(places)) / np.maximum(number - 1, 1)
         count[here], mean[here] = number[here], centre[here]
-        rough[here] = (scatter / np.maximum(number, 1) * _wider(number) ** 2)[here]
+        rough[here] = (scatter / np.maximum(number, 1) * _student_ratio(number) ** 2)[here]
         if frame is not None:
-            sums, expected = _of_images(place, frame[point], off, scatter, number)
+            sums, expected = _image_sums(place, frame[point], off, scatter, number)
             together[here], alone[here] = sums[here], expected[here]
         if uncertainty is not None:
-            single, images, shared = _stated(place, point, normals, uncertainty, frame, number)
+            single, images, shared = _propagated_variance(place, point, normals, uncertainty, frame, number)
             stated[here], other[here], patterns[here] = single[here], images[here], shared[here]
-    # The scatter of whole images is part of what is seen.
-    variance = np.maximum(_neighbours_share(together, alone, count) * rough, stated + other)
-    mean[count < FEWEST] = np.nan
+    # The empirical scatter includes that between images.
+    variance = np.maximum(_correlation_factor(together, alone, count) * rough, stated + other)
+    mean[count < OPTIONS.fewest_points] = np.nan
     return LocalMeans(mean, variance, patterns)
 
 
-def _wider(number: np.ndarray) -> np.ndarray:
-    """Ratio (P,) of Student's quantile to the normal one, for a standard deviation from so many points."""
+def _student_ratio(number: np.ndarray) -> np.ndarray:
+    """Return the ratio (P,) of Student's quantile to the normal one for numbers of points (P,)."""
     table = np.ones(_NEARLY_NORMAL + 1)
     table[2:_NEARLY_NORMAL] = t_distribution.ppf(0.975, np.arange(1, _NEARLY_NORMAL - 1)) / TWO_SIDED
     return table[np.minimum(number, _NEARLY_NORMAL)]
 
 
-def _neighbours(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Numbers of places and of the points near them, pair by pair, some places at a time."""
+def _nearby_pairs(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the indices of nearby pairs of places and points, in blocks."""
     counts = tree.query_ball_point(places, radius, return_length=True, workers=-1)
     part = np.cumsum(counts) // _PAIRS_AT_A_TIME
     for number in np.unique(part):
@@ -103,7 +111,7 @@ def _neighbours(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tup
             yield np.repeat(chosen, lengths), np.concatenate([np.asarray(each, np.intp) for each in found])
 
 
-def _stated(
+def _propagated_variance(
     place: np.ndarray,
     point: np.ndarray,
     normals: np.ndarray,
@@ -111,11 +119,11 @@ def _stated(
     frame: np.ndarray | None,
     number: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Variances (P,) of each place's mean by single points and by images, and its moves (P, M) by patterns."""
+    """Return the variance (P,) of each mean by points and by images, and its shift (P, M) by systematic patterns."""
     size, normal, many = len(number), normals[place], np.maximum(number, 1)
     single = np.bincount(place, variance_along(known.random_mm2[point], normal), minlength=size) / many**2
     image = np.arange(len(point)) if frame is None else frame[point].astype(np.int64)
-    # Points of one image move together, those of different images do not.
+    # Position errors are fully correlated within an image and independent between images.
     group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
     result = np.zeros(size)
     for part in known.by_image_mm():
@@ -129,12 +137,12 @@ def _stated(
     return single, result, moves
 
 
-def _of_images(
+def _image_sums(
     place: np.ndarray, image: np.ndarray, off: np.ndarray, scatter: np.ndarray, number: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Squares of the sums (P,) of each image's points off their place's mean, and what independent points would give.
+    """Return the squared sums (P,) of residuals of each image, and their expectation for independent points.
 
-    The sums of all images of a place add up to zero, which takes the squares of the images' shares off.
+    The residuals of a place sum to zero, which reduces the expectation by the squared fraction of each image.
     """
     group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
     sums, counts = np.bincount(owner.ravel(), off), np.bincount(owner.ravel())
@@ -144,13 +152,14 @@ def _of_images(
     return squares, scatter * np.maximum(number - shares, 0)
 
 
-def _neighbours_share(together: np.ndarray, alone: np.ndarray, count: np.ndarray) -> float:
-    """Factor (1 or more) on the variance of means because neighbours in an image err together.
+def _correlation_factor(together: np.ndarray, alone: np.ndarray, count: np.ndarray) -> float:
+    """Return the factor, at least 1, on the variance of means for correlated noise within an image.
 
-    Of all places at once, as each has few images; those that scatter most, which hold edges, do not count.
+    It is estimated from all places together, because each has few images. Places of high scatter are excluded, since
+    they may hold edges.
     """
-    full = (count >= FEWEST) & (alone > 0)
+    full = (count >= OPTIONS.fewest_points) & (alone > 0)
     if not full.any():
         return 1.0
-    usual = full & (alone <= np.quantile(alone[full], _WITHOUT_EDGES))
+    usual = full & (alone <= np.quantile(alone[full], OPTIONS.quiet_share))
     return max(1.0, float(together[usual].sum() / alone[usual].sum()))

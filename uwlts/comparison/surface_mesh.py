@@ -1,8 +1,8 @@
-"""A triangle mesh of one or several clouds, with the uncertainty of every vertex; open where nothing was seen.
+"""Triangle mesh of one or several clouds, with the uncertainty of each vertex and open holes.
 
-The distance from the surface is evaluated on the corners of cubes near points (a sparse signed-distance field), each by
-a local patch weighted by the points' covariance; marching cubes (Lewiner et al., J. Graphics Tools 8, 2003) give the
-triangles, and the vertices are then moved onto their own patches.
+Local patches, weighted by the points' covariance, give a sparse signed-distance field at the corners of cubes near
+points. Marching cubes (Lewiner et al., J. Graphics Tools 8, 2003) extract the triangles. The vertices are then moved
+onto their own patches.
 """
 
 from __future__ import annotations
@@ -19,26 +19,29 @@ from scipy.spatial import KDTree
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.fitting.local_surface import LocalSurface, SurfacePoints, surface_normals
-from uwlts.fitting.point_spacing import disc_of
+from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud, images_along, variance_along
 from uwlts.storage.cloud_files import loaded_cloud
 from uwlts.storage.mesh_file import SurfaceMesh
 
 _BLOCK = 48
-"""Cubes along the edge of a block that marching cubes see at once."""
+"""Cubes along the edge of a block that marching cubes processes at once."""
 _PLACES_AT_A_TIME = 500_000
 _FEWEST = 50
+"""Least number of points of a scan."""
 _CUBES_OF_RADIUS = 3.0
+"""Cubes per patch radius."""
 _CUBES_OF_WALL = 1.5
-"""Every wall holds a corner of the cubes then, up to an angle of 48 deg to their edges with the noise left out."""
+"""Cubes per thickness of the thinnest wall. Without noise, walls up to 48 deg from the cube edges hold a corner."""
 _WALLS_ASKED = 4000
+"""Number of points at which the wall thickness is measured."""
 _OPPOSITE = 0.7
-"""Cosine of the angle between one side's normal and the other's turned about, at most: 45 deg."""
+"""Cosine of the largest angle (45 deg) between the normals of two opposite sides, one of them reversed."""
 _FARTHEST_CUBES = 0.75
-"""How far from its patch a vertex may lie: by linear interpolation it lies much nearer, unless two walls were mixed."""
+"""Largest distance of a vertex from its patch, in cubes; a larger one mixes two walls."""
 _FEWEST_OF_PIECE = 20
-"""Triangles of a piece that is kept; smaller ones are outliers."""
+"""Least number of triangles of a connected piece; smaller ones are outliers."""
 
 
 def mesh(
@@ -48,28 +51,28 @@ def mesh(
     towards: Sequence[tuple[float, float, float]] | None = None,
     progress: ProgressListener = unheard,
 ) -> SurfaceMesh:
-    """Make a mesh from one or several clouds of one frame, open where nothing was seen, with uncertainty.
+    """Make a mesh with uncertainty and open holes from one or several clouds in one frame.
 
     Parameters
     ----------
     clouds
-        Clouds or their files. In a cloud that `uwlts.register` has merged the scans count on their own.
+        Clouds or their files. A cloud merged by `uwlts.register` is split into its scans.
     cube_mm
-        Edge of the cubes; walls need to be thicker. A third of the patches' radius unless given, or two thirds of the
-        thinnest wall.
+        Edge of the cubes, smaller than the walls; by default the smaller of a third of the patch radius and two thirds
+        of the thinnest wall.
     radius_mm
-        Radius of the patches over which points are averaged: holes that are much smaller are closed. For some thirty
-        points, and three images, unless given.
+        Radius of the averaging patches; much smaller holes are closed. By default a patch holds about thirty points of
+        three images.
     towards
-        Direction x y z from the surface to the sensor, once for each cloud; -Z turned as its scan was, unless given.
+        Direction x y z from the surface to the sensor for each cloud; by default -Z, rotated by the pose of each scan.
     progress
-        Called with the number of places done and the number in all.
+        Called with the number of places done and the total number.
 
     Returns
     -------
     SurfaceMesh
-        Holes are open where nothing was seen. Points are weighted by one over their variance along the normal, so that
-        of two clouds the better one counts more; the clouds' shared errors count as independent of each other.
+        Mesh with open holes. Points are weighted by their inverse variance along the normal. Systematic errors of
+        different clouds are treated as independent.
 
     Raises
     ------
@@ -87,37 +90,39 @@ def mesh(
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
     if not clouds:
-        raise EvaluationError("a mesh needs at least one cloud")
+        raise EvaluationError("no cloud was given; a mesh needs at least one")
     read = [loaded_cloud(each) for each in clouds]
     if towards is not None and (np.shape(towards) != (len(read), 3) or not np.all(np.linalg.norm(towards, axis=1) > 0)):
-        raise EvaluationError(f"there are {len(read)} clouds: expected a direction of three numbers for each")
+        raise EvaluationError(
+            f"the directions are not valid; expected {len(read)} of three numbers, one per cloud, none of them 0 0 0"
+        )
     scans = [
         scan
         for number, cloud in enumerate(read)
-        for scan in _scans(cloud, None if towards is None else np.asarray(towards[number], float))
+        for scan in _split_scans(cloud, None if towards is None else np.asarray(towards[number], float))
     ]
     if small := [len(cloud) for cloud, _ in scans if len(cloud) < _FEWEST]:
         raise EvaluationError(f"a cloud or scan has {small[0]} points; at least {_FEWEST} are needed")
-    radius = radius_mm or max(0.65 * disc_of(cloud.points_mm, cloud.frame) for cloud, _ in scans)
+    radius = radius_mm or max(0.65 * choose_disc_diameter(cloud.points_mm, cloud.frame) for cloud, _ in scans)
     if cube_mm is not None and cube_mm > radius:
         raise EvaluationError(f"cube_mm is {cube_mm:g}; expected at most the patches' radius, {radius:g} mm")
-    points = _surface_points(scans, radius)
+    points = _collect_points(scans, radius)
     cube = cube_mm or max(min(radius / _CUBES_OF_RADIUS, _thinnest_wall(points, radius) / _CUBES_OF_WALL), radius / 16)
     surface = LocalSurface(points, radius_mm=radius)
     low = points.points_mm.min(axis=0) - 4 * cube
     corners = _corners_near(np.floor((points.points_mm - low) / cube).astype(np.int64))
-    distance, known = _distances(surface, low + cube * corners, progress)
-    vertices, faces = _marched(corners, distance / cube, known)
+    distance, known = _signed_distances(surface, low + cube * corners, progress)
+    vertices, faces = _march_cubes(corners, distance / cube, known)
     places = low + cube * vertices
     patches = surface.patches(places, with_uncertainty=True)
     kept = patches.found & (np.abs(patches.height_mm) < _FARTHEST_CUBES * cube)
     places = places + np.where(kept, patches.height_mm, 0.0)[:, None] * patches.normals
-    faces = _facing(places, faces[kept[faces].all(axis=1)], patches.normals)
-    used, faces = _without_crumbs(faces, len(places))
+    faces = _orient_faces(places, faces[kept[faces].all(axis=1)], patches.normals)
+    used, faces = _remove_small_pieces(faces, len(places))
     if not len(faces):
         raise EvaluationError(
-            f"no surface was found with patches of {radius:g} mm radius: are the points so sparse? Give a "
-            "larger radius_mm"
+            f"no surface was found with patches of {radius:g} mm radius: the points may be too sparse. Give a larger "
+            "radius_mm"
         )
     every = points.points_mm[:: max(1, len(points.points_mm) // _WALLS_ASKED)]
     away = np.asarray(KDTree(places[used]).query(every, distance_upper_bound=radius)[0])
@@ -134,8 +139,8 @@ def mesh(
     )
 
 
-def _scans(cloud: PointCloud, towards: np.ndarray | None) -> list[tuple[PointCloud, np.ndarray]]:
-    """The scans of a cloud with the direction from the surface to the sensor."""
+def _split_scans(cloud: PointCloud, towards: np.ndarray | None) -> list[tuple[PointCloud, np.ndarray]]:
+    """Split a cloud into its scans, each with the direction from the surface to the sensor."""
     listed = cloud.metadata.get("scans")
     if towards is not None or not isinstance(listed, list) or not listed:
         way = TOWARDS_SENSOR if towards is None else towards
@@ -154,8 +159,8 @@ def _scans(cloud: PointCloud, towards: np.ndarray | None) -> list[tuple[PointClo
     ]
 
 
-def _surface_points(scans: list[tuple[PointCloud, np.ndarray]], radius: float) -> SurfacePoints:
-    """All points with what is known of them along their normals."""
+def _collect_points(scans: list[tuple[PointCloud, np.ndarray]], radius: float) -> SurfacePoints:
+    """Collect all points with their normals, and their uncertainty along the normals."""
     parts, first, most = [], 0, max((len(c.uncertainty.patterns_mm) for c, _ in scans if c.uncertainty), default=0)
     for number, (cloud, towards) in enumerate(scans):
         count, known = len(cloud), cloud.uncertainty
@@ -164,10 +169,10 @@ def _surface_points(scans: list[tuple[PointCloud, np.ndarray]], radius: float) -
         weight = np.ones(count)
         if known is not None:
             noise = np.maximum(variance_along(known.random_mm2, normals), 0.0)
-            # Shift and turn of an image count together, as if they moved all its points alike.
+            # Simplification: shift and rotation of an image are combined into one shift that all its points share.
             position = np.sqrt(np.sum(images_along(known, normals) ** 2, axis=0))
             patterns[: len(known.patterns_mm)] = np.einsum("mni,ni->mn", known.patterns_mm, normals)
-            # A tenth of a micrometre, so that no point weighs infinitely.
+            # The lower bound (0.1 um) squared keeps weights finite.
             weight = 1.0 / np.maximum(noise + position**2 + np.sum(patterns**2, axis=0), 1e-8)
         image = np.arange(count) if (cloud.frame < 0).any() else cloud.frame.astype(np.int64)
         owner = np.full(count, number)
@@ -176,7 +181,7 @@ def _surface_points(scans: list[tuple[PointCloud, np.ndarray]], radius: float) -
     points, normals, weight, noise, position, image, patterns, owner = (
         np.concatenate(each) for each in zip(*parts, strict=True)
     )
-    # Clouds without uncertainty beside others count as the usual point of these.
+    # Points without uncertainty receive the median weight of the others.
     stated = np.concatenate([np.full(len(cloud), cloud.uncertainty is not None) for cloud, _ in scans])
     if stated.any() and not stated.all():
         weight[~stated] = np.median(weight[stated])
@@ -184,10 +189,10 @@ def _surface_points(scans: list[tuple[PointCloud, np.ndarray]], radius: float) -
 
 
 def _thinnest_wall(points: SurfacePoints, radius: float) -> float:
-    """Thickness of the thinnest walls (2 % of the points may lie on thinner ones); infinite where there are none."""
+    """Return the thickness of the thinnest walls (2 % quantile over the points); infinite without walls."""
     places, tree = points.points_mm, KDTree(points.points_mm)
     chosen = np.arange(len(places))[:: max(1, len(places) // _WALLS_ASKED)]
-    # Some of the neighbours are enough: a wall has many points on its other side.
+    # A subset of the neighbours suffices, since a wall has many points on its other side.
     neighbours = cast(list[list[int]], tree.query_ball_point(places[chosen], radius))
     found = [near[:: max(1, len(near) // 200)] for near in neighbours]
     owner, other = np.repeat(chosen, [len(each) for each in found]), np.concatenate(found)
@@ -200,7 +205,7 @@ def _thinnest_wall(points: SurfacePoints, radius: float) -> float:
 
 
 def _corners_near(cells: np.ndarray) -> np.ndarray:
-    """Corners (C, 3) of the cubes that hold points, and of those two around."""
+    """Return the corners (C, 3) of cubes that hold points, and of cubes up to two away."""
     corners = np.unique(cells, axis=0)
     shape = corners.max(axis=0) + 8
     keys = np.asarray(np.ravel_multi_index(tuple(corners.T + 3), tuple(shape)))
@@ -210,8 +215,10 @@ def _corners_near(cells: np.ndarray) -> np.ndarray:
     return np.stack(np.unravel_index(keys, tuple(shape)), axis=1) - 3
 
 
-def _distances(surface: LocalSurface, places: np.ndarray, progress: ProgressListener) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances (P,) of places from the surface, positive outside, and where they are known."""
+def _signed_distances(
+    surface: LocalSurface, places: np.ndarray, progress: ProgressListener
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return signed distances (P,) of places from the surface, positive outside, and a mask (P,) of known ones."""
     distance, known = np.zeros(len(places)), np.zeros(len(places), bool)
     for start in range(0, len(places), _PLACES_AT_A_TIME):
         here = slice(start, start + _PLACES_AT_A_TIME)
@@ -221,12 +228,12 @@ def _distances(surface: LocalSurface, places: np.ndarray, progress: ProgressList
     return distance, known
 
 
-def _marched(corners: np.ndarray, distance: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3), in units of the cubes, and triangles (F, 3) of the zero of distances at corners (C, 3)."""
+def _march_cubes(corners: np.ndarray, distance: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Extract vertices (V, 3), in cubes, and triangles (F, 3) of the zero surface of distances at corners (C, 3)."""
     from skimage.measure import marching_cubes
 
     corners, distance = corners[known], distance[known]
-    # A block has one more corner than cubes along each edge; corners between blocks belong to both.
+    # A block has one more corner than cubes along each edge. Adjacent blocks share corners.
     block = np.floor_divide(corners, _BLOCK)
     blocks, owner = np.unique(block, axis=0, return_inverse=True)
     order = np.argsort(owner.ravel(), kind="stable")
@@ -245,7 +252,7 @@ def _marched(corners: np.ndarray, distance: np.ndarray, known: np.ndarray) -> tu
             volume[tuple(local[inside].T)] = distance[chosen[inside]]
             here[tuple(local[inside].T)] = True
         mask = np.zeros(volume.shape, bool)
-        # A cube stands at its last corner.
+        # The mask refers to the last corner of each cube.
         mask[1:, 1:, 1:] = np.logical_and.reduce(
             [here[x : _BLOCK + x, y : _BLOCK + y, z : _BLOCK + z] for x, y, z in np.ndindex(2, 2, 2)]
         )
@@ -255,18 +262,18 @@ def _marched(corners: np.ndarray, distance: np.ndarray, known: np.ndarray) -> tu
         try:
             found, triangles, _, _ = marching_cubes(volume, 0.0, mask=mask, allow_degenerate=False)
         except (RuntimeError, ValueError):
-            # The library's words for a block without a crossing.
+            # scikit-image raises these for a block without a zero crossing.
             continue
         vertices.append(found.astype(np.float64) + _BLOCK * np.array(each))
         faces.append(triangles + first)
         first += len(found)
     if not vertices:
         return np.empty((0, 3)), np.empty((0, 3), np.int64)
-    return _welded(np.concatenate(vertices), np.concatenate(faces).astype(np.int64))
+    return _weld_vertices(np.concatenate(vertices), np.concatenate(faces).astype(np.int64))
 
 
-def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same with the vertices between blocks joined."""
+def _weld_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Merge coincident vertices on the boundaries of blocks."""
     away = np.abs(vertices / _BLOCK - np.round(vertices / _BLOCK)) * _BLOCK
     shared = np.flatnonzero((away < 1e-3).any(axis=1))
     if not len(shared):
@@ -278,8 +285,8 @@ def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return vertices[first], owner[faces]
 
 
-def _facing(places: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Triangles without those of no area, turned so that they face along the vertices' normals."""
+def _orient_faces(places: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Remove triangles of zero area, and orient the others along the normals of their vertices."""
     a, b, c = (places[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     backwards = np.einsum("fi,fi->f", across, normals[faces].sum(axis=1)) < 0
@@ -287,8 +294,8 @@ def _facing(places: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.nd
     return faces[np.linalg.norm(across, axis=1) > 0]
 
 
-def _without_crumbs(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V,) that are left, and triangles of these, without pieces of few triangles."""
+def _remove_small_pieces(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Remove small connected pieces; return the indices (V,) of the remaining vertices and their triangles."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     links = coo_array((np.ones(len(edges), bool), edges.T), shape=(count, count))
     piece = connected_components(links, directed=False)[1]

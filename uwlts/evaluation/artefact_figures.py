@@ -1,4 +1,4 @@
-"""Evaluation of clouds against artefacts: planes, pipes and steps; spheres by `uwlts.evaluation.spheres`."""
+"""Evaluation of clouds against planes, pipes and steps; `uwlts.evaluation.spheres` evaluates spheres."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,23 +17,23 @@ from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereS
 from uwlts.storage.cloud import PointCloud
 
 _MOST_REJECTED = 0.1
-"""Share of outliers: a larger one is another surface."""
+"""Largest fraction of outliers; a larger one indicates another surface."""
 _DIAMETER_TOLERANCE = 0.2
-"""Relative error of a diameter: one that differs by more is another pipe's."""
+"""Largest relative error of a diameter; a larger one indicates another pipe."""
 _LEAST_ARC = np.pi
-"""Arc, rad, that must be seen for the ovality."""
+"""Least visible arc, rad, for the ovality."""
 _SECTORS = 72
-"""Sectors of 5 deg, in which the arc is counted."""
+"""Number of sectors (5 deg each) for measuring the arc."""
 _LEAST_OF_PROFILE = 5
-"""Points on each face for the height of one profile; a line through fewer is uncertain by its own noise."""
+"""Least number of points on each face for the height of a profile; noise dominates a line through fewer."""
 
 _fit_facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
 
 
 def evaluate_cloud(cloud: PointCloud, artefact: Artefact) -> ArtefactEvaluation:
-    """Measure the artefact in the cloud and compare it with its calibrated sizes.
+    """Measure an artefact in a cloud and compare it with its calibrated sizes.
 
-    EvaluationError where the cloud does not show what the artefact's description says, with what was found.
+    EvaluationError if the cloud does not match the artefact's description.
     """
     match artefact:
         case SphereStandard():
@@ -50,9 +50,9 @@ def evaluate_cloud(cloud: PointCloud, artefact: Artefact) -> ArtefactEvaluation:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlaneEvaluation(ArtefactEvaluation):
-    """A plane: `re_mm` is the range of the residuals (range error), `std_mm` their standard deviation.
+    """Evaluation of a plane; `re_mm` is the range of the residuals (range error), `std_mm` their standard deviation.
 
-    `normal` points to the sensor; positive deviations lie on that side.
+    `normal` points to the sensor; deviations are positive on that side.
     """
 
     kind: ClassVar[str] = "plane"
@@ -68,10 +68,10 @@ class PlaneEvaluation(ArtefactEvaluation):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PipeEvaluation(ArtefactEvaluation):
-    """A pipe: diameter and range and standard deviation of the radial residuals, positive outside.
+    """Evaluation of a pipe: diameter, and range and standard deviation of the radial residuals, positive outside.
 
-    `ovality_mm` is the largest less the smallest diameter of the elliptic part of the residuals; None where less than
-    half of the circumference was seen, because a shift of the axis would pass for ovality.
+    `ovality_mm` is the difference between the largest and smallest diameter of the elliptic component. It is None if
+    less than half of the circumference is visible, since a shift of the axis then resembles ovality.
     """
 
     kind: ClassVar[str] = "pipe"
@@ -95,11 +95,11 @@ class PipeEvaluation(ArtefactEvaluation):
 
 
 def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluation:
-    """Range and standard deviation about the best plane of points (N, 3), mm, OCS.
+    """Evaluate points (N, 3), mm, in the OCS as a plane.
 
-    EvaluationError for too few points, or a tenth of them away from the plane.
+    EvaluationError for too few points, or more than a tenth of outliers.
     """
-    robust, counts = _fitted(_fit_facing_plane, points, artefact.kind)
+    robust, counts = _fit_robustly_checked(_fit_facing_plane, points, artefact.kind)
     return PlaneEvaluation(
         artefact=artefact,
         **counts,
@@ -111,17 +111,17 @@ def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluati
 
 
 def evaluate_pipe(points: np.ndarray, artefact: PipeStandard) -> PipeEvaluation:
-    """Diameter and form of the best cylinder of points (N, 3), mm, OCS.
+    """Evaluate points (N, 3), mm, in the OCS as a pipe.
 
-    EvaluationError for too few points, a tenth of them away from the cylinder, a patch that leaves the cylinder open,
-    or a diameter that is not the artefact's within a fifth.
+    EvaluationError for too few points, more than a tenth of outliers, an undetermined cylinder, or a diameter that
+    differs from the artefact's by more than a fifth.
     """
-    robust, counts = _fitted(fit_cylinder, points, artefact.kind)
+    robust, counts = _fit_robustly_checked(fit_cylinder, points, artefact.kind)
     fit = robust.fit
     error = 2 * fit.radius_mm - artefact.diameter_mm
     if abs(error) > _DIAMETER_TOLERANCE * artefact.diameter_mm:
         raise EvaluationError(
-            f"the cloud holds a cylinder of {2 * fit.radius_mm:.1f} mm diameter; the artefact is described with "
+            f"the cloud shows a cylinder of {2 * fit.radius_mm:.1f} mm diameter; the artefact's description says "
             f"{artefact.diameter_mm:g} mm"
         )
     return PipeEvaluation(
@@ -132,27 +132,29 @@ def evaluate_pipe(points: np.ndarray, artefact: PipeStandard) -> PipeEvaluation:
         diameter_std_mm=2 * float(np.sqrt(fit.covariance[4, 4])),
         range_mm=spread_mm(fit.residuals_mm),
         std_mm=fit.std_mm,
-        ovality_mm=_ovality(points[robust.inliers], fit),
+        ovality_mm=_measure_ovality(points[robust.inliers], fit),
         point_mm=tuple(fit.point_mm.tolist()),
         axis=tuple(fit.axis.tolist()),
     )
 
 
-def _fitted(fit: Callable[[np.ndarray], Any], points: np.ndarray, kind: str) -> tuple[RobustFit[Any], dict[str, Any]]:
-    """A shape fitted to nearly all points, and the fields of its evaluation that concern the points."""
+def _fit_robustly_checked(
+    fit: Callable[[np.ndarray], Any], points: np.ndarray, kind: str
+) -> tuple[RobustFit[Any], dict[str, Any]]:
+    """Fit a shape robustly; return it with the fields of its evaluation that concern the points."""
     robust = fit_robustly(fit, points)
     if robust.rejected_share > _MOST_REJECTED:
         raise EvaluationError(
-            f"{robust.rejected} of {len(points)} points lie more than {robust.limit_mm:.3g} mm off the best {kind}; "
-            f"the cloud holds other surfaces, cut them off"
+            f"{robust.rejected} of {len(points)} points deviate by more than {robust.limit_mm:.3g} mm from the best "
+            f"{kind}; the cloud contains other surfaces, remove them"
         )
     deviation = np.where(robust.inliers, robust.distances_mm, np.nan)
     used = len(points) - robust.rejected
     return robust, {"points_used": used, "points_rejected": robust.rejected, "deviation_mm": deviation}
 
 
-def _ovality(points: np.ndarray, fit: CylinderFit) -> float | None:
-    """4 sqrt(a2 + b2) of the part a cos 2w + b sin 2w of the radius, solved beside a circle's shift and size."""
+def _measure_ovality(points: np.ndarray, fit: CylinderFit) -> float | None:
+    """Return 4 sqrt(a2 + b2) of the radius component a cos 2w + b sin 2w; circle shift and size are fitted too."""
     across = (points - fit.point_mm) @ fit.across.T
     angle = np.arctan2(across[:, 1], across[:, 0])
     sectors = np.unique(np.floor((angle / (2 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS)
@@ -165,13 +167,22 @@ def _ovality(points: np.ndarray, fit: CylinderFit) -> float | None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepEvaluation(ArtefactEvaluation):
-    """A step, mm. Deviations are from the reference face's plane, and from that plane at the calibrated height.
+    """Evaluation of a step, mm. Deviations refer to the reference face's plane, shifted by the calibrated height.
 
-    The height is the mean distance of one face's points to the plane through the other's, its standard uncertainty that
-    by the scatter of the points alone. The height by profiles is the mean of the heights of the ``profiles`` that show
-    both faces, measured within the sheet and turned to the faces' normal, with their standard deviation; None where
-    there is no such profile. Standard deviations of the faces are about their own planes, between which the
-    parallelism is the angle.
+    Attributes
+    ----------
+    height_mm, height_std_mm : float
+        Mean distance of the points of one face from the plane of the other, and its standard uncertainty by the scatter
+        of the points alone.
+    profile_height_mm, profile_height_std_mm : float or None
+        Mean and standard deviation of the heights of single profiles, projected onto the normal of the faces; None
+        without a profile of both faces.
+    profiles : int
+        Number of profiles that show both faces.
+    lower_std_mm, upper_std_mm : float
+        Standard deviation of each face about its own plane.
+    parallelism_deg : float
+        Angle between both planes.
     """
 
     kind: ClassVar[str] = "step"
@@ -196,9 +207,9 @@ class StepEvaluation(ArtefactEvaluation):
 
 
 def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard, *, seed: int = 0) -> StepEvaluation:
-    """Find the faces in points (N, 3), mm, OCS, of the images `frame` (N,) and measure their distance.
+    """Evaluate points (N, 3), mm, in the OCS with images ``frame`` (N,) as a step.
 
-    EvaluationError where there are no two faces at this height.
+    EvaluationError if the points show no two faces of this height.
     """
     labels = label_step_faces(points, height_mm=artefact.height_mm, edge_mm=artefact.edge_mm, seed=seed)
     planes: dict[StepFace, FlatFit] = {}
@@ -219,7 +230,7 @@ def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard,
         own = frame == number
         if min(np.count_nonzero(labels[own] == face) for face in planes) >= _LEAST_OF_PROFILE:
             heights.append(step_height(points[own, 1:], labels[own], reference=artefact.reference).height_mm)
-    # The sheet cuts the step at an angle to its normal, where it is longer by one over the cosine.
+    # The sheet is inclined to the step's normal, so a height within the sheet is divided by the cosine.
     by_profile = float(np.linalg.norm(planes[base].normal[1:])) * np.array(heights)
     mean = float(by_profile.mean()) if heights else None
     lower, upper = planes.values()

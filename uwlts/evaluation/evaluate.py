@@ -1,4 +1,4 @@
-"""Evaluation of point clouds against artefacts with calibrated sizes and against ground truth, and its JSON files."""
+"""Evaluation of point clouds against calibrated artefacts and ground truth, and evaluation files (JSON)."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,28 +11,29 @@ from uwlts.errors import EvaluationError, problems_of
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
 from uwlts.evaluation.figures import ArtefactEvaluation, Figure, FigureKey, Quantity, figure_keys
-from uwlts.evaluation.truth_comparison import TruthComparison, best_fit_motion, compare_with_truth
+from uwlts.evaluation.truth_comparison import TruthComparison, compare_with_truth
 from uwlts.files.json_files import read_model, write_model
+from uwlts.fitting.least_squares import fit_rigid_transform
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
 from uwlts.model.brief import Brief
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.truth import Truth, read_truth
 
-# What points from perfect images by true parameters have to keep (tests/system/test_campaign.py).
 TOLERANCE_MM = 0.010
+"""Tolerance for points from perfect images and true parameters (tests/system/test_campaign.py)."""
 FORMAT = "uwlts-evaluation"
 VERSION = 1
 Count = Annotated[int, Field(ge=0)]
 
 
 class _Stored(BaseModel):
-    # The results of each kind of artefact, and what newer versions may add, are kept as they are.
+    # Keep results of specific artefacts and fields of newer versions.
     model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 
 
 class ArtefactFigures(_Stored):
-    """Figures of an artefact's evaluation by name, mm, the numbers of points, and the kind's own results."""
+    """Figures of an artefact by name, mm, the numbers of points, and results of the specific artefact."""
 
     kind: str
     figures_mm: dict[str, float]
@@ -49,7 +50,7 @@ class ArtefactFigures(_Stored):
 
 
 class TruthFigures(_Stored):
-    """Signed distances of the matched points to the true surface, mm; see `TruthComparison`."""
+    """Statistics of signed distances from the true surface, mm; see `TruthComparison`."""
 
     matched: Count
     tolerance_mm: float
@@ -65,7 +66,7 @@ class TruthFigures(_Stored):
 
 
 class TruthComparisons(TruthFigures):
-    """The points as measured, and after the rigid motion that fits them best to the truth.
+    """Statistics of the points as measured, and after the best-fit rigid motion to the truth.
 
     ``shift_mm`` is the mean error of the points along X, Y and Z, ``shift_expanded_mm`` its stated uncertainty (k = 2).
     """
@@ -76,7 +77,7 @@ class TruthComparisons(TruthFigures):
 
 
 class StoredUncertainty(_Stored):
-    """Standard uncertainties of a figure, mm, and the expanded one (k = 2) of both together."""
+    """Standard uncertainties of a figure, mm, and their combined expanded uncertainty (k = 2)."""
 
     random_mm: float
     systematic_mm: float
@@ -84,7 +85,7 @@ class StoredUncertainty(_Stored):
 
 
 class EvaluationRecord(_Stored):
-    """Content of an evaluation file; ``calibration`` is the digest of the one with which the cloud was made."""
+    """Content of an evaluation file; ``calibration`` is the digest of the cloud's calibration."""
 
     cloud: str
     capture: str | None = None
@@ -98,12 +99,12 @@ class EvaluationRecord(_Stored):
     uncertainty: dict[str, StoredUncertainty] = {}
 
     def figure_keys(self) -> dict[str, FigureKey]:
-        """Keys of the artefact's figures by name; empty where the file names no artefact."""
+        """Return the keys of the artefact's figures by name; empty if the file names no artefact."""
         return {} if self.artefact is None else {key.name: key for key in figure_keys(self.artefact)}
 
     @model_serializer(mode="wrap")
     def _as_given(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without the keys that were not given: a cloud of another program has no metadata."""
+        """Omit missing keys, since clouds of other programs have no metadata."""
         return {key: value for key, value in plain(self).items() if key in self.model_fields_set}
 
 
@@ -116,14 +117,14 @@ class Evaluation(Brief):
     source : str
         Name of the cloud.
     cloud : PointCloud
-        The evaluated cloud with the deviation of every point from the artefact's fit, or without an artefact from the
-        true surface after a best fit.
+        The evaluated cloud with the deviation of each point from the artefact's fit. Without an artefact, deviations
+        are from the true surface after a best fit.
     artefact : ArtefactEvaluation or None
-        The artefact and everything measured of it; None where there is no artefact.
+        Measurement of the artefact; None without an artefact.
     figures : tuple of Figure
-        Of the artefact, with uncertainties where the cloud has them.
+        Figures of the artefact, with uncertainties if the cloud has them.
     truth, truth_after_best_fit : TruthComparison or None
-        Of the points as measured, and after the rigid motion that fits them best to the truth; None without a truth.
+        Comparison of the points as measured, and after the best-fit rigid motion to the truth; None without a truth.
     """
 
     source: str
@@ -134,7 +135,7 @@ class Evaluation(Brief):
     truth_after_best_fit: TruthComparison | None
 
     def all_of(self, quantity: Quantity) -> tuple[Figure, ...]:
-        """All figures of a quantity; EvaluationError where there is none."""
+        """Return all figures of a quantity; EvaluationError if there is none."""
         found = tuple(figure for figure in self.figures if figure.key.quantity is quantity)
         if not found:
             shown = "no artefact" if self.artefact is None else f"the artefact '{self.artefact.kind}'"
@@ -148,12 +149,12 @@ class Evaluation(Brief):
 
     @property
     def sphere_spacing(self) -> Figure:
-        """Spacing of consecutive spheres with the largest error."""
+        """Sphere spacing with the largest error."""
         return max(self.sphere_spacings, key=lambda figure: abs(figure.value_mm))
 
     @property
     def diameters(self) -> tuple[Figure, ...]:
-        """Diameters of the spheres, or of the pipe."""
+        """Diameters of the spheres or of the pipe."""
         return self.all_of(Quantity.DIAMETER_ERROR)
 
     @property
@@ -173,11 +174,11 @@ class Evaluation(Brief):
 
     @property
     def std(self) -> Figure:
-        """Standard deviation about the fitted surface, of the worst one."""
+        """Largest standard deviation about a fitted surface."""
         return self.all_of(Quantity.STD)[0]
 
     def record(self) -> EvaluationRecord:
-        """Content of the evaluation's file; EvaluationError where the cloud's metadata does not fit in."""
+        """Return the content of the evaluation file; EvaluationError if the cloud's metadata is not valid."""
         found = self.artefact
         content: dict[str, Any] = {"cloud": self.source, **self.cloud.metadata}
         content |= {"artefact": found and found.artefact, "evaluation": found and found.as_dict(), "truth": None}
@@ -198,12 +199,12 @@ class Evaluation(Brief):
             ) from error
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the evaluation as indented JSON, whole or not at all; OutputError if that fails."""
+        """Write the evaluation as indented JSON, atomically; OutputError if writing fails."""
         write_model(path, self.record(), format=FORMAT, version=VERSION, overwrite=overwrite)
 
 
 def compared_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
-    """Distances of a cloud's points to the true surface; EvaluationError where truth and cloud do not match."""
+    """Compare a cloud with the true surface; EvaluationError if truth and cloud do not match."""
     return compare_with_truth(
         cloud.points_mm,
         cloud.frame,
@@ -229,11 +230,11 @@ def evaluate(
     cloud : PointCloud or path
         Point cloud (.ply or .h5) in the object coordinate system (OCS), mm.
     artefact : Artefact, dict or path of a TOML file, optional
-        TOML file with the artefact's kind and calibrated values, in place of those in the capture.
+        The artefact's kind and calibrated values; by default those in the capture.
     truth : Truth or path, optional
-        Ground truth of the capture, if it was rendered.
+        Ground truth of a rendered capture.
     source : str, optional
-        Name of the cloud in the evaluation's file; that of the cloud's file or capture unless given.
+        Name of the cloud in the evaluation file; by default the name of the cloud's file or capture.
 
     Raises
     ------
@@ -256,13 +257,15 @@ def evaluate(
         truth = read_truth(truth)[1]
     if artefact is None and truth is None:
         raise EvaluationError(
-            "nothing to judge by: the capture names no artefact (give `artefact`) and there is no truth file (`truth`)"
+            "there is no reference for the evaluation: the capture names no artefact. Give `artefact` or `truth`"
         )
     compared = fitted = None
     if truth is not None:
         compared = compared_with_truth(cloud, truth)
-        # Takes out the difference of the coordinate systems.
-        motion = best_fit_motion(compared, cloud.points_mm)
+        # A calibrated sensor's frame has its own origin and axes. After the best-fit motion, errors of form and size
+        # remain.
+        measured = cloud.points_mm[compared.matched]
+        motion = fit_rigid_transform(measured, measured - compared.error_mm[compared.matched])
         moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
         fitted = compared_with_truth(replace(cloud, points_mm=moved), truth)
     found = None if artefact is None else evaluate_cloud(cloud, artefact)
@@ -277,6 +280,6 @@ def evaluate(
 
 
 def read_evaluation(path: str | Path) -> EvaluationRecord:
-    """Read an evaluation file; CaptureError where it is missing, foreign, newer or damaged."""
+    """Read an evaluation file; CaptureError if it is missing, newer, damaged, or of another format."""
     advice = "; evaluate the cloud again"
     return read_model(path, EvaluationRecord, format=FORMAT, version=VERSION, called="evaluation", advice=advice)

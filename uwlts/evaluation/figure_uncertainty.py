@@ -1,4 +1,4 @@
-"""Uncertainty of an artefact's figures and of a cloud's place, including the correlations between the points."""
+"""Uncertainty of an artefact's figures and of a cloud's position, including correlations between points."""
 
 from dataclasses import replace
 
@@ -7,26 +7,26 @@ import numpy as np
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, spread_mm
 from uwlts.evaluation.spheres import SphereEvaluation
-from uwlts.fitting.propagation import PointErrors, noise_mm
+from uwlts.fitting.propagation import PointErrors, noise_shifts
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.storage.cloud import PointCloud
 
 _DRAWS = 8
-"""Draws for which the cloud is evaluated again: their standard deviation is right to 27 %."""
+"""Number of draws with a full evaluation: their standard deviation has a relative uncertainty of 27 %."""
 _QUICK_DRAWS = 50
-"""Draws for spheres, whose fits follow the points linearly: their standard deviation is right to 10 %."""
+"""Number of draws for spheres with linearised fits: their standard deviation has a relative uncertainty of 10 %."""
 
 
 def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> dict[str, FigureUncertainty]:
-    """Uncertainty of the figures of an evaluation of a cloud; nothing where the cloud's points have none.
+    """Return the uncertainty of each figure of an evaluation by name; empty if the points have no uncertainty.
 
-    Figures are calculated again with each pattern of the calibration added to the points, and with noise drawn anew
-    (`PointErrors.propagate`). Spheres are not searched for again. EvaluationError as `evaluate_cloud`.
+    Figures are recalculated with each systematic pattern added to the points, and with random draws of noise
+    (`PointErrors.propagate`). The assignment of points to spheres is kept. EvaluationError as `evaluate_cloud`.
     """
     if (uncertainty := cloud.uncertainty) is None:
         return {}
     plain = evaluation.figures_mm
-    spheres = MovedSpheres(cloud.points_mm, evaluation) if isinstance(evaluation, SphereEvaluation) else None
+    spheres = LinearisedSpheres(cloud.points_mm, evaluation) if isinstance(evaluation, SphereEvaluation) else None
 
     def changed(by: np.ndarray) -> np.ndarray:
         if spheres is not None:
@@ -44,9 +44,10 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
 
 
 def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
-    """Standard uncertainty (3,) of the mean of the ``used`` (N,) points, mm; NaN where the points have none.
+    """Return the standard uncertainty (3,) of the mean of the ``used`` (N,) points, mm; NaN without uncertainty.
 
-    Patterns move all points together, an image's position those of the image, noise each alone (GUM, Eq. 13).
+    Patterns are common to all points, position errors to the points of an image, and noise is independent (GUM,
+    Eq. 13).
     """
     if (uncertainty := cloud.uncertainty) is None:
         return np.full(3, np.nan)
@@ -56,15 +57,15 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     by_image = [
         np.stack([np.bincount(image, moves) for moves in part[used].T], axis=1) for part in uncertainty.by_image_mm()
     ]
-    moved = np.vstack([together, *by_image, noise_mm(uncertainty)[used]])
+    moved = np.vstack([together, *by_image, noise_shifts(uncertainty)[used]])
     return np.sqrt(np.sum(moved**2, axis=0)) / count
 
 
-class _MovedFit:
-    """Fit of a sphere of free or known radius to the ``used`` (K,) of points (N, 3), which follows their moves.
+class _LinearisedSphere:
+    """Linearised sphere fit of free or known radius to the ``used`` (K,) of points (N, 3).
 
-    Centre and, where it is free, radius follow changes of the residuals linearly. Moves are so small against the radius
-    that the outward unit vectors stay.
+    Centre and free radius are linear in changes of the residuals. The outward unit vectors are constant, since shifts
+    of points are small compared with the radius.
     """
 
     def __init__(self, points: np.ndarray, used: np.ndarray, radius_mm: float | None):
@@ -75,8 +76,8 @@ class _MovedFit:
         by_parameters = np.hstack([self._outward, free])
         self._solve = np.linalg.solve(by_parameters.T @ by_parameters, by_parameters.T)
 
-    def moved(self, moves: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-        """Centre (3,), change of the radius (0 where it is known) and residuals (K,) after moves (N, 3)."""
+    def shift(self, moves: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+        """Return centre (3,), change of radius (0 if known) and residuals (K,) after shifts (N, 3) of points."""
         change = np.einsum("ni,ni->n", self._outward, moves[self._used])
         step = self._solve @ change
         by_radius = float(step[3:].sum())
@@ -84,8 +85,8 @@ class _MovedFit:
         return self._fit.centre_mm + step[:3], by_radius, residuals
 
 
-class MovedSpheres:
-    """The spheres of an evaluation of points (N, 3), in mm: the same points belong to each wherever they move."""
+class LinearisedSpheres:
+    """Linearised spheres of an evaluation of points (N, 3), mm, with a fixed assignment of points."""
 
     def __init__(self, points: np.ndarray, evaluation: SphereEvaluation):
         self._evaluation = evaluation
@@ -95,13 +96,13 @@ class MovedSpheres:
         radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
         off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
         members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
-        self._free = [_MovedFit(points, own, None) for own in members]
-        self._known = [_MovedFit(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
+        self._free = [_LinearisedSphere(points, own, None) for own in members]
+        self._known = [_LinearisedSphere(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
-        """The evaluation's figures after moves (N, 3) of all points."""
-        free = [fit.moved(moves) for fit in self._free]
-        known = [fit.moved(moves)[0] for fit in self._known]
+        """Return the evaluation's figures after shifts (N, 3) of all points."""
+        free = [fit.shift(moves) for fit in self._free]
+        known = [fit.shift(moves)[0] for fit in self._known]
         spheres = [
             replace(
                 sphere,

@@ -1,4 +1,4 @@
-"""Figures of artefacts' evaluations: their typed keys, calibrated values and uncertainties."""
+"""Figures of artefact evaluations: typed keys, calibrated values and uncertainties."""
 
 import dataclasses
 from abc import ABC, abstractmethod
@@ -31,12 +31,12 @@ class Quantity(StrEnum):
 
 
 FigureId = tuple[Quantity, tuple[int, ...]]
-"""A quantity, and the numbers (from 1) of the spheres it belongs to; none where it belongs to the whole artefact."""
+"""Quantity and the numbers (from 1) of its spheres; no numbers for a figure of the whole artefact."""
 
 
 @dataclass(frozen=True)
 class CalibratedQuantity:
-    """A quantity of an artefact in mm: calibrated value and, if stated, its expanded uncertainty (k = 2)."""
+    """Calibrated quantity of an artefact, mm, and its expanded uncertainty (k = 2) if stated."""
 
     name: str
     value_mm: float
@@ -45,11 +45,17 @@ class CalibratedQuantity:
 
 @dataclass(frozen=True)
 class FigureKey:
-    """Which figure of an artefact is meant.
+    """Identifier of a figure of an artefact.
 
-    ``name`` stands in evaluation files and on pages. ``spheres`` are the numbers, from 1, of the spheres the figure
-    belongs to, empty where it belongs to the whole artefact. ``calibrated`` is the quantity whose error the figure is,
-    None for figures that are no error of one.
+    Attributes
+    ----------
+    quantity : Quantity
+    name : str
+        Name in evaluation files and on pages.
+    spheres : tuple of int
+        Numbers, from 1, of the spheres of the figure; empty for a figure of the whole artefact.
+    calibrated : CalibratedQuantity or None
+        Calibrated quantity, if the figure is its error.
     """
 
     quantity: Quantity
@@ -67,20 +73,20 @@ class FigureKey:
 
 @dataclass(frozen=True)
 class FigureUncertainty:
-    """Standard uncertainties in mm of one figure: by noise of stripe and positions, and by calibration and stage."""
+    """Standard uncertainties of a figure, mm: by noise of stripe and positions, and by calibration and stage."""
 
     random_mm: float
     systematic_mm: float
 
     @property
     def expanded_mm(self) -> float:
-        """Expanded uncertainty in mm with the coverage factor 2."""
+        """Expanded uncertainty, mm, with the coverage factor 2."""
         return 2.0 * float(np.hypot(self.random_mm, self.systematic_mm))
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure's key, value in mm and, where the points have one, uncertainty."""
+    """Key and value (mm) of a figure, and its uncertainty if the points have one."""
 
     key: FigureKey
     value_mm: float
@@ -88,27 +94,27 @@ class Figure:
 
     @property
     def calibrated_mm(self) -> float | None:
-        """Calibrated value of the quantity whose error the figure is; None for other figures."""
+        """Calibrated value of the quantity; None if the figure is not the error of one."""
         return None if self.key.calibrated is None else self.key.calibrated.value_mm
 
     @property
     def error_mm(self) -> float | None:
-        """Measured less calibrated value; None for figures without a calibrated value."""
+        """Measured minus calibrated value; None without a calibrated value."""
         return None if self.key.calibrated is None else self.value_mm
 
     @property
     def measured_mm(self) -> float:
-        """Measured value of the quantity: for errors the calibrated value is added."""
+        """Measured value of the quantity, which is the sum of an error and its calibrated value."""
         return self.value_mm + (self.calibrated_mm or 0.0)
 
     @property
     def expanded_uncertainty_mm(self) -> float | None:
-        """Expanded uncertainty (k = 2) of the measured value; None where not known."""
+        """Expanded uncertainty (k = 2) of the measured value; None if unknown."""
         return None if self.uncertainty is None else self.uncertainty.expanded_mm
 
 
 def figure_keys(artefact: Artefact) -> tuple[FigureKey, ...]:
-    """Keys of all figures that the evaluation of an artefact may have, in their order."""
+    """Return the keys of all possible figures of an artefact, in their order."""
     errors, plain = [], ()
     match artefact:
         case SphereStandard():
@@ -143,11 +149,10 @@ def _sphere_keys(artefact: SphereStandard) -> tuple[FigureKey, ...]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArtefactEvaluation(ABC):
-    """Figures of an artefact and the numbers of points.
+    """Figures of an artefact and the numbers of its points.
 
-    ``points_rejected`` are the outliers on the artefact that were left out (`fit_robustly`); points of the cloud that
-    do not belong to the artefact are in neither number. ``deviation_mm`` (N,) is the signed deviation of every used
-    point of the cloud, NaN for all others.
+    ``points_rejected`` counts the outliers on the artefact (`fit_robustly`). Points that do not belong to the artefact
+    are not counted. ``deviation_mm`` (N,) is the signed deviation of each used point of the cloud, NaN for all others.
     """
 
     kind: ClassVar[str]
@@ -159,32 +164,32 @@ class ArtefactEvaluation(ABC):
 
     @property
     def rejected_share(self) -> float:
-        """Share of the artefact's points that were left out."""
+        """Fraction of the artefact's points that were rejected."""
         return self.points_rejected / (self.points_used + self.points_rejected)
 
     @property
     def within_vdi_outliers(self) -> bool:
-        """Whether no more points were left out than the 3 permille that VDI/VDE 2634 allows."""
+        """Whether the rejected fraction is at most 0.3 %, the limit of VDI/VDE 2634."""
         return self.rejected_share <= VDI_OUTLIER_SHARE
 
     @abstractmethod
     def values_mm(self) -> dict[FigureId, float | None]:
-        """Values of the figures, mm; None, or no entry, for one that could not be measured."""
+        """Return the values of the figures, mm; None or no entry for a figure that could not be measured."""
 
     @property
     def figures(self) -> tuple[Figure, ...]:
-        """The figures by which the artefact is judged."""
+        """Measured figures of the artefact."""
         values = self.values_mm()
         found = ((key, values.get((key.quantity, key.spheres))) for key in figure_keys(self.artefact))
         return tuple(Figure(key, value) for key, value in found if value is not None)
 
     @property
     def figures_mm(self) -> dict[str, float]:
-        """Values of the figures by name, mm, as evaluation files hold them."""
+        """Values of the figures by name, mm, as in evaluation files."""
         return {figure.key.name: figure.value_mm for figure in self.figures}
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything but the artefact and the deviations of the single points, as plain JSON."""
+        """Return everything except the artefact and the deviations of single points as JSON."""
         own = [field.name for field in dataclasses.fields(self) if field.name not in ("artefact", "deviation_mm")]
         return {
             "kind": self.kind,
@@ -197,7 +202,7 @@ class ArtefactEvaluation(ABC):
 
 
 def spread_mm(residuals_mm: np.ndarray) -> float:
-    """Range of residuals: largest less smallest (PE and RE of VDI/VDE 2634)."""
+    """Return the range of residuals, largest minus smallest (PE and RE of VDI/VDE 2634)."""
     return float(np.ptp(residuals_mm))
 
 

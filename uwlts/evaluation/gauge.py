@@ -1,4 +1,4 @@
-"""Gauge study: how far a figure repeats, and agrees between operators, over repeated scans of several parts."""
+"""Gauge study: repeatability and reproducibility of a figure over repeated scans of several parts."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ from uwlts.model.sensor import Table
 
 _MOST_BYTES = 64 * 2**20
 _POOLED_ABOVE = 0.25
-"""Probability of the interaction's F from which AIAG takes it for noise and pools it with the repeatability."""
+"""p-value of the interaction above which it is pooled with the repeatability (AIAG)."""
 _DRAWS = 20_000
-"""Draws of the mean squares: five hundred are beyond either end of a 95 % interval."""
+"""Number of draws of the mean squares, of which 500 exceed each end of a 95 % interval."""
 _SEED = 7
-"""Of the draws, so that the same study has the same intervals."""
+"""Seed of the draws, so that a study always has the same intervals."""
 _SIGMAS = 6.0
-"""Width of a process in standard deviations, as in %P/T (AIAG, Measurement Systems Analysis, 4th ed., ch. III-B)."""
+"""Process width in standard deviations, as in %P/T (AIAG, Measurement Systems Analysis, 4th ed., ch. III-B)."""
 _DISTINCT = 1.41
+"""Factor of the number of distinct categories (AIAG)."""
 _NEEDED_CG = 1.33
-"""Least Cg and Cgk of a capable gauge (VDA 5; ISO 22514-7 for the quantities)."""
+"""Least Cg and Cgk of a capable gauge (VDA 5; ISO 22514-7 defines the quantities)."""
 
 
 @dataclass(frozen=True)
 class Component:
-    """Standard deviation of a source of variation, its 95 % interval, and its share of the total in %."""
+    """Standard deviation of a source of variation, its 95 % interval, and its percentage of the total."""
 
     std: float
     low: float
@@ -45,7 +46,7 @@ class Component:
 
 @dataclass(frozen=True)
 class Variance:
-    """Row of the analysis of variance; F and its probability where there is one."""
+    """Row of the analysis of variance, with F and its p-value if tested."""
 
     source: str
     degrees: int
@@ -57,10 +58,10 @@ class Variance:
 
 @dataclass(frozen=True, repr=False)
 class GaugeStudy(Brief, RecordFile):
-    """A crossed study: every operator measures every part equally often.
+    """Crossed study: each operator measures each part equally often.
 
-    ``components`` by their names: repeatability (EV), reproducibility (AV, with the interaction), gauge (GRR), parts
-    (PV), total (TV). ``distinct`` is the number of distinct categories, 1.41 PV / GRR.
+    The names in ``components`` are repeatability (EV), reproducibility (AV, including the interaction), gauge (GRR),
+    parts (PV) and total (TV). ``distinct`` is the number of distinct categories, 1.41 PV / GRR.
     """
 
     parts: int
@@ -73,11 +74,11 @@ class GaugeStudy(Brief, RecordFile):
     tolerance: float | None
 
     def record(self) -> Table:
-        """The study as JSON."""
+        """Return the study as JSON."""
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """The study as text."""
+        """Return the study as text."""
         lines = [f"{self.parts} parts, {self.operators} operators, {self.repeats} repeats"]
         lines += ["source                    degrees  mean square        F  probability"]
         for row in self.variances:
@@ -94,10 +95,10 @@ class GaugeStudy(Brief, RecordFile):
 
 @dataclass(frozen=True, repr=False)
 class RepeatedReference(Brief, RecordFile):
-    """One part of known size measured again and again (type-1 study).
+    """Repeated measurements of one part of known size (type-1 study).
 
-    ``bias`` is the mean less the reference, significant where its 95 % interval does not hold 0. With a tolerance T:
-    Cg = 0.2 T / (6 s), Cgk = (0.1 T - |bias|) / (3 s).
+    ``bias`` is the mean minus the reference; it is significant if its 95 % interval excludes 0. For a tolerance T and a
+    standard deviation s, Cg = 0.2 T / (6 s) and Cgk = (0.1 T - |bias|) / (3 s).
     """
 
     count: int
@@ -109,11 +110,11 @@ class RepeatedReference(Brief, RecordFile):
     cgk: float | None
 
     def record(self) -> Table:
-        """The study as JSON."""
+        """Return the study as JSON."""
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """The study as text."""
+        """Return the study as text."""
         said = "significant" if abs(self.bias) > self.bias_half_interval else "not significant"
         lines = [
             f"{self.count} repeats               mean {self.mean:.6g}, std {self.std:.4g}",
@@ -131,51 +132,51 @@ def gauge_study(
     tolerance: float | None = None,
     reference: float | None = None,
 ) -> GaugeStudy | RepeatedReference:
-    """Judge a gauge by repeated measurements of a figure: repeatability, reproducibility, share of a tolerance.
+    """Evaluate a gauge from repeated measurements: repeatability, reproducibility and percentage of a tolerance.
 
-    Several parts and operators, each part measured by each operator equally often, make a crossed study by analysis of
-    variance with random effects (AIAG, Measurement Systems Analysis, 4th ed., chapter III-B and appendix A); an
-    interaction whose probability exceeds 0.25 is pooled with the repeatability. With a ``reference`` the measurements
-    are of one part of that size: a type-1 study. 95 % intervals of the components are generalised ones (Hamada and
-    Weerahandi, J. Quality Technology 32, 2000).
+    In a crossed study, each operator measures each part equally often. It is evaluated by analysis of variance with
+    random effects (AIAG, Measurement Systems Analysis, 4th ed., chapter III-B and appendix A). An interaction with a
+    p-value above 0.25 is pooled with the repeatability. The 95 % intervals are generalised confidence intervals (Hamada
+    and Weerahandi, J. Quality Technology 32, 2000). With a ``reference``, repeated measurements of one part form a
+    type-1 study.
 
     Parameters
     ----------
     table
-        CSV file with the columns part, operator and value, one measurement a line (with a reference value alone will
-        do); or (part, operator, value) one by one.
+        CSV file with the columns part, operator and value, one measurement per line; or a sequence of (part, operator,
+        value). With a reference, the column value suffices.
     tolerance
         Width of the tolerance, in the unit of the values.
     reference
-        True value of the only part: a type-1 study with Cg and Cgk.
+        True value of the only part, for a type-1 study with Cg and Cgk.
 
     Raises
     ------
     DescriptionError
-        The file is no such table, or a number is not finite.
+        The file is not such a table, or a number is not finite.
     EvaluationError
-        Parts, operators or repeats are too few, or combinations are missing.
+        There are too few parts, operators or repeats, or combinations are missing.
     """
     if tolerance is not None and not 0 < tolerance < np.inf:
-        raise EvaluationError(f"the tolerance is {tolerance:g}; expected its width, a positive number")
+        raise EvaluationError(f"the tolerance is {tolerance:g}; expected a positive width")
     rows = (
-        _read(Path(table))
+        _read_table(Path(table))
         if isinstance(table, str | os.PathLike)
         else [(str(p), str(o), float(v)) for p, o, v in table]
     )
     if not np.isfinite([value for *_, value in rows]).all():
-        raise DescriptionError("the table holds values that are not finite")
+        raise DescriptionError("the table contains values that are not finite; remove or correct these lines")
     if reference is not None:
-        return _repeated(rows, reference, tolerance)
-    return _crossed(rows, tolerance)
+        return _evaluate_repeats(rows, reference, tolerance)
+    return _evaluate_crossed(rows, tolerance)
 
 
-def _read(path: Path) -> list[tuple[str, str, float]]:
+def _read_table(path: Path) -> list[tuple[str, str, float]]:
     content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DescriptionError(f"{path} is no text table: {error}") from error
+        raise DescriptionError(f"{path} is not a text file: {error}") from error
     first = text.partition("\n")[0]
     mark = next((each for each in (";", "\t", ",") if each in first), ",")
     reader = csv.DictReader(io.StringIO(text), delimiter=mark)
@@ -190,29 +191,31 @@ def _read(path: Path) -> list[tuple[str, str, float]]:
         try:
             value = float(written.replace(",", ".") if mark == ";" else written)
         except ValueError as error:
-            raise DescriptionError(f"{path}, line {number}: '{written}' is no number") from error
+            raise DescriptionError(f"{path}, line {number}: found '{written}', expected a number") from error
         part, operator = ((row[names[key]] or "").strip() if key in names else "" for key in ("part", "operator"))
         rows.append((part, operator, value))
     return rows
 
 
-def _repeated(rows: Sequence[tuple[str, str, float]], reference: float, tolerance: float | None) -> RepeatedReference:
+def _evaluate_repeats(
+    rows: Sequence[tuple[str, str, float]], reference: float, tolerance: float | None
+) -> RepeatedReference:
     if len({part for part, *_ in rows}) > 1:
-        raise EvaluationError("a reference is the size of one part; the table has several")
+        raise EvaluationError("a reference is the size of one part, but the table contains several parts")
     if len(rows) < 10:
-        raise EvaluationError(f"there are {len(rows)} measurements; a type-1 study needs at least 10, usually 50")
+        raise EvaluationError(f"found {len(rows)} measurements; a type-1 study needs at least 10, usually 50")
     values = np.array([value for *_, value in rows])
     mean, std = float(values.mean()), float(values.std(ddof=1))
     half = float(t_distribution.ppf(0.975, len(values) - 1)) * std / np.sqrt(len(values))
     if tolerance is not None and std == 0:
-        raise EvaluationError("all values are the same: is the figure rounded?")
+        raise EvaluationError("all values are equal: the figure may be rounded")
     cg = None if tolerance is None else 0.2 * tolerance / (6 * std)
     cgk = None if tolerance is None else (0.1 * tolerance - abs(mean - reference)) / (3 * std)
     return RepeatedReference(len(values), mean, std, mean - reference, float(half), cg, cgk)
 
 
-def _crossed(rows: Sequence[tuple[str, str, float]], tolerance: float | None) -> GaugeStudy:
-    values = _balanced(rows)
+def _evaluate_crossed(rows: Sequence[tuple[str, str, float]], tolerance: float | None) -> GaugeStudy:
+    values = _arrange_values(rows)
     a, b, n = values.shape
     mean, of_part, of_operator, of_both = (
         values.mean(),
@@ -229,7 +232,7 @@ def _crossed(rows: Sequence[tuple[str, str, float]], tolerance: float | None) ->
     }
     degrees = {"parts": a - 1, "operators": b - 1, "parts x operators": (a - 1) * (b - 1), "repeats": a * b * (n - 1)}
     if squares["repeats"] == 0:
-        raise EvaluationError("all repeats agree exactly: is the figure rounded, or one scan counted several times?")
+        raise EvaluationError("all repeats are equal: the figure may be rounded, or one scan repeated in the table")
     ms = {name: squares[name] / degrees[name] for name in squares}
 
     def tested(name: str, against: str) -> tuple[float, float]:
@@ -244,13 +247,14 @@ def _crossed(rows: Sequence[tuple[str, str, float]], tolerance: float | None) ->
         used, counts = (ms["parts"], ms["operators"], error, error), (a - 1, b - 1, joint, joint)
     else:
         used, counts = tuple(ms.values()), tuple(degrees.values())
-    estimate = _components(np.array(used)[:, None], (a, b, n), pooled)
-    # A mean square is its expectation times chi-square over its degrees: turned about, what the expectation may be.
+    estimate = _variance_components(np.array(used)[:, None], (a, b, n), pooled)
+    # A mean square is its expectation times chi-square divided by its degrees of freedom. Dividing by draws of the
+    # latter gives the distribution of the expectation.
     rng = np.random.default_rng(_SEED)
     chi = [rng.chisquare(count, _DRAWS) / count for count in counts]
     if pooled:
         chi[3] = chi[2]
-    drawn = _components(np.array([m / c for m, c in zip(used, chi, strict=True)]), (a, b, n), pooled)
+    drawn = _variance_components(np.array([m / c for m, c in zip(used, chi, strict=True)]), (a, b, n), pooled)
     total = float(estimate["total (TV)"][0])
     components = {}
     for name, value in estimate.items():
@@ -270,8 +274,8 @@ def _crossed(rows: Sequence[tuple[str, str, float]], tolerance: float | None) ->
     return GaugeStudy(a, b, n, variances, pooled, components, max(distinct, 1), tolerance)
 
 
-def _components(ms: np.ndarray, sizes: tuple[int, int, int], pooled: bool) -> dict[str, np.ndarray]:
-    """Standard deviations (K,) from mean squares (4, K) of parts, operators, interaction and repeats."""
+def _variance_components(ms: np.ndarray, sizes: tuple[int, int, int], pooled: bool) -> dict[str, np.ndarray]:
+    """Return standard deviations (K,) from mean squares (4, K) of parts, operators, interaction and repeats."""
     (a, b, n), (parts, operators, both, repeats) = sizes, ms
     interaction = np.zeros_like(repeats) if pooled else np.maximum((both - repeats) / n, 0)
     against = repeats if pooled else both
@@ -283,8 +287,8 @@ def _components(ms: np.ndarray, sizes: tuple[int, int, int], pooled: bool) -> di
     return {name: np.sqrt(value) for name, value in variances.items()}
 
 
-def _balanced(rows: Sequence[tuple[str, str, float]]) -> np.ndarray:
-    """Values (parts, operators, repeats); EvaluationError where combinations are missing."""
+def _arrange_values(rows: Sequence[tuple[str, str, float]]) -> np.ndarray:
+    """Arrange values as (parts, operators, repeats); EvaluationError if combinations are missing."""
     found: dict[tuple[str, str], list[float]] = {}
     for part, operator, value in rows:
         found.setdefault((part, operator), []).append(value)
@@ -297,7 +301,9 @@ def _balanced(rows: Sequence[tuple[str, str, float]]) -> np.ndarray:
     counts = {pair: len(found.get(pair, ())) for pair in ((p, o) for p in parts for o in operators)}
     repeats = max(counts.values())
     if short := [f"part {p}, operator {o}: {n}" for (p, o), n in counts.items() if n != repeats]:
-        raise EvaluationError(f"every operator measures every part {repeats} times, but {'; '.join(short[:5])}")
+        raise EvaluationError(
+            f"expected {repeats} measurements of each part by each operator; found {'; '.join(short[:5])}"
+        )
     if repeats < 2:
-        raise EvaluationError("every part was measured once by each operator: repeats are needed, usually 3")
+        raise EvaluationError("each operator measured each part once; a study needs repeats, usually 3")
     return np.array([[found[part, operator] for operator in operators] for part in parts])

@@ -1,4 +1,4 @@
-"""Spheres in clouds: found by their radius among other surfaces, and evaluated after VDI/VDE 2634."""
+"""Detection of spheres of known radius in clouds, and their evaluation by VDI/VDE 2634."""
 
 from dataclasses import dataclass
 from itertools import pairwise, permutations
@@ -15,44 +15,52 @@ from uwlts.fitting.shapes import SphereFit, fit_sphere
 from uwlts.model.artefacts import SphereStandard
 
 LEAST_POINTS = 50
-"""A sphere is judged by at least so many points."""
+"""Least number of points of a sphere."""
 
 _SEARCH_LIMIT = 0.05
-"""Half width, in radii, of the band in which the points of a proposed sphere are counted."""
+"""Half width (unit: radius) of the band of points that support a proposed sphere."""
 _LARGEST_LIMIT = 0.1
-"""Largest limit, in radii, of the band of a sphere's points."""
+"""Largest half width (unit: radius) of the band of a sphere's points."""
 _SMALLEST_LIMIT = 1e-4
-"""Smallest limit, in radii: exact points have no scatter."""
+"""Smallest half width (unit: radius), for exact points without scatter."""
 _RADIUS_TOLERANCE = 0.1
-"""Error of a fitted radius, relative to the known one, within which points are the sphere's."""
+"""Largest relative error of a fitted radius."""
 _CELL = 0.12
-"""Cells, in radii, in which other surfaces are noticed."""
+"""Size (unit: radius) of cells for the detection of other surfaces."""
 _THINNING = 1 / 15
-"""Cells, in radii, of which one point each is kept for the search."""
+"""Size (unit: radius) of cells that keep one point each for the search."""
 _THINNED = 4000
-"""Points on which centres are judged; more take longer without finding more."""
+"""Number of points for scoring centres; more take longer without a benefit."""
 _SCREENED = 1000
-"""Points of the first screening."""
+"""Number of points for the first screening."""
 _SEEDS = 2000
-"""Centres that are proposed."""
+"""Number of proposed centres."""
 _KEPT_OF_SCREENING = 150
-"""Centres that remain after the screening."""
+"""Number of centres kept by the screening."""
 _KEPT = 8
-"""Centres that are refined."""
+"""Number of refined centres."""
 _ATTEMPTS = 3
-"""Searches, each with other seeds."""
+"""Number of searches, each with new random seeds."""
 _OUTER_SHARE = 0.1
-"""Share of a cell's points beyond the limit that shows another surface; noise puts 6 in ten million there."""
+"""Fraction of a cell's points beyond the limit that indicates another surface; for noise it is 6 in ten million."""
 _OUTER_COUNT = 2
-"""Number of such points, at least."""
+"""Least number of such points."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundSphere:
-    """A sphere in a cloud: the free-radius fit to its points, and their numbers (M,) in the cloud, in that order.
+    """Sphere in a cloud.
 
-    ``near`` (N,) are all points of the cloud within three limits of the sphere, including the ``points_mixed`` on it
-    where another surface crosses it, which do not belong.
+    Attributes
+    ----------
+    robust : RobustFit
+        Fit of free radius to its points.
+    members : (M,) int
+        Indices of these points in the cloud.
+    near : (N,) bool
+        Points of the cloud within three limits of the sphere.
+    points_mixed : int
+        Number of points on the sphere that were excluded, because another surface crosses it there.
     """
 
     robust: RobustFit[SphereFit]
@@ -64,27 +72,26 @@ class FoundSphere:
 def find_sphere(
     points: np.ndarray, radius_mm: float, *, usable: np.ndarray, rng: np.random.Generator
 ) -> FoundSphere | None:
-    """The best supported sphere of this radius among the ``usable`` (N,) of the points (N, 3), mm, or None.
+    """Find the best supported sphere of a radius among the ``usable`` (N,) points (N, 3), mm; None without one.
 
-    Centres are proposed by triples of neighbouring points (two spheres of known radius pass through three points),
-    judged by the number of points near the surface of the thinned cloud (RANSAC), refined, and accepted when the
-    points found there have the known radius within a tenth by themselves.
+    RANSAC: triples of neighbouring points propose centres, and the number of points near the surface scores them. The
+    best centres are refined. A sphere is accepted if a free fit to its points gives the known radius within 10 %.
 
-    Points belong to the sphere when they lie within three limits of it (a limit is five robust standard deviations,
-    at most a tenth of the radius), except where two points and more than 10 % of those within a patch of about 0.12
-    radius lie beyond one limit: there another surface, a wall or a stem, crosses the sphere.
+    Points belong to the sphere if they are within three limits of it. A limit is five robust standard deviations, at
+    most a tenth of the radius. Another surface crosses the sphere in a patch of about 0.12 radii if at least two of its
+    points, and more than 10 %, exceed one limit. Such a patch is excluded.
     """
     usable = usable.copy()
     for _ in range(_ATTEMPTS):
         if np.count_nonzero(usable) < LEAST_POINTS:
             return None
-        # One point of each cell, so that density does not count.
+        # One point per cell removes the influence of point density.
         left = points[usable]
         _, first = np.unique(_cells(left - left.min(axis=0), radius_mm * _THINNING), return_index=True)
         centre = _best_centre(left[rng.permutation(first)[:_THINNED]], radius_mm, rng)
         if centre is None:
             return None
-        found = _accepted(points, usable, centre, radius_mm)
+        found = _accept_sphere(points, usable, centre, radius_mm)
         if found is not None:
             return found
         usable &= np.abs(np.linalg.norm(points - centre, axis=1) - radius_mm) > _SEARCH_LIMIT * radius_mm
@@ -92,14 +99,14 @@ def find_sphere(
 
 
 def _cells(points: np.ndarray, size: float) -> np.ndarray:
-    """Numbers (N,) of the cells of a cubic grid in which points (N, 3) lie, none of whose coordinates is negative."""
+    """Return the cell (N,) of each point (N, 3) in a cubic grid; coordinates must be non-negative."""
     cells = np.floor(points / size).astype(np.int64)
     return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
 
 
 def _best_centre(points: np.ndarray, radius: float, rng: np.random.Generator) -> np.ndarray | None:
-    """The proposed and refined centre with most points near its sphere."""
-    centres = _proposed_centres(points, radius, rng)
+    """Return the refined centre with the most points near its sphere; None without proposals."""
+    centres = _propose_centres(points, radius, rng)
     limit = _SEARCH_LIMIT * radius
 
     def best(centres: np.ndarray, sample: np.ndarray, count: int) -> np.ndarray:
@@ -109,17 +116,18 @@ def _best_centre(points: np.ndarray, radius: float, rng: np.random.Generator) ->
     if not len(centres):
         return None
     centres = best(best(centres, points[:_SCREENED], _KEPT_OF_SCREENING), points, _KEPT)
-    return best(np.array([_refined_centre(points, centre, radius) for centre in centres]), points, 1)[0]
+    return best(np.array([_refine_centre(points, centre, radius) for centre in centres]), points, 1)[0]
 
 
-def _proposed_centres(points: np.ndarray, radius: float, rng: np.random.Generator) -> np.ndarray:
-    """Centres (M, 3) of the spheres through triples of points that lie within one radius of their first point."""
+def _propose_centres(points: np.ndarray, radius: float, rng: np.random.Generator) -> np.ndarray:
+    """Return the centres (M, 3) of spheres through triples of points within one radius of their first point."""
     seeds = rng.integers(len(points), size=_SEEDS)
     balls = KDTree(points).query_ball_point(points[seeds], radius)
     picks = rng.random((_SEEDS, 2))
     pairs = [[ball[int(pick * len(ball))] for pick in pair] for ball, pair in zip(balls, picks, strict=True)]
     first, (second, third) = points[seeds], points[np.array(pairs).T]
-    # Circumcentre of a triangle with the sides a, b from its first corner: ((|a|2 b - |b|2 a) x (a x b)) / 2 |a x b|2.
+    # Circumcentre of a triangle with sides a, b relative to its first corner:
+    # ((|a|2 b - |b|2 a) x (a x b)) / (2 |a x b|2).
     a, b = second - first, third - first
     normal = np.cross(a, b)
     area = np.sum(normal**2, axis=1)
@@ -132,8 +140,8 @@ def _proposed_centres(points: np.ndarray, radius: float, rng: np.random.Generato
     return np.vstack([first[fits] + foot[fits] + rise, first[fits] + foot[fits] - rise])
 
 
-def _refined_centre(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """A few Gauss-Newton steps with known radius on the points within the search limit."""
+def _refine_centre(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    """Refine a centre by Gauss-Newton steps with known radius on the points within the search limit."""
     for _ in range(4):
         away = points - centre
         distance = np.linalg.norm(away, axis=1)
@@ -146,12 +154,12 @@ def _refined_centre(points: np.ndarray, centre: np.ndarray, radius: float) -> np
     return centre
 
 
-def _accepted(points: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius: float) -> FoundSphere | None:
-    """The sphere at this place if its points bear out the radius."""
+def _accept_sphere(points: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius: float) -> FoundSphere | None:
+    """Return the sphere at a centre if its points confirm the radius; else None."""
     distances = np.linalg.norm(points - centre, axis=1) - radius
     limit = _SEARCH_LIMIT * radius
     for _ in range(8):
-        mixed = _crossed_by_others(points - centre, distances, limit, usable)
+        mixed = _mark_crossed(points - centre, distances, limit, usable)
         members = np.flatnonzero(usable & ~mixed & (np.abs(distances) <= limit))
         if len(members) < LEAST_POINTS:
             return None
@@ -166,7 +174,7 @@ def _accepted(points: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius
         limit = min(max(DEFAULT_K * spread, _SMALLEST_LIMIT * radius), _LARGEST_LIMIT * radius)
         if abs(limit - last) <= 0.05 * last:
             break
-    mixed = _crossed_by_others(points - centre, distances, limit, usable)
+    mixed = _mark_crossed(points - centre, distances, limit, usable)
     near = np.abs(distances) <= 3 * limit
     members = np.flatnonzero(usable & ~mixed & near)
     points_mixed = int(np.count_nonzero(usable & mixed & (np.abs(distances) <= limit)))
@@ -175,11 +183,11 @@ def _accepted(points: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius
     return FoundSphere(fit_robustly(fit_sphere, points[members]), members, near, points_mixed)
 
 
-def _crossed_by_others(away: np.ndarray, distances: np.ndarray, limit: float, usable: np.ndarray) -> np.ndarray:
-    """Points (N,) bool in patches where many points lie between one and three limits from the sphere.
+def _mark_crossed(away: np.ndarray, distances: np.ndarray, limit: float, usable: np.ndarray) -> np.ndarray:
+    """Return a mask (N,) of points in patches where many points are between one and three limits from the sphere.
 
-    The sphere itself leaves that band nearly empty; a surface that crosses it fills the band twice as much as the
-    limit itself.
+    For the sphere alone this band is nearly empty. A crossing surface has twice as many points in it as within one
+    limit.
     """
     near = np.flatnonzero(usable & (np.abs(distances) <= 3 * limit))
     crossed = np.zeros(len(away), dtype=bool)
@@ -193,18 +201,17 @@ def _crossed_by_others(away: np.ndarray, distances: np.ndarray, limit: float, us
     return crossed
 
 
-# Orders of the spheres whose misfit to the calibrated sizes differs by less than this share of the smallest diameter
-# are equally good: measurement errors would decide between them.
 _SAME_SIZE = 0.005
+"""Difference in misfit, relative to the smallest diameter, below which two orders of spheres are equivalent."""
 
 
 @dataclass(frozen=True)
 class SphereResult:
-    """One sphere by its free-radius fit, mm, OCS.
+    """Sphere measured by its fit of free radius, mm, OCS.
 
-    The probing error ``pe_mm`` is the range of the radial residuals, ``std_mm`` their standard deviation;
-    ``diameter_std_mm`` is a standard uncertainty by the scatter of the points alone. ``points_mixed`` were left aside,
-    as another surface crosses the sphere there.
+    The probing error ``pe_mm`` is the range of the radial residuals, ``std_mm`` their standard deviation.
+    ``diameter_std_mm`` is the standard uncertainty by the scatter of the points alone. ``points_mixed`` counts points
+    that were excluded because another surface crosses the sphere there.
     """
 
     centre_mm: tuple[float, float, float]
@@ -220,7 +227,7 @@ class SphereResult:
 
 @dataclass(frozen=True)
 class SpacingResult:
-    """Distance of two consecutive centres, mm: of the free-radius fits, and its error with the known radii too."""
+    """Distance of two consecutive centres, mm, with its error for fits of free and of known radius."""
 
     spacing_mm: float
     sse_mm: float
@@ -230,7 +237,7 @@ class SpacingResult:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SphereEvaluation(ArtefactEvaluation):
-    """Spheres in the order of the artefact's description, and the spacings between consecutive ones."""
+    """Evaluation of spheres in the order of the artefact's description, and of their consecutive spacings."""
 
     kind: ClassVar[str] = "spheres"
 
@@ -245,12 +252,12 @@ class SphereEvaluation(ArtefactEvaluation):
 
     @property
     def std_mm(self) -> float:
-        """Largest standard deviation of the radial residuals of one sphere."""
+        """Largest standard deviation of the radial residuals of a sphere."""
         return max(sphere.std_mm for sphere in self.spheres)
 
     @property
     def sse_mm(self) -> float | None:
-        """Sphere spacing error of the largest size, with its sign; None for a single sphere."""
+        """Signed sphere spacing error of the largest absolute value; None for a single sphere."""
         return max((spacing.sse_mm for spacing in self.spacings), key=abs, default=None)
 
     def values_mm(self) -> dict[FigureId, float | None]:
@@ -267,21 +274,20 @@ class SphereEvaluation(ArtefactEvaluation):
 
 
 def evaluate_spheres(points: np.ndarray, artefact: SphereStandard, *, seed: int = 0) -> SphereEvaluation:
-    """Find the spheres in points (N, 3), mm, OCS, and evaluate them.
+    """Find the spheres in points (N, 3), mm, in the OCS, and evaluate them.
 
-    EvaluationError for fewer spheres than the artefact has, with those that were found and where; or if they are
-    hollow, as turned images make them.
+    EvaluationError for missing spheres, or for hollow spheres, which indicate rotated images.
     """
-    found = _in_order(_found_spheres(points, artefact, np.random.default_rng(seed)), artefact)
+    found = _sort_spheres(_find_spheres(points, artefact, np.random.default_rng(seed)), artefact)
     deviation = np.full(len(points), np.nan)
     spheres, fits = [], []
     for sphere, diameter in zip(found, artefact.diameters_mm, strict=True):
-        members, robust = _within_cap(points, sphere, artefact.cap_angle_deg)
+        members, robust = _fit_cap(points, sphere, artefact.cap_angle_deg)
         used, fit = members[robust.inliers], robust.fit
         if np.mean((points[used] - fit.centre_mm) @ TOWARDS_SENSOR) < 0:
             raise EvaluationError(
-                "the spheres are hollow: their points lie behind their centres, where the sensor cannot see them. Are "
-                "the images turned by 180 deg or mirrored against those of the calibration?"
+                "the spheres are hollow: their points are behind their centres, where the sensor cannot see them. The "
+                "images may be rotated by 180 deg or mirrored relative to those of the calibration"
             )
         deviation[used] = fit.residuals_mm
         fits.append((fit, fit_sphere(points[used], diameter / 2)))
@@ -316,7 +322,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard, *, seed: int 
     )
 
 
-def _found_spheres(points: np.ndarray, artefact: SphereStandard, rng: np.random.Generator) -> list[FoundSphere]:
+def _find_spheres(points: np.ndarray, artefact: SphereStandard, rng: np.random.Generator) -> list[FoundSphere]:
     usable = np.ones(len(points), dtype=bool)
     found: list[FoundSphere] = []
     for diameter in artefact.diameters_mm:
@@ -335,8 +341,8 @@ def _found_spheres(points: np.ndarray, artefact: SphereStandard, rng: np.random.
     return found
 
 
-def _in_order(found: list[FoundSphere], artefact: SphereStandard) -> list[FoundSphere]:
-    """The spheres in the order of the description: by sizes and spacings, and by position where those are equal."""
+def _sort_spheres(found: list[FoundSphere], artefact: SphereStandard) -> list[FoundSphere]:
+    """Sort the spheres in the order of the description by sizes and spacings; equivalent orders by position."""
     centres = np.array([sphere.robust.fit.centre_mm for sphere in found])
     diameters = np.array([2 * sphere.robust.fit.radius_mm for sphere in found])
     along = int(np.ptp(centres[:, 1]) >= np.ptp(centres[:, 0]))
@@ -349,7 +355,7 @@ def _in_order(found: list[FoundSphere], artefact: SphereStandard) -> list[FoundS
     return [found[position] for position in orders[best]]
 
 
-def _within_cap(
+def _fit_cap(
     points: np.ndarray, sphere: FoundSphere, cap_angle_deg: float | None
 ) -> tuple[np.ndarray, RobustFit[SphereFit]]:
     if cap_angle_deg is None:
@@ -359,7 +365,7 @@ def _within_cap(
     members = sphere.members[cosine >= np.cos(np.radians(cap_angle_deg))]
     if len(members) < LEAST_POINTS:
         raise EvaluationError(
-            f"only {len(members)} of {len(away)} points of the sphere lie within {cap_angle_deg:g} deg of the point "
-            f"that faces the sensor (-Z); {LEAST_POINTS} are needed. Widen cap_angle_deg"
+            f"only {len(members)} of {len(away)} points of the sphere are within {cap_angle_deg:g} deg of the point "
+            f"nearest to the sensor (-Z); {LEAST_POINTS} are needed. Increase cap_angle_deg"
         )
     return members, fit_robustly(fit_sphere, points[members])

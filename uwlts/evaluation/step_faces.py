@@ -1,6 +1,6 @@
-"""Faces of a step standard: the points on each and the distance between them.
+"""Detection of the faces of a step standard, and the distance between them.
 
-Points are (N, 2) of one profile (Y, Z) or (N, 3) of a scan (X, Y, Z); the last coordinate points away from the sensor.
+Points are (N, 2) of one profile (Y, Z) or (N, 3) of a scan (X, Y, Z). The last axis points away from the sensor.
 """
 
 from dataclasses import dataclass
@@ -11,32 +11,32 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import DEFAULT_K, accepted_points, evenly_thinned, principal_axes, robust_std
+from uwlts.fitting.least_squares import DEFAULT_K, check_points, evenly_thinned, principal_axes, robust_std
 from uwlts.fitting.shapes import fit_line, fit_plane
 from uwlts.runtime.compiled import compiled
 
 _SEARCH_LIMIT = 0.05
-"""Half width, in step heights, of the band in which the points of a proposed face are counted."""
+"""Half width (unit: step height) of the band of points that support a proposed face."""
 _HEIGHT_TOLERANCE = 0.25
-"""Error of the described height, relative to it."""
+"""Largest relative error of the described height."""
 _SMALLEST_LIMIT = 0.01
-"""Smallest limit, in step heights, of the band of a face."""
+"""Smallest half width (unit: step height) of the band of a face."""
 _LARGEST_LIMIT = 0.3
-"""Largest limit, in step heights: the bands of both faces stay apart."""
+"""Largest half width (unit: step height), so that the bands of both faces do not overlap."""
 _LARGEST_STD = 0.125
-"""Standard deviation of a face, in step heights: a slope that fills the widest band has 0.17."""
+"""Largest standard deviation of a face (unit: step height); a slope that fills the widest band has 0.17."""
 _PROPOSALS = 500
-"""Pairs (triples) of points that are tried."""
+"""Number of tested pairs (triples) of points."""
 _THINNED = 800
-"""Points on which they are judged."""
+"""Number of points for scoring them."""
 _SMALLEST_FACE = 0.02
-"""Least share of these on a face."""
+"""Least fraction of these points on a face."""
 _ROUNDS = 5
-"""Refinements of the best proposal."""
+"""Number of refinements of the best proposal."""
 
 
 class StepFace(IntEnum):
-    """Label of a point: on the face farther from the sensor, on the nearer one, or on neither."""
+    """Label of a point: on the face farther from the sensor (lower), on the nearer one (upper), or on neither."""
 
     NEITHER = 0
     LOWER = 1
@@ -44,7 +44,7 @@ class StepFace(IntEnum):
 
     @property
     def other(self) -> "StepFace":
-        """The upper face of the lower one and the other way round."""
+        """The opposite face."""
         return StepFace(3 - self)
 
 
@@ -57,28 +57,47 @@ class StepMeasurement:
 
 
 def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, seed: int = 0) -> np.ndarray:
-    """Face of every point (N,) int8, as `StepFace`.
+    """Label the face of each point as `StepFace`.
 
-    Two parallel lines (planes) about one height apart, within a quarter, are searched among the directions of random
-    pairs (triples) of points; the faces may be in several pieces (base - block - base) and lie at any angle. A point
-    belongs to a face when it is nearer to it than five robust standard deviations (within 1 to 30 % of the height)
-    and, along the face, farther than `edge_mm` from all points that are not on it: so the rounded, mixed points at
-    edges and the riser stay out. ``height_mm`` is approximate. EvaluationError, which says what was found, for too few
-    points or no two such faces.
+    Random pairs (triples) of points propose directions of two parallel lines (planes) at the distance of the height,
+    within a quarter. The faces may have any inclination and several parts (base - block - base). A point belongs to a
+    face if its distance is at most five robust standard deviations, limited to 1 to 30 % of the height. It must also be
+    farther than ``edge_mm`` from all points off the face, which excludes rounded edges and the riser.
+
+    Parameters
+    ----------
+    points : (N, 2) or (N, 3)
+        Points of a profile or a scan, mm.
+    height_mm
+        Approximate height of the step.
+    edge_mm
+        Width of the excluded border of a face.
+    seed
+        Seed of the random proposals.
+
+    Returns
+    -------
+    (N,) int8
+        Labels.
+
+    Raises
+    ------
+    EvaluationError
+        There are too few points, or no two such faces.
     """
-    points = accepted_points(points, least=20, what="a step", dimensions=(2, 3))
+    points = check_points(points, least=20, what="a step", dimensions=(2, 3))
     least = 10 if points.shape[1] == 2 else 40
     proposal = _best_proposal(evenly_thinned(points, _THINNED), height_mm, np.random.default_rng(seed))
     if proposal is None:
         raise EvaluationError(
-            f"no two parallel step faces about {height_mm:g} mm apart among {len(points)} points; "
+            f"no two parallel step faces at a distance of about {height_mm:g} mm among {len(points)} points; "
             f"show both faces, or correct the height"
         )
     normal, anchor, offset = proposal
     on_anchor = on_other = np.zeros(len(points), dtype=bool)
     for _ in range(_ROUNDS):
-        on_anchor, on_other = _levels(points @ normal, anchor, offset)
-        # Common to two parallel lines or planes, each through the middle of its points.
+        on_anchor, on_other = _find_levels(points @ normal, anchor, offset)
+        # Joint fit of two parallel lines or planes, each through the centroid of its points.
         faces = [face - face.mean(axis=0) for face in (points[on_anchor], points[on_other]) if len(face)]
         axis = principal_axes(np.vstack(faces))[1][-1]
         normal = axis if axis @ normal > 0 else -axis
@@ -99,17 +118,29 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
 def step_height(
     points: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
 ) -> StepMeasurement:
-    """Mean distance of one face's points to the line (profile) or plane (scan) through the other's.
+    """Measure the mean distance of one face's points from the line (profile) or plane (scan) of the other face.
 
-    Thesis, section 3.2.2. In a profile whose sheet does not cut the step along its normal this is the height over the
-    cosine of the angle between. ``points`` are (N, 2) or (N, 3), mm, ``labels`` (N,) from `label_step_faces`; while
-    points move a little, as in a calibration, the labels can stay. The line or plane is fitted to the ``reference``
-    face. EvaluationError for too few points on a face.
+    Thesis, section 3.2.2. If the sheet of a profile is inclined to the step's normal, the result is the height divided
+    by the cosine of the angle. Labels remain valid for small changes of the points, for example in a calibration.
+
+    Parameters
+    ----------
+    points : (N, 2) or (N, 3)
+        Points of a profile or a scan, mm.
+    labels : (N,)
+        Labels from `label_step_faces`.
+    reference
+        Face to which the line or plane is fitted.
+
+    Raises
+    ------
+    EvaluationError
+        A face has too few points.
     """
     base = StepFace[reference.upper()]
     points = np.asarray(points, dtype=np.float64)
     surface = (fit_line if points.shape[1] == 2 else fit_plane)(points[labels == base])
-    across = accepted_points(points[labels == base.other], least=2, what="a step face", dimensions=(2, 3))
+    across = check_points(points[labels == base.other], least=2, what="a step face", dimensions=(2, 3))
     distances = surface.distances_mm(across)
     lever = np.array([1.0, *(surface.axes @ (across.mean(axis=0) - surface.point_mm))])
     variance = lever @ surface.covariance @ lever + distances.var(ddof=1) / len(distances)
@@ -117,32 +148,32 @@ def step_height(
 
 
 def _require_faces(*, heights: np.ndarray, labels: np.ndarray, height: float, least: int) -> None:
-    """Two levels at the right distance, each with enough points and narrow: a slope or curve fills its whole band."""
+    """Raise EvaluationError unless both levels have enough points, a small scatter and the expected distance."""
     lower, upper = heights[labels == StepFace.LOWER], heights[labels == StepFace.UPPER]
     found = ""
     if min(len(lower), len(upper)) < least:
-        found = (
-            f"{len(lower)} points on the lower level, {len(upper)} on the upper one, at least {least} needed on each"
-        )
+        found = f"{len(lower)} points on the lower level, {len(upper)} on the upper one; each needs at least {least}"
     elif (widest := max(float(lower.std()), float(upper.std()))) > _LARGEST_STD * height:
-        found = f"what lies at these levels scatters by {widest:.2g} mm (standard deviation) and is sloping or curved"
+        found = f"the points at these levels have a standard deviation of {widest:.2g} mm and are inclined or curved"
     if found:
         raise EvaluationError(
-            f"no two step faces about {height:g} mm apart: {found}; show both faces, or correct the height"
+            f"no two step faces at a distance of about {height:g} mm: {found}; show both faces, or correct the height"
         )
     distance = float(upper.mean() - lower.mean())
     if abs(distance - height) > _HEIGHT_TOLERANCE * height:
-        raise EvaluationError(f"the step faces are {distance:.2f} mm apart; the step is described with {height:g} mm")
+        raise EvaluationError(
+            f"the distance of the step faces is {distance:.2f} mm; the step's description says {height:g} mm"
+        )
 
 
 def _best_proposal(
     points: np.ndarray, height: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, float, float] | None:
-    """Normal towards the sensor, level of one face and signed offset of the other, with most points on both."""
+    """Return the normal towards the sensor, the level of one face and the signed offset of the best supported pair."""
     limit, least = _SEARCH_LIMIT * height, max(3, _SMALLEST_FACE * len(points))
     most, best = 0.0, None
     here, there = np.empty((2, len(points)), np.intp)
-    for normal in _proposed_normals(points, rng):
+    for normal in _propose_normals(points, rng):
         heights = np.sort(points @ normal)
         _count_within(heights, -limit, limit, here)
         for side in (1.0, -1.0):
@@ -157,7 +188,7 @@ def _best_proposal(
 
 @compiled
 def _count_within(heights: np.ndarray, low: float, high: float, counts: np.ndarray) -> None:
-    """How many of some heights (N,) in growing order lie from ``low`` to ``high`` above each of them."""
+    """Count, for each of the ascending heights (N,), those from ``low`` to ``high`` above it."""
     first = last = 0
     for n in range(len(heights)):
         while first < len(heights) and heights[first] < heights[n] + low:
@@ -167,8 +198,8 @@ def _count_within(heights: np.ndarray, low: float, high: float, counts: np.ndarr
         counts[n] = last - first
 
 
-def _proposed_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Unit normals (M, D), towards the sensor, of lines (planes) through random pairs (triples) of points."""
+def _propose_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return unit normals (M, D), towards the sensor, of lines (planes) through random pairs (triples) of points."""
     dimension = points.shape[1]
     corners = points[rng.integers(len(points), size=(_PROPOSALS, dimension))]
     side = corners[:, 1] - corners[:, 0]
@@ -182,17 +213,17 @@ def _proposed_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarra
     return np.where(normals[:, -1:] > 0, -normals, normals)
 
 
-def _levels(heights: np.ndarray, anchor: float, offset: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N,) bool on the face at the anchor's level, and on the one where points crowd most about an offset."""
+def _find_levels(heights: np.ndarray, anchor: float, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return masks (N,) of points on the face at the anchor's level, and on the densest level near the offset."""
     height = abs(offset)
     about = np.sort(heights[np.abs(heights - anchor - offset) <= _HEIGHT_TOLERANCE * height])
     window = _SEARCH_LIMIT * height
     crowd = np.searchsorted(about, about + 2 * window, side="right") - np.arange(len(about))
     other = float(about[np.argmax(crowd)]) + window if len(about) else anchor + offset
-    return _near_level(heights, anchor, height), _near_level(heights, other, height)
+    return _select_near_level(heights, anchor, height), _select_near_level(heights, other, height)
 
 
-def _near_level(heights: np.ndarray, level: float, height: float) -> np.ndarray:
+def _select_near_level(heights: np.ndarray, level: float, height: float) -> np.ndarray:
     limit = 2 * _SEARCH_LIMIT * height
     for _ in range(3):
         near = heights[np.abs(heights - level) <= limit]

@@ -1,4 +1,4 @@
-"""Compares measured points with ground truth, point by point."""
+"""Point-by-point comparison of measured points with ground truth."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,22 +11,24 @@ from uwlts.storage.truth import TruthStatus
 
 @dataclass(frozen=True, eq=False)
 class TruthComparison:
-    """Errors of the points, and how complete and how clean they are.
+    """Errors, completeness and false points of a cloud.
 
     Attributes
     ----------
     matched : (N,) bool
         Points whose frame and line have a true stripe; all others are false points.
     error_mm : (N, 3)
-        Point less true point; NaN where not matched.
+        Measured minus true point; NaN if not matched.
     distance_mm : (N,)
-        Component of the error along the true surface's normal; NaN where not matched.
+        Component of the error along the true normal; NaN if not matched.
     mean_mm, std_mm, rms_mm : float
-        Of the distances of the matched points; percentiles and the largest are of their absolute values.
+        Statistics of the distances of matched points.
+    p95_mm, p99_mm, largest_mm : float
+        Percentiles and maximum of their absolute values.
     share_within_tolerance : float
-        Share of the matched points with an absolute distance of at most `tolerance_mm`.
+        Fraction of the matched points with an absolute distance of at most `tolerance_mm`.
     false_points, missed : int
-        Points without a true stripe, and true stripes (a line of a frame) without a point.
+        Number of points without a true stripe, and of true stripes (a line of a frame) without a point.
     """
 
     matched: np.ndarray
@@ -49,7 +51,7 @@ class TruthComparison:
         return np.mean(self.error_mm[self.matched], axis=0)
 
     def as_dict(self) -> dict[str, Any]:
-        """The statistics as plain JSON, with the number of matched points."""
+        """Return the statistics and the number of matched points as JSON."""
         arrays = ("matched", "error_mm", "distance_mm")
         statistics = {name: value for name, value in vars(self).items() if name not in arrays}
         return {"matched": int(np.count_nonzero(self.matched)), **statistics}
@@ -65,44 +67,53 @@ def compare_with_truth(
     status: np.ndarray,
     tolerance_mm: float = 0.01,
 ) -> TruthComparison:
-    """Signed distances (p - p_true) . n of points (N, 3), mm, to the true surface, and their statistics.
+    """Compare points with the true surface by their signed distances (p - p_true) . n.
 
-    ``frame`` and ``line`` (N,) are the image and row (or column) of each point. ``point_mm`` and ``normal`` (F, L, 3)
-    are the true point and unit surface normal of each line of each frame, in the frame of the points, where its
-    ``status`` (F, L) is 0, a visible stripe.
+    Parameters
+    ----------
+    points : (N, 3)
+        Measured points, mm.
+    frame, line : (N,)
+        Image and row (or column) of each point.
+    point_mm, normal : (F, L, 3)
+        True point and unit normal of each line of each frame, in the frame of the points.
+    status : (F, L)
+        0 for a visible stripe; points and normals elsewhere are ignored.
+    tolerance_mm
+        Tolerance for the fraction of accurate points.
 
     Raises
     ------
     EvaluationError
-        Points without frame and line, or with ones beyond the truth; truth that is not finite or has no unit normals
-        where it says visible; no point matches.
+        Points have no frame and line or ones outside the truth, visible truth is not finite or has no unit normals, or
+        no point matches.
     """
     points, point_mm, normal = (np.asarray(values, dtype=np.float64) for values in (points, point_mm, normal))
     frame, line = np.asarray(frame), np.asarray(line)
     visible = np.asarray(status) == TruthStatus.VISIBLE
     if points.shape != (len(points), 3) or frame.shape != (len(points),) or line.shape != frame.shape:
-        raise ValueError(f"(N, 3) points and (N,) indices expected: {points.shape}, {frame.shape}, {line.shape}")
+        raise ValueError(f"expected (N, 3) points and (N,) indices; found {points.shape}, {frame.shape}, {line.shape}")
     shapes = point_mm.shape, normal.shape, visible.shape
     if visible.ndim != 2 or shapes[:2] != ((*visible.shape, 3),) * 2:
-        raise ValueError(f"truth of the shapes (F, L, 3), (F, L, 3), (F, L) expected: {shapes}")
+        raise ValueError(f"expected truth of the shapes (F, L, 3), (F, L, 3), (F, L); found {shapes}")
     outside = (frame < 0) | (frame >= visible.shape[0]) | (line < 0) | (line >= visible.shape[1])
     if not np.isfinite(points).all():
-        raise EvaluationError("points to be compared must be finite; leave the others out")
+        raise EvaluationError("some points are not finite; remove them")
     if outside.any():
         first = int(np.argmax(outside))
         raise EvaluationError(
-            f"{np.count_nonzero(outside)} of {len(points)} points have no place in the truth of {visible.shape[0]} "
+            f"{np.count_nonzero(outside)} of {len(points)} points are outside the truth of {visible.shape[0]} "
             f"frames and {visible.shape[1]} lines (the first: frame {frame[first]}, line {line[first]}); "
             f"cloud and truth belong to different captures"
         )
     if not np.isfinite(point_mm[visible]).all():
-        raise EvaluationError("the truth is not finite on lines whose stripe it calls visible")
-    # Normals may come in single precision (1e-7); a wrong length would scale every distance.
+        raise EvaluationError("the truth is not finite on lines with a visible stripe")
+    # The tolerance allows for normals in single precision (1e-7). A wrong length would scale all distances.
     if not np.allclose(np.sum(np.square(normal[visible]), axis=1), 1.0, rtol=0, atol=1e-5):
-        raise EvaluationError("the truth has normals that are not of unit length on lines it calls visible")
+        raise EvaluationError("the truth has normals that are not of unit length on lines with a visible stripe")
     matched = visible[frame, line]
     if not matched.any():
-        raise EvaluationError(f"none of the {len(points)} points lies on a frame and line with a visible true stripe")
+        raise EvaluationError(f"none of the {len(points)} points has a visible true stripe on its frame and line")
     error, distance = np.full(points.shape, np.nan), np.full(len(points), np.nan)
     at = frame[matched], line[matched]
     error[matched] = points[matched] - point_mm[at]
@@ -126,19 +137,3 @@ def compare_with_truth(
         false_points=int(np.count_nonzero(~matched)),
         missed=int(np.count_nonzero(visible & ~found)),
     )
-
-
-def best_fit_motion(comparison: TruthComparison, points: np.ndarray) -> np.ndarray:
-    """Rigid motion (4, 4) that brings matched points (N, 3) closest to their true points, by least squares.
-
-    A calibrated sensor's coordinate system has its own origin and directions. What is left after this motion is the
-    error of form and size; the motion itself is the datum's. Kabsch 1976, Acta Crystallographica A32:922.
-    """
-    measured = points[comparison.matched]
-    true = measured - comparison.error_mm[comparison.matched]
-    middle_measured, middle_true = measured.mean(axis=0), true.mean(axis=0)
-    u, _, vt = np.linalg.svd((true - middle_true).T @ (measured - middle_measured))
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = rotation, middle_true - rotation @ middle_measured
-    return motion

@@ -1,8 +1,7 @@
-"""The surface near any place, by points about it: oriented normals, and curved patches weighted by covariance.
+"""Local surface at any place: oriented normals, and curved patches weighted by the points' covariance.
 
-A patch is a paraboloid over the plane of a normal, fitted by moving least squares (Levin, Math. Comp. 67, 1998) to the
-points on the same side of a wall. Its height at the place is linear in the points, so that its uncertainty follows from
-theirs by propagation.
+A patch is a paraboloid over the tangent plane, fitted by moving least squares (Levin, Math. Comp. 67, 1998) to the
+points on one side of a wall. Its height is linear in the points, so their uncertainty propagates linearly.
 """
 
 from __future__ import annotations
@@ -15,21 +14,22 @@ import numpy as np
 from uwlts.runtime.compiled import compiled, compiled_with_arrays
 
 _SAME_SIDE = 0.5
-"""Cosine of the angle between normals up to which points lie on the same side of a wall or an edge: 60 deg."""
+"""Cosine of the largest angle (60 deg) between normals of points on the same side of a wall or an edge."""
 _FEWEST = 8
-"""Points of a patch, which has six coefficients."""
+"""Least number of points of a patch, which has six coefficients."""
 _MOST_IMAGES = 256
+"""Largest number of images of a patch that are distinguished; further ones are combined."""
 _TERMS = 6
 
 
 class PointGrid:
-    """Points (N, 3) sorted into cubes, for all those near a place."""
+    """Points (N, 3) sorted into cubes for fast neighbour searches."""
 
     def __init__(self, points_mm: np.ndarray, cell_mm: float):
         self.cell_mm = cell_mm
         self.low = points_mm.min(axis=0) - cell_mm
         cells = np.floor((points_mm - self.low) / cell_mm).astype(np.int64)
-        # A border of empty cubes, so that neighbours never wrap around.
+        # A border of empty cubes keeps neighbour keys from wrapping around.
         self.shape = cells.max(axis=0) + 2
         keys = (cells[:, 0] * self.shape[1] + cells[:, 1]) * self.shape[2] + cells[:, 2]
         self.order = np.argsort(keys, kind="stable")
@@ -39,21 +39,22 @@ class PointGrid:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """What the patches are fitted to.
+    """Points to which patches are fitted, with their uncertainty along the normals.
 
     Attributes
     ----------
     points_mm, normals : (N, 3) float64
-        Points, and unit normals out of the material.
+        Points and outward unit normals.
     weight : (N,) float64
-        One over the variance along the normal, by everything that is known.
+        Inverse of the total variance along the normal.
     noise_mm2 : (N,) float64
-        Variance along the normal by each point's own noise; 0 where it is not known.
+        Noise variance of each point along the normal; 0 if unknown.
     position_mm : (N,) float64
-        Move along the normal by the position of the point's image, which moves those of an image together.
+        Standard deviation along the normal by the position of the image, common to all points of an image.
     image : (N,) int64
+        Image of each point.
     patterns_mm : (M, N) float64
-        Moves along the normal that all points of a scan share.
+        Shift along the normal by each systematic pattern, common to all points of a scan.
     scan : (N,) int64
         Scan of each point; the patterns of different scans are independent.
     """
@@ -75,15 +76,13 @@ class LocalPatches:
     Attributes
     ----------
     height_mm : (P,) float64
-        Of the surface over the place, along the normal.
+        Height of the surface above the place, along the normal.
     normals : (P, 3) float64
-        Of the patch at the place, out of the material.
+        Outward unit normals of the patches.
     found : (P,) bool
-        Where points about the place determine the height better than one point alone would; elsewhere it would be an
-        extrapolation.
+        Mask of places whose height is better determined than by one point; elsewhere it would be an extrapolation.
     noise_mm, shared_mm : (P,) float64
-        Standard uncertainty of the height by what differs from point to point or image to image, and by what all points
-        of a scan share.
+        Standard uncertainty of the height by errors of points and images, and by systematic errors of a scan.
     """
 
     height_mm: np.ndarray
@@ -94,17 +93,17 @@ class LocalPatches:
 
 
 def surface_normals(points_mm: np.ndarray, *, radius_mm: float, towards: np.ndarray) -> np.ndarray:
-    """Unit normals (N, 3) of the planes through all points within a radius of each, turned ``towards`` (3,)."""
+    """Return unit normals (N, 3) of planes through the points within a radius of each, oriented ``towards`` (3,)."""
     grid = PointGrid(points_mm, radius_mm)
     moments = np.empty((len(points_mm), 6))
-    _moments(points_mm.astype(np.float64), grid.points_mm, grid.keys, grid.low, grid.shape, radius_mm, moments)
+    _fill_moments(points_mm.astype(np.float64), grid.points_mm, grid.keys, grid.low, grid.shape, radius_mm, moments)
     matrices = moments[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     normals = np.linalg.eigh(matrices)[1][:, :, 0]
     return np.where((normals @ towards)[:, None] < 0, -normals, normals)
 
 
 class LocalSurface:
-    """A surface given by `SurfacePoints`, smoothed over a radius."""
+    """Surface given by `SurfacePoints`, smoothed over a radius."""
 
     def __init__(self, surface: SurfacePoints, *, radius_mm: float):
         self.radius_mm = radius_mm
@@ -117,12 +116,12 @@ class LocalSurface:
         self._scan = np.ascontiguousarray(surface.scan[grid.order])
 
     def patches(self, places_mm: np.ndarray, *, with_uncertainty: bool = False) -> LocalPatches:
-        """Patches at places (P, 3), each on the side of a wall on which its nearest point lies."""
+        """Fit patches at places (P, 3), each to the side of a wall that holds the nearest point."""
         places, grid = np.ascontiguousarray(places_mm, dtype=np.float64), self._grid
         height, found = np.zeros(len(places)), np.zeros(len(places), np.bool_)
         normals, variance = np.zeros((len(places), 3)), np.zeros((len(places), 2))
         scans = int(self._scan.max(initial=0)) + 1
-        fill: Any = _patches
+        fill: Any = _fit_patches
         fill(
             places,
             grid.points_mm,
@@ -143,8 +142,8 @@ class LocalSurface:
 
 
 @compiled
-def _row(keys, low, shape, cell, place, row):
-    """First and last of the sorted points in three cubes in a row, of the nine rows about a place."""
+def _row_range(keys, low, shape, cell, place, row):
+    """Return the range of sorted points in three adjacent cubes, one of the nine rows around a place."""
     x = int(np.floor((place[0] - low[0]) / cell)) + row // 3 - 1
     y = int(np.floor((place[1] - low[1]) / cell)) + row % 3 - 1
     z = int(np.floor((place[2] - low[2]) / cell))
@@ -156,13 +155,13 @@ def _row(keys, low, shape, cell, place, row):
 
 
 @compiled_with_arrays
-def _moments(places, points, keys, low, shape, radius, moments):
-    """Second central moments (P, 6) xx, xy, xz, yy, yz, zz of the points within the radius of each place."""
+def _fill_moments(places, points, keys, low, shape, radius, moments):
+    """Fill the second central moments (P, 6) xx, xy, xz, yy, yz, zz of the points within the radius of each place."""
     for number in range(len(places)):
         place, count = places[number], 0
         sums, products = np.zeros(3), np.zeros(6)
         for row in range(9):
-            start, end = _row(keys, low, shape, radius, place, row)
+            start, end = _row_range(keys, low, shape, radius, place, row)
             for k in range(start, end):
                 a, b, c = points[k, 0] - place[0], points[k, 1] - place[1], points[k, 2] - place[2]
                 if a * a + b * b + c * c <= radius * radius:
@@ -177,7 +176,7 @@ def _moments(places, points, keys, low, shape, radius, moments):
 
 
 @compiled_with_arrays
-def _patches(
+def _fit_patches(
     places,
     points,
     keys,
@@ -197,13 +196,13 @@ def _patches(
     found,
     variance,
 ):
-    """Fill heights (P,), normals (P, 3), whether found (P,), and variances (P, 2) by noise and by what is shared."""
+    """Fill heights (P,), normals (P, 3), ``found`` (P,), and variances (P, 2) by noise and by systematic errors."""
     by = np.empty(_TERMS)
     for number in range(len(places)):
         place = places[number]
         nearest, least = -1, radius * radius
         for row in range(9):
-            start, end = _row(keys, low, shape, radius, place, row)
+            start, end = _row_range(keys, low, shape, radius, place, row)
             for k in range(start, end):
                 away = (points[k, 0] - place[0]) ** 2 + (points[k, 1] - place[1]) ** 2 + (points[k, 2] - place[2]) ** 2
                 if away < least:
@@ -211,7 +210,7 @@ def _patches(
         if nearest < 0:
             continue
         normal = normals[nearest]
-        # Two directions across the normal.
+        # Two tangents.
         first = (
             np.array((0.0, -normal[2], normal[1])) if abs(normal[0]) < 0.7 else np.array((-normal[1], normal[0], 0.0))
         )
@@ -220,16 +219,16 @@ def _patches(
         matrix, right = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
         count, total, left_u, left_v = 0, 0.0, 0.0, 0.0
         for row in range(9):
-            start, end = _row(keys, low, shape, radius, place, row)
+            start, end = _row_range(keys, low, shape, radius, place, row)
             for k in range(start, end):
-                kernel = _term(points[k], place, normal, first, second, normals[k], radius, by)
+                kernel = _fill_terms(points[k], place, normal, first, second, normals[k], radius, by)
                 if kernel > 0:
                     share = kernel * weight[k]
                     count += 1
                     total += share
                     left_u += share * by[1] * radius
                     left_v += share * by[2] * radius
-                    up = _height(points[k], place, normal)
+                    up = _height_above(points[k], place, normal)
                     for i in range(_TERMS):
                         right[i] += share * by[i] * up
                         for j in range(_TERMS):
@@ -237,7 +236,7 @@ def _patches(
         if count < _FEWEST:
             continue
         for i in range(_TERMS):
-            # So little that it only keeps points on few lines from having any curvature along them.
+            # A small ridge suppresses the curvature that points on few lines leave undetermined.
             matrix[i, i] += 1e-6 * total
         inverse = np.linalg.inv(matrix)
         answer = inverse[0]
@@ -246,15 +245,15 @@ def _patches(
         single, images, moves, many = 0.0, np.empty(_MOST_IMAGES, np.int64), np.zeros(_MOST_IMAGES), 0
         shared = np.zeros((scans, patterns.shape[1]))
         for row in range(9):
-            start, end = _row(keys, low, shape, radius, place, row)
+            start, end = _row_range(keys, low, shape, radius, place, row)
             for k in range(start, end):
-                kernel = _term(points[k], place, normal, first, second, normals[k], radius, by)
+                kernel = _fill_terms(points[k], place, normal, first, second, normals[k], radius, by)
                 if kernel <= 0:
                     continue
                 share = kernel * weight[k]
                 part = share * np.sum(answer * by)
                 square += part * part
-                residual = _height(points[k], place, normal) - np.sum(coefficients * by)
+                residual = _height_above(points[k], place, normal) - np.sum(coefficients * by)
                 scatter += share * residual * residual
                 freedom += share
                 single += part * part * noise[k]
@@ -268,7 +267,7 @@ def _patches(
                 moves[at] += part * position[k]
                 for m in range(patterns.shape[1]):
                     shared[scan[k], m] += part * patterns[k, m]
-        # Better known than by one point, and not at the edge of its points.
+        # Reject heights that are less certain than one point, and places at the border of their points.
         beside = np.sqrt(left_u * left_u + left_v * left_v) / total
         if square >= 1.0 or beside > 0.4 * radius:
             continue
@@ -282,14 +281,14 @@ def _patches(
 
 
 @compiled
-def _height(point, place, normal):
-    """Height of a point over a place along the normal."""
+def _height_above(point, place, normal):
+    """Return the height of a point above a place along the normal."""
     return (point[0] - place[0]) * normal[0] + (point[1] - place[1]) * normal[1] + (point[2] - place[2]) * normal[2]
 
 
 @compiled
-def _term(point, place, normal, first, second, own, radius, by):
-    """Fill the terms (6,) 1, u, v, u^2, u v, v^2 of a point in units of the radius; its kernel, 0 without weight."""
+def _fill_terms(point, place, normal, first, second, own, radius, by):
+    """Fill the terms (6,) 1, u, v, u^2, u v, v^2 of a point (unit: radius) and return its kernel weight."""
     if own[0] * normal[0] + own[1] * normal[1] + own[2] * normal[2] < _SAME_SIDE:
         return 0.0
     a, b, c = point[0] - place[0], point[1] - place[1], point[2] - place[2]

@@ -1,7 +1,7 @@
-"""Local surfaces of a cloud: second-order patches with their covariance, and distances of one set from another.
+"""Second-order patches of a cloud's surface with covariance, and distances between two sets of patches.
 
-A patch is a second-order fit to the points of a disc. It follows curved surfaces, inside of which a plane would lie,
-and its covariance says how much of a distance, and of a slope, is noise.
+A patch is a second-order fit to the points of a disc. Unlike a plane, it is unbiased on curved surfaces. Its covariance
+gives the noise of distances and slopes.
 """
 
 from __future__ import annotations
@@ -19,27 +19,29 @@ from uwlts.errors import EvaluationError
 from uwlts.storage.cloud import PointUncertainty, variance_along
 
 _CELLS_PER_RADIUS = 3.0
-"""Points are averaged in cubes of a third of the disc's radius: 28 of them fill a disc, enough for 6 coefficients."""
+"""Cubes per disc radius, in which points are averaged: a disc holds 28 averages for 6 coefficients."""
 _NEIGHBOURS = 40
 _FEWEST = 10
-"""Averages in a disc; a second-order surface has 6 coefficients."""
+"""Least number of averages in a disc; a second-order surface has 6 coefficients."""
 _ROUND = 0.3
-"""Smallest share of a disc's narrow by its wide extent, squared: profiles far apart give strips instead of discs."""
+"""Least squared ratio of a disc's narrow to its wide extent; distant profiles give strips instead of discs."""
 _LARGEST_PATCH = 0.1
-"""Of the cloud's size: a larger disc is no local surface."""
+"""Largest disc radius relative to the cloud's size; a larger disc is not local."""
 _ROUGH = 5.0
-"""Times the usual scatter within a patch: one that scatters more lies on an edge."""
+"""Largest ratio of a patch's scatter to the median scatter; patches on edges exceed it."""
 _MOST = 15_000
+"""Number of patches above which they are thinned."""
 _SAMPLE = 400
+"""Number of discs from which the radius is found."""
 _SAME_WAY = 0.8
-"""Cosine of 37 deg: surfaces that lie on each other have normals that differ by less."""
+"""Least cosine (37 deg) between the normals of corresponding patches."""
 _FACING = 0.15
-"""Cosine of 81 deg: a sensor sees hardly anything of a surface that leans more."""
+"""Least cosine (81 deg) between a normal and the viewing direction; a sensor sees little of steeper surfaces."""
 
 LEAST_INFORMATION = 5.0
-"""Information about a movement relative to that which the noise of normals alone would give: with less it is open."""
+"""Information on a motion, relative to that produced by noise of normals, below which the motion is undetermined."""
 _ROUNDING = 1e-9
-"""Information relative to that on the best determined movement: less is rounding."""
+"""Information relative to that on the best determined motion, below which it is rounding noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,27 +51,27 @@ class Patches:
     Attributes
     ----------
     places_mm : (P, 3) float64
-        Middle of each patch, on the surface.
+        Centre of each patch, on the surface.
     axes : (P, 3, 3) float64
-        In rows two tangents and the unit normal.
+        Two tangents and the unit normal, in rows.
     shape : (P, 6) float64
-        Height over the tangents: 1, u, v, u2, uv, v2.
+        Coefficients of the height over the tangents: 1, u, v, u2, uv, v2.
     covariance : (P, 6, 6) float64
-        Of the shape, by the noise of the points.
+        Covariance of the shape by noise of the points.
     patterns_mm : (M, P, 3) float64
-        How each patch moves by one standard deviation of what all points share (`PointUncertainty`).
+        Shift of each patch for one standard deviation of each systematic pattern (`PointUncertainty`).
     numbers : (P,) int
-        Number of a point in the middle of the patch.
+        Number of a point near the centre of the patch.
     radius_mm : float
-        Of the discs.
+        Radius of the discs.
     shared : float
-        Number of patches that each point is part of: neighbouring patches are not independent.
+        Mean number of patches that contain a point; overlapping patches are correlated.
     one_sided : bool
-        All normals look to -Z, where the sensor was; else their signs have no meaning.
+        True if all normals point to the sensor (-Z); otherwise their signs have no meaning.
     by_images : float
-        Share of the usual patch's variance that the errors of images make, which patches along an image have in common.
+        Fraction of the median patch variance due to image errors, which are common to all patches along an image.
     strips : float
-        Into how many strips of that kind, as wide as a patch, the cloud's images fall.
+        Number of strips, as wide as a patch, into which the images are divided.
     """
 
     places_mm: np.ndarray
@@ -84,8 +86,8 @@ class Patches:
     by_images: float = 0.0
     strips: float = 1.0
 
-    def alike(self, count: int) -> float:
-        """Of how many patches as one, so many of them tell, all over the images."""
+    def correlated_count(self, count: int) -> float:
+        """Return the number of patches that carry the information of one independent patch, among ``count`` patches."""
         along = max(count / self.strips, self.shared)
         return (1 - self.by_images) * self.shared + self.by_images * along
 
@@ -94,7 +96,7 @@ class Patches:
 
     @property
     def normals(self) -> np.ndarray:
-        """(P, 3) unit normals."""
+        """Unit normals (P, 3)."""
         return self.axes[:, 2]
 
     @cached_property
@@ -102,7 +104,7 @@ class Patches:
         return KDTree(self.places_mm)
 
     def __getitem__(self, selection: Any) -> Patches:
-        """Some of the patches, by a slice, indices or a mask."""
+        """Select patches by a slice, indices or a mask."""
         return Patches(
             self.places_mm[selection],
             self.axes[selection],
@@ -125,64 +127,72 @@ def surface_patches(
     frame: np.ndarray | None = None,
     radius_mm: float | None = None,
 ) -> Patches:
-    """Patches of the surface that points (N, 3) lie on, of images (N,) where these are known.
+    """Fit patches to the surface of a cloud.
 
-    The radius of the discs is the smallest that holds enough points on both sides of every profile, unless given. What
-    moves all points of an image together (`PointUncertainty.poses_mm`) is averaged over the images of a disc alone, and
-    is common to all patches along an image.
+    Pose errors of images (`PointUncertainty.poses_mm`) average only over the images of a disc, and are common to all
+    patches along an image.
+
+    Parameters
+    ----------
+    points_mm : (N, 3)
+        Points of the cloud.
+    uncertainty, frame
+        Uncertainty of the points, and the image (N,) of each point.
+    radius_mm
+        Radius of the discs; by default the smallest one with enough points on several profiles (`find_disc_radius`).
 
     Raises
     ------
     EvaluationError
-        There are too few points, or they do not lie on a surface.
+        There are too few points, or they form no surface.
     """
     if len(points_mm) < 10 * _FEWEST:
         raise EvaluationError(f"the cloud has {len(points_mm)} points; at least {10 * _FEWEST} are needed")
-    radius = radius_mm or disc_radius(points_mm)
-    owner, means, counts = _averaged(points_mm, radius / _CELLS_PER_RADIUS)
-    middle = _one_each(means, radius)
-    away, near = _nearest(KDTree(means), means[middle], radius)
+    radius = radius_mm or find_disc_radius(points_mm)
+    owner, means, counts = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)
+    middle = _select_central(means, radius)
+    away, near = _nearest_within(KDTree(means), means[middle], radius)
     held = np.isfinite(away)
     enough = held.sum(axis=1) >= _FEWEST
     middle, near, held = middle[enough], near[enough], held[enough]
     if not len(middle):
-        raise EvaluationError(f"no disc of {radius:.3g} mm holds points enough for a surface: the cloud is too sparse")
+        raise EvaluationError(f"no disc of {radius:.3g} mm radius contains enough points: the cloud is too sparse")
     near = np.where(held, near, 0)
     about = means[near] - means[middle][:, None]
     weight = np.where(held, counts[near], 0.0)
-    axes = _principal(about, weight)
+    axes = _principal_frames(about, weight)
     u, v, w = np.einsum("pij,pkj->ipk", axes, about) / radius
     columns = _columns(u, v)
     normal = np.einsum("pka,pk,pkb->pab", columns, weight, columns)
-    # Discs that hold points on a line do not tell a second order: the ridge stands for 1e-6 of the weight.
+    # Points on a line leave second-order terms undetermined. A ridge of 1e-6 of the total weight sets these to zero.
     ridge = 1e-6 * weight.sum(axis=1)[:, None, None] * np.eye(6)
     inverse = np.linalg.inv(normal + ridge)
     shape = np.einsum("pab,pkb,pk,pk->pa", inverse, columns, weight, w)
     left = np.where(held, w - np.einsum("pka,pa->pk", columns, shape), 0.0)
     freedom = np.maximum(held.sum(axis=1) - 6, 1)
-    # Variance of one point: averages of n points scatter by a share 1/n of it.
+    # Variance of one point: the variance of an average of n points is 1/n of it.
     variance = np.einsum("pk,pk,pk->p", weight, left, left) / freedom
     typical = np.median(variance)
     kept = variance <= _ROUGH**2 * max(typical, 1e-30)
     if uncertainty is not None:
-        variance = np.maximum(variance, _along(uncertainty, points_mm, owner, middle, axes[:, 2]) / radius**2)
+        variance = np.maximum(variance, _stated_variance(uncertainty, points_mm, owner, middle, axes[:, 2]) / radius**2)
     variance = np.maximum(variance, typical)
     covariance = variance[:, None, None] * inverse
     shared, share, strips = max(float(weight.sum() / counts.sum()), 1.0), 0.0, 1.0
     if uncertainty is not None and uncertainty.poses_mm is not None and frame is not None:
         first = _first_points(owner)
-        by_image, images = _by_images(uncertainty.poses_mm, frame, first[middle], first[near], held, axes[:, 2])
+        by_image, images = _pose_variance(uncertainty.poses_mm, frame, first[middle], first[near], held, axes[:, 2])
         own, moved = covariance[:, 0, 0], by_image / radius**2 / images
         share = float(np.median(moved) / (np.median(moved) + np.median(own)))
         strips = max(len(np.unique(frame)) / float(np.median(images)), 1.0)
         covariance[:, 0, 0] = own + moved
     units = radius ** np.array([1.0, 0, 0, -1, -1, -1])
-    places, axes, shape = _levelled(means[middle], axes, shape * units)
+    places, axes, shape = _level(means[middle], axes, shape * units)
     flipped = axes[:, 2, 2] > 0
     one_sided = bool(np.mean(np.abs(axes[:, 2, 2]) > _FACING) > 0.98)
     sign = np.where(flipped, -1.0, 1.0)
     axes = axes * np.stack([np.ones_like(sign), sign, sign], axis=1)[:, :, None]
-    # The mirrored tangent changes the sign of v, the mirrored normal that of the height.
+    # Reversing the second tangent changes the sign of v, and reversing the normal that of the height.
     signs = sign[:, None] ** np.array([1, 1, 2, 1, 2, 1])
     shape = shape * signs
     covariance = covariance * np.outer(units, units) * signs[:, :, None] * signs[:, None]
@@ -193,17 +203,17 @@ def surface_patches(
     return patches[chosen[:: max(1, -(-len(chosen) // _MOST))]]
 
 
-def disc_radius(points_mm: np.ndarray) -> float:
-    """Radius of the smallest discs that hold enough points on several profiles.
+def find_disc_radius(points_mm: np.ndarray) -> float:
+    """Find the radius of the smallest discs with enough points on several profiles.
 
-    EvaluationError where not even a tenth of the cloud's size is enough.
+    EvaluationError if a tenth of the cloud's size does not suffice.
     """
     size = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
     sample = points_mm[:: max(1, len(points_mm) // _SAMPLE)][:_SAMPLE]
     radius = float(np.median(KDTree(points_mm).query(sample, k=7)[0][:, 6])) * np.sqrt(_FEWEST)
     while radius < _LARGEST_PATCH * size:
-        means = _averaged(points_mm, radius / _CELLS_PER_RADIUS)[1]
-        away, near = _nearest(KDTree(means), means[:: max(1, len(means) // _SAMPLE)], radius)
+        means = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)[1]
+        away, near = _nearest_within(KDTree(means), means[:: max(1, len(means) // _SAMPLE)], radius)
         held = np.isfinite(away)
         near = np.where(held, near, 0)
         about = means[near] - means[near[:, 0]][:, None]
@@ -213,23 +223,23 @@ def disc_radius(points_mm: np.ndarray) -> float:
         if np.mean(enough & round_) > 0.6:
             return radius
         radius *= 1.25
-    raise EvaluationError("the points lie too far apart for their surface to be found: scan with a smaller step")
+    raise EvaluationError("the spacing of the points is too large to find their surface: scan with a smaller step")
 
 
 @dataclass(frozen=True, eq=False)
 class PatchDistances:
-    """Distances of patches from the patches of another cloud, Q of them, in the common frame.
+    """Q distances of patches from the patches of another cloud, in the common frame.
 
     Attributes
     ----------
     source, target : (Q,) int
         Numbers of the patches.
     places_mm, normals : (Q, 3) float64
-        Of the source, and of the target's surface below it.
+        Centre of the source patch, and normal of the target surface below it.
     distance_mm, std_mm : (Q,) float64
-        Along the normal, positive on the normal's side; and its standard deviation by the noise of both.
+        Distance along the normal, positive on its side, and its standard deviation by noise of both patches.
     slope_variance : (Q,) float64
-        Of the normal, for each direction across it.
+        Variance of the normal's slope in each tangential direction.
     """
 
     source: np.ndarray
@@ -241,17 +251,26 @@ class PatchDistances:
     slope_variance: np.ndarray
 
     def __getitem__(self, selection: np.ndarray) -> PatchDistances:
-        """Some of the distances, by indices or a mask."""
+        """Select distances by indices or a mask."""
         return PatchDistances(*(values[selection] for values in vars(self).values()))
 
 
 def distances_between(
     source: Patches, source_pose: np.ndarray, target: Patches, target_pose: np.ndarray, *, reach_mm: float
 ) -> PatchDistances:
-    """Distances of the patches of one cloud from the surface of another, where both lie within ``reach_mm``.
+    """Measure the distances of the patches of one cloud from the surface of another.
 
-    Poses (4, 4) are into the common frame. A patch counts where the nearest patch of the other faces the same way and
-    lies within one radius across its normal, so that nothing is extrapolated.
+    A patch is used if the nearest target patch has a similar normal and a lateral offset below one radius, so that no
+    surface is extrapolated.
+
+    Parameters
+    ----------
+    source, target
+        Patches of both clouds.
+    source_pose, target_pose : (4, 4)
+        Transforms from the frame of each cloud to the common frame.
+    reach_mm
+        Largest distance.
     """
     places = source.places_mm @ source_pose[:3, :3].T + source_pose[:3, 3]
     inverse = target_pose[:3, :3].T
@@ -289,17 +308,26 @@ def distances_between(
 
 
 def rigid_derivatives(places_mm: np.ndarray, directions: np.ndarray, middle_mm: np.ndarray) -> np.ndarray:
-    """Return the motion (Q, 6) of places (Q, 3) along directions (Q, 3) by a shift, then a turn about a middle (3,)."""
+    """Return the derivatives (Q, 6) of positions (Q, 3) along directions (Q, 3) by a translation and a rotation vector.
+
+    The rotation is about ``middle_mm`` (3,).
+    """
     return np.hstack([directions, np.cross(places_mm - middle_mm, directions)])
 
 
-def information_of_slopes(
+def slope_information(
     normals: np.ndarray, noise: np.ndarray, derivatives: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Return the information (K, K) on movements that the noise of the normals alone would give.
+    """Return the information (K, K) on motions that noise of the normals alone would produce.
 
-    ``noise`` (Q,) is the weight of each distance times the variance of the slope there. ``derivatives`` gives those
-    (Q, K) of the distances by the movements, for directions (Q, 3) instead of the normals (Q, 3).
+    Parameters
+    ----------
+    normals : (Q, 3)
+        Normals of the distances.
+    noise : (Q,)
+        Weight of each distance times its slope variance.
+    derivatives
+        Function that returns the derivatives (Q, K) of distances by the motions, for directions (Q, 3) as normals.
     """
     across = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -307,11 +335,24 @@ def information_of_slopes(
     return sum((by.T @ (noise[:, None] * by) for by in parts), np.zeros(()))
 
 
-def ways_of_moving(information: np.ndarray, of_slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the information (K,) on independent movements relative to that of the normals' noise, and the movements.
+def decompose_motions(information: np.ndarray, of_slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Decompose motions into independent ones, ordered by information relative to that of slope noise.
 
-    Movements are columns (K, K), orthonormal in the metric (K, K) that is returned, too. One with less than
-    `LEAST_INFORMATION` is open.
+    A motion with less than `LEAST_INFORMATION` is undetermined.
+
+    Parameters
+    ----------
+    information, of_slopes : (K, K)
+        Information of the distances, and that of slope noise (`slope_information`).
+
+    Returns
+    -------
+    values : (K,)
+        Relative information on each motion, ascending.
+    motions : (K, K)
+        Motions in columns, orthonormal in the metric.
+    metric : (K, K)
+        Regularised slope information.
     """
     rounding = _ROUNDING / LEAST_INFORMATION * float(np.linalg.eigvalsh(information)[-1])
     metric = of_slopes + max(rounding, np.finfo(float).tiny) * np.eye(len(information))
@@ -320,12 +361,12 @@ def ways_of_moving(information: np.ndarray, of_slopes: np.ndarray) -> tuple[np.n
 
 
 def _columns(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Terms (..., 6) of a second-order surface."""
+    """Return the terms (..., 6) of a second-order surface."""
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
-def _averaged(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cube (N,) of each point, and means (C, 3) and counts (C,) of the points of each cube."""
+def _average_in_cubes(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Average points in cubes; return the cube (N,) of each point, and means (C, 3) and counts (C,) of the cubes."""
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     size = cells.max(axis=0) + 1
     keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
@@ -334,8 +375,8 @@ def _averaged(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, 
     return owner, means, counts.astype(np.float64)
 
 
-def _one_each(points: np.ndarray, apart: float) -> np.ndarray:
-    """Numbers of the points nearest to the middle of each cube that holds any."""
+def _select_central(points: np.ndarray, apart: float) -> np.ndarray:
+    """Select the point nearest to the centre of each non-empty cube of side ``apart``."""
     place = (points - points.min(axis=0)) / apart
     cells = np.floor(place).astype(np.int64)
     off = np.sum((place - cells - 0.5) ** 2, axis=1)
@@ -344,13 +385,13 @@ def _one_each(points: np.ndarray, apart: float) -> np.ndarray:
     return np.sort(order[np.r_[True, changed]])
 
 
-def _nearest(tree: KDTree, places: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def _nearest_within(tree: KDTree, places: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
     found: Any = tree.query(places, k=min(_NEIGHBOURS, tree.n), distance_upper_bound=radius)
     return found
 
 
-def _principal(about: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Right-handed axes (P, 3, 3) in rows of weighted points (P, K, 3), the normal last."""
+def _principal_frames(about: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return right-handed principal axes (rows of (P, 3, 3)) of weighted points (P, K, 3), the normal last."""
     middle = np.einsum("pk,pki->pi", weight, about) / weight.sum(axis=1)[:, None]
     centred = about - middle[:, None]
     vectors = np.linalg.eigh(np.einsum("pk,pki,pkj->pij", weight, centred, centred))[1]
@@ -358,8 +399,11 @@ def _principal(about: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(normal, first), normal], axis=1)
 
 
-def _levelled(places: np.ndarray, axes: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same patches about their point on the surface, with the normal there; curvatures change by slope squared."""
+def _level(places: np.ndarray, axes: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Move the origin of patches onto the surface and align their normals with it.
+
+    Changes of the curvatures, which are of second order in the slope, are neglected.
+    """
     slopes = shape[:, 1:3]
     moved = places + shape[:, :1] * axes[:, 2]
     normal = axes[:, 2] - slopes[:, :1] * axes[:, 0] - slopes[:, 1:] * axes[:, 1]
@@ -371,33 +415,33 @@ def _levelled(places: np.ndarray, axes: np.ndarray, shape: np.ndarray) -> tuple[
     return moved, np.stack([first, np.cross(normal, first), normal], axis=1), level
 
 
-def _along(
+def _stated_variance(
     known: PointUncertainty, points: np.ndarray, owner: np.ndarray, middle: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """Stated variance (P,) of one point along the normals of patches: single points, and images."""
+    """Return the stated variance (P,) of a point along the normals of patches, by noise and image position."""
     at = _first_points(owner)[middle]
     of_image = np.einsum("pi,pi->p", known.position_mm[at], normals)
     return of_image**2 + variance_along(known.random_mm2[at], normals)
 
 
 def _first_points(owner: np.ndarray) -> np.ndarray:
-    """Number of the first point in each cube, by the cubes (N,) of the points."""
+    """Return the number of the first point in each cube, from the cubes (N,) of the points."""
     first = np.zeros(int(owner.max()) + 1, np.int64)
     first[owner[::-1]] = np.arange(len(owner))[::-1]
     return first
 
 
-def _by_images(
+def _pose_variance(
     poses_mm: np.ndarray, frame: np.ndarray, at: np.ndarray, near: np.ndarray, held: np.ndarray, normals: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Variance (P,) along normals by the pose of an image, and the number of images (P,) in each patch."""
+    """Return the variance (P,) along normals by pose errors of one image, and the number of images (P,) in a patch."""
     variance = np.sum(np.einsum("kpi,pi->kp", poses_mm[:, at], normals) ** 2, axis=0)
     images = np.sort(np.where(held, frame[near], frame[at][:, None]), axis=1)
     return variance, 1 + np.count_nonzero(np.diff(images, axis=1), axis=1)
 
 
 def _patch_patterns(known: PointUncertainty | None, owner: np.ndarray, middle: np.ndarray, cells: int) -> np.ndarray:
-    """Patterns (M, P, 3) of patches: those of the middle's points."""
+    """Return the patterns (M, P, 3) of patches, averaged over the points of the central cube."""
     if known is None:
         return np.zeros((0, len(middle), 3))
     counts = np.bincount(owner, minlength=cells)[middle]

@@ -1,4 +1,4 @@
-"""Spacing of a cloud's points, which lie dense along a stripe and sparse from image to image, and their footprint."""
+"""Point spacing of a cloud, which differs along a stripe and between images, and footprint of the points."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from scipy.spatial import KDTree
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 
 POINTS_PER_DISC = 30
-"""Points of a disc over which they are averaged: their mean's noise is a fifth of theirs."""
+"""Number of points of an averaging disc: the mean has about a fifth of their noise."""
 _IMAGES_PER_DISC = 3.0
-"""Images across a disc, at least: in fewer, errors of single images do not average."""
+"""Least number of images in a disc, so that errors of single images average."""
 _SAMPLED = 2000
-"""Points of which the spacing is the median: right to a few percent."""
+"""Number of points for the median spacing, which is then accurate to a few percent."""
 _ASKED = 64
-"""Neighbours among which one of another image is looked for."""
+"""Number of points for the median distance between images."""
 _STEEPEST = 0.3
-"""Least cosine of a surface towards the laser: on steeper ones a footprint counts as no longer."""
+"""Least cosine of the angle between surface normal and laser, which limits the length of a footprint."""
 
 
-def disc_of(points_mm: np.ndarray, frame: np.ndarray | None = None) -> float:
-    """Diameter of discs that hold some thirty points (N, 3), and by their images ``frame`` (N,) lines of three."""
+def choose_disc_diameter(points_mm: np.ndarray, frame: np.ndarray | None = None) -> float:
+    """Return the diameter of discs with about thirty points (N, 3) and, given ``frame`` (N,), at least three images."""
     tree, sample = KDTree(points_mm), points_mm[:: max(1, len(points_mm) // _SAMPLED)]
     seventh = np.asarray(tree.query(sample, k=7)[0])[:, 6]
-    # A disc of radius r about a point holds six neighbours more: the area for thirty is five times as large.
+    # A disc with the radius of the sixth neighbour holds six points. Thirty points need five times its area.
     disc = float(2 * np.median(seventh) * np.sqrt(POINTS_PER_DISC / 6.0))
     if frame is None or (frame < 0).any() or frame.min() == frame.max():
         return disc
@@ -31,7 +31,7 @@ def disc_of(points_mm: np.ndarray, frame: np.ndarray | None = None) -> float:
 
 
 def _between_images(points_mm: np.ndarray, frame: np.ndarray) -> float:
-    """Median distance of a point from the nearest point of another image."""
+    """Return the median distance between a point and the nearest point of another image."""
     middle = np.unique(frame)
     chosen = np.isin(frame, middle[:: max(1, len(middle) // 20)])
     sample = np.flatnonzero(chosen)
@@ -41,16 +41,16 @@ def _between_images(points_mm: np.ndarray, frame: np.ndarray) -> float:
 
 
 def footprint_on(cloud: PointCloud, chosen: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, float]:
-    """Standard deviations (K, 2) of the footprints of chosen (K,) points along tangents (K, 2, 3) of the surface, mm.
+    """Return the footprints of chosen (K,) points along tangents (K, 2, 3), and their relative uncertainty.
 
-    And the relative standard uncertainty of their squares. Zeros where the cloud does not state a footprint, as it is
-    for clouds of moved sensors and of other programs.
+    A footprint is a pair of standard deviations (K, 2) in mm. The uncertainty is that of their squares. Both are zero
+    if the cloud states no footprint, for example for moved sensors or clouds of other programs.
     """
     known = cloud.metadata.get(FOOTPRINT)
     if not (isinstance(known, list) and len(known) == 2 and all(isinstance(each, float) for each in known)):
         return np.zeros((len(chosen), 2)), 0.0
     size, std = np.array(known, float), cloud.metadata.get(FOOTPRINT_STD)
-    # The laser's light comes along Z: what it covers across it, X and Y, is longer on a surface that leans.
+    # The laser is parallel to Z. Its footprint in X and Y is longer on an inclined surface.
     flat = tangents[:, :, :2]
     leaning = np.abs(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0])
     inverse = np.stack([flat[:, 1, ::-1] * [1, -1], flat[:, 0, ::-1] * [-1, 1]], axis=1)

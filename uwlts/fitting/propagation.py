@@ -1,7 +1,7 @@
-"""Propagation of the errors of points to figures: by patterns, by draws, and linearly.
+"""Propagation of point errors to derived figures: by patterns, by random draws, and linearly.
 
-Patterns, which all points share, are added one by one, and the squares of the changes add up (GUM, JCGM 100:2008,
-section 5.1, with independent inputs). Noise is drawn anew (GUM Supplement 1, JCGM 101:2008).
+Systematic patterns are added one by one, and the squared changes are summed (GUM, JCGM 100:2008, section 5.1, for
+independent inputs). Noise is simulated by random draws (GUM Supplement 1, JCGM 101:2008).
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ import numpy as np
 from uwlts.storage.cloud import PointCloud, PointUncertainty, images_along, matrices_of, variance_along
 
 _SEED = 635
-"""Of all draws: the same cloud has the same uncertainties."""
+"""Seed of the draws, so that a cloud always has the same uncertainties."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointErrors:
-    """Independent parts of the errors of points, as moves (N, 3) or as distances (N,) along given normals, mm.
+    """Independent components of point errors, as shifts (N, 3) or as distances (N,) along normals, mm.
 
     Attributes
     ----------
     single_mm : (N, 3) or (N,)
-        Move of each point for one standard deviation of its own noise; zero if the cloud states none.
+        Shift of each point for one standard deviation of its own noise; zero if the cloud has no uncertainty.
     image_mm : (K, N, 3) or (K, N)
-        Moves for one standard deviation of each part of the position and pose of an image.
+        Shifts for one standard deviation of each component of an image's position and pose.
     image : (N,) int
         Image of each point.
     patterns_mm : (M, N, 3) or (M, N) or None
-        Moves for one standard deviation of each pattern that all points share; None if the cloud states nothing.
+        Shifts for one standard deviation of each systematic pattern; None if the cloud has no uncertainty.
     """
 
     single_mm: np.ndarray
@@ -41,12 +41,12 @@ class PointErrors:
 
     @classmethod
     def of(cls, known: PointUncertainty, frame: np.ndarray) -> PointErrors:
-        """Return the errors of points with an uncertainty and images (N,)."""
-        return cls(noise_mm(known), known.by_image_mm(), frame, known.patterns_mm)
+        """Return the error components of points with an uncertainty and images (N,)."""
+        return cls(noise_shifts(known), known.by_image_mm(), frame, known.patterns_mm)
 
     @classmethod
     def along(cls, cloud: PointCloud, chosen: np.ndarray, normals: np.ndarray) -> PointErrors:
-        """Return the errors of the chosen (K,) points of a cloud along normals (K, 3)."""
+        """Return the error components of chosen (K,) points of a cloud along normals (K, 3)."""
         frame = cloud.frame[chosen]
         image = frame if np.any(frame >= 0) else np.arange(len(chosen))
         if (known := cloud.uncertainty) is None:
@@ -57,13 +57,13 @@ class PointErrors:
         return cls(single, images_along(known, normals), image, patterns)
 
     def __getitem__(self, chosen: np.ndarray) -> PointErrors:
-        """Those of a selection of the points."""
+        """Return the components of a selection of the points."""
         patterns = None if self.patterns_mm is None else self.patterns_mm[:, chosen]
         return PointErrors(self.single_mm[chosen], self.image_mm[:, chosen], self.image[chosen], patterns)
 
     def drawn(self, count: int, rng: np.random.Generator | None = None) -> list[np.ndarray]:
-        """Draw moves of all points by noise and images, as often as ``count``; with a fixed seed unless given."""
-        rng, image = rng or np.random.default_rng(_SEED), _numbered(self.image)
+        """Draw ``count`` random shifts of all points by noise and image errors; by default with a fixed seed."""
+        rng, image = rng or np.random.default_rng(_SEED), _group_numbers(self.image)
         one_each = (1,) * (self.single_mm.ndim - 1)
         moves = []
         for _ in range(count):
@@ -74,36 +74,43 @@ class PointErrors:
         return moves
 
     def by_patterns(self, change: Callable[[np.ndarray], Any]) -> np.ndarray | None:
-        """Return the standard deviations (F,) of figures by the patterns, by the changes (F,) for moves of the points.
+        """Return the standard deviations (F,) of figures by systematic patterns; None without patterns.
 
-        Changes that are NaN do not count. None if the cloud states nothing.
+        ``change`` returns the changes (F,) of the figures for given shifts of the points. Changes that are NaN are
+        ignored.
         """
         if self.patterns_mm is None:
             return None
         return np.sqrt(np.nansum(np.square([change(pattern) for pattern in self.patterns_mm]), axis=0))
 
     def propagate(self, change: Callable[[np.ndarray], Any], *, draws: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the standard deviations (F,) of figures by noise and by patterns.
+        """Return the standard deviations (F,) of figures by noise and by systematic patterns.
 
-        ``change`` gives the changes (F,) of the figures for moves of the points.
+        ``change`` returns the changes (F,) of the figures for given shifts of the points.
         """
         return np.std([change(move) for move in self.drawn(draws)], axis=0, ddof=1), self.by_patterns(change)
 
     def covariances(
         self, weights: np.ndarray, residuals: np.ndarray, groups: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the covariances (K, K) of sums of distances with weights (K, N): by noise, and by patterns.
+        """Return the covariances (K, K) of weighted sums of distances by noise and by systematic patterns.
 
-        To first order the values of a fitted shape are such sums (GUM, Eq. 13). ``residuals`` (N,) are the distances
-        that are left, ``groups`` (N,) numbers of neighbourhoods whose points may err together. Noise counts at least as
-        much as the residuals show in groups (the sandwich estimator of Liang and Zeger, Biometrika 73, 1986):
-        neighbours err together, and roughness is noise.
+        To first order, the parameters of a fitted shape are such sums (GUM, Eq. 13). The noise covariance is at least
+        that of the residuals, correlated in groups (sandwich estimator: Liang and Zeger, Biometrika 73, 1986).
+
+        Parameters
+        ----------
+        weights : (K, N)
+            Weights of the distances in each sum.
+        residuals : (N,)
+            Residual distances of the fit, mm.
+        groups : (N,) int
+            Neighbourhood of each point; errors in a neighbourhood may be correlated.
         """
-        noise = (weights * self.single_mm**2) @ weights.T
-        noise = noise + sum(covariance_of_groups(weights * part, self.image) for part in self.image_mm)
-        seen = covariance_of_groups(weights * residuals, groups)
+        noise = (weights * self.single_mm**2) @ weights.T + grouped_covariance(weights, self.image_mm, self.image)
+        seen = grouped_covariance(weights, residuals[None], groups)
         size = np.maximum(np.diag(seen), 1e-300) / np.maximum(np.diag(noise), 1e-300)
-        # As a whole, so that what is left stays a covariance.
+        # The covariance is selected and scaled as a whole, so that it stays positive semidefinite.
         random = seen if np.median(size) > 1 else noise
         scale = np.sqrt(np.maximum(np.maximum(np.diag(seen), np.diag(noise)) / np.maximum(np.diag(random), 1e-300), 1))
         random = random * np.outer(scale, scale)
@@ -114,19 +121,25 @@ class PointErrors:
 
 
 def neighbours_in_order(count: int) -> np.ndarray:
-    """Return groups (N,) of neighbours that may err together: eight points that follow each other."""
+    """Return the group (N,) of each point: eight consecutive points, whose errors may be correlated."""
     return np.arange(count) // 8
 
 
-def covariance_of_groups(along: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return the covariance (K, K) of sums of columns (K, N) that are one in each group, independent between groups."""
-    number = _numbered(group)
-    together = np.stack([np.bincount(number, row) for row in along])
-    return together @ together.T
+def grouped_covariance(weights: np.ndarray, parts_mm: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Return the covariance (K, K) of sums of errors with weights (K, N).
+
+    ``parts_mm`` (P, N) are standard deviations of independent parts of the errors. Each part is fully correlated within
+    a group (N,) and independent between groups.
+    """
+    number, covariance = _group_numbers(group), np.zeros((len(weights),) * 2)
+    for part in parts_mm:
+        sums = np.stack([np.bincount(number, row) for row in weights * part])
+        covariance += sums @ sums.T
+    return covariance
 
 
-def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
-    """Return the move (N, 3) of each point for one standard deviation of its stripe centre; of either sign."""
+def noise_shifts(uncertainty: PointUncertainty) -> np.ndarray:
+    """Return the shift (N, 3) of each point for one standard deviation of its stripe centre, up to its sign."""
     covariance = matrices_of(uncertainty.random_mm2.astype(np.float64))
     # The covariance is v v^T: its column with the largest element on the diagonal is v times that of v.
     largest = np.argmax(np.einsum("nii->ni", covariance), axis=1)
@@ -135,6 +148,6 @@ def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
     return np.divide(covariance[rows, largest], size, out=np.zeros((len(rows), 3)), where=size > 0)
 
 
-def _numbered(group: np.ndarray) -> np.ndarray:
-    """Numbers (N,) of groups from 0."""
+def _group_numbers(group: np.ndarray) -> np.ndarray:
+    """Return consecutive group numbers (N,), starting at 0."""
     return np.unique(group, return_inverse=True)[1].ravel()

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for observations in groups, with global parameters and local ones of each group."""
+"""Levenberg-Marquardt least squares with global parameters and local parameters of groups of observations."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,21 +7,23 @@ import numpy as np
 
 from uwlts.errors import CalibrationError
 
-_ROUNDS = 60  # several times what usual problems take
-_SMALLEST_STEP = 1e-11  # in the residuals' unit: rounding of sums over all of them
-# Damping beside columns of length one up to which a step is the full one.
+_ROUNDS = 60
+"""Largest number of rounds: several times that of typical problems."""
+_SMALLEST_STEP = 1e-11
+"""Step, in the unit of residuals, that rounding of sums over all residuals produces."""
 _HARDLY_DAMPED = 1e-8
-# Largest share of the cost that is gained so near the solution that residuals are linear.
+"""Damping, relative to columns of unit length, up to which a step is practically a full Gauss-Newton step."""
 _SAFE = 1e-7
-# Columns are scaled to length one: a smaller eigenvalue of the global parameters' normal matrix is rounding.
+"""Largest relative gain at which the linear model may replace an evaluation of all residuals."""
 _SINGULAR = 1e-13
+"""Eigenvalue of the normal matrix of the scaled global parameters, below which it is rounding noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
     """Residuals (n, c) of one group and their derivatives by global (c n, k) and local (c n, b) parameters.
 
-    Derivatives by only some of the group's local parameters, ``local_columns``, may be given; the others are zero.
+    If ``local_columns`` is given, ``by_local`` has only these columns and the others are zero.
     """
 
     residuals: np.ndarray
@@ -35,21 +37,36 @@ Model = Callable[[int, np.ndarray, np.ndarray], Observation | Sequence[Observati
 
 @dataclass(frozen=True, eq=False)
 class SchurFit:
-    """Solution of a grouped least-squares problem."""
+    """Solution of a grouped least-squares problem.
 
-    global_values: np.ndarray  # (k,)
-    local: list[np.ndarray]  # list of (b,)
-    residuals: list[np.ndarray]  # list of (n, c)
-    covariance: np.ndarray  # (k, k); of the global parameters, scaled by the residuals' variance
-    local_covariances: list[np.ndarray]  # list of (b, b)
-    sigma: float  # standard deviation of one coordinate of a residual, with the degrees of freedom counted
+    Attributes
+    ----------
+    global_values : (k,) float64
+    local : list of (b,) float64
+    residuals : list of (n, c) float64
+    covariance : (k, k) float64
+        Covariance of the global parameters, scaled by the variance of the residuals.
+    local_covariances : list of (b, b) float64
+    sigma : float
+        Standard deviation of one coordinate of a residual, by the degrees of freedom.
+    rounds : int
+    stopped : str
+        Reason for the end of the iteration.
+    """
+
+    global_values: np.ndarray
+    local: list[np.ndarray]
+    residuals: list[np.ndarray]
+    covariance: np.ndarray
+    local_covariances: list[np.ndarray]
+    sigma: float
     rounds: int
-    stopped: str  # why the iteration ended
+    stopped: str
 
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """A group's residuals (n, c), and its blocks of the normal equations with columns scaled to length one."""
+    """Residuals (n, c) of a group and its blocks of the normal equations, with columns scaled to unit length."""
 
     residuals: np.ndarray
     border: np.ndarray
@@ -60,7 +77,7 @@ class _Group:
 
 @dataclass(frozen=True, eq=False)
 class _Normal:
-    """Normal equations in blocks, with columns scaled to length one, and the cost they belong to."""
+    """Normal equations in blocks, with columns scaled to unit length, and the cost of their parameters."""
 
     cost: float
     block: np.ndarray
@@ -69,7 +86,7 @@ class _Normal:
     groups: list[_Group]
 
     def count(self) -> int:
-        """Number of coordinates of all residuals."""
+        """Count the coordinates of all residuals."""
         return sum(group.residuals.size for group in self.groups)
 
 
@@ -83,27 +100,36 @@ def schur_least_squares(
     damping: float = 1e-4,
     enough_rounds: int | None = None,
 ) -> SchurFit:
-    """Least squares over all groups; each step eliminates the groups' local parameters (Schur complement).
+    """Minimise the squares over all groups, eliminating the local parameters in each step (Schur complement).
 
     Parameters
     ----------
-    model : callable; (group, shared, own of the group) to its `Observation`, or several that make it up, or None where
-        the parameters have no meaning
-    global_values : (k,); start
-    local : sequence of (b,); starts of the groups
-    soft_limit : residual vectors r count as 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1), the "soft L1" loss with this s;
-        quadratic without it
-    smallest_gain : the iteration ends with a step that lowers the cost, or is to lower it, by less than this share
-    damping : of the first step, as a share of the squared lengths of the derivatives; none is needed near the solution
-    enough_rounds : the iteration ends after so many rounds, settled or not
+    model : callable
+        Function of the group number, global values and local values. It returns an `Observation`, several that form
+        one, or None if the parameters are infeasible.
+    global_values : (k,)
+        Initial global parameters.
+    local : sequence of (b,)
+        Initial local parameters of the groups.
+    soft_limit : float, optional
+        Scale s of the "soft L1" loss 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1) of residual vectors r; quadratic by default.
+    smallest_gain : float
+        Relative reduction of the cost, measured or predicted, that ends the iteration.
+    damping : float
+        Initial damping relative to the squared lengths of the derivatives; near the solution none is needed.
+    enough_rounds : int, optional
+        Number of rounds after which the iteration ends in any case.
 
-    Raises CalibrationError: the start has no meaning, the observations do not determine the parameters, or no end
-    within 60 rounds.
+    Raises
+    ------
+    CalibrationError
+        The initial parameters are infeasible, the observations do not determine the parameters, or the iteration does
+        not converge within 60 rounds.
     """
     global_values, local = np.array(global_values, dtype=np.float64), [np.array(o, dtype=np.float64) for o in local]
-    normal = _assembled(model, global_values, local, soft_limit)
+    normal = _assemble(model, global_values, local, soft_limit)
     if normal is None:
-        raise CalibrationError("the calibration's start puts what was seen behind the camera: check points and poses")
+        raise CalibrationError("the initial parameters place observed points behind the camera: check points and poses")
     for rounds in range(1, _ROUNDS + 1):
         global_step, local_steps = _step(normal, damping)
         tried_global = global_values + global_step
@@ -111,33 +137,33 @@ def schur_least_squares(
         scales = (normal.scale, *(group.scale for group in normal.groups))
         steps = zip((global_step, *local_steps), scales, strict=True)
         size = max(float(np.max(np.abs(step * scale), initial=0.0)) for step, scale in steps)
-        # Scaled steps are in the unit of the residuals, summed over all of them.
+        # Scaled steps have the unit of residuals, summed over all of them.
         small = size <= _SMALLEST_STEP * np.sqrt(normal.count())
         settling = damping <= _HARDLY_DAMPED and not small
         if settling and _expected_gain(normal, global_step, local_steps) <= min(smallest_gain, _SAFE) * normal.cost:
-            # So near the solution the linear model tells what another look at all residuals would.
-            return _solution(tried_global, tried_local, normal, rounds, "cost settled")
-        tried = _assembled(model, tried_global, tried_local, soft_limit)
+            # Near the solution, the linear model replaces another evaluation of all residuals.
+            return _make_solution(tried_global, tried_local, normal, rounds, "cost settled")
+        tried = _assemble(model, tried_global, tried_local, soft_limit)
         if tried is not None and tried.cost <= normal.cost:
             gain = normal.cost - tried.cost
             settled = small or gain <= smallest_gain * normal.cost
             global_values, local, normal, damping = tried_global, tried_local, tried, max(damping / 10, 1e-12)
             if settled:
                 why = "step below rounding" if small else "cost settled"
-                return _solution(global_values, local, normal, rounds, why)
+                return _make_solution(global_values, local, normal, rounds, why)
         elif small or damping > 1e8 or (tried is not None and tried.cost - normal.cost <= smallest_gain * normal.cost):
-            return _solution(global_values, local, normal, rounds, "no step lowers the cost further")
+            return _make_solution(global_values, local, normal, rounds, "no step lowers the cost further")
         else:
             damping *= 10
         if rounds == enough_rounds:
-            return _solution(global_values, local, normal, rounds, "enough rounds")
+            return _make_solution(global_values, local, normal, rounds, "enough rounds")
     raise CalibrationError(
-        f"the camera calibration did not settle in {_ROUNDS} rounds: either the target images do not determine the "
-        f"camera (tilt the target, or fix some parameters), or they contradict each other"
+        f"the camera calibration did not converge in {_ROUNDS} rounds. Either the target images do not determine the "
+        "camera (tilt the target, or fix some parameters), or they contradict each other"
     )
 
 
-def _assembled(
+def _assemble(
     model: Model, global_values: np.ndarray, local: list[np.ndarray], soft_limit: float | None
 ) -> _Normal | None:
     count, cost, found = len(global_values), 0.0, []
@@ -162,10 +188,10 @@ def _assembled(
             at = np.r_[0:count, count + places, count + len(values)]
             product[np.ix_(at, at)] += columns.T @ columns
         found.append((np.vstack([part.residuals for part in parts]), product))
-    global_scale = _lengths(sum((np.diag(product)[:count] for _, product in found), np.zeros(count)))
+    global_scale = _column_lengths(sum((np.diag(product)[:count] for _, product in found), np.zeros(count)))
     block, gradient, groups = np.zeros((count, count)), np.zeros(count), []
     for residuals, product in found:
-        scale = _lengths(np.diag(product)[count:-1])
+        scale = _column_lengths(np.diag(product)[count:-1])
         scaled = product / np.outer(both := np.r_[global_scale, scale, 1.0], both)
         block += scaled[:count, :count]
         gradient += scaled[:count, -1]
@@ -174,12 +200,12 @@ def _assembled(
     return _Normal(cost, block, gradient, global_scale, groups)
 
 
-def _lengths(squares: np.ndarray) -> np.ndarray:
+def _column_lengths(squares: np.ndarray) -> np.ndarray:
     return np.where(squares > 0, np.sqrt(squares), 1.0)
 
 
 def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Damped step that lowers the cost; every block is positive definite for positive damping."""
+    """Solve for the damped step; each block is positive definite for positive damping."""
     reduced = normal.block + damping * np.eye(len(normal.block))
     right = -normal.gradient
     inverses = [np.linalg.inv(group.block + damping * np.eye(len(group.block))) for group in normal.groups]
@@ -195,13 +221,13 @@ def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]
 
 
 def _expected_gain(normal: _Normal, global_step: np.ndarray, local_steps: list[np.ndarray]) -> float:
-    """By how much a step is to lower the cost if residuals were linear, and damping small."""
+    """Return the predicted reduction of the cost for linear residuals and small damping."""
     groups = zip(normal.groups, local_steps, strict=True)
     slopes = [normal.gradient @ (normal.scale * global_step), *(g.gradient @ (g.scale * step) for g, step in groups)]
     return -float(sum(slopes))
 
 
-def _solution(
+def _make_solution(
     global_values: np.ndarray, local: list[np.ndarray], normal: _Normal, rounds: int, stopped: str
 ) -> SchurFit:
     undetermined = CalibrationError(

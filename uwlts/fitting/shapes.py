@@ -1,4 +1,4 @@
-"""Planes, straight lines, spheres and cylinders by orthogonal distances, the round ones with free or known radius."""
+"""Orthogonal-distance fits of planes, straight lines, spheres and cylinders; the radius may be free or known."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,34 +10,43 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import (
     LARGEST_RELATIVE_STD,
     Normalised,
-    covariance_of,
     evenly_thinned,
-    minimised,
-    normalised,
+    minimise_squares,
+    normalise_points,
+    parameter_covariance,
     principal_axes,
 )
 
 _THINNED = 600
-"""Points for the search of a cylinder's axis."""
+"""Number of points for the search of a cylinder axis."""
 _NEIGHBOURS = 12
-"""Neighbours of a point for its local normal."""
+"""Number of neighbours for a local normal."""
 _DIRECTIONS = 80
-"""Directions of the axis that are tried on the half sphere, some 15 deg apart."""
+"""Number of axis directions tried on the half sphere, about 15 deg apart."""
 _TRIED = 5
-"""Best directions that are refined."""
+"""Number of best directions that are refined."""
 _LARGEST_SLOPE_STD = 0.2
-"""Standard uncertainty of the axis's slope from which the direction is open: 11 deg."""
+"""Largest standard uncertainty of the axis slope (11 deg); beyond, the direction is undetermined."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlatFit:
-    """A straight line (K = 1) or plane (K = 2) through points with D coordinates.
+    """Straight line (K = 1) or plane (K = 2) fitted to N points with D coordinates.
 
-    ``point_mm`` (D,) is the centroid of the points, ``axes`` (K, D) are unit directions in the shape, the longest
-    extent of the points first, ``normals`` (D - K, D) those across it. ``residuals_mm`` (N,) are distances: with one
-    normal signed, positive on the side to which it points; with two never negative. ``std_mm`` is the standard
-    deviation of one coordinate across the shape, with (D - K) (N - K - 1) degrees of freedom. ``covariance`` is of the
-    offsets along the normals at the point (mm), then of the slopes (rad) towards them along the axes.
+    Attributes
+    ----------
+    point_mm : (D,) float64
+        Centroid of the points.
+    axes : (K, D) float64
+        Unit directions in the shape, the longest extent of the points first.
+    normals : (D - K, D) float64
+        Unit directions normal to the shape.
+    residuals_mm : (N,) float64
+        Distances of the points: signed if there is one normal, else non-negative.
+    std_mm : float
+        Standard deviation of one normal coordinate, with (D - K) (N - K - 1) degrees of freedom.
+    covariance : float64
+        Covariance of the offsets along the normals at the point (mm), then of the slopes (rad) along the axes.
     """
 
     point_mm: np.ndarray
@@ -58,35 +67,37 @@ class FlatFit:
         return self.axes[0]
 
     def distances_mm(self, points: np.ndarray) -> np.ndarray:
-        """Distances (M,) of any points (M, D), as in `residuals_mm`."""
-        return _lengths((np.asarray(points, dtype=np.float64) - self.point_mm) @ self.normals.T)
+        """Return the distances (M,) of points (M, D), as in `residuals_mm`."""
+        return _norms((np.asarray(points, dtype=np.float64) - self.point_mm) @ self.normals.T)
 
 
 def fit_plane(points: Any, towards: Any = None) -> FlatFit:
-    """Least-squares plane through points (N, 3), mm, its normal turned ``towards`` (3,) or its largest part positive.
+    """Fit a plane to points (N, 3), mm, by least squares.
 
-    EvaluationError for fewer than 4 points, points that are not finite, or points on one line.
+    The normal is oriented ``towards`` (3,); by default its largest component is positive. EvaluationError for fewer
+    than 4 points, points that are not finite, or points on one line.
     """
-    unit = normalised(points, least=4, what="a plane fit")
+    unit = normalise_points(points, least=4, what="a plane fit")
     if unit.is_flat(1):
         raise EvaluationError(f"a plane fit: all {len(unit.points)} points lie on one line")
-    return _flat_fit(unit, unit.axes[:2], _turned(unit.axes[2], towards)[None])
+    return _flat_fit(unit, unit.axes[:2], _orient(unit.axes[2], towards)[None])
 
 
 def fit_line(points: Any, towards: Any = None) -> FlatFit:
-    """Least-squares line through points (N, 2) or (N, 3), mm, turned ``towards`` (D,) or its largest part positive.
+    """Fit a straight line to points (N, 2) or (N, 3), mm, by least squares.
 
-    In a plane the normal is the direction turned from the first axis towards the second by 90 degrees. EvaluationError
-    for fewer than 3 points, points that are not finite, or points without a longest direction.
+    The direction is oriented ``towards`` (D,); by default its largest component is positive. For D = 2, the normal is
+    the direction rotated by 90 degrees from the first axis to the second. EvaluationError for fewer than 3 points,
+    points that are not finite, or points without a longest direction.
     """
-    unit = normalised(points, least=3, what="a line fit", dimensions=(2, 3))
+    unit = normalise_points(points, least=3, what="a line fit", dimensions=(2, 3))
     if unit.extents[0] - unit.extents[1] <= 1e-9 * unit.extents[0]:
         raise EvaluationError(f"a line fit: the {len(unit.points)} points extend equally in two directions")
-    x, y, *z = direction = _turned(unit.axes[0], towards)
+    x, y, *z = direction = _orient(unit.axes[0], towards)
     return _flat_fit(unit, direction[None], unit.axes[1:] if z else np.array([[-y, x]]))
 
 
-def _turned(direction: np.ndarray, towards: Any) -> np.ndarray:
+def _orient(direction: np.ndarray, towards: Any) -> np.ndarray:
     side = direction[np.argmax(np.abs(direction))] if towards is None else float(direction @ np.asarray(towards))
     return -direction if side < 0 else direction
 
@@ -96,21 +107,28 @@ def _flat_fit(unit: Normalised, axes: np.ndarray, normals: np.ndarray) -> FlatFi
     variance = float(np.sum(across**2)) / (len(normals) * (len(across) - len(axes) - 1))
     leverage = np.array([len(across), *(unit.extents[: len(axes)] * unit.scale_mm) ** 2])
     covariance = np.diag(variance / np.repeat(leverage, len(normals)))
-    return FlatFit(unit.centroid_mm, axes, normals, _lengths(across), variance**0.5, covariance)
+    return FlatFit(unit.centroid_mm, axes, normals, _norms(across), variance**0.5, covariance)
 
 
-def _lengths(across: np.ndarray) -> np.ndarray:
-    """Distances from components (..., C) across a line or plane, signed where there is one."""
+def _norms(across: np.ndarray) -> np.ndarray:
+    """Return distances from normal components (..., C), signed if there is one component."""
     return across[..., 0] if across.shape[-1] == 1 else np.linalg.norm(across, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class SphereFit:
-    """A sphere of a fitted or known radius through points.
+    """Sphere of fitted or known radius.
 
-    ``residuals_mm`` (N,) are |p - centre| - radius, positive outside, ``std_mm`` their standard deviation with N less
-    the number of parameters as degrees of freedom. ``covariance`` (4, 4) or (3, 3), mm2, is of the centre and, where it
-    was free, the radius, for equal independent noise on all points.
+    Attributes
+    ----------
+    centre_mm : (3,) float64
+    radius_mm : float
+    residuals_mm : (N,) float64
+        Signed distances |p - centre| - radius, positive outside.
+    std_mm : float
+        Standard deviation of the residuals; the degrees of freedom are N minus the number of parameters.
+    covariance : (4, 4) or (3, 3) float64
+        Covariance of the centre and, if free, the radius, mm2, for equal independent noise of all points.
     """
 
     centre_mm: np.ndarray
@@ -120,28 +138,31 @@ class SphereFit:
     covariance: np.ndarray
 
     def distances_mm(self, points: np.ndarray) -> np.ndarray:
-        """Signed distances (M,) of any points (M, 3), as in `residuals_mm`."""
+        """Return the signed distances (M,) of points (M, 3), as in `residuals_mm`."""
         return np.linalg.norm(np.asarray(points, dtype=np.float64) - self.centre_mm, axis=1) - self.radius_mm
 
 
 def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
-    """Least-squares sphere through points (N, 3), mm, with free or known radius; a cap is enough.
+    """Fit a sphere of free or known radius to points (N, 3), mm, by least squares; a cap suffices.
 
-    EvaluationError for too few points (5, or 4 with known radius), points that are not finite or lie in one plane, or a
-    cap so small or noisy that the centre is uncertain by more than a fifth of the radius.
+    Raises
+    ------
+    EvaluationError
+        There are too few points (fewer than 5, or 4 with known radius), points are not finite or in one plane, or the
+        standard uncertainty of the centre exceeds a fifth of the radius.
     """
-    unit, known = _prepared_round(points, radius_mm, least=5, what="a sphere fit")
+    unit, known = _prepare_round(points, radius_mm, least=5, what="a sphere fit")
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        """d|p - c| / dc is minus the unit vector from the centre; d/dr is -1."""
-        return np.hstack([-_units(unit.points - x[:3]), np.full((len(unit.points), len(x) - 3), -1.0)])
+        """Return d|p - c| / dc, minus the unit vector from the centre, and -1 for the radius."""
+        return np.hstack([-_unit_vectors(unit.points - x[:3]), np.full((len(unit.points), len(x) - 3), -1.0)])
 
-    parameters, cost = minimised(
+    parameters, cost = minimise_squares(
         lambda x: np.linalg.norm(unit.points - x[:3], axis=1) - (x[3] if known is None else known),
         jacobian,
-        np.hstack(algebraic_centres(unit.points)) if known is None else centre_of_known_radius(unit.points, known),
+        np.hstack(algebraic_centres(unit.points)) if known is None else initial_centre(unit.points, known),
     )
-    covariance, std = covariance_of(jacobian(parameters), cost, what="a sphere")
+    covariance, std = parameter_covariance(jacobian(parameters), cost, what="a sphere")
     centre = unit.centroid_mm + unit.scale_mm * parameters[:3]
     radius = float(radius_mm if radius_mm is not None else parameters[3] * unit.scale_mm)
     uncertainty = float(np.sqrt(np.trace(covariance[:3, :3]))) * unit.scale_mm
@@ -154,28 +175,39 @@ def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
     return SphereFit(centre, radius, residuals, std * unit.scale_mm, covariance * unit.scale_mm**2)
 
 
-def _prepared_round(points: Any, radius_mm: float | None, *, least: int, what: str) -> tuple[Normalised, float | None]:
-    """Points for a fit of a round surface, and the known radius in their unit, if any, which saves one point."""
-    unit = normalised(points, least=least if radius_mm is None else least - 1, what=what)
+def _prepare_round(points: Any, radius_mm: float | None, *, least: int, what: str) -> tuple[Normalised, float | None]:
+    """Normalise points for a fit of a sphere or cylinder, and a known radius; with it, one point fewer is needed."""
+    unit = normalise_points(points, least=least if radius_mm is None else least - 1, what=what)
     if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0):
-        raise ValueError(f"a radius is positive, not {radius_mm}")
+        raise ValueError(f"the radius is {radius_mm}; expected a positive number")
     if unit.is_flat(2):
         raise EvaluationError(f"{what}: all {len(unit.points)} points lie in one plane")
     return unit, None if radius_mm is None else radius_mm / unit.scale_mm
 
 
-def _units(vectors: np.ndarray) -> np.ndarray:
+def _unit_vectors(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 @dataclass(frozen=True, eq=False)
 class CylinderFit:
-    """A cylinder of a fitted or known radius through points.
+    """Cylinder of fitted or known radius.
 
-    ``point_mm`` (3,) of the axis is nearest to the centroid of the points, the largest component of the unit ``axis``
-    (3,) is positive, ``across`` (2, 3) are unit directions normal to it and to each other. ``residuals_mm`` (N,) are
-    distances to the axis less the radius, ``std_mm`` as of `SphereFit`. ``covariance`` (5, 5) or (4, 4) is of the
-    offsets of the axis along ``across`` (mm), its slopes towards them (rad) and, where it was free, the radius (mm).
+    Attributes
+    ----------
+    point_mm : (3,) float64
+        Point of the axis nearest to the centroid of the points.
+    axis : (3,) float64
+        Unit direction of the axis; its largest component is positive.
+    across : (2, 3) float64
+        Orthogonal unit directions normal to the axis.
+    radius_mm : float
+    residuals_mm : (N,) float64
+        Distances from the axis minus the radius.
+    std_mm : float
+        Standard deviation of the residuals, as for `SphereFit`.
+    covariance : (5, 5) or (4, 4) float64
+        Covariance of the axis offsets along ``across`` (mm), the axis slopes along them (rad), and a free radius (mm).
     """
 
     point_mm: np.ndarray
@@ -187,26 +219,30 @@ class CylinderFit:
     covariance: np.ndarray
 
     def distances_mm(self, points: np.ndarray) -> np.ndarray:
-        """Signed distances (M,) of any points (M, 3), as in `residuals_mm`."""
+        """Return the signed distances (M,) of points (M, 3), as in `residuals_mm`."""
         across = (np.asarray(points, dtype=np.float64) - self.point_mm) @ self.across.T
         return np.hypot(across[:, 0], across[:, 1]) - self.radius_mm
 
 
 def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = None) -> CylinderFit:
-    """Least-squares cylinder through points (N, 3), mm, with free or known radius.
+    """Fit a cylinder of free or known radius to points (N, 3), mm, by least squares.
 
-    ``axis_start`` (3,) is an approximate direction of the axis. Without it the direction is searched: the principal
-    axes of the points, the direction most nearly normal to all local surface normals, and an even grid over the half
-    sphere are judged by a circle through the points seen along them; the best few are refined on some of the points.
-    EvaluationError for too few points (6, or 5 with known radius), points that are not finite or lie in one plane, or
-    a patch so small or noisy that it leaves the axis open.
+    ``axis_start`` (3,) is an approximate axis direction. By default the direction is searched. The candidates are the
+    principal axes, the direction most nearly normal to all local surface normals, and an even grid over the half
+    sphere. Each is scored by a circle fit to the projected points, and the best few are refined on a subset.
+
+    Raises
+    ------
+    EvaluationError
+        There are too few points (fewer than 6, or 5 with known radius), points are not finite or in one plane, or the
+        axis is not determined.
     """
-    unit, known = _prepared_round(points, radius_mm, least=6, what="a cylinder fit")
+    unit, known = _prepare_round(points, radius_mm, least=6, what="a cylinder fit")
     thinned = evenly_thinned(unit.points, _THINNED)
     trials = [_refined_cylinder(thinned, *start, known) for start in _cylinder_starts(thinned, known, axis_start)]
     frame, start, _ = min(trials, key=lambda trial: trial[2])
     frame, parameters, cost = _refined_cylinder(unit.points, frame, start, known)
-    covariance, std = covariance_of(_cylinder_jacobian(parameters, unit.points, frame), cost, what="a cylinder")
+    covariance, std = parameter_covariance(_cylinder_jacobian(parameters, unit.points, frame), cost, what="a cylinder")
     units = np.array([unit.scale_mm, unit.scale_mm, 1.0, 1.0, unit.scale_mm])[: len(parameters)]
     covariance = covariance * np.outer(units, units)
     point = unit.centroid_mm + unit.scale_mm * parameters[:2] @ frame[:2]
@@ -226,7 +262,7 @@ def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = 
 def _cylinder_geometry(
     parameters: np.ndarray, points: np.ndarray, frame: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Radial vectors (N, 3), positions along the axis (N,), stretch of the direction a + s u + t v."""
+    """Return radial vectors (N, 3), positions along the axis (N,), and the norm of the direction a + s u + t v."""
     direction = frame[2] + parameters[2:4] @ frame[:2]
     stretch = float(np.linalg.norm(direction))
     direction = direction / stretch
@@ -236,9 +272,9 @@ def _cylinder_geometry(
 
 
 def _cylinder_jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """With the radial unit vector e, normal to the axis: -e.u, -e.v; -along e.u / stretch, same with v; -1."""
+    """Return the derivatives -e.u, -e.v, -along e.u / stretch, the same with v, and -1, for radial unit vectors e."""
     radial, along, stretch = _cylinder_geometry(parameters, points, frame)
-    across = -_units(radial) @ frame[:2].T
+    across = -_unit_vectors(radial) @ frame[:2].T
     by_radius = np.full((len(points), len(parameters) - 4), -1.0)
     return np.hstack([across, across * (along / stretch)[:, None], by_radius])
 
@@ -246,22 +282,22 @@ def _cylinder_jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.nda
 def _refined_cylinder(
     points: np.ndarray, frame: np.ndarray, start: np.ndarray, known: float | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Solution as (frame, parameters, cost) with the frame turned so that both slopes are zero."""
-    parameters, cost = minimised(
+    """Return frame, parameters and cost of the solution, with the frame rotated so that both slopes are zero."""
+    parameters, cost = minimise_squares(
         lambda x: np.linalg.norm(_cylinder_geometry(x, points, frame)[0], axis=1) - (x[4] if known is None else known),
         lambda x: _cylinder_jacobian(x, points, frame),
         start,
     )
-    turned = _frame(frame[2] + parameters[2:4] @ frame[:2])
+    turned = _axis_frame(frame[2] + parameters[2:4] @ frame[:2])
     foot = turned[:2] @ (parameters[:2] @ frame[:2])
     return turned, np.array([*foot, 0.0, 0.0, *parameters[4:]]), cost
 
 
-def _frame(axis: np.ndarray) -> np.ndarray:
-    """Right-handed unit directions (u, v, axis) in rows; the largest component of the axis becomes positive.
+def _axis_frame(axis: np.ndarray) -> np.ndarray:
+    """Return right-handed unit directions (u, v, axis) in rows; the largest component of the axis becomes positive.
 
-    The first is square to the coordinate axis that follows the largest component's, so that noise of an axis along a
-    coordinate axis does not turn it.
+    The first is normal to the coordinate axis after that of the largest component. Noise of an axis along a coordinate
+    axis therefore does not rotate the frame.
     """
     axis = axis / np.linalg.norm(axis)
     largest = int(np.argmax(np.abs(axis)))
@@ -282,8 +318,8 @@ def _cylinder_starts(points: np.ndarray, known: float | None, axis_start: Any) -
     else:
         directions = np.asarray(axis_start, dtype=np.float64).reshape(1, 3)
         if not np.isfinite(directions).all() or not directions.any():
-            raise ValueError(f"axis_start must be a direction, not {axis_start}")
-    frames = np.array([_frame(direction) for direction in directions])
+            raise ValueError(f"axis_start is {axis_start}; expected a direction")
+    frames = np.array([_axis_frame(direction) for direction in directions])
     seen = np.einsum("nd,kcd->knc", points, frames[:, :2])
     middle = seen.mean(axis=1)
     centred = seen - middle[:, None]
@@ -291,14 +327,14 @@ def _cylinder_starts(points: np.ndarray, known: float | None, axis_start: Any) -
     misfit = np.sum((np.linalg.norm(centred - centres[:, None], axis=2) - radii[:, None]) ** 2, axis=1)
     starts = []
     for best in np.argsort(misfit)[:_TRIED]:
-        centre = centres[best] if known is None else centre_of_known_radius(centred[best], known)
+        centre = centres[best] if known is None else initial_centre(centred[best], known)
         free = [radii[best]] if known is None else []
         starts.append((frames[best], np.array([*(middle[best] + centre), 0.0, 0.0, *free])))
     return starts
 
 
 def _normal_to_normals(points: np.ndarray) -> np.ndarray:
-    """The direction most nearly normal to the surface normals of small neighbourhoods."""
+    """Return the direction most nearly normal to the surface normals of small neighbourhoods."""
     _, nearest = KDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
     patches = points[nearest] - points[nearest].mean(axis=1, keepdims=True)
     _, vectors = np.linalg.eigh(np.swapaxes(patches, 1, 2) @ patches)
@@ -307,11 +343,11 @@ def _normal_to_normals(points: np.ndarray) -> np.ndarray:
 
 
 def algebraic_centres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (..., D) and radii (...) of circles (D = 2) or spheres (D = 3) through centred points (..., N, D).
+    """Fit centres (..., D) and radii (...) of circles (D = 2) or spheres (D = 3) to centred points (..., N, D).
 
-    Taubin's fit, nearly unbiased on short arcs where the simpler one of Kasa shrinks the radius: the eigenvector of
-    the smallest eigenvalue of the moments of (|p|^2 - m) / (2 sqrt m) and p, with m the mean of |p|^2 (N. Chernov,
-    Circular and linear regression, 2010, section 5.10). Points on a line or plane give huge, finite radii.
+    Taubin's fit, which is nearly unbiased on short arcs. It is the eigenvector of the smallest eigenvalue of the
+    moments of (|p|^2 - m) / (2 sqrt m) and p, where m is the mean of |p|^2 (N. Chernov, Circular and linear
+    regression, 2010, section 5.10). Points on a line or plane give huge, finite radii.
     """
     squares = np.sum(points**2, axis=-1)
     mean = squares.mean(axis=-1)
@@ -326,10 +362,10 @@ def algebraic_centres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return centres, radii
 
 
-def centre_of_known_radius(points: np.ndarray, radius: float) -> np.ndarray:
-    """Start centre (D,) of a circle or sphere of known radius through centred points (N, D).
+def initial_centre(points: np.ndarray, radius: float) -> np.ndarray:
+    """Return an initial centre (D,) of a circle or sphere of known radius through centred points (N, D).
 
-    In the direction of the algebraic centre, as deep below the points as their extent across it demands.
+    It has the direction of the algebraic centre, and the depth that follows from the lateral extent of the points.
     """
     centre, _ = algebraic_centres(points)
     direction = centre / max(float(np.linalg.norm(centre)), 1e-12)

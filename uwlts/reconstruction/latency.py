@@ -1,8 +1,8 @@
-"""Latency between camera and stage, from a scan there and back.
+"""Latency between camera and stage, from a forward and a backward scan.
 
-Where the clock of the stage's positions runs late against the camera's, what is seen on the way there is shifted along
-the stage one way, and what is seen on the way back the other way, by the speed times the latency each. So both passes
-show the same surface, displaced by twice that. Play of the drive displaces them too, by the same way at every speed.
+A latency of the stage positions shifts the forward and the backward pass in opposite directions, each by speed times
+latency. Both passes therefore show the same surface with twice this displacement. Backlash of the drive also displaces
+them, but by an amount independent of speed.
 """
 
 from dataclasses import dataclass
@@ -13,31 +13,30 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
 
 _LARGEST_S = 0.5
-"""Latency that is looked for at most: that of slow drivers."""
+"""Largest latency of the search, that of slow drivers."""
 _MOST_BENT_PX = 2.0
-"""Largest change of the stripe's motion from one frame to the next, px. Beyond is an edge, unless the motion changes
-alike beside it."""
+"""Largest second difference of a stripe centre over frames, px. A larger one is an edge, unless neighbours share it."""
 _MOST_BENT = 0.5
-"""The same as a share of the motion: at a jump it changes by twice its mean, and next by the opposite."""
+"""The same limit relative to the mean first difference. At a jump the ratio is 2, followed by the opposite sign."""
 _FEWEST = 200
-"""Pairs of stripe centres with relief from which the latency is estimated."""
+"""Least number of pairs of stripe centres with relief."""
 _GRAIN = 2.0
-"""Neighbouring lines share their speckle, so that the scatter of their mean is so many times as large."""
+"""Factor on the standard error, because adjacent lines have correlated speckle."""
 _LEAST_RELIEF = 0.5
-"""Passes are compared where they share so much of the most relief that they share at any shift."""
+"""Least relief common to both passes, relative to its maximum over all shifts, for a shift to be compared."""
 _FAR_PX = 20.0
-"""Distances beyond are those of something else."""
+"""Distance at which the cost of a mismatch saturates."""
 _ROUNDS = 8
-"""Rounds, at most, in which outliers are found anew."""
+"""Largest number of rounds of outlier rejection."""
 _OUTLIER = 4.0
-"""Standard deviations beyond which a distance is left out: one in 16,000 of Gaussian ones."""
+"""Outlier limit in standard deviations; one in 16,000 Gaussian distances exceeds it."""
 
 
 @dataclass(frozen=True)
 class Latency:
-    """A stage's positions are those of a time ``latency_s`` before the camera's, with a standard uncertainty in s.
+    """Delay ``latency_s`` of the stage positions relative to the camera, with its standard uncertainty ``std_s``.
 
-    A frame's position is the reported one plus its speed times the latency.
+    The true position of a frame is the reported one plus its speed times the latency.
     """
 
     latency_s: float
@@ -45,36 +44,42 @@ class Latency:
 
 
 def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray) -> Latency:
-    """The latency from frames (N,) of passes in both directions over a surface that stands still.
+    """Measure the latency from passes in both directions over a static surface.
 
     Parameters
     ----------
-    centre_px : (N, L) stripe centres on all profile lines, NaN where there is none
-    stage_mm, speed_mm_per_s : (N,) position and signed speed of the stage at each frame
+    centre_px : (N, L)
+        Stripe centres of each frame on all profile lines; NaN without a stripe.
+    stage_mm, speed_mm_per_s : (N,)
+        Position and signed speed of the stage at each frame.
 
-    Raises EvaluationError: a pass is missing, or the surface has too little relief along the motion.
+    Raises
+    ------
+    EvaluationError
+        A pass is missing, or the surface has too little relief along the motion.
     """
     there, back = (np.flatnonzero(sign * speed_mm_per_s > 0) for sign in (1, -1))
     if min(len(there), len(back)) < 4:
         raise EvaluationError(
-            f"{len(there)} frames were taken one way and {len(back)} the other: a latency shows in four or more each"
+            f"found {len(there)} frames of the forward and {len(back)} of the backward pass; at least four of each are "
+            "needed"
         )
     there, back = (frames[np.argsort(stage_mm[frames])] for frames in (there, back))
     surface = _Surface.of(stage_mm[there], centre_px[there])
     speed = float(np.median(speed_mm_per_s[there]) - np.median(speed_mm_per_s[back])) / 2
     seen, position = centre_px[back], stage_mm[back]
-    # A frame at x on the way back shows what the way there shows at x - 2 v latency.
+    # A backward frame at x shows the same as the forward pass at x - 2 v latency.
     step = surface.step_mm / 2
     reach = int(np.ceil(2 * speed * _LARGEST_S / step))
     ways = step * np.arange(-reach, reach + 1)
     ways = ways[np.argsort(np.abs(ways), kind="stable")]
     costs, relief = np.array([_cost(surface, position, seen, way) for way in ways]).T
-    # Flat ground beside the relief fits flat ground, whatever the shift.
+    # Without relief, flat areas match at any shift.
     comparable = relief >= _LEAST_RELIEF * relief.max()
     if not relief.max() > 0:
         raise EvaluationError(
-            "the passes there and back hardly see the same lines, or no relief on them: was a surface with slopes in "
-            "view both ways?"
+            "the forward and backward passes share too few lines, or these show no relief. Scan a surface with slopes "
+            "in both directions"
         )
     shift = float(ways[np.argmin(np.where(comparable, costs, np.inf))])
     away = slope = np.empty(0)
@@ -84,8 +89,8 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
         near = np.abs(away) <= max(_OUTLIER * scatter, 1e-6)
         if np.count_nonzero(near) < _FEWEST or not (slope[near] ** 2).sum() > 0:
             raise EvaluationError(
-                "the surface has too little relief along the motion to show the latency: scan something with slopes, "
-                "such as a sphere, or give latency_ms"
+                "the surface has too little relief along the motion to determine the latency: scan a surface with "
+                "slopes, such as a sphere, or give latency_ms"
             )
         away, slope = away[near], slope[near]
         # away = c_back(x) - c_there(x - shift); a further shift d changes it by slope d.
@@ -98,7 +103,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
 
 
 def _cost(surface: "_Surface", position: np.ndarray, seen: np.ndarray, shift: float) -> tuple[float, float]:
-    """Mean distance in px of what is seen on the way back, and the sum of the slopes squared where it is compared."""
+    """Return the mean capped distance, px, of the backward pass at a shift, and the sum of squared slopes."""
     away, slope = surface.at(position - shift, seen)
     if len(away) < _FEWEST:
         return np.inf, 0.0
@@ -107,7 +112,7 @@ def _cost(surface: "_Surface", position: np.ndarray, seen: np.ndarray, shift: fl
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """Stripe centres (N, L) as a function of the position (N,), between frames by a cubic through their slopes."""
+    """Stripe centres (N, L) as a function of the position (N,), with cubic Hermite interpolation between frames."""
 
     position: np.ndarray
     centre: np.ndarray
@@ -127,13 +132,13 @@ class _Surface:
 
     @property
     def step_mm(self) -> float:
-        """Usual way from one frame to the next."""
+        """Median distance between frames, mm."""
         return float(np.median(np.diff(self.position)))
 
     def at(self, places: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (K,) of what is ``seen`` (M, L) at places (M,) from the surface, and its slope there (K,) in px/mm.
+        """Return the distances (K,), px, of centres ``seen`` (M, L) at places (M,), and slopes (K,), px/mm.
 
-        Hermite's cubic; only where both neighbours are seen.
+        Only places between two visible neighbours are returned.
         """
         left = np.clip(np.searchsorted(self.position, places) - 1, 0, len(self.position) - 2)
         gap = self.position[left + 1] - self.position[left]

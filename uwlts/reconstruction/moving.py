@@ -1,10 +1,10 @@
-"""Scans by a moving platform: the sensor's poses from a mount and a trajectory, and what both leave open.
+"""Scans from a moving platform: sensor poses from a mount and a trajectory, and their uncertainty.
 
-Errors of poses move all points of an image together. Where each pose errs by itself they are independent from image to
-image. The errors of a navigation go along the path: those of a filter in its estimates before and after a step of time,
-or before and after a measurement, are correlated by the root of the smaller over the larger variance (a prediction adds
-independent noise; for an update Cov(e+, e-) = P+, J. A. Farrell, Aided Navigation, 2008, section 5.4), and over many
-steps by the product. So the correlation of any two moments follows from the stated covariances.
+Pose errors move all points of an image together. They may be independent between images. Navigation errors, however,
+are correlated along the path. The correlation of a filter's errors before and after a time step or an update is the
+square root of the ratio of the smaller to the larger variance. A prediction adds independent noise; for an update,
+Cov(e+, e-) = P+ (J. A. Farrell, Aided Navigation, 2008, section 5.4). Over many steps the correlation is the product.
+The correlation of any two times therefore follows from the stated covariances.
 """
 
 from dataclasses import dataclass, replace
@@ -16,29 +16,41 @@ from uwlts.calibration.joint.stored_estimate import covariance_root
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount
 from uwlts.model.trajectory import Trajectory, on_clock
-from uwlts.reconstruction.path_uncertainty import chief_parts, moved_by_poses, pose_roots, sampled
+from uwlts.reconstruction.path_uncertainty import (
+    principal_components,
+    propagate_pose_errors,
+    root_covariances,
+    sample_indices,
+)
 from uwlts.storage.capture import Capture, FrameTable
 from uwlts.storage.cloud import PointUncertainty
 
 _MOST_SHAPES = 8
-"""Shapes in time of errors along a path; faster ones are taken as independent from image to image."""
+"""Largest number of temporal modes of errors along a path; faster modes count as independent between images."""
 _LEFT = 0.01
-"""Share of the variance in time that may be left to these."""
+"""Largest fraction of the temporal variance outside these modes."""
 _LEFT_OF_SHAPES = 1e-3
-"""The same of all parts of the poses together."""
+"""Largest fraction of the variance of all pose components outside the retained patterns."""
 _MOST_MOMENTS = 400
-"""By which shapes are found: they change slowly."""
+"""Number of times from which the modes are computed; they vary slowly."""
 _LEAST = 1e-6
-"""Of the largest variance: where a path begins exactly known, nothing is correlated with it."""
+"""Lower bound of a variance relative to the largest one, for a path with an exact start."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ride:
     """Poses of a platform at the N images of a capture.
 
-    ``poses`` (N, 4, 4) are ``T_base_platform``, mm, NaN for images without one. ``covariance`` (N, 6, 6), as of a
-    `Trajectory`, is that of each, or None; ``times_s`` (N,) are the images'. ``rates`` (N, 6) are velocity in mm/s and
-    turn in rad/s in the base frame, or None where the poses are not from a trajectory.
+    Attributes
+    ----------
+    poses : (N, 4, 4) float64
+        ``T_base_platform``, mm; NaN for images without a pose.
+    covariance : (N, 6, 6) float64 or None
+        Covariance of each pose, as in `Trajectory`.
+    times_s : (N,) float64
+        Times of the images.
+    rates : (N, 6) float64 or None
+        Velocity (mm/s) and angular velocity (rad/s) in the base frame; None without a trajectory.
     """
 
     poses: np.ndarray
@@ -55,24 +67,24 @@ def platform_ride(
     clock_offset_s: float | None,
     clock_drift_ppm: float = 0.0,
 ) -> Ride:
-    """Poses of the platform at all images, by the trajectory at their times or as the capture holds them.
+    """Return the poses of the platform at all images, from the trajectory or from the capture.
 
     Raises
     ------
     CalibrationError
-        There is no trajectory, and an image with the laser has no pose.
+        There is no trajectory, and a laser image has no pose.
     DescriptionError
         Images were taken before or after the trajectory.
     """
     scale = 1.0 if mount is None or mount.robot_scale is None else mount.robot_scale
     if trajectory is None:
         if clock_offset_s is not None or clock_drift_ppm:
-            raise DescriptionError("an offset or drift of the clocks was given without a trajectory")
+            raise DescriptionError("a clock offset or drift was given without a trajectory; give the trajectory too")
         poses = capture.pose.copy()
         if missing := int(np.count_nonzero(capture.laser_on & ~np.isfinite(poses).all(axis=(1, 2)))):
             raise CalibrationError(
-                f"{missing} of {int(capture.laser_on.sum())} laser images have no pose: a mount needs that of the "
-                "platform for each. Give a trajectory, or import the images with poses"
+                f"{missing} of {int(capture.laser_on.sum())} laser images have no pose. With a mount, each needs the "
+                "pose of the platform: give a trajectory, or import the images with poses"
             )
         poses[:, :3, 3] *= scale
         return Ride(poses, capture.pose_covariance, capture.time_s)
@@ -91,7 +103,7 @@ def platform_ride(
 
 
 def carried(capture: Capture, ride: Ride, mount: Mount | None) -> FrameTable:
-    """The images of a capture with the poses of the sensor on a platform."""
+    """Return the frames of a capture with the poses of the platform and the transform of the mount."""
     header = capture.header
     if mount is not None:
         header = header.model_copy(update={"T_platform_sensor": tuple(map(tuple, mount.transform().tolist()))})
@@ -109,17 +121,29 @@ def with_platform(
     mount_covariance: np.ndarray | None = None,
     correlation_s: float | None = None,
 ) -> PointUncertainty:
-    """The uncertainty of points (N, 3) of images (N,) in the base frame with those of mount, time offset and poses.
+    """Add the uncertainty of mount, time offset and poses to that of points.
 
-    ``mount_covariance`` (6, 6) replaces the mount's own, where ``uncertainty`` holds a part of it already.
-    ``correlation_s`` is the time over which errors of poses stay alike, 0 where each errs by itself; by default 0
-    without and as of a navigation filter with a trajectory. Images without a covariance have none of their pose.
+    Parameters
+    ----------
+    uncertainty
+        Uncertainty of the points without that of the platform.
+    points_mm : (N, 3)
+        Points in the base frame.
+    frame : (N,)
+        Image of each point.
+    ride, mount
+        Poses of the platform and mount of the sensor.
+    mount_covariance : (6, 6), optional
+        Replaces the mount's own covariance if ``uncertainty`` already contains a part of it.
+    correlation_s
+        Correlation time of pose errors; 0 for independent errors. By default 0 without a trajectory; with a trajectory,
+        the correlation of a navigation filter. Images without a covariance have no pose uncertainty.
     """
     levers, errors, poses_mm = points_mm - ride.poses[frame, :3, 3], [], uncertainty.poses_mm
     count, shared = len(uncertainty.patterns_mm), dict(uncertainty.shared)
     if mount is not None:
         own = np.array(mount.covariance) if mount_covariance is None else mount_covariance
-        errors.append(_by_mount(ride.poses, mount.transform()[:3, 3], own))
+        errors.append(_mount_errors(ride.poses, mount.transform()[:3, 3], own))
         digest = sha256(mount.transform().tobytes() + own.tobytes()).hexdigest()[:16]
         shared[f"mount {digest}"] = np.eye(count + 6, 6, -count)
         if ride.rates is not None and mount.time_offset_std_s:
@@ -129,45 +153,49 @@ def with_platform(
         if correlation_s is None and ride.rates is None:
             correlation_s = 0.0
         if correlation_s != 0:
-            of_path = _along_path(ride, np.flatnonzero(np.bincount(frame)), correlation_s)
-            some = sampled(len(frame))
-            parts = chief_parts(moved_by_poses(of_path, frame[some], levers[some]), left=_LEFT_OF_SHAPES)
+            of_path = _path_errors(ride, np.flatnonzero(np.bincount(frame)), correlation_s)
+            some = sample_indices(len(frame))
+            parts = principal_components(
+                propagate_pose_errors(of_path, frame[some], levers[some]), left=_LEFT_OF_SHAPES
+            )
             errors.append(of_path @ parts)
             left = left - errors[-1] @ errors[-1].transpose(0, 2, 1)
-        poses_mm = moved_by_poses(pose_roots(left), frame, levers)
+        poses_mm = propagate_pose_errors(root_covariances(left), frame, levers)
     if not errors:
         return replace(uncertainty, poses_mm=poses_mm)
-    patterns = moved_by_poses(np.concatenate(errors, axis=2), frame, levers, after=uncertainty.patterns_mm)
-    # Of what comes behind them clouds have nothing in common.
+    patterns = propagate_pose_errors(np.concatenate(errors, axis=2), frame, levers, after=uncertainty.patterns_mm)
+    # Clouds share none of the patterns that follow.
     shared = {name: np.pad(each, ((0, len(patterns) - len(each)), (0, 0))) for name, each in shared.items()}
     return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm, shared=shared)
 
 
-def _by_mount(poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Errors (F, 6, 6) of poses (F, 4, 4) that are like independent parts of the mount's error.
+def _mount_errors(poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return errors (F, 6, 6) of poses (F, 4, 4) that are equivalent to independent components of the mount's error.
 
-    A shift d and a turn w of the mount, both in the platform's frame, move a point p of the platform by
-    d + w x (p - t), t being the sensor's place there, ``place_mm`` (3,).
+    A translation d and a rotation w of the mount move a point p by d + w x (p - t), all in the platform's frame. The
+    sensor's position t is ``place_mm`` (3,).
     """
     root = covariance_root(covariance)
     turns, shifts = poses[:, :3, :3] @ root[3:], poses[:, :3, :3] @ root[:3]
     return np.concatenate([shifts - np.cross(turns, (poses[:, :3, :3] @ place_mm)[:, :, None], axis=1), turns], axis=1)
 
 
-def _along_path(ride: Ride, used: np.ndarray, correlation_s: float | None) -> np.ndarray:
-    """Independent errors (F, 6, K) of the poses of some images (U,) along a path, by shapes in time of each part."""
+def _path_errors(ride: Ride, used: np.ndarray, correlation_s: float | None) -> np.ndarray:
+    """Return independent errors (F, 6, K) of the poses of some images (U,) along a path, by temporal modes."""
     covariances, times = ride.covariance, ride.times_s
     assert covariances is not None
-    some = used[sampled(len(used), _MOST_MOMENTS)]
-    shapes = _shapes(_alike(covariances[some], times[some], correlation_s))
+    some = used[sample_indices(len(used), _MOST_MOMENTS)]
+    shapes = _temporal_modes(_pose_correlation(covariances[some], times[some], correlation_s))
     at_images = np.stack([np.interp(times[used], times[some], shape) for shape in shapes], axis=1)
     result = np.zeros((*covariances.shape[:2], 6 * len(shapes)))
-    result[used] = (pose_roots(covariances[used])[:, :, None] * at_images[:, None, :, None]).reshape(len(used), 6, -1)
+    result[used] = (root_covariances(covariances[used])[:, :, None] * at_images[:, None, :, None]).reshape(
+        len(used), 6, -1
+    )
     return result
 
 
-def _alike(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | None) -> np.ndarray:
-    """Correlation (F, F) of the errors of poses at times."""
+def _pose_correlation(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | None) -> np.ndarray:
+    """Return the correlation (F, F) of pose errors at times (F,)."""
     if correlation_s is not None:
         return np.exp(-np.abs(times_s[:, None] - times_s) / correlation_s)
     variances = np.einsum("nii->ni", np.nan_to_num(covariances))
@@ -178,8 +206,8 @@ def _alike(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | 
     return np.exp(-np.abs(way[:, None] - way))
 
 
-def _shapes(alike: np.ndarray) -> np.ndarray:
-    """Shapes (K, F) in time whose squares add up to the correlations, but for what is left out."""
+def _temporal_modes(alike: np.ndarray) -> np.ndarray:
+    """Return temporal modes (K, F) whose outer products sum to the correlation, up to a small remainder."""
     values, vectors = np.linalg.eigh(alike)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     share = 1 - np.cumsum(values) / values.sum()

@@ -1,4 +1,4 @@
-"""Uncertainty of points by the poses of their images, and along a corrected path."""
+"""Uncertainty of points by pose errors of their images, and along a corrected path."""
 
 from __future__ import annotations
 
@@ -9,34 +9,42 @@ from uwlts.runtime.compiled import compiled
 from uwlts.storage.cloud import PointUncertainty, turned_pairs
 
 _MOST_SHAPES = 12
-"""Shapes along the path; what they leave counts as independent from image to image."""
+"""Largest number of modes along the path; the remainder counts as independent between images."""
 _LEFT = 0.01
-"""Share of the variance that may be left to that."""
+"""Largest fraction of the variance in this remainder."""
 _SAMPLE = 1500
-"""Points by which the shapes are chosen."""
+"""Number of points from which the modes are chosen."""
 _BLOCK = 50_000
 
 
-def moved_by_poses(
+def propagate_pose_errors(
     errors: np.ndarray, image: np.ndarray, levers_mm: np.ndarray, *, after: np.ndarray | None = None
 ) -> np.ndarray:
-    """Motions (K, N, 3) float32 of points by K errors (F, 6, K) of the poses of F images, shift (mm) and turn (rad).
+    """Return the shifts (K, N, 3) float32 of points by K pose errors, preceded by given patterns.
 
-    ``image`` (N,) is that of each point, ``levers_mm`` (N, 3) its place from the platform along the base's axes. With
-    others, ``after`` (M, N, 3), the result (M + K, N, 3) begins with these.
+    Parameters
+    ----------
+    errors : (F, 6, K)
+        Translation (mm) and rotation (rad) errors of the poses of F images.
+    image : (N,)
+        Image of each point.
+    levers_mm : (N, 3)
+        Positions of the points relative to the platform, along the axes of the base.
+    after : (M, N, 3), optional
+        Patterns at the beginning of the result (M + K, N, 3).
     """
     first = 0 if after is None else len(after)
     moved = np.empty((first + errors.shape[2], len(image), 3), np.float32)
     if after is not None:
         moved[:first] = after
     by_image = np.ascontiguousarray(errors.transpose(0, 2, 1), dtype=float)
-    _move_by_poses(by_image, image.astype(np.int64), np.ascontiguousarray(levers_mm, dtype=float), moved[first:])
+    _fill_shifts(by_image, image.astype(np.int64), np.ascontiguousarray(levers_mm, dtype=float), moved[first:])
     return moved
 
 
 @compiled
-def _move_by_poses(errors: np.ndarray, image: np.ndarray, levers: np.ndarray, moved: np.ndarray) -> None:
-    """Fill the motions (K, N, 3) by errors (F, K, 6); points of one image after the other are the fastest."""
+def _fill_shifts(errors: np.ndarray, image: np.ndarray, levers: np.ndarray, moved: np.ndarray) -> None:
+    """Fill the shifts (K, N, 3) by errors (F, K, 6); points sorted by image are fastest."""
     first = 0
     while first < image.size:
         end = first + 1
@@ -51,15 +59,18 @@ def _move_by_poses(errors: np.ndarray, image: np.ndarray, levers: np.ndarray, mo
         first = end
 
 
-def sampled(count: int, most: int = _SAMPLE) -> np.ndarray:
-    """Numbers of some of so many, evenly: points by which errors of poses are weighed, or moments."""
+def sample_indices(count: int, most: int = _SAMPLE) -> np.ndarray:
+    """Return at most ``most`` evenly spaced indices below ``count``."""
     return np.linspace(0, count - 1, min(most, count)).astype(int)
 
 
-def chief_parts(moved: np.ndarray, *, left: float = 0.0, left_mm: float = 0.0, most: int | None = None) -> np.ndarray:
-    """Weights (K, C) for the fewest independent sums of K motions (K, N, 3) that hold nearly all of them.
+def principal_components(
+    moved: np.ndarray, *, left: float = 0.0, left_mm: float = 0.0, most: int | None = None
+) -> np.ndarray:
+    """Return weights (K, C) of the principal components of K shifts (K, N, 3).
 
-    They leave no more than a share ``left`` of the variance, or ``left_mm`` root mean square; at ``most`` so many.
+    The number of components is the smallest that omits at most the fraction ``left`` of the variance, or ``left_mm``
+    root mean square, but never more than ``most``.
     """
     flat = moved.reshape(len(moved), -1).astype(float)
     strengths, ways = np.linalg.eigh(flat @ flat.T)
@@ -69,17 +80,17 @@ def chief_parts(moved: np.ndarray, *, left: float = 0.0, left_mm: float = 0.0, m
     return np.ascontiguousarray(ways[:, :most][:, :count])
 
 
-def pose_roots(covariances: np.ndarray) -> np.ndarray:
-    """Symmetric roots (F, 6, 6), which change as slowly along a path as the covariances do; 0 where one is NaN."""
+def root_covariances(covariances: np.ndarray) -> np.ndarray:
+    """Return symmetric square roots (F, 6, 6) of covariances, which vary smoothly with them; 0 for NaN."""
     known = np.where(np.isfinite(covariances).all(axis=(1, 2), keepdims=True), covariances, 0.0)
-    # Rotations are far smaller numbers than shifts: scaled, so that none is lost.
+    # Scale to unit variances, because rotations are numerically far smaller than translations.
     sizes = np.sqrt(np.maximum(np.einsum("nii->ni", known), 1e-30))
     values, vectors = np.linalg.eigh(known / (sizes[:, :, None] * sizes[:, None]))
     root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
     return sizes[:, :, None] * root
 
 
-def along_corrected_path(
+def correct_path_uncertainty(
     known: PointUncertainty,
     turns: np.ndarray,
     levers_mm: np.ndarray,
@@ -88,29 +99,37 @@ def along_corrected_path(
     covariance: np.ndarray,
     poses: np.ndarray,
 ) -> PointUncertainty:
-    """Uncertainty of N points after a correction of the path's poses, in place of that by the navigation.
+    """Return the uncertainty of N points after a correction of the path, which replaces that of the navigation.
 
-    What they have by the calibrations of sensor and mount (``shared`` of ``known``) stays and turns with them, and so
-    does their noise; all else was the navigation's and goes. The correction is a shift (mm) and a turn (rad) about the
-    platform: the C coefficients of ``covariance`` (6 C, 6 C) with the weights ``basis`` (F, C) at the F images. What
-    the covariances ``poses`` (F, 6, 6) of these have besides is independent from image to image.
+    Noise and the patterns of sensor and mount calibration (``shared`` of ``known``) are kept and rotated. All other
+    patterns come from the navigation and are dropped.
 
     Parameters
     ----------
+    known
+        Uncertainty of the points along the original path.
     turns, levers_mm : (N, 3)
-        Rotation vectors by which the points were turned, rad, and where they lie from the platform then.
+        Rotation vectors of the correction, rad, and positions relative to the platform afterwards.
     image : (N,) int
-        Row of the weights of each point.
+        Image of each point.
+    basis : (F, C)
+        Weights of the C nodes at the F images.
+    covariance : (6 C, 6 C)
+        Covariance of the correction at the nodes, translation (mm) and rotation (rad) about the platform.
+    poses : (F, 6, 6)
+        Covariance of the corrected poses. The part beyond that of the nodes is independent between images.
     """
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))).reshape(-1, 6, len(values))
 
-    some = sampled(len(image))
+    some = sample_indices(len(image))
     by_pose = np.einsum("nc,cik->kni", basis[image[some]], root, optimize=True)
     by_pose = by_pose[:, :, :3] + np.cross(by_pose[:, :, 3:], levers_mm[some])
-    shapes = np.einsum("fc,cik->fik", basis, root @ chief_parts(by_pose, left=_LEFT, most=_MOST_SHAPES), optimize=True)
-    rest = pose_roots(poses - shapes @ shapes.transpose(0, 2, 1))
-    # As few patterns as before that consist of the parts of sensor and mount alone.
+    shapes = np.einsum(
+        "fc,cik->fik", basis, root @ principal_components(by_pose, left=_LEFT, most=_MOST_SHAPES), optimize=True
+    )
+    rest = root_covariances(poses - shapes @ shapes.transpose(0, 2, 1))
+    # Compress the patterns to those that contain parts of sensor and mount.
     names = list(known.shared)
     parts = np.vstack([known.shared[name].T for name in names]) if names else np.zeros((0, len(known.patterns_mm)))
     factors, sizes, rows = np.linalg.svd(parts, full_matrices=False)
@@ -124,10 +143,10 @@ def along_corrected_path(
         random[here] = turned_pairs(known.random_mm2[here], matrices)
         position[here] = np.einsum("nij,nj->ni", matrices, known.position_mm[here])
         own[:, here] = np.einsum("nij,knj->kni", matrices, np.tensordot(mixing, known.patterns_mm[:, here], axes=1))
-    patterns = moved_by_poses(shapes, image, levers_mm, after=own)
+    patterns = propagate_pose_errors(shapes, image, levers_mm, after=own)
     shared, first = {}, 0
     for name in names:
         last = first + known.shared[name].shape[1]
         shared[name] = np.vstack([factors[first:last].T, np.zeros((shapes.shape[2], last - first))])
         first = last
-    return PointUncertainty(random, position, patterns, moved_by_poses(rest, image, levers_mm), shared)
+    return PointUncertainty(random, position, patterns, propagate_pose_errors(rest, image, levers_mm), shared)

@@ -1,9 +1,9 @@
-"""Uncertainty of measured points: by the stripe's own noise, and by the calibration that all of them share.
+"""Uncertainty of measured points by stripe noise and by the calibration.
 
-GUM (JCGM 100:2008), section 5: the law of propagation, linear in the stripe's centre and in the calibration's
-parameters. What the calibration leaves open moves all points together. It is kept as patterns: each moves every point
-by one standard deviation of something that is independent of all other patterns, so that a figure's uncertainty
-follows, correlations included, from calculating it again with each pattern added.
+The propagation is linear in the stripe centre and in the calibration parameters (GUM, JCGM 100:2008, section 5). Errors
+of the calibration are common to all points. They are stored as mutually independent patterns, each the shift of all
+points for one standard deviation. To obtain the uncertainty of a figure including correlations, recalculate the figure
+with each pattern added to the points.
 """
 
 from functools import partial
@@ -23,29 +23,28 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.optics.brightness import BLUR_STD, beside_std
 from uwlts.optics.line_table import LineTable, sum_terms
-from uwlts.reconstruction.path_uncertainty import chief_parts
+from uwlts.reconstruction.path_uncertainty import principal_components
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable, sensor_poses
 from uwlts.storage.cloud import WATER, PointUncertainty
 
-# Patterns that together move the points by no more than this (root mean square) are left out.
 _NEGLIGIBLE_MM = 5e-5
-# Centres between two neighbours from which noise is measured: its relative standard error is then a third.
+"""Largest rms shift of the points by all omitted patterns together."""
 _FEWEST_NEIGHBOURS = 10
-# Points by which patterns are chosen: their root mean square is within some percent that of all.
+"""Least number of centres with two neighbours for the noise, whose relative standard error is then one third."""
 _SAMPLED = 500
+"""Number of points from which patterns are chosen: their rms agrees with that of all within some percent."""
 _TABLE_TOLERANCE_MM = 1e-6
-"""Error of tabulated moves of points: far below any of them that matters."""
+"""Error of tabulated shifts, far below any relevant shift."""
 _LEFT_OUT_MM = 1e-9
-"""Sum of the last terms of tables that may be left out."""
+"""Largest sum of omitted last terms of tables."""
 
 
 def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
-    """Standard deviation (N,) of stripe centres, from how they scatter about their neighbours in the same image.
+    """Estimate the standard deviation (N,) of stripe centres from their second differences in each image.
 
-    The centre of a line less the mean of its two neighbours has 3/2 of the variance of one, where the surface is
-    smooth; edges and outliers do not count, as half the lines would have to hold some. Images with few lines take the
-    value of all.
+    On a smooth surface, the centre minus the mean of its two neighbours has 3/2 of the variance of one centre. The
+    median makes the estimate robust against edges and outliers. Images with few lines receive the value of all images.
     """
     f, at, c = frame, line, centre_px.astype(np.float64)
     if np.any((f[1:] < f[:-1]) | ((f[1:] == f[:-1]) & (at[1:] < at[:-1]))):
@@ -54,7 +53,9 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
     beside = (f[2:] == f[:-2]) & (at[2:] - at[:-2] == 2)
     off, image = np.abs(c[1:-1] - 0.5 * (c[2:] + c[:-2]))[beside], f[1:-1][beside]
     if len(off) < _FEWEST_NEIGHBOURS:
-        raise CalibrationError(f"only {len(off)} stripe centres have two neighbours: too few to measure their noise")
+        raise CalibrationError(
+            f"only {len(off)} stripe centres have two neighbours; {_FEWEST_NEIGHBOURS} are needed to measure noise"
+        )
     scale = MAD_TO_STD / np.sqrt(1.5)
     noise = np.full(int(frame.max()) + 1, np.nan)
     starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1], True])
@@ -67,7 +68,7 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
 
 
 def _median(values: np.ndarray) -> float:
-    """Median of values that are finite; NumPy's own takes several times as long for a few hundred."""
+    """Return the median of finite values; several times faster than NumPy's for a few hundred values."""
     middle = [(len(values) - 1) // 2, len(values) // 2]
     low, high = np.partition(values, middle)[middle].tolist()
     return 0.5 * (low + high)
@@ -85,21 +86,33 @@ def point_uncertainty(
     mount_by: np.ndarray | None = None,
     digest: str | None = None,
 ) -> PointUncertainty:
-    """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
+    """Calculate the uncertainty of points from stripe centres (N,) and a joint calibration.
 
-    In the OCS, or in the scene where the frames carry poses. What the stage does by its positions, scale and direction
-    is part of it, about the middle of its positions; what poses add is not (`uwlts.reconstruction.moving`). The water
-    may have drifted since the calibration, unless that was made from this very capture. ``blur_px`` (N,), how far blur
-    may move the centres, and ``beside_mm`` (N, 3), how far points were moved to where their light comes from
-    (`uwlts.optics.brightness`), are each wrong by some share, the same for all points. ``mount_by`` (6, P) are
-    derivatives of the mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), where the frames
-    carry poses of a platform: what the calibration does to points and mount then belongs together. ``digest`` is
-    that of the calibration where it is known.
+    It refers to the OCS, or to the scene for frames with poses. It includes errors of the stage's position, scale and
+    direction about its central position, and drift of the water since the calibration, unless the calibration uses this
+    capture. It excludes errors of poses (`uwlts.reconstruction.moving`).
+
+    Parameters
+    ----------
+    capture, calibration
+        Capture and joint calibration of the points.
+    frame, line, centre_px : (N,)
+        Image, profile line and position of each stripe centre.
+    blur_px : (N,), optional
+        Possible shift of the centres by blur; its relative error is common to all points.
+    beside_mm : (N, 3), optional
+        Applied shift of the points to the origin of their light (`uwlts.optics.brightness`); its relative error is
+        common to all points.
+    mount_by : (6, P), optional
+        Derivatives of the mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), for frames
+        with poses of a platform. They correlate the errors of points and mount.
+    digest
+        Digest of the calibration, if known.
 
     Raises
     ------
     CalibrationError
-        The calibration holds no joint estimate, or the points cannot be reconstructed by it.
+        The calibration has no joint estimate, or it cannot reconstruct the points.
     """
     header = capture.header
     sensor = header.sensor
@@ -107,7 +120,7 @@ def point_uncertainty(
     if scans and sha256_of(capture.path) in scans:
         sensor = sensor.model_copy(update={"uncertainty": sensor.uncertainty.model_copy(update={"drift_k": 0.0})})
     known = stored_estimate(calibration, sensor, header.medium)
-    # Neighbours err together, so that they show only a part of the noise.
+    # Noise is correlated between neighbours, so that second differences show only a part of it.
     shared = require_joint(calibration).shared_variance.get(STRIPE, 1.0)
     noise = stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
     of_sensor = sensor_poses(capture)
@@ -116,16 +129,18 @@ def point_uncertainty(
     pose_of = np.where(posed, pose, np.eye(3))
     found = require_joint(calibration).covariance_matrix()
     root = np.zeros((len(known.covariance), 1 + len(found)))
-    # What the medium's index adds to the estimate: its drift, or all of it in a medium that was not calibrated in.
+    # Variance added by the medium's index: its drift, or its full variance in a medium without calibration.
     root[:, 0] = np.sqrt(np.maximum(np.diag(known.covariance) - np.pad(np.diag(found), (0, len(root) - len(found))), 0))
     root[: len(found), 1:] = covariance_root(found)
     by_stage_alone = ~posed[:, 0, 0]
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
-    by_stage = stage_root(known, calibration, header, root)
+    by_stage = stage_components(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
     rigid = (
-        np.zeros((6, root.shape[1])) if mount_by is None else _in_sensor(mount_by, header) @ root[: mount_by.shape[1]]
+        np.zeros((6, root.shape[1]))
+        if mount_by is None
+        else _rotate_to_sensor(mount_by, header) @ root[: mount_by.shape[1]]
     )
     exact = partial(_derivatives, known, root, rigid)
     of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
@@ -135,8 +150,8 @@ def point_uncertainty(
     blur = np.zeros(len(line)) if blur_px is None else BLUR_STD * blur_px
 
     def moved(some: slice, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Covariance by noise (n, 6) of some points, and sums (M, n, 3) of their parts with weights (2 + R, M)."""
-        # In each axis the derivative by the pixel first, as it is.
+        """Return the noise covariance (n, 6) of some points, and weighted sums (M, n, 3) of their error components."""
+        # The first column of each axis is the unweighted derivative by the pixel.
         of_parts = np.zeros((1 + len(by_stage), 1 + weights.shape[1]))
         of_parts[0, 0], of_parts[1:, 1:] = 1.0, weights[2:]
         of_axes, where = np.kron(np.eye(3), of_parts), (line[some], centre_px[some])
@@ -149,20 +164,20 @@ def point_uncertainty(
         image, error, by_blur, off = (np.ascontiguousarray(each[some]) for each in (frame, noise, blur, beside))
         of_blur, of_beside, of_stage = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
         room, images = np.empty(of_axes.shape[1]), (pose_of, stage, image)
-        _move(series, row, at, *images, error, by_blur, off, of_blur, of_beside, of_stage, room, random, sums)
+        _fill_errors(series, row, at, *images, error, by_blur, off, of_blur, of_beside, of_stage, room, random, sums)
         return random, sums
 
-    # What moves all points together is smooth, so that some of them show which patterns hold nearly all of it.
+    # Patterns are smooth over the points, so that a sample determines the principal ones.
     few = slice(None, None, max(1, len(line) // _SAMPLED))
     sampled = moved(few, np.eye(2 + len(by_stage)))[1]
-    weights = chief_parts(sampled, left_mm=_NEGLIGIBLE_MM)
+    weights = principal_components(sampled, left_mm=_NEGLIGIBLE_MM)
     random, patterns = moved(slice(None), weights)
     if not np.isfinite(random).all():
-        raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
+        raise CalibrationError("the calibration's joint estimate gives no point for some stripe centre")
     along = header.sensor.uncertainty.stage_position_mm * np.array(header.stage_direction)
     position = np.where(posed[:, :, 0], 0.0, along).astype(np.float32)
     position = position[frame] if posed.any() else np.broadcast_to(position[:1], (len(frame), 3))
-    # All but blur is the sensor's, its stage's and its water's, whatever they scan in this medium.
+    # Except for blur, the errors of sensor, stage and water are common to all scans in this medium.
     source = f"{digest or calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
     name = sha256(source.encode()).hexdigest()[:16]
     of_sensor_parts = np.delete(weights, [0, 2], axis=0)
@@ -171,7 +186,7 @@ def point_uncertainty(
 
 
 @compiled
-def _move(
+def _fill_errors(
     series: np.ndarray,
     row: np.ndarray,
     at: np.ndarray,
@@ -188,11 +203,11 @@ def _move(
     random: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Fill ``random`` (N, 6), in the order of `PAIRS`, and ``sums`` (M, N, 3); ``flat`` (3 + 3 M,) is room to work in.
+    """Fill ``random`` (N, 6), in the order of `PAIRS`, and ``sums`` (M, N, 3); ``flat`` (3 + 3 M,) is a work array.
 
-    ``series`` (L, n, 3 + 3 M) are of derivatives by the pixel across the stripe and of sums of the estimate's parts, in
-    each axis; what images turn, blur, brightness beside the sheet (N, 3) and the stage add is ``of_...`` (M,) and
-    (3, M) times that of the point.
+    ``series`` (L, n, 3 + 3 M) represent, for each axis, the derivative by the pixel across the stripe and the weighted
+    sums of the estimate's error components. The arrays ``of_...``, (M,) or (3, M), are the factors of blur, brightness
+    shift and stage in these sums.
     """
     count = sums.shape[0]
     value = flat.reshape(3, 1 + count)
@@ -215,8 +230,8 @@ def _move(
             sums[m, n, 0], sums[m, n, 1], sums[m, n, 2] = value[0, 1 + m], value[1, 1 + m], value[2, 1 + m]
 
 
-def _in_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
-    """Derivatives (6, P) of a mount, shift and turn, along the axes of the sensor in place of the platform's."""
+def _rotate_to_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
+    """Rotate the derivatives (6, P) of a mount, translation and rotation, from platform axes to sensor axes."""
     turn = np.array(header.T_platform_sensor)[:3, :3]
     return np.vstack([turn.T @ mount_by[:3], turn.T @ mount_by[3:]])
 
@@ -224,10 +239,10 @@ def _in_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
 def _derivatives(
     known: StoredEstimate, root: np.ndarray, rigid: np.ndarray, line: np.ndarray, centre_px: np.ndarray
 ) -> np.ndarray:
-    """Derivatives (N, 3 (1 + R)), axis by axis, of points by the pixel across the stripe and independent parts.
+    """Return the derivatives (N, 3 (1 + R)) of points by the pixel across the stripe and independent components.
 
-    In the OCS. The parts are ``root`` (P, R), those of all parameters, and move the OCS by ``rigid`` (6, R), shift and
-    turn. NaN where a centre has no point.
+    They are ordered by axis of the OCS. ``root`` (P, R) are the components of the parameters, which move the OCS by
+    ``rigid`` (6, R), translation and rotation. The result is NaN for a centre without a point.
     """
     result = np.empty((len(line), 3, 1 + root.shape[1]))
     found = known.points_by(line, centre_px)
@@ -242,11 +257,13 @@ def _derivatives(
     return result.reshape(len(line), -1)
 
 
-def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray) -> np.ndarray:
-    """Motion of a point (R + E, 3) by independent parts for each mm that the stage has gone; OCS.
+def stage_components(
+    known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray
+) -> np.ndarray:
+    """Return the shift (R + E, 3) of a point per mm of stage travel by independent error components, in the OCS.
 
-    What the estimate knows of the stage goes with its own parts, ``root`` (P, R). The others are as the sensor's
-    description says, and the scale that was found, as it is not applied to scans.
+    Estimated stage parameters vary with the components ``root`` (P, R) of the estimate. All others have the uncertainty
+    of the sensor's description. The estimated scale counts as an error, since it is not applied to scans.
     """
     described, uncertainty = np.array(header.stage_direction), header.sensor.uncertainty
     keys = known.parameters.keys

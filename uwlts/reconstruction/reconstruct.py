@@ -1,4 +1,4 @@
-"""Reconstruction of captures: point clouds from the stripes of all laser images by a calibration of any kind."""
+"""Reconstruction of point clouds from the stripes of all laser images, with any kind of calibration."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -54,52 +54,52 @@ def reconstruct(
     calibration : Calibration, PolynomialCalibration or path
         Calibration of the sensor, or one by polynomials.
     mount : Mount or path, optional
-        Where the sensor is on its platform (uwlts mount), in place of what the capture states. Poses are the platform's
-        then, and points are given in the frame of the poses.
+        Pose of the sensor on its platform (uwlts mount); by default that in the capture. Poses are then those of the
+        platform, and points are in the frame of the poses.
     trajectory : Trajectory or path, optional
-        CSV file or ROS bag with times and poses of the platform (of the sensor without a mount), which replace poses in
-        the capture and the stage.
+        CSV file or ROS bag with times and poses of the platform, or of the sensor without a mount. They replace the
+        poses in the capture and the stage.
     pose_format : str
-        Format of the trajectory: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about
-        the moved axes), euler-zyx-deg (about the fixed axes) or another order, -rad for radians; tum; or of a ROS bag
-        ros, ros:/TOPIC, ros:PARENT>CHILD (frames).
+        Format of the trajectory: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg
+        (intrinsic axes), euler-zyx-deg (extrinsic axes) or another order, -rad for radians; tum; or for a ROS bag ros,
+        ros:/TOPIC, ros:PARENT>CHILD (frames).
     pose_unit : {"mm", "m"}
         Unit of the trajectory's positions.
     clock_offset_s : float, optional
-        What to add to the times of the images for those of the trajectory; as the mount says unless given.
+        Offset from the times of the images to those of the trajectory; by default that of the mount.
     clock_drift_ppm : float, optional
-        By how many parts in a million the trajectory's clock runs faster than the camera's, from the first laser image
-        on.
+        Rate difference between the clocks of trajectory and camera from the first laser image on, parts per million;
+        positive if that of the trajectory runs faster.
     pose_correlation_s : float, optional
-        Time over which errors of poses stay alike: 0 if each pose errs by itself, inf if all err together. Unless given
-        it is 0 for poses in the capture; errors of a trajectory are those of a navigation filter of its covariances.
+        Correlation time of pose errors: 0 for independent errors, inf for a common error. The default is 0 for poses in
+        the capture. For a trajectory, the correlation of a navigation filter follows from its covariances.
     stripe : StripeOptions or dict, optional
-        How stripes are found: all options, or settings such as half_window_px=32 threshold_sigmas=4, in place of those
-        in the sensor's table [stripe] (docs: StripeOptions).
+        Options of the stripe detection, or settings such as half_window_px=32 threshold_sigmas=4, in place of those in
+        the sensor's table [stripe] (docs: StripeOptions).
     index : float, optional
-        Refractive index of the medium relative to air, in place of the one that follows from the capture.
+        Refractive index of the medium relative to air; by default that of the capture's medium.
     with_uncertainty : bool, optional
-        Calculate the uncertainty of the points, by default with a joint calibration, which alone holds one. Files with
-        it are more than ten times as large.
+        Calculate the uncertainty of the points, which requires a joint calibration; by default if it is joint. Files
+        are then more than ten times larger.
     progress : callable, optional
-        Called after each image with the number of images done and the number in all.
+        Called after each image with the number of images done and the total number.
 
     Returns
     -------
     PointCloud
-        ``points_mm`` (N, 3) in the object coordinate system, or in the frame in which poses or trajectory are given;
-        ``covariance_mm2`` (N, 3, 3) or None, to which mount, time offset and poses of known covariance add theirs.
-        ``time_s`` (N,) is each point's time of scans by a platform.
+        ``points_mm`` (N, 3) in the object coordinate system, or in the frame of the poses or trajectory.
+        ``covariance_mm2`` (N, 3, 3) or None, including that of mount, time offset and poses if known. ``time_s`` (N,)
+        is the time of each point, for scans from a platform.
 
     Raises
     ------
     CaptureError, CalibrationError, RangeError
-        As `find_stripes` and `reconstruct_stripes`; a file cannot be read; or images have no pose where one is needed.
+        As for `find_stripes` and `reconstruct_stripes`; a file cannot be read; or images lack a required pose.
     DescriptionError
         Images were taken before or after the trajectory.
     """
     if pose_correlation_s is not None and not pose_correlation_s >= 0:
-        raise DescriptionError(f"pose_correlation_s is {pose_correlation_s:g}; it must not be negative")
+        raise DescriptionError(f"pose_correlation_s is {pose_correlation_s:g}; expected zero or a positive number")
     calibration = loaded_calibration(calibration)
     with opened_capture(capture) as scan:
         check_fits(scan.header, calibration, source=scan.path.name)
@@ -122,7 +122,7 @@ def reconstruct(
         )
         warnings = cloud.warnings
         if mount is None and scan.header.T_platform_sensor is not None:
-            warnings = [*warnings, "the mount is that of the drawing: calibrate it (uwlts mount) and give `mount`"]
+            warnings = [*warnings, "the mount has its design values: calibrate it (uwlts mount) and give `mount`"]
         own = cloud.uncertainty
         if own is not None:
             where = cloud.points_mm, cloud.frame, ride
@@ -139,28 +139,38 @@ def reconstruct_stripes(
     with_uncertainty: bool = False,
     mount_by: np.ndarray | None = None,
 ) -> PointCloud:
-    """Point cloud of a capture in the OCS, with the stage's motion added (or the pose, where a frame has one).
+    """Triangulate the stripes of a capture to a point cloud.
 
-    ``index`` replaces the refractive index that follows from the capture's medium. ``with_uncertainty`` adds the
-    uncertainty of the points by a joint calibration, ``mount_by`` as in `point_uncertainty`. Without a mounted window
-    the calibration's is left out. Points that a calibration by polynomials does not reach are left out and counted in
-    ``rays_by_status``.
+    Points are in the OCS, moved by the stage or by the pose of their frame. Points outside the range of a polynomial
+    calibration are omitted and counted in ``rays_by_status``. The window of the calibration is ignored for a capture
+    without a mounted window.
 
-    By a joint calibration points are taken where the light comes from, beside the sheet's middle where the surface
-    shines brighter there (`uwlts.optics.brightness`), and lines are left out, counted as ``blurred``, where blur may
-    move the stripe's centre more than noise does.
+    A joint calibration moves points from the centre of the sheet to the origin of their light, which depends on
+    brightness gradients (`uwlts.optics.brightness`). It also omits lines whose stripe centre may be shifted more by
+    blur than by noise, counted as ``blurred``.
+
+    Parameters
+    ----------
+    capture, stripes, calibration
+        Capture, its stripes, and calibration of the sensor.
+    index
+        Refractive index; by default that of the capture's medium.
+    with_uncertainty
+        Calculate the uncertainty of the points (joint calibration only).
+    mount_by : (6, P), optional
+        As for `point_uncertainty`.
 
     Raises
     ------
     CalibrationError
-        The calibration does not fit the capture, or an index is given for a calibration by polynomials.
+        The calibration does not fit the capture, or an index is given for a polynomial calibration.
     RangeError
-        The refractive index is none of a medium.
+        The refractive index is outside the range of media.
     """
     doubts = check_fits(capture.header, calibration, source=capture.path.name)
     if index is not None and isinstance(calibration, PolynomialCalibration):
         raise CalibrationError(
-            "polynomials hold the refraction of the medium they were made in: a refractive index cannot replace it"
+            "a polynomial calibration is valid only for its own medium, so a refractive index cannot be given; omit it"
         )
     index = calibration.index_of(capture.header.medium) if index is None else index
     require_index(index)
@@ -174,18 +184,18 @@ def reconstruct_stripes(
         stripes = stripes[sharp]
     digest = calibration_digest(calibration)
     sheet = _lit_sheet(capture, calibration, stripes, index, digest)
-    found = _points(capture, calibration, stripes, index, sheet)
+    found = _triangulate(capture, calibration, stripes, index, sheet)
     beside, points = np.zeros((len(sharp), 3)), found.points_mm
     if exact is not None and sheet is not None:
-        beside = _beside(capture, sheet, stripes)
+        beside = _brightness_shifts(capture, sheet, stripes)
         points = points + beside
-    points = _posed(points, capture, stripes.frame)
+    points = _apply_poses(points, capture, stripes.frame)
     there = found.status == RayStatus.OK
     good = slice(None) if there.all() else np.flatnonzero(there)
     kept, known = stripes[good], None
     if with_uncertainty:
         if exact is None:
-            raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (`water` or `joint`)")
+            raise CalibrationError("the calibration states no uncertainty: calibrate jointly (`water` or `joint`)")
         where = kept.frame, kept.line, kept.centre_px
         moved = {"blur_px": blur[good], "beside_mm": beside[good], "mount_by": mount_by}
         known = point_uncertainty(capture, exact, *where, **moved, digest=digest)
@@ -203,7 +213,7 @@ def reconstruct_stripes(
             "medium_index": index,
             "artefact": capture.header.artefact,
             "calibration": digest,
-            **({} if sheet is None else _footprint(capture, sheet, stripes)),
+            **({} if sheet is None else _footprint_metadata(capture, sheet, stripes)),
         },
         lines_by_status=lines,
         rays_by_status={status.name.lower(): int(rays[status]) for status in RayStatus},
@@ -214,23 +224,23 @@ def reconstruct_stripes(
 def _lit_sheet(
     capture: Capture | FrameTable, calibration: AnyCalibration, stripes: CaptureStripes, index: float, digest: str
 ) -> LitSheet | None:
-    """What stripe centres see of the sheet; none with poses, or by polynomials."""
+    """Return the part of the sheet at the stripe centres; None with poses or a polynomial calibration."""
     if isinstance(calibration, PolynomialCalibration) or np.isfinite(capture.pose).any():
         return None
     sensor = capture.header.sensor
     return LitSheet.of(calibration, sensor, stripes.line, stripes.centre_px, medium_index=index, digest=digest)
 
 
-def _points(
+def _triangulate(
     capture: Capture | FrameTable,
     calibration: AnyCalibration,
     stripes: CaptureStripes,
     index: float,
     sheet: LitSheet | None,
 ) -> MeasuredPoints:
-    """Points in the OCS of stripe centres, by whichever kind of calibration, with the stage's motion added."""
+    """Triangulate stripe centres with any kind of calibration to points in the OCS, moved by the stage."""
     direction = np.array(capture.header.stage_direction)
-    # A rolling shutter exposes each row at its own time, and so at its own place of a stage that moves.
+    # A rolling shutter exposes each row at its own time, and hence at its own position of a moving stage.
     stage = capture.stage_mm[stripes.frame] + capture.speed_mm_per_s[stripes.frame] * _row_delay_s(capture, stripes)
     line, centre = stripes.line, stripes.centre_px
     if isinstance(calibration, PolynomialCalibration):
@@ -244,7 +254,7 @@ def _points(
 
 
 def _row_delay_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.ndarray | float:
-    """Time (N,) by which the rows of stripe centres are exposed after the middle row."""
+    """Return the exposure delay (N,), s, of the rows of stripe centres relative to the central row."""
     camera, detector = capture.header.sensor.camera, capture.header.sensor.detector
     if detector.shutter == "global":
         return 0.0
@@ -252,22 +262,22 @@ def _row_delay_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.n
     return 1e-6 * detector.line_time_us * (row - (camera.height_px - 1) / 2)
 
 
-def _beside(capture: Capture | FrameTable, sheet: LitSheet, stripes: CaptureStripes) -> np.ndarray:
-    """From points on the sheet's middle to where their light comes from (N, 3), OCS."""
+def _brightness_shifts(capture: Capture | FrameTable, sheet: LitSheet, stripes: CaptureStripes) -> np.ndarray:
+    """Return the shifts (N, 3), OCS, from points on the central plane of the sheet to the origin of their light."""
     slopes = slopes_of_brightness(stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm, capture.exposure_ms)
     return sheet.beside(stripes.width_px, slopes, stage_direction=capture.header.stage_direction)
 
 
-def _footprint(capture: Capture | FrameTable, sheet: LitSheet, stripes: CaptureStripes) -> Table:
-    """Metadata of how much of the surface a point is the mean of; none where that is not known."""
+def _footprint_metadata(capture: Capture | FrameTable, sheet: LitSheet, stripes: CaptureStripes) -> Table:
+    """Return metadata on the footprint of a point on the surface; empty if unknown."""
     if not np.isfinite(stripes.width_px[sheet.found.status == RayStatus.OK]).any():
         return {}
     std = footprint_std(capture.header.sensor.uncertainty)
     return {FOOTPRINT: list(sheet.footprint_mm(stripes.width_px)), FOOTPRINT_STD: std}
 
 
-def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray) -> np.ndarray:
-    """Points of frames that carry a full pose ``T_scene_object`` are placed by it instead of by the stage."""
+def _apply_poses(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray) -> np.ndarray:
+    """Apply full poses ``T_scene_object`` in place of the stage motion, for frames that have them."""
     poses = sensor_poses(capture)
     posed = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     if not posed.any():
@@ -284,7 +294,7 @@ def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray)
 
 @compiled
 def _place(poses: np.ndarray, image: np.ndarray, by_sensor: np.ndarray, placed: np.ndarray) -> None:
-    """Fill the places (N, 3) of points of the sensor's frame (N, 3) by the poses (F, 4, 4) of their images (N,)."""
+    """Fill ``placed`` (N, 3) with points (N, 3) of the sensor's frame, transformed by poses of their images."""
     for n in range(image.size):
         pose, x, y, z = poses[image[n]], by_sensor[n, 0], by_sensor[n, 1], by_sensor[n, 2]
         for axis in range(3):

@@ -1,4 +1,4 @@
-"""Verification in the field: a known object is measured, and the result must agree with its certificate."""
+"""Field verification: measurement of a calibrated artefact and comparison with its certificate."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +18,9 @@ from uwlts.storage.capture import Capture, opened_capture
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """One calibrated quantity, measured, mm.
+    """Result for one calibrated quantity, mm.
 
-    The ``expanded`` values are uncertainties (k = 2), None where not known; ``limit_mm`` is the largest permissible
+    The ``expanded`` values are expanded uncertainties (k = 2), None if unknown. ``limit_mm`` is the maximum permissible
     error, if any.
     """
 
@@ -33,31 +33,31 @@ class Verdict:
 
     @property
     def error_mm(self) -> float:
-        """Measured less calibrated value."""
+        """Measured minus calibrated value."""
         return self.measured_mm - self.calibrated_mm
 
     @property
     def expanded_mm(self) -> float:
-        """Expanded uncertainty of the error, of what is known of it."""
+        """Expanded uncertainty of the error; unknown contributions count as zero."""
         return float(np.hypot(self.calibrated_expanded_mm or 0.0, self.measured_expanded_mm or 0.0))
 
     @property
     def normalised_error(self) -> float | None:
-        """E_n of ISO/IEC 17043: error over expanded uncertainty; None where the measured value's is not known."""
+        """E_n of ISO/IEC 17043, error divided by expanded uncertainty; None if that of the measurement is unknown."""
         return None if self.measured_expanded_mm is None else abs(self.error_mm) / self.expanded_mm
 
     @property
     def passed(self) -> bool:
-        """Whether E_n is 1 at most and the error within its limit, as far as there are these.
+        """Whether E_n, if known, is at most 1, and the error conforms to its limit, if given.
 
-        The limit is kept if the error and its expanded uncertainty together do (ISO 14253-1, conformity proven).
+        Conformity requires that the sum of absolute error and expanded uncertainty is within the limit (ISO 14253-1).
         """
         agrees = self.normalised_error is None or self.normalised_error <= 1.0
         return agrees and (self.limit_mm is None or abs(self.error_mm) + self.expanded_mm <= self.limit_mm)
 
     @property
     def text(self) -> str:
-        """The verdict in one line."""
+        """The result as one line of text."""
         text = f"{self.quantity}: {self.measured_mm:.4f} mm, calibrated {self.calibrated_mm:.4f} mm, "
         text += f"error {self.error_mm:+.4f} ± {self.expanded_mm:.4f} mm"
         agreement = "" if self.normalised_error is None else f", E_n {self.normalised_error:.2f}"
@@ -67,61 +67,60 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Verification:
-    """Verdicts on all calibrated quantities of an artefact, and what such an artefact cannot show."""
+    """Results for all calibrated quantities of an artefact, and errors that the artefact cannot reveal."""
 
     verdicts: tuple[Verdict, ...]
     not_shown: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
-        """Whether all verdicts are passed."""
+        """Whether all quantities passed."""
         return all(verdict.passed for verdict in self.verdicts)
 
     @property
     def text(self) -> str:
-        """One line for each verdict."""
+        """One line of text for each quantity."""
         return "\n".join(verdict.text for verdict in self.verdicts)
 
 
 def verify(
     capture: Capture | str | Path, calibration: AnyCalibration | str | Path, *, limit_mm: float | None = None
 ) -> Verification:
-    """Measure the artefact that a capture shows and compare it with its calibrated values.
+    """Measure the artefact in a capture and compare it with its calibrated values.
 
-    Each calibrated size must agree with its certificate within both uncertainties (E_n at most 1, ISO/IEC 17043) and,
-    with a limit, conform to it beyond doubt (ISO 14253-1).
+    Each calibrated size must agree with its certificate within both uncertainties (E_n at most 1, ISO/IEC 17043). With
+    a limit, conformity must be proven (ISO 14253-1).
 
     Parameters
     ----------
     capture : Capture or path
         Scan of an artefact with calibrated sizes.
     calibration : Calibration, PolynomialCalibration or path
-        Calibration of the sensor; a joint one holds its uncertainty.
+        Calibration of the sensor; only a joint one states its uncertainty.
     limit_mm : float, optional
-        Largest permissible error.
+        Maximum permissible error.
 
     Raises
     ------
     EvaluationError
-        The capture names no artefact with a calibrated size, does not show it, or there is nothing to judge by: neither
-        a limit nor a joint calibration, which alone holds the measurement's uncertainty.
+        The capture names no artefact with a calibrated size or does not show it, or there is neither a limit nor a
+        joint calibration, which states the uncertainty of the measurement.
     RangeError
         The limit is not positive.
     CalibrationError, CaptureError
         The calibration does not fit the capture, there is no stripe, or a file cannot be read.
     """
     if limit_mm is not None and not limit_mm > 0:
-        raise RangeError(f"`limit_mm` is {limit_mm:g}; a permissible error is positive")
+        raise RangeError(f"`limit_mm` is {limit_mm:g}; expected a positive number")
     calibration = loaded_calibration(calibration)
     with opened_capture(capture) as scan:
         if calibration.joint is None and limit_mm is None:
-            advice = "give `limit_mm`, or calibrate jointly"
-            raise EvaluationError(f"the calibration holds no uncertainty to judge by: {advice}")
+            raise EvaluationError("the calibration states no uncertainty: give `limit_mm`, or calibrate jointly")
         if scan.header.artefact is None:
-            raise EvaluationError(f"{scan.path.name} does not say what it shows: its header needs an artefact")
+            raise EvaluationError(f"the header of {scan.path.name} names no artefact; add the artefact that it shows")
         artefact = parse_artefact(scan.header.artefact)
         cloud = reconstruct(scan, calibration)
-        not_shown = not_shown_by(artefact.kind, scan.stage_mm, scan.header.stage_direction)
+        not_shown = find_undetectable_errors(artefact.kind, scan.stage_mm, scan.header.stage_direction)
     evaluation = evaluate_cloud(cloud, artefact)
     known = figure_uncertainties(cloud, evaluation)
     verdicts = tuple(
@@ -137,23 +136,23 @@ def verify(
         if (calibrated := figure.key.calibrated) is not None and not figure.key.is_detail
     )
     if not verdicts:
-        raise EvaluationError(f"the artefact '{artefact.kind}' has no calibrated size to verify by")
+        raise EvaluationError(f"the artefact '{artefact.kind}' has no calibrated size; add one to its description")
     return Verification(verdicts, not_shown)
 
 
 _ACROSS = 0.1
-"""Share of a stage's motion along the sheet below which a reversed stage makes a mirror image rather than a shear."""
+"""Largest ratio of the stage motion along the sheet at which a reversed stage mirrors the cloud instead of shearing."""
 
 
-def not_shown_by(kind: str, stage_mm: np.ndarray, direction: Vector) -> tuple[str, ...]:
-    """What the sizes of an artefact of a kind say nothing of.
+def find_undetectable_errors(kind: str, stage_mm: np.ndarray, direction: Vector) -> tuple[str, ...]:
+    """Return warnings of errors that the sizes of an artefact cannot reveal.
 
-    ``stage_mm`` (F,) are the positions of its images, ``direction`` is that in which the stage moves the sensor, OCS.
+    ``stage_mm`` (F,) are the stage positions of the images; ``direction`` is the direction of the stage in the OCS.
     """
     x, y, z = direction
     if len(np.unique(stage_mm)) < 2 or np.hypot(y, z) > _ACROSS * abs(x):
         return ()
     return (
-        "not shown: whether the stage moves as its direction says or the other way; the sizes of an artefact "
-        f"({kind}) are the same in a mirror image. Look once at the cloud of something with lettering",
+        "not shown: a reversed stage direction. It produces a mirror image, in which the sizes of an artefact "
+        f"({kind}) are the same. Check once with the cloud of an object with lettering",
     )

@@ -1,6 +1,6 @@
-"""Start of a registration without known poses: by features of the surfaces (KISS-Matcher), or by spheres.
+"""Global registration without initial poses, by surface features (KISS-Matcher) or marker spheres.
 
-Pairs of scans are matched, judged by how much of their surfaces lies on each other then, and joined by a spanning tree.
+Each pair of scans is matched and scored by the number of coinciding patches. A maximum spanning tree joins the pairs.
 KISS-Matcher: Lim et al., IEEE ICRA 2025.
 """
 
@@ -14,22 +14,23 @@ import numpy as np
 
 from uwlts.errors import EvaluationError, SetupError
 from uwlts.fitting.patches import Patches
+from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair
-from uwlts.registration.marker_spheres import MarkerSphere, movement_by_markers
+from uwlts.registration.marker_spheres import MarkerSphere, match_markers
 
 _TRIES = ((0.55, 2.0, 6.0), (0.55, 3.0, 5.0), (0.8, 2.0, 6.0), (0.8, 3.0, 5.0), (1.6, 3.0, 5.0))
-"""Size of the voxels in radii of patches, and in voxels the radii within which normals and features are taken."""
+"""Voxel size (unit: patch radius), normal radius and feature radius (unit: voxel) of each attempt."""
 _VOXEL_UNITS = 0.3
-"""Size of a voxel in the units of KISS-Matcher, its default."""
+"""Default voxel size of KISS-Matcher, in its own units."""
 _LEAST_SHARE = 0.6
-"""Of the patches that lie near each other, those that agree within their noise: a wrong start leaves a few."""
+"""Least fraction of overlapping patches that coincide within their noise; at a wrong pose only a few do."""
 _LEAST_OVERLAP = 30
-"""Patches on each other that make a pair; chance gives a few."""
+"""Least number of coinciding patches of a matched pair; a few coincide by chance."""
 _CLOSE = 5.0
-"""Standard deviations within which patches lie on each other."""
+"""Largest distance of coinciding patches, in standard deviations."""
 
 
-def coarse_poses(
+def estimate_coarse_poses(
     points_mm: Sequence[np.ndarray],
     patches: Sequence[Patches],
     markers: Sequence[Sequence[MarkerSphere]],
@@ -37,23 +38,37 @@ def coarse_poses(
     *,
     sphere_mm: float | None,
 ) -> np.ndarray:
-    """Poses (N, 4, 4) in the frame of the first scan, good to about a patch's radius.
+    """Estimate poses (N, 4, 4) in the frame of the first scan, accurate to about one patch radius.
 
-    EvaluationError where some scan fits none of the others; SetupError where KISS-Matcher is not installed.
+    Parameters
+    ----------
+    points_mm : sequence of (K, 3)
+        Points of each scan.
+    patches, markers, names
+        Patches, marker spheres and name of each scan.
+    sphere_mm
+        Diameter of the marker spheres; None without spheres.
+
+    Raises
+    ------
+    EvaluationError
+        A scan matches no other scan.
+    SetupError
+        KISS-Matcher is not installed.
     """
     edges = []
     for a, b in combinations(range(len(patches)), 2):
-        if found := _movement(patches[a], patches[b], points_mm[a], points_mm[b], markers[a], markers[b], sphere_mm):
+        if found := _match_pair(patches[a], patches[b], points_mm[a], points_mm[b], markers[a], markers[b], sphere_mm):
             edges.append((found[1], a, b, found[0]))
     poses: dict[int, np.ndarray] = {0: np.eye(4)}
-    # The best pair that leads to a new scan, again and again (Prim).
+    # Prim's algorithm: add the best pair that reaches a new scan.
     while len(poses) < len(patches):
         leading = [edge for edge in edges if (edge[1] in poses) != (edge[2] in poses)]
         if not leading:
             lost = ", ".join(name for number, name in enumerate(names) if number not in poses)
             raise EvaluationError(
-                f"{lost}: no start was found by the shape; the surfaces overlap too little or have too few features. "
-                "Give poses at the start, or put at least three spheres into the scene (sphere_mm)"
+                f"{lost}: no initial pose was found from the surfaces. They overlap too little or have too few "
+                "features. Give initial poses, or place at least three spheres in the scene (sphere_mm)"
             )
         _, a, b, movement = max(leading, key=lambda edge: edge[0])
         if a in poses:
@@ -63,7 +78,7 @@ def coarse_poses(
     return np.array([poses[number] for number in range(len(patches))])
 
 
-def _movement(
+def _match_pair(
     a: Patches,
     b: Patches,
     points_a: np.ndarray,
@@ -72,41 +87,39 @@ def _movement(
     spheres_b: Sequence[MarkerSphere],
     sphere_mm: float | None,
 ) -> tuple[np.ndarray, float] | None:
-    """Movement (4, 4) of the first scan onto the second and a score; None where nothing fits."""
-    if sphere_mm is not None and (found := movement_by_markers(spheres_a, spheres_b, sphere_mm)) is not None:
+    """Return the transform (4, 4) from the first scan to the second and its score; None without a match."""
+    if sphere_mm is not None and (found := match_markers(spheres_a, spheres_b, sphere_mm)) is not None:
         return found[0], 1e6 * found[1]
     for voxel, *gains in _TRIES:
-        movement = _by_features(points_a, points_b, voxel * a.radius_mm, *gains)
-        if movement is not None and (found := _refined(a, b, movement))[1] >= _LEAST_OVERLAP:
+        movement = _match_features(points_a, points_b, voxel * a.radius_mm, *gains)
+        if movement is not None and (found := _refine_transform(a, b, movement))[1] >= _LEAST_OVERLAP:
             return found
     return None
 
 
-def _by_features(
+def _match_features(
     a: np.ndarray, b: np.ndarray, voxel: float, normal_gain: float, feature_gain: float
 ) -> np.ndarray | None:
-    """Movement (4, 4) of points (N, 3) onto others by features in voxels of a size, mm; None where none match.
+    """Return the transform (4, 4) between points (N, 3) by features; None if none match.
 
-    Normals and features are taken within so many voxels. SetupError where KISS-Matcher is not installed.
+    ``voxel`` is the voxel size in mm. The gains are the radii for normals and features, in voxels.
     """
-    kiss = _library()
-    # The library warns of bounds above one unit on standard output.
+    kiss = _import_kiss_matcher()
+    # KISS-Matcher prints warnings for bounds above one unit, so coordinates are scaled.
     gains = {"normal_r_gain": normal_gain, "fpfh_r_gain": feature_gain}
     matcher = kiss.KISSMatcher(kiss.KISSMatcherConfig(voxel_size=_VOXEL_UNITS, **gains))
     source, target = ((_VOXEL_UNITS / voxel * each).astype(np.float32) for each in (a, b))
     found = matcher.estimate(source, target)
     if not found.valid:
         return None
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = np.asarray(found.rotation), np.asarray(found.translation) * voxel / _VOXEL_UNITS
+    result = rigid_transform(np.asarray(found.rotation), np.asarray(found.translation) * voxel / _VOXEL_UNITS)
     return result if np.isfinite(result).all() else None
 
 
-def _refined(a: Patches, b: Patches, movement: np.ndarray) -> tuple[np.ndarray, float]:
-    """A movement after a few rounds of the joint estimate for this pair, and the number of patches on each other.
+def _refine_transform(a: Patches, b: Patches, movement: np.ndarray) -> tuple[np.ndarray, float]:
+    """Refine a transform by the joint estimate of this pair; return it with the number of coinciding patches.
 
-    The number is 0 where many patches disagree, and where the shape leaves a direction open, as a pipe or a plane does:
-    then any place along it would fit as well.
+    The number is 0 if many patches disagree or if the overlap leaves a direction undetermined.
     """
     if (fitted := fit_pair(a, b, movement)) is None:
         return movement, 0.0
@@ -115,12 +128,12 @@ def _refined(a: Patches, b: Patches, movement: np.ndarray) -> tuple[np.ndarray, 
     return fitted[0], float(np.count_nonzero(fits)) if len(fits) and np.mean(fits) > _LEAST_SHARE else 0.0
 
 
-def _library() -> Any:
+def _import_kiss_matcher() -> Any:
     try:
         import kiss_matcher
     except ImportError as error:
         raise SetupError(
-            "the search for a start needs the library kiss-matcher, which is not installed: pip install "
-            "'uwlts[registration]', or give poses at the start"
+            "the search for initial poses needs the library kiss-matcher, which is not installed: pip install "
+            "'uwlts[registration]', or give initial poses"
         ) from error
     return kiss_matcher

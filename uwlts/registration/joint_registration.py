@@ -1,8 +1,8 @@
-"""Joint least squares for the poses of scans: distances between their surfaces, common spheres, patterns, and a prior.
+"""Joint least-squares registration of scans by surface distances, common spheres and prior knowledge.
 
-Unknown are the pose of every scan but the first, as a shift (mm) and a turn (rad) about the scan's middle in the common
-frame, and how much of each of its systematic patterns every scan has. Scans by one calibration of the sensor, or one of
-its mount, have these errors in common: their patterns are correlated beforehand as far as they consist of them.
+The unknowns are the pose of each scan except the first, and the amplitudes of the systematic patterns of all scans. A
+pose step is a translation (mm) and a rotation vector (rad) about the scan's centroid, in the common frame. Scans that
+share a calibration of the sensor or mount share its errors. The prior correlates their pattern amplitudes accordingly.
 """
 
 from __future__ import annotations
@@ -16,39 +16,50 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
 from uwlts.fitting.patches import (
     LEAST_INFORMATION,
     PatchDistances,
     Patches,
+    decompose_motions,
     distances_between,
-    information_of_slopes,
     rigid_derivatives,
-    ways_of_moving,
+    slope_information,
 )
-from uwlts.registration.marker_spheres import MarkerSphere, common_markers
+from uwlts.registration.marker_spheres import MarkerSphere, group_markers
 
 FEWEST_OF_PAIR = 12
-"""Patches of an overlap that counts: two for each of the six parameters of a movement."""
+"""Least number of patches of a usable overlap: two for each of the six parameters of a rigid motion."""
 _OWN_PART = 1e-4
-"""Variance of a pattern that no other scan has, of one: a hundredth of its errors, as temperature and load change."""
+"""Variance of each amplitude that is independent in every scan: 1 % of its errors change with temperature and load."""
 NARROWER = 0.8
-"""Reach of a round relative to that of the round before."""
+"""Factor on the matching distance from one round to the next."""
 _PAIR_REACH = 4.0
-"""Reach of the first round of a pair's own fit, in patch radii: a search is right to about one."""
+"""Matching distance in the first round of a pair fit (unit: patch radius); a search is accurate to about one radius."""
 _PAIR_ROUNDS = 12
-"""Rounds of a pair's own fit: after seven the reach is one patch radius."""
+"""Rounds of a pair fit; after seven the matching distance is one patch radius."""
 _SPHERE_REACH = 0.25
-"""Of the diameter: how far the centres of one sphere lie apart in two scans, at most."""
+"""Largest distance between the centres of one sphere in two scans, relative to its diameter."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairEvidence:
-    """What one pair of scans says: derivatives (Q, U) by all unknowns, residuals, weights and their noise (Q,).
+    """Linearised observations of one pair of scans.
 
-    Rows of ``patches`` surface distances, with their places (patches, 3), come first, then three rows for each of so
-    many ``spheres``. ``spread`` is the scatter of the distances over their noise, ``spurious`` (P, P) the information
-    that the noise of the normals alone would give.
+    Attributes
+    ----------
+    derivatives : (Q, U) float64
+        Derivatives of the residuals by all unknowns. Rows of surface distances come first, then three for each sphere.
+    residuals, weights, std : (Q,) float64
+        Residuals, their weights and their stated standard deviations.
+    spread : float
+        Ratio of the robust scatter of the distances to their stated noise, at least 1.
+    spurious : (P, P) float64
+        Information on the poses that noise of the normals alone would produce.
+    places_mm : (patches, 3) float64
+        Positions of the surface distances.
+    patches, spheres : int
+        Numbers of surface distances and of common spheres.
     """
 
     derivatives: np.ndarray
@@ -62,22 +73,22 @@ class PairEvidence:
     spheres: int
 
     def normal(self) -> np.ndarray:
-        """Normal matrix (U, U)."""
+        """Return the normal matrix (U, U)."""
         return self.derivatives.T @ (self.weights[:, None] * self.derivatives)
 
     def gradient(self) -> np.ndarray:
-        """Gradient (U,) of half the sum of squares."""
+        """Return the gradient (U,) of half the sum of squares."""
         return self.derivatives.T @ (self.weights * self.residuals)
 
     @property
     def counted(self) -> np.ndarray:
-        """(Q,) bool: rows of surfaces that count."""
+        """Mask (Q,) of the surface distances with a positive weight."""
         return (self.weights > 0) & (np.arange(len(self.weights)) < self.patches)
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """Step (U,) in the determined directions, joint covariance (U, U), and open directions (K, P) of the poses."""
+class PoseSolution:
+    """Step (U,) in the determined directions, joint covariance (U, U), and undetermined directions (K, P) of poses."""
 
     step: np.ndarray
     covariance: np.ndarray
@@ -85,7 +96,7 @@ class Solved:
 
 
 class JointRegistration:
-    """The estimate, round by round; `poses` (N, 4, 4) and `patterns`, N arrays (M,), are its present state."""
+    """Iterative joint estimate with the current `poses` (N, 4, 4) and pattern amplitudes `patterns` (N arrays (M,))."""
 
     def __init__(
         self,
@@ -103,56 +114,56 @@ class JointRegistration:
         self.start_std, self.sphere_mm = start_std, sphere_mm
         self.local_middles = np.array([each.places_mm.mean(axis=0) for each in patches])
         self._start_middles_mm = self.middles_mm
-        self.sizes = np.array([_usual_distance(p.places_mm) for p in patches])
+        self.sizes = np.array([rms_distance(each.places_mm, each.places_mm.mean(axis=0)) for each in patches])
         ends = 6 * (len(patches) - 1) + np.cumsum([0, *map(len, self.patterns)])
         self.pattern_columns = [np.arange(a, b) for a, b in pairwise(ends)]
         self.pose_columns = [np.arange(6 * (n - 1), 6 * n) if n else np.arange(0) for n in range(len(patches))]
-        # Turns in units of the shift that they give to the usual point.
+        # Rotations are scaled by the scan's rms radius, so that all pose unknowns are lengths.
         turns = np.repeat(np.array([[1.0, 1 / size] for size in self.sizes[1:]]).ravel(), 3)
         self.units = np.append(turns, np.ones(ends[-1] - ends[0]))
-        self.alike = _alike(self.patterns, shared or [{}] * len(patches))
+        self.prior_information = _prior_information(self.patterns, shared or [{}] * len(patches))
 
     @property
     def unknown_poses(self) -> int:
-        """Number of parameters of all poses but the first."""
+        """Number of pose parameters; the first pose is fixed."""
         return 6 * (len(self.patches) - 1)
 
     @property
     def middles_mm(self) -> np.ndarray:
-        """(N, 3): middles of the scans in the common frame."""
+        """Centroids (N, 3) of the scans in the common frame."""
         return np.einsum("nij,nj->ni", self.poses[:, :3, :3], self.local_middles) + self.poses[:, :3, 3]
 
-    def distances(self, reach_mm: float) -> dict[tuple[int, int], PatchDistances]:
-        """Return the distances of the patches of each scan from each other one that it overlaps."""
-        moved = [self._moved(number) for number in range(len(self.patches))]
+    def measure_distances(self, reach_mm: float) -> dict[tuple[int, int], PatchDistances]:
+        """Measure the patch distances of each ordered pair of scans that overlap within ``reach_mm``."""
+        moved = [self._corrected_patches(number) for number in range(len(self.patches))]
         found = {
             (a, b): distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
             for a, b in permutations(range(len(moved)), 2)
         }
         return {pair: distances for pair, distances in found.items() if len(distances.source)}
 
-    def evidence(self, found: dict[tuple[int, int], PatchDistances]) -> dict[tuple[int, int], PairEvidence]:
-        """Return what all pairs of scans that overlap or share spheres say, by the `distances` of the present state."""
+    def collect_evidence(self, found: dict[tuple[int, int], PatchDistances]) -> dict[tuple[int, int], PairEvidence]:
+        """Linearise the observations of all pairs of scans that overlap or share spheres."""
         others = [np.ones(len(each)) for each in self.patches]
         for (a, _), distances in found.items():
             others[a][distances.source] += 1
-        centres = [self._centres(number) for number in range(len(self.markers))]
-        common = common_markers(centres, _SPHERE_REACH * (self.sphere_mm or 0.0))
+        centres = [self._common_centres(number) for number in range(len(self.markers))]
+        common = group_markers(centres, _SPHERE_REACH * (self.sphere_mm or 0.0))
         pairs = {}
         for a, b in combinations(range(len(self.patches)), 2):
-            ways = _both_ways(found, a, b) if _patches_of(found, a, b) >= FEWEST_OF_PAIR else []
+            ways = _distances_both_ways(found, a, b) if _count_patches(found, a, b) >= FEWEST_OF_PAIR else []
             shared = [(views[a], views[b], len(views)) for views in common if a in views and b in views]
             if ways or shared:
-                pairs[a, b] = self._pair(a, b, ways, others, shared)
+                pairs[a, b] = self._pair_evidence(a, b, ways, others, shared)
         return pairs
 
-    def narrow_overlaps(self, found: dict[tuple[int, int], PatchDistances]) -> tuple[tuple[int, int, int], ...]:
-        """Return the pairs of scans that overlap too little to count, with the number of patches, by `distances`."""
-        counts = ((a, b, _patches_of(found, a, b)) for a, b in combinations(range(len(self.patches)), 2))
+    def find_narrow_overlaps(self, found: dict[tuple[int, int], PatchDistances]) -> tuple[tuple[int, int, int], ...]:
+        """Return the pairs of scans whose overlap has too few patches to be used, with the number of patches."""
+        counts = ((a, b, _count_patches(found, a, b)) for a, b in combinations(range(len(self.patches)), 2))
         return tuple((a, b, count) for a, b, count in counts if 0 < count < FEWEST_OF_PAIR)
 
-    def solved(self, pairs: Sequence[PairEvidence]) -> Solved:
-        """The least-squares step by the evidence of pairs and what is known beforehand."""
+    def solve(self, pairs: Sequence[PairEvidence]) -> PoseSolution:
+        """Solve for the least-squares step from the observations of pairs and the prior."""
         count, unknown = self.unknown_poses, len(self.units)
         normal, gradient, spurious = np.zeros((unknown, unknown)), np.zeros(unknown), np.zeros((count, count))
         for pair in pairs:
@@ -162,17 +173,17 @@ class JointRegistration:
         scale = np.outer(self.units, self.units)
         normal, gradient = normal * scale, gradient * self.units
         spurious *= scale[:count, :count]
-        beside = normal[count:, count:] + self.alike
-        gradient[count:] += self.alike @ np.concatenate(self.patterns)
+        beside = normal[count:, count:] + self.prior_information
+        gradient[count:] += self.prior_information @ np.concatenate(self.patterns)
         within = np.linalg.solve(beside, normal[count:, :count])
         reduced = normal[:count, :count] - normal[:count, count:] @ within
         reduced = (reduced + reduced.T) / 2
-        values, vectors, metric = ways_of_moving(reduced, spurious)
+        values, vectors, metric = decompose_motions(reduced, spurious)
         known = values > LEAST_INFORMATION
         ways, strengths = vectors[:, known], values[known]
         down = gradient[:count] - within.T @ gradient[count:]
         open_ways = np.linalg.qr(vectors[:, np.logical_not(known)])[0]
-        off = self._from_start()
+        off = self._offset_from_start()
         if self.start_std is None:
             ways = ways - open_ways @ (open_ways.T @ ways)
             covariance = (ways / strengths) @ ways.T
@@ -183,7 +194,7 @@ class JointRegistration:
             down = by @ (ways.T @ down) + beforehand * off / self.units[:count]
         step = -covariance @ down
         if self.start_std is None:
-            # Along open directions scans go back to where they were: a wrong start may seem to tell more.
+            # Undetermined directions return to the initial pose: far from the solution they may appear determined.
             step = step - open_ways @ (open_ways.T @ (off / self.units[:count]))
         rest = -np.linalg.solve(beside, gradient[count:]) - within @ step
         whole = np.block(
@@ -192,10 +203,10 @@ class JointRegistration:
                 [-within @ covariance, np.linalg.inv(beside) + within @ covariance @ within.T],
             ]
         )
-        return Solved(self.units * np.append(step, rest), whole * scale, open_ways.T * self.units[:count])
+        return PoseSolution(self.units * np.append(step, rest), whole * scale, open_ways.T * self.units[:count])
 
     def move(self, step: np.ndarray) -> None:
-        """Change the state by a step (U,)."""
+        """Update poses and pattern amplitudes by a step (U,)."""
         middles = self.middles_mm
         for number, columns in enumerate(self.pose_columns):
             if not len(columns):
@@ -208,22 +219,22 @@ class JointRegistration:
         self.patterns = [z + step[columns] for z, columns in zip(self.patterns, self.pattern_columns, strict=True)]
 
     def require_connected(self, pairs: Sequence[tuple[int, int]], names: Sequence[str]) -> None:
-        """EvaluationError where some scans overlap none of those that the first is connected with."""
+        """Raise EvaluationError if a scan is not connected with the first by overlaps."""
         reached = {0}
         while more := {number for pair in pairs if reached & set(pair) for number in pair} - reached:
             reached |= more
         if lost := [names[number] for number in range(len(names)) if number not in reached]:
             raise EvaluationError(
-                f"{', '.join(lost)}: no overlap with {names[0]} or with what overlaps it. Give better poses at the "
-                "start, a larger reach, spheres, or search the start (search)"
+                f"{', '.join(lost)}: not connected with {names[0]} by overlaps. Give better initial poses, a larger "
+                "reach or spheres, or search for the initial poses (search)"
             )
 
-    def _moved(self, number: int) -> Patches:
+    def _corrected_patches(self, number: int) -> Patches:
         patches, amounts = self.patches[number], self.patterns[number]
         return replace(patches, places_mm=patches.places_mm + np.tensordot(amounts, patches.patterns_mm, axes=1))
 
-    def _centres(self, number: int) -> list[MarkerSphere]:
-        """The spheres of a scan in the common frame."""
+    def _common_centres(self, number: int) -> list[MarkerSphere]:
+        """Transform the spheres of a scan into the common frame."""
         pose, amounts, turned = self.poses[number], self.patterns[number], []
         for marker in self.markers[number]:
             centre = marker.centre_mm + amounts @ marker.patterns_mm
@@ -237,7 +248,7 @@ class JointRegistration:
             )
         return turned
 
-    def _pair(
+    def _pair_evidence(
         self,
         a: int,
         b: int,
@@ -252,10 +263,11 @@ class JointRegistration:
         spurious = np.zeros((self.unknown_poses, self.unknown_poses))
         for source, target, found in ways:
             std = found.std_mm * spread
-            # Both directions count by half, and K scans of one place have K (K - 1) / 2 pairs and K - 1 differences.
-            each = 1 / (others[source][found.source] * self.patches[source].alike(len(found.source)))
+            # Each pair is measured in both directions. K scans of one place form K (K - 1) / 2 pairs, but only K - 1
+            # independent differences.
+            each = 1 / (others[source][found.source] * self.patches[source].correlated_count(len(found.source)))
             weight = biweight(found.distance_mm / std) / std**2 * each
-            by_poses = partial(self._by_poses, source, target, found.places_mm)
+            by_poses = partial(self._derivatives_by_poses, source, target, found.places_mm)
             block = np.zeros((len(weight), unknown))
             block[:, : self.unknown_poses] = by_poses(found.normals)
             for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):
@@ -265,7 +277,7 @@ class JointRegistration:
             residuals.append(found.distance_mm)
             weights.append(weight)
             deviations.append(found.std_mm)
-            spurious += information_of_slopes(found.normals, weight * found.slope_variance, by_poses)
+            spurious += slope_information(found.normals, weight * found.slope_variance, by_poses)
         for first, second, views in spheres:
             covariance = first.covariance + second.covariance
             root = np.linalg.cholesky(np.linalg.inv(covariance)).T
@@ -277,7 +289,7 @@ class JointRegistration:
                 block[:, self.pattern_columns[number]] = sign * root @ marker.patterns_mm.T
             blocks.append(block)
             residuals.append(off)
-            # Where surfaces fit worse than stated, spheres do too: else they would decide, and keep surfaces apart.
+            # Spheres are scaled by the same spread as surfaces, since they would otherwise dominate a poor fit.
             weights.append(np.full(3, 2 / views / spread**2))
             deviations.append(np.ones(3))
         return PairEvidence(
@@ -292,62 +304,59 @@ class JointRegistration:
             len(spheres),
         )
 
-    def _by_poses(self, source: int, target: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Derivatives (Q, P) of distances between two scans along directions (Q, 3) by all poses."""
+    def _derivatives_by_poses(self, source: int, target: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return the derivatives (Q, P), by all poses, of distances between two scans along directions (Q, 3)."""
         block, middles = np.zeros((len(places), self.unknown_poses)), self.middles_mm
         for number, sign in ((source, 1.0), (target, -1.0)):
             if len(columns := self.pose_columns[number]):
                 block[:, columns] = sign * rigid_derivatives(places, directions, middles[number])
         return block
 
-    def _from_start(self) -> np.ndarray:
-        """Shifts and turns (P,) of the poses from the start."""
+    def _offset_from_start(self) -> np.ndarray:
+        """Return the translations and rotations (P,) of the poses relative to the initial poses."""
         turned = Rotation.from_matrix(self.poses[1:, :3, :3] @ self.start[1:, :3, :3].transpose(0, 2, 1)).as_rotvec()
         return np.hstack([(self.middles_mm - self._start_middles_mm)[1:], turned]).ravel()
 
 
 def fit_pair(source: Patches, target: Patches, start: np.ndarray) -> tuple[np.ndarray, PatchDistances] | None:
-    """Fit a pose (4, 4) that brings patches onto others, from a start; return it and the distances then.
+    """Fit the pose (4, 4) that moves ``source`` onto ``target``; return it and the remaining distances.
 
-    None if they do not overlap, or if their shape leaves a direction open, as a pipe or a plane does: any place along
-    it would fit as well.
+    Return None if the patches do not overlap, or if their shape leaves a direction undetermined. A plane or a plain
+    pipe does so.
     """
     joint = JointRegistration([target, source], [[], []], np.array([np.eye(4), start]), start_std=None, sphere_mm=None)
     reach = _PAIR_REACH * max(source.radius_mm, target.radius_mm)
     for _ in range(_PAIR_ROUNDS):
-        if not (pairs := joint.evidence(joint.distances(reach))):
+        if not (pairs := joint.collect_evidence(joint.measure_distances(reach))):
             return None
-        joint.move(joint.solved(list(pairs.values())).step)
+        joint.move(joint.solve(list(pairs.values())).step)
         reach = max(NARROWER * reach, source.radius_mm)
-    pairs = joint.evidence(joint.distances(reach))
-    if not pairs or len(joint.solved(list(pairs.values())).open_directions):
+    pairs = joint.collect_evidence(joint.measure_distances(reach))
+    if not pairs or len(joint.solve(list(pairs.values())).open_directions):
         return None
     return joint.poses[1], distances_between(source, joint.poses[1], target, np.eye(4), reach_mm=reach)
 
 
-def _both_ways(found: dict[tuple[int, int], PatchDistances], a: int, b: int) -> list[tuple[int, int, PatchDistances]]:
-    """Source, target and distances of two scans, each from the other one, as far as they overlap."""
+def _distances_both_ways(
+    found: dict[tuple[int, int], PatchDistances], a: int, b: int
+) -> list[tuple[int, int, PatchDistances]]:
+    """Return source, target and distances of two scans in both directions, where they overlap."""
     return [(*way, found[way]) for way in ((a, b), (b, a)) if way in found]
 
 
-def _patches_of(found: dict[tuple[int, int], PatchDistances], a: int, b: int) -> int:
-    """Number of patches in the overlap of two scans."""
-    return sum(len(distances.source) for *_, distances in _both_ways(found, a, b))
+def _count_patches(found: dict[tuple[int, int], PatchDistances], a: int, b: int) -> int:
+    """Count the patches in the overlap of two scans."""
+    return sum(len(distances.source) for *_, distances in _distances_both_ways(found, a, b))
 
 
-def _alike(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
-    """Information (U, U) beforehand on the patterns of all scans, each of variance one."""
+def _prior_information(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
+    """Return the prior information (U, U) on the pattern amplitudes of all scans, each of unit variance."""
     ends = np.cumsum([0, *map(len, patterns)])
     covariance = (1 + _OWN_PART) * np.eye(ends[-1])
     for a, b in permutations(range(len(patterns)), 2):
         for name in shared[a].keys() & shared[b].keys():
             if shared[a][name].shape[1] == shared[b][name].shape[1]:
                 covariance[ends[a] : ends[a + 1], ends[b] : ends[b + 1]] += shared[a][name] @ shared[b][name].T
-    # What rounds wrong, or contradicts itself, counts as apart.
+    # Keep the matrix positive definite despite rounding and inconsistent shared parts.
     least = float(np.linalg.eigvalsh(covariance)[0]) if len(covariance) else 1.0
     return np.linalg.inv(covariance + max(_OWN_PART - least, 0.0) * np.eye(ends[-1]))
-
-
-def _usual_distance(points: np.ndarray) -> float:
-    """Root mean square distance of points (N, 3) from their middle."""
-    return float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))))

@@ -1,4 +1,4 @@
-"""Spheres as markers: their centres in each scan, and which centres in several scans are those of one sphere."""
+"""Marker spheres: detection in each scan and correspondence between scans."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from itertools import permutations
 import numpy as np
 
 from uwlts.evaluation.spheres import find_sphere
+from uwlts.fitting.least_squares import fit_rigid_transform
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.storage.cloud import PointCloud
 
 _AGREE = 0.05
-"""Difference of distances between centres, relative to the diameter, within which they agree before registration."""
+"""Tolerance of centre distances before registration, relative to the sphere diameter."""
 _TRIPLES = 200
-"""Triples of spheres that are tried, spread evenly over all; all of up to six spheres."""
+"""Number of sphere triples that are tried, spread evenly over all; up to six spheres give fewer."""
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerSphere:
-    """A sphere's centre (3,), its covariance (3, 3) by noise, and how patterns move it (M, 3), mm."""
+    """Centre (3,) of a sphere, its noise covariance (3, 3), and its shift (M, 3) by each systematic pattern, in mm."""
 
     centre_mm: np.ndarray
     covariance: np.ndarray
@@ -28,17 +29,17 @@ class MarkerSphere:
 
 
 def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
-    """Find all spheres of a diameter in a cloud."""
+    """Find all spheres of the given diameter in a cloud."""
     usable, found = np.ones(len(cloud), bool), []
     rng = np.random.default_rng(0)
     while (sphere := find_sphere(cloud.points_mm, diameter_mm / 2, usable=usable, rng=rng)) is not None:
         members = sphere.members[sphere.robust.inliers]
         usable[sphere.near] = False
-        # Of a cap, centre and radius are known together only; the diameter is given.
+        # On a cap, centre and radius are strongly correlated. The known diameter removes this correlation.
         fit = fit_sphere(cloud.points_mm[members], diameter_mm / 2)
         outwards = cloud.points_mm[members] - fit.centre_mm
         outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-        # A displacement moves the centre of the fit by least squares.
+        # Shift of the least-squares centre for a displacement along the normals.
         solve = np.linalg.pinv(outwards)
         patterns = np.zeros((0, 3))
         if cloud.uncertainty is not None:
@@ -48,12 +49,15 @@ def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
     return found
 
 
-def common_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> list[dict[int, MarkerSphere]]:
-    """Spheres of different scans within a reach of each other in the common frame, by the number of the scan."""
+def group_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> list[dict[int, MarkerSphere]]:
+    """Group spheres of different scans that lie within ``reach_mm`` of each other in the common frame.
+
+    Each group maps scan numbers to spheres. Spheres seen in one scan only are omitted.
+    """
     groups: list[dict[int, MarkerSphere]] = []
     for number, markers in enumerate(scans):
         for marker in markers:
-            away = [np.inf if number in group else _from_middle(marker, group) for group in groups]
+            away = [np.inf if number in group else _distance_from_mean(marker, group) for group in groups]
             if away and min(away) < reach_mm:
                 groups[int(np.argmin(away))][number] = marker
             else:
@@ -61,10 +65,13 @@ def common_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> 
     return [group for group in groups if len(group) > 1]
 
 
-def movement_by_markers(
+def match_markers(
     source: Sequence[MarkerSphere], target: Sequence[MarkerSphere], diameter_mm: float
 ) -> tuple[np.ndarray, int] | None:
-    """Movement (4, 4) of most spheres of one scan onto those of another, and their number; None below three."""
+    """Find the transform (4, 4) that matches the most spheres of two scans; return it with their number.
+
+    Return None if fewer than three spheres match.
+    """
     a, b = (np.array([each.centre_mm for each in markers]).reshape(-1, 3) for markers in (source, target))
     if min(len(a), len(b)) < 3:
         return None
@@ -78,23 +85,13 @@ def movement_by_markers(
                 (np.abs(sides_b[p] - sides_a[i, k]) < limit) & (np.abs(sides_b[q] - sides_a[j, k]) < limit)
             )
             for r in last[(last != p) & (last != q)]:
-                movement = movement_of(a[[i, j, k]], b[[p, q, r]])
+                movement = fit_rigid_transform(a[[i, j, k]], b[[p, q, r]])
                 off = np.linalg.norm((a @ movement[:3, :3].T + movement[:3, 3])[:, None] - b[None], axis=2)
                 fits = off.min(axis=1) < limit
                 if best is None or np.count_nonzero(fits) > best[1]:
-                    best = movement_of(a[fits], b[off.argmin(axis=1)[fits]]), int(np.count_nonzero(fits))
+                    best = fit_rigid_transform(a[fits], b[off.argmin(axis=1)[fits]]), int(np.count_nonzero(fits))
     return best if best is not None and best[1] >= 3 else None
 
 
-def _from_middle(marker: MarkerSphere, group: dict[int, MarkerSphere]) -> float:
+def _distance_from_mean(marker: MarkerSphere, group: dict[int, MarkerSphere]) -> float:
     return float(np.linalg.norm(np.mean([each.centre_mm for each in group.values()], axis=0) - marker.centre_mm))
-
-
-def movement_of(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Rigid movement (4, 4) of points (N, 3) onto others in the same order (Arun, Huang and Blostein, 1987)."""
-    middle = source.mean(axis=0), target.mean(axis=0)
-    left, _, right = np.linalg.svd((target - middle[1]).T @ (source - middle[0]))
-    rotation = left @ np.diag([1, 1, np.sign(np.linalg.det(left @ right))]) @ right
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, middle[1] - rotation @ middle[0]
-    return result

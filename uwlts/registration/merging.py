@@ -1,4 +1,4 @@
-"""One cloud of several scans, with the uncertainty of points and poses together."""
+"""Merging of registered scans into one cloud, whose uncertainty includes that of the poses."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, NO_INDEX, PointCloud, 
 
 _BLOCK = 50_000
 _LEFT_OUT = 1e-4
-"""Of the sum of squares of all patterns: patterns that together have less are left out, a hundredth of the distance."""
+"""Largest fraction of the patterns' total variance that omitted patterns may hold; 1 % of the rms shift."""
 
 
-def merged_cloud(
+def merge_clouds(
     scans: Sequence[PointCloud], names: Sequence[str], joint: JointRegistration, covariance: np.ndarray
 ) -> PointCloud:
-    """All points in the common frame, moved by the patterns that were found.
+    """Merge all points in the common frame, corrected by the estimated pattern amplitudes.
 
-    ``covariance`` (U, U) is that of all unknowns of the estimate. Scans without uncertainty have that of their pose
+    ``covariance`` (U, U) is that of all unknowns of the estimate. A scan without uncertainty receives that of its pose
     alone.
     """
     points, random, position, frames, firsts = [], [], [], [], []
     first = 0
     for number, scan in enumerate(scans):
         rotation = joint.poses[number, :3, :3]
-        points.append(_corrected(scan, joint.patterns[number]) @ rotation.T + joint.poses[number, :3, 3])
+        points.append(_correct_points(scan, joint.patterns[number]) @ rotation.T + joint.poses[number, :3, 3])
         known = scan.uncertainty
         random.append(np.zeros((len(scan), 6)) if known is None else turned_pairs(known.random_mm2, rotation))
         position.append(np.zeros((len(scan), 3)) if known is None else known.position_mm @ rotation.T)
@@ -42,16 +42,16 @@ def merged_cloud(
         uncertainty=PointUncertainty(
             np.vstack(random).astype(np.float32),
             np.vstack(position).astype(np.float32),
-            _patterns(scans, points, joint, covariance),
-            _by_pose(scans, joint),
+            _joint_patterns(scans, points, joint, covariance),
+            _rotate_image_poses(scans, joint),
         ),
         time_s=np.concatenate(times) if len(times) == len(scans) else None,
-        metadata=_metadata(scans, names, joint, firsts),
+        metadata=_merge_metadata(scans, names, joint, firsts),
     )
 
 
-def _by_pose(scans: Sequence[PointCloud], joint: JointRegistration) -> np.ndarray | None:
-    """Parts (K, N, 3) of the poses of images, in the common frame; None where no scan has any."""
+def _rotate_image_poses(scans: Sequence[PointCloud], joint: JointRegistration) -> np.ndarray | None:
+    """Rotate the image-pose errors (K, N, 3) of all scans into the common frame; None if no scan has any."""
     known = [None if scan.uncertainty is None else scan.uncertainty.poses_mm for scan in scans]
     count = max((len(each) for each in known if each is not None), default=0)
     if not count:
@@ -63,24 +63,24 @@ def _by_pose(scans: Sequence[PointCloud], joint: JointRegistration) -> np.ndarra
     return np.concatenate(parts, axis=1)
 
 
-def _corrected(scan: PointCloud, amounts: np.ndarray) -> np.ndarray:
+def _correct_points(scan: PointCloud, amounts: np.ndarray) -> np.ndarray:
     if scan.uncertainty is None or not len(amounts):
         return scan.points_mm
     return scan.points_mm + np.tensordot(amounts, scan.uncertainty.patterns_mm, axes=1)
 
 
-def _patterns(
+def _joint_patterns(
     scans: Sequence[PointCloud], points: Sequence[np.ndarray], joint: JointRegistration, covariance: np.ndarray
 ) -> np.ndarray:
-    """Patterns (M, N, 3), orthogonal over all points, of the covariance of poses and patterns together."""
+    """Return patterns (M, N, 3), orthogonal over all points, of the joint covariance of poses and patterns."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
 
     def blocks() -> list[tuple[int, slice]]:
         return [(n, slice(k, k + _BLOCK)) for n, each in enumerate(points) for k in range(0, len(each), _BLOCK)]
 
-    def moved(number: int, here: slice) -> np.ndarray:
-        """Motion (R, B, 3) of points of a scan by independent parts."""
+    def shifts(number: int, here: slice) -> np.ndarray:
+        """Shift (R, B, 3) of some points of a scan by the independent components of the covariance."""
         scan, columns = scans[number], joint.pose_columns[number]
         result = np.zeros((root.shape[1], len(points[number][here]), 3))
         if len(columns):
@@ -95,20 +95,22 @@ def _patterns(
 
     gram = np.zeros((root.shape[1],) * 2)
     for number, here in blocks():
-        flat = moved(number, here).reshape(len(gram), -1)
+        flat = shifts(number, here).reshape(len(gram), -1)
         gram += flat @ flat.T
     strengths, ways = np.linalg.eigh(gram)
     strengths, ways = np.maximum(strengths[::-1], 0.0), ways[:, ::-1]
     left = 1 - np.cumsum(strengths) / max(strengths.sum(), 1e-300)
     count = 1 + int(np.argmax(left <= _LEFT_OUT))
     parts = [
-        np.tensordot(ways[:, :count].T, moved(number, here), axes=1).astype(np.float32) for number, here in blocks()
+        np.tensordot(ways[:, :count].T, shifts(number, here), axes=1).astype(np.float32) for number, here in blocks()
     ]
     return np.concatenate(parts, axis=1)
 
 
-def _metadata(scans: Sequence[PointCloud], names: Sequence[str], joint: JointRegistration, firsts: list[int]) -> dict:
-    """What all scans have in common, and each scan's name, pose and first image."""
+def _merge_metadata(
+    scans: Sequence[PointCloud], names: Sequence[str], joint: JointRegistration, firsts: list[int]
+) -> dict:
+    """Collect the metadata that all scans share, and the name, pose and first image number of each scan."""
     shared = {
         key: value
         for key, value in scans[0].metadata.items()

@@ -1,10 +1,9 @@
-"""Registration of several scans into one frame: joint least squares over all overlaps, with what stays open named.
+"""Registration of several scans into one frame by joint least squares over all overlaps.
 
-Residuals are distances of patches of one scan from the surface of another (`uwlts.fitting.patches`), and differences
-of the centres of spheres that several scans show. Unknown are the pose of every scan but the first, and how much of
-each of its systematic patterns a scan has (`PointUncertainty`), which are known beforehand to be of standard deviation
-one, and the same in all scans as far as they come from one calibration. Tukey's biweight leaves out what fits no
-surface.
+Residuals are the distances of patches of one scan from the surface of another (`uwlts.fitting.patches`), and the
+differences of common sphere centres. The unknowns are the pose of each scan except the first, and the amplitudes of
+the systematic patterns of each scan (`PointUncertainty`). The prior of an amplitude has unit variance. Scans of one
+calibration share amplitudes. Tukey's biweight rejects outliers. Undetermined directions are reported.
 """
 
 from __future__ import annotations
@@ -21,10 +20,16 @@ from uwlts.fitting.patches import surface_patches
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Table
-from uwlts.registration.coarse_registration import coarse_poses
-from uwlts.registration.joint_registration import FEWEST_OF_PAIR, NARROWER, JointRegistration, PairEvidence, Solved
+from uwlts.registration.coarse_registration import estimate_coarse_poses
+from uwlts.registration.joint_registration import (
+    FEWEST_OF_PAIR,
+    NARROWER,
+    JointRegistration,
+    PairEvidence,
+    PoseSolution,
+)
 from uwlts.registration.marker_spheres import find_markers
-from uwlts.registration.merging import merged_cloud
+from uwlts.registration.merging import merge_clouds
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import loaded_cloud
@@ -32,25 +37,38 @@ from uwlts.storage.pose_files import PoseFormat, Unit, read_poses, write_poses
 
 _ROUNDS = 60
 _STILL_MM = 1e-5
-"""A step that moves the usual point by less changes nothing that can be measured."""
+"""Rms shift of the points, mm, that ends the iteration: far below any measurable change."""
 _REACH = 0.05
-"""Of a scan's size: how far overlapping surfaces lie apart at the start, at most, unless that is given."""
+"""Default distance between overlapping surfaces at the initial poses, relative to the scan's size."""
 _ROUNDED = 1e-6
-"""Largest error of a rotation's elements that is rounding of a file."""
+"""Largest error of a rotation matrix element that rounding in a file may cause."""
 _PART = 0.1
-"""Part of a scan in an open direction, relative to the largest, below which it does not move in it."""
+"""Least component of a scan in an undetermined direction, relative to the largest, that is reported."""
 _NO_TURN = 0.05
-"""Shift of the usual point by the turn of a movement, relative to the movement, below which it is a shift alone."""
+"""Share of a motion's rms shift caused by its rotation, below which the motion counts as a pure translation."""
 
 
 @dataclass(frozen=True)
 class PairFit:
-    """How two scans fit: numbers of the scans, patches of the overlap that count, and distances, mm.
+    """Agreement of two scans after registration.
 
-    ``mean_mm`` and ``rms_mm`` are of the distances after registration, ``scatter`` is their robust standard deviation
-    in units of that which noise explains. ``closure_mm`` is the root mean square distance, with noise taken off, that
-    the other overlaps alone leave here; None where without this pair the scans are not connected. ``spheres`` is the
-    number of common spheres, ``sphere_rms`` the root mean square difference of their centres over its uncertainty.
+    Attributes
+    ----------
+    scans : (int, int)
+        Numbers of the scans.
+    patches : int
+        Number of patches of the overlap with a positive weight.
+    mean_mm, rms_mm : float
+        Mean and root mean square of their distances.
+    scatter : float
+        Ratio of the robust standard deviation of the distances to their stated noise.
+    closure_mm : float or None
+        Root-mean-square distance here, with noise subtracted, if all other pairs alone determine the poses; None if
+        they do not.
+    spheres : int
+        Number of common spheres.
+    sphere_rms : float or None
+        Root-mean-square difference of their centres divided by its standard uncertainty.
     """
 
     scans: tuple[int, int]
@@ -65,7 +83,7 @@ class PairFit:
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Places (Q, 3) where two scans show one surface, common frame, and their distances (Q,), mm."""
+    """Positions (Q, 3) in the common frame where two scans overlap, and the distances (Q,) there, in mm."""
 
     places_mm: np.ndarray
     distance_mm: np.ndarray
@@ -73,9 +91,9 @@ class Overlap:
 
 @dataclass(frozen=True, eq=False)
 class OpenMovement:
-    """A movement of a scan that is open: a shift along a unit direction, or a turn about a line through a point.
+    """An undetermined motion of a scan: a translation along a unit direction, or a rotation about an axis.
 
-    ``point_mm`` is None for a shift; for a turn it is the point of the line that lies nearest to the scan's middle.
+    ``point_mm`` is None for a translation. For a rotation, it is the point of the axis nearest to the scan's centroid.
     """
 
     scan: int
@@ -83,7 +101,7 @@ class OpenMovement:
     point_mm: np.ndarray | None
 
     def words(self) -> str:
-        """The movement in words, in the common frame."""
+        """Describe the motion in the common frame as text."""
         along = "({:.3f}, {:.3f}, {:.3f})".format(*(self.direction + 0.0))
         if self.point_mm is None:
             return f"shift along {along}"
@@ -98,22 +116,23 @@ class RegisteredScans(Brief):
     ----------
     names : tuple of str
     poses : (N, 4, 4) float64
-        Frame of the first scan from that of each, mm.
+        Transform from the frame of each scan to that of the first, mm.
     covariance : (6 N, 6 N) float64
-        Of a shift (mm), then a turn (rad) of each scan about its `middles_mm`; 0 for the first scan, and in directions
-        that are open unless the start was given with its standard uncertainty.
+        Covariance of the translation (mm), then the rotation (rad), of each scan about `middles_mm`. It is 0 for the
+        first scan, and in undetermined directions unless the initial poses have a standard uncertainty.
     middles_mm : (N, 3) float64
+        Centroids of the scans in the common frame.
     open_movements : tuple of OpenMovement
-        What neither surfaces nor spheres tell; left as at the start.
+        Motions that neither surfaces nor spheres determine. They keep their initial values.
     pairs : tuple of PairFit
     overlaps : tuple of Overlap
-        Where each pair overlaps, in the order of the pairs.
+        Overlap of each pair, in the order of ``pairs``.
     narrow_overlaps : tuple of (int, int, int)
-        Numbers of two scans, and of the patches of their overlap: too few to count.
+        Numbers of two scans and of the patches in their overlap, where these are too few to be used.
     scale : float
-        Patterns that were found, root mean square over all in units of what the calibration expects; NaN without.
+        Root mean square of the estimated pattern amplitudes (expected: 1); NaN without patterns.
     cloud : PointCloud
-        All points with their uncertainty, that of the registration included. Numbers of images go on from scan to scan.
+        All points with their uncertainty, including that of the registration. Image numbers continue from scan to scan.
     """
 
     names: tuple[str, ...]
@@ -129,11 +148,11 @@ class RegisteredScans(Brief):
 
     @property
     def std(self) -> np.ndarray:
-        """Standard uncertainty (N, 6) of each scan's shift (mm) and turn (rad)."""
+        """Standard uncertainty (N, 6) of each scan's translation (mm) and rotation (rad)."""
         return np.sqrt(np.diag(self.covariance)).reshape(-1, 6)
 
     def record(self) -> Table:
-        """All but points and distances as JSON; angles in rad."""
+        """Return everything except points and distances as JSON; angles in rad."""
         return {
             "scans": [
                 {"name": name, "transform": pose.tolist(), "middle_mm": middle.tolist()}
@@ -165,11 +184,11 @@ class RegisteredScans(Brief):
         }
 
     def save_poses(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the poses of the scans as CSV of the format matrix, mm; OutputError if that fails."""
+        """Write the poses of the scans as CSV in the format "matrix", mm; OutputError if writing fails."""
         write_poses(path, self.poses, overwrite=overwrite)
 
     def lines(self) -> list[str]:
-        """The summary as text."""
+        """Return a summary as text."""
         lines = [f"{len(self.names)} scans, {len(self.cloud)} points, {len(self.pairs)} overlaps"]
         for pair in self.pairs:
             first, second = (self.names[number] for number in pair.scans)
@@ -190,7 +209,8 @@ class RegisteredScans(Brief):
             shift, turn = np.linalg.norm(std[:3]), np.degrees(np.linalg.norm(std[3:]))
             lines.append(f"  {name}: standard uncertainty {shift:.4f} mm, {turn:.5f} deg")
         lines += [
-            f"  open, left as at the start: {self.names[each.scan]}: {each.words()}" for each in self.open_movements
+            f"  undetermined, initial value kept: {self.names[each.scan]}: {each.words()}"
+            for each in self.open_movements
         ]
         return lines
 
@@ -208,56 +228,56 @@ def register(
     reach_mm: float | None = None,
     progress: ProgressListener = unheard,
 ) -> RegisteredScans:
-    """Bring scans that overlap into the frame of the first, and merge them into one cloud with its uncertainty.
+    """Register overlapping scans in the frame of the first, and merge them into one cloud with uncertainty.
 
     Parameters
     ----------
     clouds
-        Two or more clouds or their files, in any order; every one overlaps another, not necessarily the first.
+        Two or more clouds or their files, in any order. Each must overlap another one, not necessarily the first.
     poses : (N, 4, 4) or path, optional
-        Pose of every scan at the start, in the order of the clouds, common frame from each scan's: an array, or a CSV
-        file. The scans' frames are taken as one unless given.
+        Initial pose of each scan in the common frame, in the order of the clouds: an array or a CSV file. By default
+        all scans have one frame.
     pose_format, pose_unit
         As for `reconstruct`.
     start_std_mm : float, optional
-        Standard uncertainty of each scan's shift at the start along each axis. The start counts as evidence then, and
-        decides what surfaces leave open.
+        Standard uncertainty of each scan's initial position along each axis. The initial poses then enter the estimate
+        as observations, and determine motions that the surfaces do not.
     start_std_deg : float, optional
-        The same of its turn about its middle.
+        Standard uncertainty of each scan's initial rotation about its centroid.
     search : bool
-        Search the start by the shape of the surfaces (KISS-Matcher), or by spheres, whatever the frames and poses are.
+        Search for the initial poses by surface features (KISS-Matcher) or spheres. Given poses are ignored.
     sphere_mm : float, optional
-        Diameter of spheres that stand in the scene: their centres tie scans together that do not see one surface.
+        Diameter of spheres in the scene. Their centres connect scans without a common surface.
     reach_mm : float, optional
-        How far overlapping surfaces lie apart at the start, at most; a twentieth of a scan's size unless given.
+        Largest distance between overlapping surfaces at the initial poses; by default a twentieth of a scan's size.
     progress : callable, optional
-        Called with steps done and steps in all.
+        Called with the number of steps done and the total number.
 
     Raises
     ------
     CaptureError
         A file cannot be read.
     EvaluationError
-        Scans have too few points or no overlap, or no start was found.
+        Scans have too few points or no overlap, or no initial poses were found.
     SetupError
-        The library for the search is not installed.
+        The search needs a library that is not installed.
 
     Examples
     --------
     >>> found = uwlts.register(["top.ply", "left.ply", "right.ply"])
     >>> found.cloud.save("pipe.ply")
     """
-    names = tuple(_name(each, number) for number, each in enumerate(clouds))
-    scans = [_opened(each) for each in clouds]
+    names = tuple(_scan_name(each, number) for number, each in enumerate(clouds))
+    scans = [loaded_cloud(each) for each in clouds]
     if isinstance(poses, str | os.PathLike):
         poses = read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0]
     if len(scans) < 2:
-        raise EvaluationError(f"found {len(scans)} cloud; two or more are needed for a registration")
+        raise EvaluationError(f"found {len(scans)} cloud; a registration needs two or more")
     for name, length in (("sphere_mm", sphere_mm), ("reach_mm", reach_mm), ("start_std_mm", start_std_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
     if (start_std_mm is None) != (start_std_deg is None):
-        raise EvaluationError("the start's uncertainty needs both parts: start_std_mm and start_std_deg")
+        raise EvaluationError("the uncertainty of the initial poses needs both start_std_mm and start_std_deg")
     steps = len(scans) + _ROUNDS
     patches = []
     for number, (name, scan) in enumerate(zip(names, scans, strict=True)):
@@ -268,9 +288,9 @@ def register(
         progress(number + 1, steps)
     markers = [find_markers(scan, sphere_mm) if sphere_mm else [] for scan in scans]
     start = (
-        coarse_poses([scan.points_mm for scan in scans], patches, markers, names, sphere_mm=sphere_mm)
+        estimate_coarse_poses([scan.points_mm for scan in scans], patches, markers, names, sphere_mm=sphere_mm)
         if search
-        else _given(poses, len(scans))
+        else _checked_poses(poses, len(scans))
     )
     std = None if start_std_mm is None or start_std_deg is None else (start_std_mm, float(np.radians(start_std_deg)))
     shared = [{} if scan.uncertainty is None else scan.uncertainty.shared for scan in scans]
@@ -278,9 +298,9 @@ def register(
     least = 2 * max(each.radius_mm for each in patches)
     reach = least if search else reach_mm or _REACH * float(np.median([_size(scan) for scan in scans]))
     for done in range(_ROUNDS):
-        pairs = joint.evidence(joint.distances(reach))
+        pairs = joint.collect_evidence(joint.measure_distances(reach))
         joint.require_connected(list(pairs), names)
-        step = joint.solved(list(pairs.values())).step
+        step = joint.solve(list(pairs.values())).step
         joint.move(step)
         progress(len(scans) + done + 1, steps)
         if (
@@ -290,40 +310,40 @@ def register(
             break
         reach = max(NARROWER * reach, least)
     progress(steps, steps)
-    distances = joint.distances(reach)
-    pairs = joint.evidence(distances)
-    solved = joint.solved(list(pairs.values()))
-    _require_settled(solved, joint.unknown_poses)
+    distances = joint.measure_distances(reach)
+    pairs = joint.collect_evidence(distances)
+    solution = joint.solve(list(pairs.values()))
+    _require_settled(solution, joint.unknown_poses)
     amounts = np.concatenate(joint.patterns)
     covariance = np.zeros((6 * len(scans),) * 2)
-    covariance[6:, 6:] = solved.covariance[: joint.unknown_poses, : joint.unknown_poses]
+    covariance[6:, 6:] = solution.covariance[: joint.unknown_poses, : joint.unknown_poses]
     return RegisteredScans(
         names=names,
         poses=joint.poses,
         covariance=covariance,
         middles_mm=joint.middles_mm,
-        open_movements=_open_movements(solved.open_directions, joint.middles_mm, joint.sizes),
-        pairs=tuple(_fit_of(joint, key, pairs, solved) for key in pairs),
+        open_movements=_open_movements(solution.open_directions, joint.middles_mm, joint.sizes),
+        pairs=tuple(_pair_fit(joint, key, pairs, solution) for key in pairs),
         overlaps=tuple(_overlap(pair) for pair in pairs.values()),
-        narrow_overlaps=joint.narrow_overlaps(distances),
+        narrow_overlaps=joint.find_narrow_overlaps(distances),
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
-        cloud=merged_cloud(scans, names, joint, solved.covariance),
+        cloud=merge_clouds(scans, names, joint, solution.covariance),
     )
 
 
-def _require_settled(solved: Solved, unknown: int) -> None:
-    """EvaluationError where a further step would move the poses by more than their uncertainty."""
-    std = np.sqrt(np.diag(solved.covariance)[:unknown])
-    moves = float(np.max(np.abs(solved.step[:unknown]) / np.where(std > 0, std, np.inf), initial=0.0))
+def _require_settled(solution: PoseSolution, unknown: int) -> None:
+    """Raise EvaluationError if a further step would move the poses by more than their uncertainty."""
+    std = np.sqrt(np.diag(solution.covariance)[:unknown])
+    moves = float(np.max(np.abs(solution.step[:unknown]) / np.where(std > 0, std, np.inf), initial=0.0))
     if moves > 1:
         raise EvaluationError(
-            f"the registration does not settle: after {_ROUNDS} rounds the next one would move a scan by {moves:.2g} "
-            "standard uncertainties. Give poses nearer to the true ones, or scans that overlap more"
+            f"the registration does not converge: after {_ROUNDS} rounds the next one would move a scan by "
+            f"{moves:.2g} standard uncertainties. Give more accurate initial poses, or scans with more overlap"
         )
 
 
-def _fit_of(
-    joint: JointRegistration, key: tuple[int, int], pairs: dict[tuple[int, int], PairEvidence], solved: Solved
+def _pair_fit(
+    joint: JointRegistration, key: tuple[int, int], pairs: dict[tuple[int, int], PairEvidence], solution: PoseSolution
 ) -> PairFit:
     pair = pairs[key]
     counted = pair.residuals[pair.counted]
@@ -334,9 +354,9 @@ def _fit_of(
         mean_mm=float(np.mean(counted)) if len(counted) else 0.0,
         rms_mm=float(np.sqrt(np.mean(counted**2))) if len(counted) else 0.0,
         scatter=pair.spread,
-        closure_mm=_closure(joint, key, pairs, solved) if len(counted) else None,
+        closure_mm=_closure_rms(joint, key, pairs, solution) if len(counted) else None,
         spheres=pair.spheres,
-        # Relative to the centres' uncertainty in the estimate.
+        # Sphere residuals are whitened, so that they are relative to their uncertainty.
         sphere_rms=float(np.sqrt(np.mean(centres**2))) if pair.spheres else None,
     )
 
@@ -347,7 +367,7 @@ def _overlap(pair: PairEvidence) -> Overlap:
 
 
 def _open_movements(directions: np.ndarray, middles_mm: np.ndarray, sizes_mm: np.ndarray) -> tuple[OpenMovement, ...]:
-    """Movements of N scans, the first fixed, from open directions (K, 6 (N - 1)): shifts, then turns about middles."""
+    """Convert undetermined directions (K, 6 (N - 1)) into motions of N scans, the first fixed: translations first."""
     found = []
     for number in range(1, len(middles_mm)):
         twists = directions[:, 6 * (number - 1) : 6 * number] * np.repeat([1.0, sizes_mm[number]], 3)
@@ -357,35 +377,38 @@ def _open_movements(directions: np.ndarray, middles_mm: np.ndarray, sizes_mm: np
         basis = rows[strengths > _PART]
         if not len(basis):
             continue
-        # Combinations without a turn first, each as a row of coefficients.
+        # Combinations in ascending order of their rotation, so that pure translations come first.
         left, turns, _ = np.linalg.svd(basis[:, 3:], full_matrices=True)
         turns = np.append(turns, np.zeros(len(basis) - len(turns)))
         for coefficients, turn in zip(left.T[::-1], turns[::-1], strict=True):
             shift, turned = (coefficients @ basis).reshape(2, 3)
             turned = turned / sizes_mm[number]
             if turn < _NO_TURN:
-                found.append(OpenMovement(number, _pointing(shift), None))
+                found.append(OpenMovement(number, _orient(shift), None))
             else:
                 nearest = middles_mm[number] + np.cross(turned, shift) / (turned @ turned)
-                found.append(OpenMovement(number, _pointing(turned), nearest))
+                found.append(OpenMovement(number, _orient(turned), nearest))
     return tuple(found)
 
 
-def _pointing(direction: np.ndarray) -> np.ndarray:
-    """The unit vector along a direction whose largest part is positive."""
+def _orient(direction: np.ndarray) -> np.ndarray:
+    """Normalise a direction so that its largest component is positive."""
     unit = direction / np.linalg.norm(direction)
     return unit * np.sign(unit[np.argmax(np.abs(unit))])
 
 
-def _closure(
-    joint: JointRegistration, key: tuple[int, int], pairs: dict[tuple[int, int], PairEvidence], solved: Solved
+def _closure_rms(
+    joint: JointRegistration, key: tuple[int, int], pairs: dict[tuple[int, int], PairEvidence], solution: PoseSolution
 ) -> float | None:
-    """Distance that the other pairs alone leave in an overlap; None where they do not tell it."""
+    """Return the rms distance that remains in an overlap if all other pairs determine the poses.
+
+    Return None if they do not determine them.
+    """
     others = [pair for other, pair in pairs.items() if other != key]
     if not others:
         return None
-    without = joint.solved(others)
-    if len(without.open_directions) > len(solved.open_directions):
+    without = joint.solve(others)
+    if len(without.open_directions) > len(solution.open_directions):
         return None
     pair = pairs[key]
     left = (pair.residuals + pair.derivatives @ without.step)[pair.counted]
@@ -393,14 +416,14 @@ def _closure(
     return float(np.sqrt(max(np.mean(left**2) - np.mean(noise**2), 0.0)))
 
 
-def _given(poses: np.ndarray | None, count: int) -> np.ndarray:
+def _checked_poses(poses: np.ndarray | None, count: int) -> np.ndarray:
     if poses is None:
         return np.tile(np.eye(4), (count, 1, 1))
     start = np.array(poses, dtype=np.float64)
     if start.shape != (count, 4, 4):
-        raise EvaluationError(f"the poses at the start have the shape {start.shape}; expected ({count}, 4, 4)")
+        raise EvaluationError(f"the initial poses have the shape {start.shape}; expected ({count}, 4, 4)")
     if not is_rigid(start, within=_ROUNDED):
-        raise EvaluationError("the poses at the start must be rotations with a shift (0 0 0 1 as last row)")
+        raise EvaluationError("an initial pose is not a rigid transform; expected a rotation and a last row of 0 0 0 1")
     return np.linalg.inv(start[0]) @ start
 
 
@@ -408,9 +431,5 @@ def _size(cloud: PointCloud) -> float:
     return float(np.linalg.norm(np.ptp(cloud.points_mm, axis=0)))
 
 
-def _opened(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
-    return loaded_cloud(cloud)
-
-
-def _name(cloud: PointCloud | str | os.PathLike[str], number: int) -> str:
+def _scan_name(cloud: PointCloud | str | os.PathLike[str], number: int) -> str:
     return f"scan {number + 1}" if isinstance(cloud, PointCloud) else Path(cloud).stem

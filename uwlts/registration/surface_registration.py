@@ -1,7 +1,7 @@
-"""Registration of a cloud to a surface: points to local planes, weighted by their covariance, robust.
+"""Robust point-to-plane registration of a cloud to a surface, weighted by the points' covariance.
 
-What the surface leaves open is named and left as it was. What all points of a cloud share is followed through the
-estimate: a registration takes up whatever looks like a movement.
+Motions that the surface does not determine are reported and left unchanged. Systematic errors that resemble a rigid
+motion are absorbed by the registration, so their effect on the estimated motion is propagated.
 """
 
 from __future__ import annotations
@@ -14,28 +14,54 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
 from uwlts.fitting.patches import rigid_derivatives
-from uwlts.fitting.propagation import covariance_of_groups
+from uwlts.fitting.propagation import grouped_covariance
+from uwlts.model.calibration import rigid_transform
 from uwlts.storage.cloud import PointUncertainty, images_along, variance_along
 
-_ROUNDS = 40
-_MOST_POINTS = 50_000
-"""More add nothing but time."""
-_OPEN_SHARE = 1e-3
-"""Of the information of the best determined direction: a direction with less rests on the noise of the normals."""
-_STILL_MM = 1e-5
-_LEAST_MM2 = 1e-8
-"""A tenth of a micrometre, squared, so that no point weighs infinitely."""
-_FEWEST = 50
 _NAMES = "shift along x", "shift along y", "shift along z", "turn about x", "turn about y", "turn about z"
+
+
+@dataclass(frozen=True)
+class SurfaceRegistrationOptions:
+    """Settings of `register_to_surface`.
+
+    The history of the values names no data. The reason beside each value follows from the method.
+
+    Attributes
+    ----------
+    rounds : int
+        Largest number of Gauss-Newton rounds, each with new correspondences.
+    most_points : int
+        Number of points above which the cloud is thinned: more points take longer without a benefit.
+    fewest_points : int
+        Least number of points near the surface: about eight for each of the six parameters.
+    open_share : float
+        Information on a direction, relative to the best determined one, below which the direction is undetermined.
+        Noise of the normals alone can produce less.
+    still_mm : float
+        Step, mm, that ends the iteration: far below any measurable change.
+    least_variance_mm2 : float
+        Lower bound of a point's variance along the normal: (0.1 um) squared, so that weights stay finite.
+    """
+
+    rounds: int = 40
+    most_points: int = 50_000
+    fewest_points: int = 50
+    open_share: float = 1e-3
+    still_mm: float = 1e-5
+    least_variance_mm2: float = 1e-8
+
+
+_DEFAULTS = SurfaceRegistrationOptions()
 
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """Signed distances (N,) of points from a surface along its unit normals (N, 3), and index (N,) of its points.
+    """Signed distances (N,) of points from a surface along unit normals (N, 3), and indices (N,) of surface points.
 
-    A distance is NaN where the surface is farther than was looked for.
+    A distance is NaN beyond the search distance.
     """
 
     distance_mm: np.ndarray
@@ -44,7 +70,7 @@ class Nearest:
 
 
 class ReferenceSurface(Protocol):
-    """What a cloud can be registered to; ``uncertainty`` is of the points that `Nearest.index` counts."""
+    """Reference surface of a registration; `Nearest.index` refers to the points of ``uncertainty``."""
 
     @property
     def uncertainty(self) -> PointUncertainty | None: ...
@@ -56,7 +82,7 @@ class ReferenceSurface(Protocol):
 
 
 class SampledSurface:
-    """A surface given by points (M, 3) with unit normals (M, 3), each with its tangent plane."""
+    """Surface given by points (M, 3) with unit normals (M, 3): each point has its tangent plane."""
 
     def __init__(
         self,
@@ -80,25 +106,26 @@ class SampledSurface:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Movement that brings a cloud to a surface.
+    """Rigid motion that registers a cloud to a surface.
 
     Attributes
     ----------
     transform : (4, 4) float64
-        Reference from cloud, mm.
-    covariance : (6, 6) float64
-        Of a shift (mm), then a turn (rad) about the cloud's `middle_mm`, after the movement: by the noise of single
-        points and the positions of images, 0 in directions that are open. Of a fitted shape whose size is free (7, 7),
-        with the radius (mm).
+        Transform from the cloud's frame to the reference's, mm.
+    covariance : (6, 6) or (7, 7) float64
+        Covariance of the translation (mm) and rotation (rad) about `middle_mm` after the motion, by the noise of points
+        and the position of images; 0 in undetermined directions. For a fitted shape of unknown size, the radius (mm)
+        comes last.
     middle_mm : (3,) float64
+        Centroid of the cloud after the motion.
     open_directions : tuple of str
-        Movements that the surface does not tell; the cloud was not moved along them.
+        Motions that the surface does not determine. The cloud was not moved along them.
     rms_mm : float
-        Root mean square distance of the points that count from the surface.
+        Root-mean-square distance from the surface of the points with a positive weight.
     points : int
-        Points that count.
-    by_cloud, by_reference : (M, 6) float64
-        Steps by which the registration answers to each pattern that the points of cloud or reference share.
+        Number of these points.
+    by_cloud, by_reference : (M, 6) or (M, 7) float64
+        Change of the estimated motion for one standard deviation of each systematic pattern of cloud or reference.
     """
 
     transform: np.ndarray
@@ -111,12 +138,12 @@ class Registration:
     by_reference: np.ndarray
 
     def std_along(self, points_mm: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Standard uncertainty (N,) of the moved points (N, 3) along normals (N, 3), mm, without shared patterns."""
-        by = _by_movement(points_mm, normals, self.middle_mm, sized=len(self.covariance) == 7)
+        """Return the standard uncertainty (N,), mm, of moved points (N, 3) along normals, without shared patterns."""
+        by = _motion_derivatives(points_mm, normals, self.middle_mm, sized=len(self.covariance) == 7)
         return np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", by, self.covariance, by), 0.0))
 
     def moves_mm(self, step: np.ndarray, points_mm: np.ndarray, normals: np.ndarray | None = None) -> np.ndarray:
-        """How points (N, 3) move by a step (6,), or (7,) along normals (N, 3) of a surface whose size is free."""
+        """Return the shift (N, 3) of points by a step (6,), or by a step (7,) with a change of radius along normals."""
         moved = step[:3] + np.cross(step[3:6], points_mm - self.middle_mm)
         return moved if normals is None or len(step) == 6 else moved + step[6] * normals
 
@@ -129,21 +156,38 @@ def register_to_surface(
     uncertainty: PointUncertainty | None = None,
     frame: np.ndarray | None = None,
     datums: np.ndarray | None = None,
+    options: SurfaceRegistrationOptions = _DEFAULTS,
 ) -> Registration:
-    """Move points (N, 3) onto a surface, from where they are.
+    """Register points to a surface, starting from their current position.
 
-    Least squares of the distances along the surface's normals (Chen and Medioni, Image and Vision Computing 10, 1992),
-    weighted by the variance of each point along the normal and by Tukey's biweight. Points farther than ``reach_mm``
-    from the surface do not count, nor points outside the spheres ``datums`` (K, 4), centre and radius, if given. What
-    the surface does not tell, as a shift along a plane or a cylinder, is left as it was.
+    Minimise the squared distances along the surface normals (Chen and Medioni, Image and Vision Computing 10, 1992),
+    weighted by each point's variance along the normal and by Tukey's biweight. Undetermined motions, such as a shift
+    along a plane, stay zero.
+
+    Parameters
+    ----------
+    points_mm : (N, 3)
+        Points of the cloud.
+    surface
+        Reference surface.
+    reach_mm
+        Points farther than this from the surface are ignored.
+    uncertainty, frame
+        Uncertainty of the points, and the image (N,) of each point.
+    datums : (K, 4), optional
+        Centres and radii, mm, of spheres: points outside all of them are ignored.
+    options
+        Settings of the iteration.
 
     Raises
     ------
     EvaluationError
-        Fewer than 50 points lie near the surface, within the datums.
+        Fewer than 50 points lie near the surface and within the datums.
     """
-    counted = np.arange(len(points_mm)) if datums is None else np.flatnonzero(_within(points_mm, datums, reach_mm))
-    chosen = counted[:: max(1, len(counted) // _MOST_POINTS)]
+    counted = (
+        np.arange(len(points_mm)) if datums is None else np.flatnonzero(_select_within(points_mm, datums, reach_mm))
+    )
+    chosen = counted[:: max(1, len(counted) // options.most_points)]
     moved = points_mm[chosen].astype(np.float64)
     known = None if uncertainty is None else uncertainty[chosen]
     image = None if frame is None else frame[chosen]
@@ -154,100 +198,107 @@ def register_to_surface(
         near = surface.nearest(moved, reach_mm=reach_mm)
         used = np.isfinite(near.distance_mm)
         if datums is not None:
-            used &= _within(moved, datums, 0.0)
-        if np.count_nonzero(used) < _FEWEST:
+            used &= _select_within(moved, datums, 0.0)
+        if np.count_nonzero(used) < options.fewest_points:
             raise EvaluationError(
                 f"{np.count_nonzero(used)} of {len(points_mm)} points lie within {reach_mm:g} mm of the reference"
-                f"{'' if datums is None else ' and within the datums'}; at least {_FEWEST} are needed: do both have "
-                "the same frame and unit?"
+                f"{'' if datums is None else ' and within the datums'}; at least {options.fewest_points} are needed. "
+                "Check that both have the same frame and unit"
             )
         rotation = transform[:3, :3]
-        variance = _variance_along(known, near.normals @ rotation)[used]
-        by = _by_movement(moved[used], near.normals[used], middle)
-        found = _estimate(by, near.distance_mm[used], variance, size=_size(moved, middle))
-        change = np.eye(4)
-        change[:3, :3] = Rotation.from_rotvec(found.step[3:]).as_matrix()
-        change[:3, 3] = middle + found.step[:3] - change[:3, :3] @ middle
+        variance = _variance_along(known, near.normals @ rotation, options.least_variance_mm2)[used]
+        by = _motion_derivatives(moved[used], near.normals[used], middle)
+        found = _solve_step(
+            by, near.distance_mm[used], variance, size=_rms_radius(moved, middle), open_share=options.open_share
+        )
+        turn = Rotation.from_rotvec(found.step[3:]).as_matrix()
+        change = rigid_transform(turn, middle + found.step[:3] - turn @ middle)
         transform, moved = change @ transform, moved @ change[:3, :3].T + change[:3, 3]
         rounds += 1
-        largest = max(np.abs(found.step[:3]).max(), np.abs(found.step[3:]).max() * _size(moved, middle))
-        if largest < _STILL_MM or rounds == _ROUNDS:
+        largest = max(np.abs(found.step[:3]).max(), np.abs(found.step[3:]).max() * _rms_radius(moved, middle))
+        if largest < options.still_mm or rounds == options.rounds:
             break
     normals = near.normals[used]
-    cloud_side = _Shared(
+    cloud_side = _CorrelatedErrors(
         None if known is None else known[used], normals @ transform[:3, :3], None if image is None else image[used]
     )
     index = near.index[used]
     reference = surface.uncertainty
-    reference_side = _Shared(
+    reference_side = _CorrelatedErrors(
         None if reference is None else reference[index],
         -normals,
         None if surface.frame is None else surface.frame[index],
     )
-    covariance = found.covariance + cloud_side.position(found.answer) + reference_side.position(found.answer)
-    covariance += reference_side.noise(found.answer, index)
+    covariance = (
+        found.covariance
+        + cloud_side.position_covariance(found.answer)
+        + reference_side.position_covariance(found.answer)
+    )
+    covariance += reference_side.noise_covariance(found.answer, index)
     return Registration(
         transform,
         covariance,
         (transform @ np.append(centroid, 1.0))[:3],
-        tuple(_words(vector) for vector in found.open_directions),
+        tuple(_name_motion(vector) for vector in found.open_directions),
         float(np.sqrt(np.mean(found.counted_mm**2))),
         len(found.counted_mm),
-        cloud_side.steps(found.answer),
-        reference_side.steps(found.answer),
+        cloud_side.pattern_steps(found.answer),
+        reference_side.pattern_steps(found.answer),
     )
 
 
-def fitted_shape(
+def shape_registration(
     points_mm: np.ndarray, near: Nearest, *, sized: bool, uncertainty: PointUncertainty | None, frame: np.ndarray | None
 ) -> Registration:
-    """Uncertainty of a shape that was fitted to points (N, 3) by least squares of their distances.
+    """Return the uncertainty of a shape that was fitted to points (N, 3) by least squares, as a zero registration.
 
-    As of a registration that found nothing to move; with ``sized`` the radius was fitted, too.
+    With ``sized``, the radius was fitted too.
     """
     middle = points_mm.mean(axis=0)
-    by = _by_movement(points_mm, near.normals, middle, sized=sized)
-    found = _estimate(by, near.distance_mm, None, size=_size(points_mm, middle), open_share=1e-12)
-    shared = _Shared(uncertainty, near.normals, frame)
+    by = _motion_derivatives(points_mm, near.normals, middle, sized=sized)
+    found = _solve_step(by, near.distance_mm, None, size=_rms_radius(points_mm, middle), open_share=1e-12)
+    shared = _CorrelatedErrors(uncertainty, near.normals, frame)
     return Registration(
         np.eye(4),
-        found.covariance + shared.position(found.answer),
+        found.covariance + shared.position_covariance(found.answer),
         middle,
         (),
         float(np.sqrt(np.mean(near.distance_mm**2))),
         len(points_mm),
-        shared.steps(found.answer),
+        shared.pattern_steps(found.answer),
         np.empty((0, by.shape[1])),
     )
 
 
-def _within(points: np.ndarray, datums: np.ndarray, margin: float) -> np.ndarray:
-    """Which points (N, 3) lie within one of the spheres (K, 4), or so far outside."""
+def _select_within(points: np.ndarray, datums: np.ndarray, margin: float) -> np.ndarray:
+    """Return a mask (N,) of points within any of the spheres (K, 4), enlarged by a margin."""
     away = np.linalg.norm(points[:, None] - datums[:, :3], axis=2)
     return np.any(away <= datums[:, 3] + margin, axis=1)
 
 
-def _size(points: np.ndarray, middle: np.ndarray) -> float:
-    return max(float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1)))), 1e-9)
+def _rms_radius(points: np.ndarray, middle: np.ndarray) -> float:
+    return max(rms_distance(points, middle), 1e-9)
 
 
-def _by_movement(points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool = False) -> np.ndarray:
-    """Derivatives (N, 6) of distances along normals by shift and turn, (N, 7) with the radius of the cloud's shape."""
+def _motion_derivatives(
+    points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool = False
+) -> np.ndarray:
+    """Return the derivatives (N, 6) of distances by translation and rotation, or (N, 7) with the radius."""
     by = rigid_derivatives(points, normals, middle)
     return np.hstack([by, np.ones((len(by), 1))]) if sized else by
 
 
-def _variance_along(known: PointUncertainty | None, normals: np.ndarray) -> np.ndarray:
-    """Variance (N,) of points along normals (N, 3) by what is not common to them; the least where it is not known."""
+def _variance_along(known: PointUncertainty | None, normals: np.ndarray, least: float) -> np.ndarray:
+    """Return the variance (N,) of points along normals (N, 3), without systematic patterns; at least ``least``."""
     if known is None:
-        # The scatter about the surface makes it as large as it is.
-        return np.full(len(normals), _LEAST_MM2)
+        # The robust scatter about the surface scales this variance up.
+        return np.full(len(normals), least)
     of_images = np.sum(images_along(known, normals) ** 2, axis=0)
-    return np.maximum(variance_along(known.random_mm2, normals) + of_images, _LEAST_MM2)
+    return np.maximum(variance_along(known.random_mm2, normals) + of_images, least)
 
 
-class _Found(NamedTuple):
-    """A step (K,), its covariance by noise, its answer (K, N) to distances, open directions, and what counts."""
+class _Step(NamedTuple):
+    """Step (K,), its noise covariance (K, K), its derivatives (K, N) by the distances, and the used distances."""
 
     step: np.ndarray
     covariance: np.ndarray
@@ -256,14 +307,14 @@ class _Found(NamedTuple):
     counted_mm: np.ndarray
 
 
-def _estimate(
-    by: np.ndarray, left: np.ndarray, variance: np.ndarray | None, *, size: float, open_share: float = _OPEN_SHARE
-) -> _Found:
-    """Weighted step against distances (N,) with derivatives (N, K), along the directions that are determined.
+def _solve_step(
+    by: np.ndarray, left: np.ndarray, variance: np.ndarray | None, *, size: float, open_share: float
+) -> _Step:
+    """Solve for the weighted least-squares step of distances (N,) with derivatives (N, K).
 
-    Without ``variance`` all distances count alike.
+    Undetermined directions are excluded. Without ``variance``, all distances have equal weight.
     """
-    # Turns in units of the shift that they give to the usual point.
+    # Rotations are scaled by the rms radius, so that all unknowns are lengths.
     units = np.array([1.0] * 3 + [1 / size] * 3 + [1.0] * (by.shape[1] - 6))
     scaled = by * units
     if variance is None:
@@ -279,37 +330,36 @@ def _estimate(
     inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
     answer = -units[:, None] * (inverse @ (scaled.T * weight))
     covariance = (answer * noise) @ answer.T
-    return _Found(answer @ left, covariance, answer, vectors[:, np.logical_not(known)].T, counted)
+    return _Step(answer @ left, covariance, answer, vectors[:, np.logical_not(known)].T, counted)
 
 
-class _Shared:
-    """What the points of one side share, along the normals (N, 3) in their own frame; nothing where it is not known."""
+class _CorrelatedErrors:
+    """Correlated errors of the points of one side along normals (N, 3), in their own frame; zero if unknown."""
 
     def __init__(self, known: PointUncertainty | None, normals: np.ndarray, frame: np.ndarray | None):
         self._known, self._normals, self._frame = known, normals, frame
 
-    def steps(self, answer: np.ndarray) -> np.ndarray:
-        """The answer (M, K) to each pattern."""
+    def pattern_steps(self, answer: np.ndarray) -> np.ndarray:
+        """Return the step (M, K) caused by each systematic pattern."""
         if self._known is None:
             return np.empty((0, len(answer)))
         return np.einsum("mni,ni->mn", self._known.patterns_mm, self._normals) @ answer.T
 
-    def position(self, answer: np.ndarray) -> np.ndarray:
-        """Covariance (K, K) of the answer by what moves the points of each image together: its position and pose."""
+    def position_covariance(self, answer: np.ndarray) -> np.ndarray:
+        """Return the covariance (K, K) of the step by errors of the image positions and poses."""
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
         image = np.arange(answer.shape[1]) if self._frame is None else self._frame
-        parts = images_along(self._known, self._normals)
-        return np.sum([covariance_of_groups(answer * part, image) for part in parts], axis=0)
+        return grouped_covariance(answer, images_along(self._known, self._normals), image)
 
-    def noise(self, answer: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """Covariance (K, K) of the answer by the noise of points that are used several times, by index (N,)."""
+    def noise_covariance(self, answer: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Return the covariance (K, K) of the step by noise of points that are used repeatedly, by index (N,)."""
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
-        return covariance_of_groups(answer * np.sqrt(variance_along(self._known.random_mm2, self._normals)), index)
+        return grouped_covariance(answer, np.sqrt(variance_along(self._known.random_mm2, self._normals))[None], index)
 
 
-def _words(direction: np.ndarray) -> str:
-    """A movement in words: its parts that are not small."""
+def _name_motion(direction: np.ndarray) -> str:
+    """Name the large components of a motion."""
     large = np.flatnonzero(np.abs(direction) > 0.3 * np.abs(direction).max())
     return " with ".join(_NAMES[k] for k in large)

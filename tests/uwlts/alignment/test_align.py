@@ -101,7 +101,7 @@ def test_a_surface_that_fits_in_many_places_is_refused():
 
     drift = {"drift_mm": 60.0, "drift_deg": 0.3}
     cloud, reported, _ = ride(np.random.default_rng(SEED), LOOP_MM, ground=ground, **drift)
-    with pytest.raises(uwlts.Error, match="fits in several places"):
+    with pytest.raises(uwlts.Error, match="fits in several positions"):
         uwlts.align_trajectory(cloud, reported, **drift)
 
 
@@ -136,7 +136,7 @@ def test_a_random_walk_is_followed_within_a_crossing():
 def test_a_plane_sea_bed_is_refused():
     drift = {"drift_mm": 60.0, "drift_deg": 0.3}
     cloud, reported, _ = ride(np.random.default_rng(SEED), LOOP_MM, ground=lambda x, y: 0.02 * x - 0.01 * y, **drift)
-    with pytest.raises(uwlts.Error, match="coincide nowhere within 3 standard deviations"):
+    with pytest.raises(uwlts.Error, match="no surfaces coincide within 3 standard deviations"):
         uwlts.align_trajectory(cloud, reported, **drift)
 
 
@@ -177,7 +177,7 @@ def test_wrong_input_is_refused(loop):
     cloud, reported, _ = loop
     with pytest.raises(uwlts.Error, match="states no covariance: give drift_mm"):
         uwlts.align_trajectory(cloud, reported)
-    with pytest.raises(uwlts.Error, match="both parts"):
+    with pytest.raises(uwlts.Error, match="give both"):
         uwlts.align_trajectory(cloud, reported, drift_mm=1.0)
     with pytest.raises(uwlts.Error, match="expected positive"):
         uwlts.align_trajectory(cloud, reported, drift_mm=-1.0, drift_deg=1.0)
@@ -189,7 +189,7 @@ def test_wrong_input_is_refused(loop):
         *(each[early] for each in (cloud.points_mm, cloud.intensity, cloud.frame, cloud.line)),
         time_s=cloud.time_s[early],
     )
-    with pytest.raises(uwlts.Error, match="no part of the path is within 3 standard dev"):
+    with pytest.raises(uwlts.Error, match="no part of it is within 3 standard dev"):
         uwlts.align_trajectory(straight, reported, drift_mm=60.0, drift_deg=0.3)
 
 

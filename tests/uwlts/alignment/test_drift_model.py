@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.alignment.drift_model import drift_of
+from uwlts.alignment.drift_model import choose_drift_model
 from uwlts.errors import EvaluationError
 from uwlts.model.trajectory import Trajectory
 
@@ -40,7 +40,7 @@ def navigated(*, by_heading: bool) -> Trajectory:
 
 @pytest.mark.parametrize("by_heading", [True, False])
 def test_rates_walks_and_dead_reckoning_are_found_from_the_covariance(by_heading: bool):
-    found = drift_of(navigated(by_heading=by_heading), None, None)
+    found = choose_drift_model(navigated(by_heading=by_heading), None, None)
     assert found.stated
     assert found.dead_reckoned == by_heading
     size, walk = found.std**2, found.std**2 * found.walk
@@ -61,13 +61,15 @@ def test_a_walk_is_told_from_a_rate_that_began_before(rate: float):
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, 0, 3] = times
     grown = times + (rate * times) ** 2
-    found = drift_of(Trajectory(times, poses, grown[:, None, None] * np.diag(np.repeat([4.0, 1e-6], 3))), None, None)
+    found = choose_drift_model(
+        Trajectory(times, poses, grown[:, None, None] * np.diag(np.repeat([4.0, 1e-6], 3))), None, None
+    )
     np.testing.assert_allclose(found.std**2, grown[-1] * np.repeat([4.0, 1e-6], 3), rtol=0.01)
     np.testing.assert_allclose(found.walk, SECONDS / grown[-1], rtol=0.01)
 
 
 def test_a_drift_that_is_given_states_its_size_alone():
-    found = drift_of(navigated(by_heading=True), 300.0, 1.0)
+    found = choose_drift_model(navigated(by_heading=True), 300.0, 1.0)
     assert not found.stated and not found.dead_reckoned
     np.testing.assert_allclose(found.std, np.repeat([300.0, np.radians(1.0)], 3))
 
@@ -75,6 +77,6 @@ def test_a_drift_that_is_given_states_its_size_alone():
 def test_a_path_without_covariance_needs_the_size_of_its_drift():
     path = navigated(by_heading=False)
     with pytest.raises(EvaluationError, match="give drift_mm and drift_deg"):
-        drift_of(Trajectory(path.times_s, path.poses), None, None)
-    with pytest.raises(EvaluationError, match="both parts"):
-        drift_of(path, 300.0, None)
+        choose_drift_model(Trajectory(path.times_s, path.poses), None, None)
+    with pytest.raises(EvaluationError, match="give both"):
+        choose_drift_model(path, 300.0, None)

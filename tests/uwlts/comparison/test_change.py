@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import uwlts
 from uwlts.cli import app
+from uwlts.comparison.options import ComparisonOptions
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
 from uwlts.registration.surface_registration import SampledSurface, register_to_surface
 from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty
@@ -351,7 +352,7 @@ def test_all_regions_are_listed_whatever_the_size_of_the_cloud(monkeypatch, tmp_
         points = np.column_stack([x.ravel(), y.ravel(), (depth + 0.01 * rng.normal(size=x.shape)).ravel()])
         return PointCloud(points, np.ones(x.size), frame.ravel(), line.ravel())
 
-    monkeypatch.setattr("uwlts.comparison.change._MOST_PLACES", 1000)
+    monkeypatch.setattr("uwlts.comparison.change.OPTIONS", ComparisonOptions(most_places=1000))
     change = uwlts.compare_clouds(seen(0.5 * lost), seen(0.0 * lost))
     assert 500 < len(change.distance_mm) <= 1000
     regions = [region for region in change.regions() if region.mean_mm < -0.1]

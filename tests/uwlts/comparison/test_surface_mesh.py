@@ -167,15 +167,15 @@ def test_files_hold_the_mesh(tmp_path, monkeypatch):
 def test_wrong_requests_are_refused():
     rng = np.random.default_rng(7)
     cloud = scan(rng, lambda x, y: 0 * x, half=3.0)
-    with pytest.raises(EvaluationError, match="at least one cloud"):
+    with pytest.raises(EvaluationError, match="at least one"):
         uwlts.mesh()
     with pytest.raises(EvaluationError, match="cube_mm is 0"):
         uwlts.mesh(cloud, cube_mm=0)
     with pytest.raises(EvaluationError, match="at most the patches' radius"):
         uwlts.mesh(cloud, cube_mm=3, radius_mm=2)
-    with pytest.raises(EvaluationError, match="a direction of three numbers for each"):
+    with pytest.raises(EvaluationError, match="the directions are not valid; expected"):
         uwlts.mesh(cloud, towards=[(0, 0, -1), (0, 0, 1)])
-    with pytest.raises(EvaluationError, match="are the points so sparse"):
+    with pytest.raises(EvaluationError, match="points may be too sparse"):
         uwlts.mesh(cloud, radius_mm=0.2)
     few = PointCloud(cloud.points_mm[:9], cloud.intensity[:9], cloud.frame[:9], cloud.line[:9])
     with pytest.raises(EvaluationError, match="has 9 points"):

@@ -130,7 +130,7 @@ def test_the_cap_leaves_the_limb_out():
     # Evenly spread over the cap: the share of the points within 45 of 75 deg, +- 4 sqrt(6000 p q).
     expected = 6000 * (1 - np.cos(np.radians(45))) / (1 - np.cos(np.radians(75)))
     assert result.spheres[0].points_used == pytest.approx(expected, abs=160)
-    with pytest.raises(EvaluationError, match="Widen cap_angle_deg"):
+    with pytest.raises(EvaluationError, match="Increase cap_angle_deg"):
         evaluate_cloud(cloud_of(points), DUMBBELL.model_copy(update={"cap_angle_deg": 2.0}))
 
 
@@ -485,7 +485,7 @@ def test_points_are_compared_with_their_own_truth():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"frame": np.array([-1])}, "no place in the truth"),
+        ({"frame": np.array([-1])}, "outside the truth"),
         ({"line": np.array([4])}, "frame 0, line 4"),
         ({"points": np.full((1, 3), np.nan)}, "finite"),
         ({"frame": np.array([1]), "line": np.array([3])}, "none of the 1"),
@@ -507,9 +507,9 @@ def test_truth_that_does_not_fit_is_refused(change, message):
 
 def test_truth_of_other_shapes_is_a_bug():
     truth = truth_of_two_frames()
-    with pytest.raises(ValueError, match="truth of the shapes"):
+    with pytest.raises(ValueError, match="expected truth of the shapes"):
         compare_with_truth(
             np.zeros((1, 3)), np.zeros(1, int), np.zeros(1, int), **{**truth, "normal": np.zeros((2, 4))}
         )
-    with pytest.raises(ValueError, match="indices expected"):
+    with pytest.raises(ValueError, match=r"points and \(N,\) indices"):
         compare_with_truth(np.zeros((1, 3)), np.zeros(2, int), np.zeros(1, int), **truth)

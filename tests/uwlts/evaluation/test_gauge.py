@@ -91,11 +91,11 @@ def test_the_command_reads_a_table_and_writes_json(tmp_path, capsys):
         (ROWS[:-1], "part;operator;value", EvaluationError, "part 9, operator C: 2"),
         ([row for row in ROWS if row[0] == "1"], "part;operator;value", EvaluationError, "1 parts"),
         ([row for row in ROWS if row[1] == "A"], "part;operator;value", EvaluationError, "1 operators"),
-        (ROWS[:10] + ROWS[30:40], "part;operator;value", EvaluationError, "repeats are needed"),
+        (ROWS[:10] + ROWS[30:40], "part;operator;value", EvaluationError, "a study needs repeats"),
         (ROWS, "part;operator;size", DescriptionError, "expected part, operator and value"),
-        ([("a", "b", "x")], "part;operator;value", DescriptionError, "line 2: 'x' is no number"),
+        ([("a", "b", "x")], "part;operator;value", DescriptionError, "line 2: found 'x', expected a number"),
         ([("a", "b", "nan")], "part;operator;value", DescriptionError, "not finite"),
-        ([(p, o, 1.0) for p, o, _ in ROWS], "part;operator;value", EvaluationError, "agree exactly"),
+        ([(p, o, 1.0) for p, o, _ in ROWS], "part;operator;value", EvaluationError, "all repeats are equal"),
     ],
 )
 def test_other_tables_are_refused(tmp_path, rows, head, error, message):
@@ -106,7 +106,7 @@ def test_other_tables_are_refused(tmp_path, rows, head, error, message):
 def test_wrong_numbers_are_refused():
     with pytest.raises(EvaluationError, match="tolerance is -1"):
         uwlts.gauge_study(ROWS, tolerance=-1.0)
-    with pytest.raises(EvaluationError, match="the table has several"):
+    with pytest.raises(EvaluationError, match="the table contains several"):
         uwlts.gauge_study(ROWS, reference=1.0)
     with pytest.raises(EvaluationError, match="at least 10"):
         uwlts.gauge_study(ROWS[:1], reference=1.0)

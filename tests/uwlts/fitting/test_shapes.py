@@ -251,7 +251,7 @@ def circle(count):
         (fit_cylinder, circle(50), "in one plane"),
         (fit_plane, np.outer(np.arange(9.0), [1, 2, 3]), "on one line"),
         (fit_line, np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]), "equally"),
-        (fit_plane, np.ones((9, 3)), "one place"),
+        (fit_plane, np.ones((9, 3)), "points coincide"),
         (fit_sphere, np.full((9, 3), np.nan), "9 of 9 points are not finite"),
         (partial(fit_robustly, fit_plane), np.full((9, 3), np.inf), "9 of 9 points are not finite"),
     ],

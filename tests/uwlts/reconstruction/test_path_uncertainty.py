@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwlts.reconstruction.path_uncertainty import along_corrected_path
+from uwlts.reconstruction.path_uncertainty import correct_path_uncertainty
 from uwlts.storage.cloud import PointUncertainty
 
 
@@ -26,7 +26,7 @@ def test_points_have_the_covariance_of_the_path_and_of_their_sensor():
     known = PointUncertainty(pairs, np.zeros((count, 3)), patterns, shared={"sensor": mixed[:, :2]})
     blocks = covariance.reshape(coefficients, 6, coefficients, 6)
     poses = np.einsum("fc,cidj,fd->fij", basis, blocks, basis)
-    found = along_corrected_path(known, np.zeros((count, 3)), levers, image, basis, covariance, poses)
+    found = correct_path_uncertainty(known, np.zeros((count, 3)), levers, image, basis, covariance, poses)
     cross = np.zeros((count, 3, 6))
     cross[:, :, :3] = np.eye(3)
     for axis, unit in enumerate(np.eye(3)):

@@ -14,15 +14,15 @@ from uwlts.calibration.joint.stored_estimate import stored_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.figure_uncertainty import MovedSpheres, figure_uncertainties, shift_std_mm
-from uwlts.fitting.propagation import noise_mm
+from uwlts.evaluation.figure_uncertainty import LinearisedSpheres, figure_uncertainties, shift_std_mm
+from uwlts.fitting.propagation import noise_shifts
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.artefacts import PlaneStandard, SphereStandard
 from uwlts.model.calibration import KnownMedium, KnownStage
 from uwlts.model.parameter_keys import MediumIndex, StageParameter
 from uwlts.model.sensor import Medium
 from uwlts.optics.triangulation import reconstruct_pixels
-from uwlts.reconstruction.point_uncertainty import point_uncertainty, stage_root, stripe_noise_px
+from uwlts.reconstruction.point_uncertainty import point_uncertainty, stage_components, stripe_noise_px
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, source_of
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
@@ -173,7 +173,7 @@ def test_random_covariance_is_the_stripes_noise_on_the_object(calibration, strip
     np.testing.assert_allclose(
         full(known.random_mm2), np.einsum("ni,nj->nij", expected, expected), rtol=1e-3, atol=1e-3 * np.max(expected**2)
     )
-    along = noise_mm(known)
+    along = noise_shifts(known)
     assert np.allclose(np.abs(along), np.abs(expected), rtol=1e-2, atol=1e-5)
 
 
@@ -222,7 +222,7 @@ def test_figures_have_the_uncertainty_of_monte_carlo(calibration, stripes, thesi
     cloud = PointCloud(grid, np.ones(len(grid)), frame[near], line[near], uncertainty=known)
     artefact = PlaneStandard(kind="plane")
     found = figure_uncertainties(cloud, evaluate_cloud(cloud, artefact))
-    along, patterns = noise_mm(known), known.patterns_mm.astype(float)
+    along, patterns = noise_shifts(known), known.patterns_mm.astype(float)
     spread = []
     for _ in range(200):
         moved = grid + rng.standard_normal((len(grid), 1)) * along
@@ -259,7 +259,7 @@ def spheres():
 def test_spheres_follow_their_points_as_when_searched_for_again(spheres):
     """To the second order of moves by 0.05 mm and residuals by 0.05 mm over the radius of 25 mm."""
     evaluation = evaluate_cloud(spheres, DUMBBELL)
-    moved = MovedSpheres(spheres.points_mm, evaluation)
+    moved = LinearisedSpheres(spheres.points_mm, evaluation)
     for move in spheres.uncertainty.patterns_mm[:2].astype(float):
         again = evaluate_cloud(replace(spheres, points_mm=spheres.points_mm + move), DUMBBELL).figures_mm
         change = np.array(list(again.values())) - list(evaluation.figures_mm.values())
@@ -272,7 +272,7 @@ def test_figures_of_spheres_have_the_uncertainty_of_monte_carlo(spheres):
     """Of 200 draws a standard deviation is right to 5 %, of 50 for the noise to 10 %: 4 sigma."""
     evaluation, known = evaluate_cloud(spheres, DUMBBELL), spheres.uncertainty
     found = figure_uncertainties(spheres, evaluation)
-    rng, along = np.random.default_rng(1), noise_mm(known)
+    rng, along = np.random.default_rng(1), noise_shifts(known)
     drawn = []
     for _ in range(200):
         move = rng.standard_normal((len(spheres), 1)) * along
@@ -297,7 +297,7 @@ def test_a_clouds_place_has_the_uncertainty_of_monte_carlo(spheres, part):
     cloud, used = replace(spheres, uncertainty=known), spheres.points_mm[:, 1] > 0
     rng, drawn = np.random.default_rng(2), []
     for _ in range(DRAWS):
-        move = rng.standard_normal((len(cloud), 1)) * noise_mm(known)
+        move = rng.standard_normal((len(cloud), 1)) * noise_shifts(known)
         move = move + rng.standard_normal((20, 1))[cloud.frame] * known.position_mm
         move = move + np.einsum("m,mni->ni", rng.standard_normal(len(known.patterns_mm)), known.patterns_mm)
         drawn.append(move[used].mean(axis=0))
@@ -316,7 +316,7 @@ def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, th
     known = replace(stored, parameters=parameters, values=np.append(stored.values, [0.0, 0.0]), covariance=covariance)
     stages = (KnownStage(described=(1.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0)),) if calibrated else ()
     header = header_of(thesis, MEDIUM).model_copy(update={"stage_direction": (way, 0.0, 0.0)})
-    found = stage_root(
+    found = stage_components(
         known,
         calibration.model_copy(update={"stages": stages}),
         header,
@@ -344,7 +344,7 @@ def test_what_blur_and_light_beside_the_sheet_leave_moves_all_points_together(ca
         plain = point_uncertainty(capture, calibration, frame, line, centre)
         known = point_uncertainty(capture, calibration, frame, line, centre, blur_px=blur, beside_mm=beside)
     per_px = (
-        noise_mm(plain)
+        noise_shifts(plain)
         / (stripe_noise_px(frame, line, centre) * np.sqrt(calibration.joint.shared_variance["stripe on the target"]))[
             :, None
         ]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwlts.reconstruction.verify import not_shown_by
+from uwlts.reconstruction.verify import find_undetectable_errors
 
 
 def test_a_reversed_stage_that_sizes_cannot_show_is_named():
@@ -12,7 +12,7 @@ def test_a_reversed_stage_that_sizes_cannot_show_is_named():
     """
     positions = np.arange(5.0)
     for direction in ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)):
-        (said,) = not_shown_by("spheres", positions, direction)
+        (said,) = find_undetectable_errors("spheres", positions, direction)
         assert "spheres" in said and "mirror image" in said
-    assert not_shown_by("spheres", positions, (0.866, 0.0, 0.5)) == ()
-    assert not_shown_by("step", np.zeros(3), (1.0, 0.0, 0.0)) == (), "nothing moved"
+    assert find_undetectable_errors("spheres", positions, (0.866, 0.0, 0.5)) == ()
+    assert find_undetectable_errors("step", np.zeros(3), (1.0, 0.0, 0.0)) == (), "nothing moved"

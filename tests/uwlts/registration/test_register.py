@@ -74,9 +74,9 @@ def test_overlaps_of_few_patches_are_named_and_do_not_count():
         patches.append(surface_patches(points + [0, 0, 300] + 0.02 * rng.standard_normal(points.shape), None))
     start = np.tile(np.eye(4), (3, 1, 1))
     joint = JointRegistration(patches, [[], [], []], start, start_std=None, sphere_mm=None)
-    ((first, third, count),) = joint.narrow_overlaps(joint.distances(1.0))
+    ((first, third, count),) = joint.find_narrow_overlaps(joint.measure_distances(1.0))
     assert (first, third) == (0, 2) and 0 < count < FEWEST_OF_PAIR
-    assert set(joint.evidence(joint.distances(1.0))) == {(0, 1), (1, 2)}
+    assert set(joint.collect_evidence(joint.measure_distances(1.0))) == {(0, 1), (1, 2)}
 
 
 def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):
@@ -180,7 +180,7 @@ def test_a_start_is_found_by_the_shape():
 
 def test_no_start_is_invented_on_a_plain_pipe():
     scans, _, _ = views(np.random.default_rng(SEED), count=5, radius=plain)
-    with pytest.raises(uwlts.Error, match="no start was found by the shape.*spheres"):
+    with pytest.raises(uwlts.Error, match="no initial pose was found from the surfaces.*spheres"):
         uwlts.register(scans[:2], search=True)
 
 
@@ -213,17 +213,17 @@ def test_spheres_tell_what_a_pipe_does_not():
 
 def test_wrong_input_is_refused(pits):
     scans = pits[0]
-    with pytest.raises(uwlts.Error, match="found 1 cloud; two or more"):
+    with pytest.raises(uwlts.Error, match="found 1 cloud; a registration needs two or more"):
         uwlts.register(scans[:1])
-    with pytest.raises(uwlts.Error, match="scan 2: no overlap with scan 1.*better poses"):
+    with pytest.raises(uwlts.Error, match="scan 2: not connected with scan 1.*better initial poses"):
         uwlts.register([scans[0], PointCloud(scans[1].points_mm + [0, 0, 500], *(np.zeros(len(scans[1])),) * 3)])
     with pytest.raises(uwlts.Error, match=r"shape \(2, 3, 4\); expected \(2, 4, 4\)"):
         uwlts.register(scans[:2], poses=np.zeros((2, 3, 4)))
-    with pytest.raises(uwlts.Error, match="rotations with a shift"):
+    with pytest.raises(uwlts.Error, match="not a rigid transform"):
         uwlts.register(scans[:2], poses=np.array([np.eye(4), 2 * np.eye(4)]))
     with pytest.raises(uwlts.Error, match="reach_mm is -1"):
         uwlts.register(scans[:2], reach_mm=-1)
-    with pytest.raises(uwlts.Error, match="both parts"):
+    with pytest.raises(uwlts.Error, match="needs both start_std_mm"):
         uwlts.register(scans[:2], start_std_mm=1.0)
     few = PointCloud(scans[0].points_mm[:50], *(np.zeros(50),) * 3)
     with pytest.raises(uwlts.Error, match="scan 2: the cloud has 50 points"):
