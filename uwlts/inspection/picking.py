@@ -9,7 +9,7 @@ import numpy as np
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import FigureUncertainty
 from uwlts.fitting.least_squares import fit_robustly
-from uwlts.fitting.propagation import PointErrors, noise_mm
+from uwlts.fitting.propagation import PointErrors, noise_shifts
 from uwlts.fitting.shapes import CylinderFit, FlatFit, SphereFit, fit_cylinder, fit_plane, fit_sphere
 from uwlts.storage.cloud import PointCloud
 
@@ -74,7 +74,7 @@ def length_between(cloud: PointCloud, first: int, second: int) -> Inspected:
         by_image = known[ends].by_image_mm() @ unit
         if cloud.frame[first] == cloud.frame[second]:
             by_image = np.diff(by_image, axis=1)
-        noise = noise_mm(known[ends]) @ unit
+        noise = noise_shifts(known[ends]) @ unit
         random = float(np.sqrt(noise @ noise + np.sum(by_image**2)))
         stated["distance"] = FigureUncertainty(random, float(np.linalg.norm(together)))
     return Inspected("length", {"distance": length}, stated, 2, 0)
