@@ -13,7 +13,7 @@ import twin
 import twin.cli
 import uwlts
 import uwlts.cli
-from uwlts.runtime.command_line import Derived, typed
+from uwlts.runtime.command_line import DerivedCommand, option_type
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "optuna", "nicegui"}
@@ -70,15 +70,15 @@ def test_unknown_names_are_refused():
 def test_commands_take_what_their_functions_take(program: str, name: str):
     """Everything that can be given as text, with the functions' defaults."""
     command = APPS[program][name].default_command
-    assert isinstance(command, Derived)
+    assert isinstance(command, DerivedCommand)
     given, hints = inspect.signature(command).parameters, get_type_hints(command.function)
     for parameter, one in inspect.signature(command.function).parameters.items():
-        if parameter in LISTENS or one.kind is one.VAR_KEYWORD or typed(hints[parameter]) is None:
+        if parameter in LISTENS or one.kind is one.VAR_KEYWORD or option_type(hints[parameter]) is None:
             continue
         # A word among several that an option takes is a tuple on the command line; so is nothing at all.
-        several = tuple in (typed(hints[parameter]), getattr(typed(hints[parameter]), "__origin__", None))
+        several = tuple in (option_type(hints[parameter]), getattr(option_type(hints[parameter]), "__origin__", None))
         default = () if several and one.default is None else one.default
-        if type(None) in get_args(typed(hints[parameter])):
+        if type(None) in get_args(option_type(hints[parameter])):
             default = one.default
         assert given[parameter].default in (default, (default,)), parameter
 
@@ -111,10 +111,13 @@ def test_commands_run_with_their_defaults(line: str, monkeypatch: pytest.MonkeyP
 
 
 def test_messages_name_options():
-    from uwlts.runtime.console import as_options
+    from uwlts.runtime.console import replace_by_options
 
     names = inspect.signature(uwlts.cli.app["calibrate"].default_command).parameters
-    assert as_options("give `new_water` with ``scan``, not `this`", names) == "give --new-water with --scan, not `this`"
+    assert (
+        replace_by_options("give `new_water` with ``scan``, not `this`", names)
+        == "give --new-water with --scan, not `this`"
+    )
 
 
 @pytest.mark.parametrize("program", APPS)

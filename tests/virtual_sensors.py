@@ -11,7 +11,7 @@ from tests.oracles import fermat
 from tests.oracles.fan import Fan
 from tests.oracles.optics import fresnel_transmittance
 from twin.scene.description import Scene
-from uwlts.model.library import merged
+from uwlts.model.library import merge_tables
 from uwlts.model.sensor import Medium, Sensor, Window
 
 _TOWARDS_LASER = {"width": np.array([0.0, -1.0, 0.0]), "height": np.array([1.0, 0.0, 0.0])}
@@ -19,7 +19,7 @@ _TOWARDS_LASER = {"width": np.array([0.0, -1.0, 0.0]), "height": np.array([1.0, 
 
 def altered(sensor: Sensor, changes: dict[str, Any]) -> Sensor:
     """The sensor with nested ``changes`` laid over its description."""
-    return Sensor.model_validate(merged(sensor.model_dump(), changes))
+    return Sensor.model_validate(merge_tables(sensor.model_dump(), changes))
 
 
 def cropped(sensor: Sensor, width_px: int, height_px: int) -> Sensor:

@@ -10,7 +10,7 @@ from cyclopts import App
 import twin
 from uwlts._version import __version__
 from uwlts.errors import CommandFailed
-from uwlts.runtime.command_line import Call, derived, show
+from uwlts.runtime.command_line import Call, command_from, show
 from uwlts.runtime.console import run
 
 app = App(
@@ -21,13 +21,13 @@ app = App(
 )
 
 
-@derived(app, twin, "simulate")
+@command_from(app, twin, "simulate")
 def simulate(call: Call) -> None:
     """Example: twin simulate spheres --sensor thesis --placement far --out spheres-far.h5"""
     call()
 
 
-@derived(app, twin, "serve")
+@command_from(app, twin, "serve")
 def serve(call: Call) -> None:
     """Stop with Ctrl-C.
 
@@ -39,25 +39,25 @@ def serve(call: Call) -> None:
     print(f"ended after {served.rates()}")
 
 
-@derived(app, twin, "record")
+@command_from(app, twin, "record")
 def record(call: Call) -> None:
     """Example: twin record demo --out runs/campaign"""
     print(f"wrote {call()}")
 
 
-@derived(app, twin, "dataset")
+@command_from(app, twin, "dataset")
 def dataset(call: Call) -> None:
     """Example: twin dataset stripe-clean --scenes 20 --out runs/stripes"""
     print(f"wrote {call()}")
 
 
-@derived(app, twin, "reproduce")
+@command_from(app, twin, "reproduce")
 def reproduce(call: Call) -> None:
     """Example: twin reproduce --campaigns 1 --every 10 --out runs/quick"""
     _run_others(call)
 
 
-@derived(app, twin, "demo")
+@command_from(app, twin, "demo")
 def demo(call: Call) -> None:
     """Example: twin demo"""
     _run_others(call)
@@ -71,7 +71,7 @@ def _run_others(call: Call) -> None:
         sys.exit(error.returncode)
 
 
-@derived(app, twin, "sweep")
+@command_from(app, twin, "sweep")
 def sweep(call: Call) -> None:
     """Example: twin sweep baseline-angle --out runs/baseline-angle"""
     show(call().lines())
@@ -84,14 +84,14 @@ def scenes() -> None:
     Example: twin scenes
     """
     from twin.scene.description import load_scene
-    from uwlts.model.library import names
+    from uwlts.model.library import list_names
     from uwlts.model.waters import WATERS
 
-    for name in names():
+    for name in list_names():
         scene = load_scene(name)
         print(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
     for folder in ("sensors", "campaigns", "datasets", "studies"):
-        print(f"{folder}: {', '.join(names(folder))}")
+        print(f"{folder}: {', '.join(list_names(folder))}")
     print(f"waters: {', '.join(WATERS)}, or a turbidity from 0 to 3")
     for name, water in WATERS.items():
         print(f"  {name}: {water.sentence}")

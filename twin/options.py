@@ -45,7 +45,7 @@ class Effects:
         """Return the names of the rendered effects, as in commands."""
         return [_option_name(f.name) for f in fields(self) if getattr(self, f.name)]
 
-    def without(self, *names: str) -> "Effects":
+    def remove(self, *names: str) -> "Effects":
         """Return the effects without some of them; DescriptionError for an unknown name."""
         known = ALL.names()
         for name in names:
@@ -106,7 +106,7 @@ class Flaws:
         return [_option_name(name) + ("" if value is True else f"={value:.9g}") for name, value in present.items()]
 
     @classmethod
-    def of(cls, *texts: str) -> "Flaws":
+    def parse(cls, *texts: str) -> "Flaws":
         """Parse flaws from NAME, with typical strength, or NAME=STRENGTH.
 
         Raises DescriptionError if a name is unknown, or a strength is not a number, out of its range, or not allowed.
@@ -137,7 +137,7 @@ def _option_name(field_name: str) -> str:
 
 
 ALL = Effects()
-NONE = ALL.without(*ALL.names())
+NONE = ALL.remove(*ALL.names())
 
 
 @dataclass(frozen=True)
@@ -156,9 +156,11 @@ class Options:
             raise DescriptionError(f"seed is {self.seed}; it must not be negative")
 
     @classmethod
-    def chosen(cls, *, spp: int, seed: int, effects: Sequence[str], without: Sequence[str], ideal: bool) -> "Options":
+    def from_names(
+        cls, *, spp: int, seed: int, effects: Sequence[str], without: Sequence[str], ideal: bool
+    ) -> "Options":
         """Make options with the flaws ``effects``, without the effects ``without``; ``ideal``: without all effects."""
-        return cls(spp, seed, (NONE if ideal else ALL).without(*without), Flaws.of(*effects))
+        return cls(spp, seed, (NONE if ideal else ALL).remove(*without), Flaws.parse(*effects))
 
     def names(self) -> list[str]:
         """Return the names of all rendered effects and flaws, as in commands."""

@@ -81,14 +81,14 @@ class CommandFailed(Error):
         self.returncode = returncode
 
 
-def first_problems(error: "ValidationError", most: int) -> "list[ErrorDetails]":
+def list_problems(error: "ValidationError", most: int) -> "list[ErrorDetails]":
     """Return the first problems found by a validation; empty if there are too many to list them."""
     return error.errors(include_url=False)[:most] if error.error_count() <= _MOST_LISTED else []
 
 
-def problems_of(error: "ValidationError") -> str:
+def describe_problems(error: "ValidationError") -> str:
     """Describe the first problems found by a validation, each with its location."""
     problems = (
-        f"{'.'.join(map(str, p['loc']))}: {p['msg']}"[:_LONGEST_PROBLEM] for p in first_problems(error, _MOST_PROBLEMS)
+        f"{'.'.join(map(str, p['loc']))}: {p['msg']}"[:_LONGEST_PROBLEM] for p in list_problems(error, _MOST_PROBLEMS)
     )
     return "; ".join(problems) or f"{error.error_count():,} values are wrong"

@@ -22,13 +22,13 @@ RIM_POINTS, NEAREST_PX = 720, 3.0
 
 def circles_table() -> str:
     """Errors of the centres by place and method, px."""
-    from twin.recording.studio import Studio
+    from twin.recording.sensor_simulator import SensorSimulator
 
     sensor, rows = load_sensor("thesis"), []
     for name, stage in STAGE_MM.items():
         along = {"direction": (0.0, 0.0, 1.0), "start_mm": stage, "count": 1, "lights": ("lamp",)}
         scene = load_scene("target", motion=along)
-        studio = Studio(sensor, scene, Options(spp=64))
+        studio = SensorSimulator(sensor, scene, Options(spp=64))
         image = studio.image(next(scene.motion.shots()), 0)
         truth, middles = _true_images(sensor, scene.objects[0], stage)
         apart = np.linalg.norm(middles - truth, axis=1)

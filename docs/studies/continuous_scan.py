@@ -87,10 +87,10 @@ def main(*options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> None
             uwlts.scan(plan(), folder / "stops.h5", home=True)
             text, stops = spheres(uwlts.reconstruct(folder / "stops.h5", calibration))
             print(f"stop and go:      {text}", flush=True)
-            usual = recorder._compared
+            usual = recorder._compare_clocks
             for speed in SPEEDS_MM_S:
                 for shift in SHIFTS_S:
-                    recorder._compared = lambda *about, by=shift: recorder._Clock(
+                    recorder._compare_clocks = lambda *about, by=shift: recorder._Clock(
                         (found := usual(*about)).offset_s + by, found.encoder
                     )
                     said_by: list[str] = []

@@ -20,7 +20,7 @@ from playwright.sync_api import Page, sync_playwright
 import uwlts
 from tests.browser import SOFTWARE_WEBGL, find_chromium
 from twin.devices.serve import serve
-from twin.scene.campaign import load_campaign, takes
+from twin.scene.campaign import list_takes, load_campaign
 
 COUNT, STEP_MM = 38, 1.0
 LONG_MS = 900_000
@@ -40,7 +40,7 @@ def main(calibration: Path, folder: Path, pictures: Path) -> None:
     shutil.copy(calibration, tank / "calibration.json")
     campaign = {"base": "thesis", "title": "desk", "recordings": [{"scene": "spheres", "placements": ["standoff"]}]}
     (folder / "desk.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
-    (take,) = takes(load_campaign(folder / "desk.toml"), seed=0)
+    (take,) = list_takes(load_campaign(folder / "desk.toml"), seed=0)
     with serve(take.scene, sensor=take.sensor, as_built=take.built, spp=8, speed_up=50.0) as served:
         plan = {"title": "Spheres", "sensor": "thesis", "medium": "water", "camera": served.camera.address}
         start = served.track.start_mm + take.scene.motion.start_mm - min(take.scene.motion.start_mm, 0.0)

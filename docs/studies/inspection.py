@@ -72,7 +72,7 @@ def distances(pits: Pits, places: np.ndarray) -> np.ndarray:
 def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
     """The feature that lies on each pit, the deepest of several."""
     result: list[Feature | None] = [None] * len(pits.depth)
-    for feature in reversed(found.of(*HOLLOWS)):
+    for feature in reversed(found.select(*HOLLOWS)):
         away = distances(pits, feature.place_mm)
         nearest = int(np.argmin(away / pits.diameter))
         if away[nearest] < pits.diameter[nearest] / 2 + 0.5:
@@ -82,7 +82,9 @@ def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
 
 def false_ones(found: Inspection, pits: Pits) -> int:
     """Features that lie on no pit."""
-    return sum(bool(np.all(distances(pits, each.place_mm) > pits.diameter / 2 + 0.5)) for each in found.of(*BLEMISHES))
+    return sum(
+        bool(np.all(distances(pits, each.place_mm) > pits.diameter / 2 + 0.5)) for each in found.select(*BLEMISHES)
+    )
 
 
 def detection(depth: np.ndarray, hit: np.ndarray) -> tuple[float, float, np.ndarray]:
@@ -186,7 +188,7 @@ def small_pits_in(folder: Path, water: str, draw: int = 0) -> tuple[list[list[st
     found = matched(inspected, pits)
     hit = np.array([each is not None for each in found])
     plain = uwlts.inspect_pipe(cloud_of(folder, water, "pipe-before"))
-    false = false_ones(inspected, pits), len(plain.of(*BLEMISHES))
+    false = false_ones(inspected, pits), len(plain.select(*BLEMISHES))
     print(f"{water}: indications that are no pit: {false[0]} with pits, {false[1]} without; {inspected.notes[-1]}")
     seen, figures, curves = [], [], {}
     for diameter in np.unique(pits.diameter):
@@ -215,9 +217,9 @@ def wholes_in(folder: Path, water: str) -> list[list[str]]:
     pipe = uwlts.inspect_pipe(around(folder, water))
     truth = {"diameter": DIAMETER_MM, "ovality": DIAMETER_MM * OVALITY, "ovality share": 100 * OVALITY}
     rows = figure_rows(f"{water}, pipe", [(pipe.features[0], truth | {"straightness": 0.0})])
-    sections = pipe.of(FeatureKind.SECTION)
+    sections = pipe.select(FeatureKind.SECTION)
     rows += figure_rows(f"{water}, sections", [(each, {"ovality": truth["ovality"]}) for each in sections])
-    print(f"{water}: blemishes on the smooth pipe from six sides: {len(pipe.of(*BLEMISHES))}")
+    print(f"{water}: blemishes on the smooth pipe from six sides: {len(pipe.select(*BLEMISHES))}")
     return rows + welds_in(folder, water)
 
 
@@ -251,7 +253,7 @@ def flanges_in(folder: Path, water: str) -> list[list[str]]:
     assert isinstance(scene, Flange)
     found = uwlts.inspect_flange(cloud_of(folder, "flanges", f"flange-{water}"))
     truth = {"flatness": scene.flatness_mm, "bore": scene.bore_diameter_mm, "bolt circle": scene.bolt_circle_mm}
-    holes = [(hole, {"diameter": scene.hole_diameter_mm, "position": 0.0}) for hole in found.of(FeatureKind.HOLE)]
+    holes = [(hole, {"diameter": scene.hole_diameter_mm, "position": 0.0}) for hole in found.select(FeatureKind.HOLE)]
     rows = figure_rows(f"{water}, flange", [(found.features[0], truth)])
     return rows + figure_rows(f"{water}, holes of the flange", holes)
 
@@ -328,7 +330,7 @@ def draw_map(folder: Path, path: Path) -> None:
         vmax=0.2,
         linewidths=0,
     )
-    for feature in found.of(*BLEMISHES):
+    for feature in found.select(*BLEMISHES):
         x, y, z = feature.place_mm
         depth = feature["depth"]
         text = f"{depth.value:.2f} ± {0.5 * (depth.high - depth.low):.2f}"

@@ -100,21 +100,21 @@ class Rendered:
 @cache
 def render(place: Place) -> Rendered:
     """The place's light: the stripe with many samples, the light around it with all effects of the place."""
-    from twin.recording.frame_truth import true_stripe
-    from twin.recording.studio import Studio
+    from twin.recording.frame_truth import find_true_stripe
+    from twin.recording.sensor_simulator import SensorSimulator
 
     scene, sensor = place.scene(), place.sensor()
-    still = place.effects.without("noise", "speckle")
-    whole = Studio(sensor, scene, Options(spp=place.spp, effects=still))
+    still = place.effects.remove("noise", "speckle")
+    whole = SensorSimulator(sensor, scene, Options(spp=place.spp, effects=still))
     pose = whole.pose(next(scene.motion.shots()))
-    straight = still.without("multiple-scattering", "secondary-light")
-    fine = Studio(sensor.model_copy(update={"exposure": _fixed(sensor)}), scene, Options(effects=straight))
+    straight = still.remove("multiple-scattering", "secondary-light")
+    fine = SensorSimulator(sensor.model_copy(update={"exposure": _fixed(sensor)}), scene, Options(effects=straight))
     frame = fine.renderer.laser_frame(pose, spp=FINE_SPP)
     around = whole.renderer.laser_frame(pose, spp=place.spp).scattered
     if place.thing == "plane":
         # A running sum of single precision may end a little below zero.
         around = np.maximum(cv2.blur(around, (SMOOTHED_LINES, 1), borderType=cv2.BORDER_REPLICATE), 0)
-    truth = true_stripe(whole.renderer, pose)
+    truth = find_true_stripe(whole.renderer, pose)
     used = np.isfinite(truth.centre_px) & (-truth.normal[:, 2] >= FACING)
     step = step_per_px(place, truth.point_mm[None, :, 2])[0]
     return Rendered(
@@ -133,7 +133,7 @@ def _fixed(sensor: Sensor):
 
 
 PLACES = {"near": -60.0, "stand-off": 0.0, "far": 90.0}
-CONVEX = ALL.without("secondary-light")
+CONVEX = ALL.remove("secondary-light")
 """For the pipe, which does not light itself."""
 
 

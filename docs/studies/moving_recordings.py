@@ -17,7 +17,7 @@ import twin
 import uwlts
 from twin.options import CPU, Options, use_variant
 from twin.recording.record_scene import record_scene
-from twin.scene.campaign import load_campaign, takes
+from twin.scene.campaign import list_takes, load_campaign
 from twin.scene.description import load_scene
 
 CAMPAIGN = """
@@ -55,7 +55,7 @@ def main() -> None:
                 step=sorted(path for path in folder.glob("step-*.h5") if ".truth." not in path.name),
             )
             calibration.save(folder / "calibration.json")
-        take = takes(load_campaign(plan), seed=number)[0]
+        take = list_takes(load_campaign(plan), seed=number)[0]
         for name in given.scenes:
             for seed in given.seeds:
                 path = folder / f"{name}-{seed}.h5"

@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 import uwlts
 from twin.scene.description import Scene
 from twin.scene.platforms import Platform
-from uwlts.calibration.mount.sensor import CapturedProfiles, profiles_of
+from uwlts.calibration.mount.sensor import CapturedProfiles, reconstruct_profiles
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount
 from uwlts.storage.truth import Truth, read_truth, truth_path
@@ -44,7 +44,7 @@ def captured(path: Path) -> CapturedProfiles:
     calibration = uwlts.read(path.parent / "calibration.json")
     assert isinstance(calibration, Calibration)
     with uwlts.read(path) as capture:
-        return profiles_of(capture, calibration, None, None)
+        return reconstruct_profiles(capture, calibration, None, None)
 
 
 def rotary(path: Path) -> str:
@@ -74,7 +74,7 @@ def pipe(path: Path, calibration: Calibration, mount: Mount) -> np.ndarray:
     """
     cloud = uwlts.reconstruct(path, calibration, mount=mount)
     view = cloud.frame * VIEWS // (int(cloud.frame.max()) + 1)
-    views = [cloud.selected(view == number) for number in range(VIEWS)]
+    views = [cloud.select(view == number) for number in range(VIEWS)]
     rows, numbers = [(*form(cloud.points_mm, view), np.nan)], np.repeat(np.arange(VIEWS), [len(each) for each in views])
     start = {"start_std_mm": ROBOT_STD_MM, "start_std_deg": ROBOT_STD_DEG}
     for known in ({}, start, start | {"sphere_mm": SPHERES_MM}):

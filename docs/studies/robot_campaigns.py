@@ -19,7 +19,7 @@ from stripe_tables import table
 import uwlts
 from twin.scene.description import Scene
 from twin.scene.robot import Robot
-from uwlts.calibration.mount.sensor import CapturedProfiles, profiles_of
+from uwlts.calibration.mount.sensor import CapturedProfiles, reconstruct_profiles
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount, SphereFound
@@ -60,7 +60,7 @@ def main(folder: Path) -> None:
         assert isinstance(motion, Robot) and truth.pose is not None
         true = (motion.true_mount or motion.mount).matrix()
         with uwlts.read(path) as capture:
-            reported = profiles_of(capture, calibration, None, None)
+            reported = reconstruct_profiles(capture, calibration, None, None)
         ideal = profiles_of_poses(reported, truth.pose @ np.linalg.inv(true))
         for name, captured in {"ideal": ideal, "as reported": reported}.items():
             first, held = (captured.select(each) for each in np.split(np.arange(len(captured.poses)), [FOR_THE_MOUNT]))

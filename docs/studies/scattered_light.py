@@ -50,19 +50,19 @@ def render(kind: str, water: str, out: Path, *, seed: int) -> None:
 def reference(renderer: "Renderer", distance: np.ndarray, *, seed: int) -> np.ndarray:
     """Means (rows, columns) of what walks found per cell of an image (H, W) of distances from the stripe."""
     import twin.light.multiple_scattering as ways
-    from twin.light.illumination import lights
+    from twin.light.illumination import make_lights
     from twin.light.pose import SensorPose
     from twin.light.walk import Walker
 
     pose, side = SensorPose(np.eye(4)), ways.WALK_CELL_PX
-    direct, _ = lights(renderer._sheets, pose)
+    direct, _ = make_lights(renderer._sheets, pose)
     walker = Walker(renderer.objects, renderer.scattering, renderer.effects, pose, direct, renderer._reach_mm)
     rows, columns = (size // side for size in distance.shape)
     nearest = distance.reshape(rows, side, columns, side).min(axis=(1, 3)).ravel()
     total, count = np.zeros((2, rows * columns))
     for cells, walks in ((np.arange(nearest.size), WALKS), (np.flatnonzero(nearest <= NEAR_PX), MORE_WALKS)):
         place = cells // columns * side, cells % columns * side, np.full(len(cells), side)
-        for cell, *light in ways.walked(renderer.view, walker, *place, seed=seed, walks=walks):
+        for cell, *light in ways.trace_walks(renderer.view, walker, *place, seed=seed, walks=walks):
             total += np.bincount(cells[cell], sum(light), rows * columns)
         count[cells] += walks
         seed += 500_000

@@ -12,7 +12,7 @@ from twin.options import Options, use_variant
 from twin.scene.description import Scene
 from uwlts.model.library import load_sensor
 from uwlts.stripe import extract_stripe
-from uwlts.stripe.exposures import fused
+from uwlts.stripe.exposures import fuse_exposures
 
 BRACKET = (1.0, 5.0, 25.0)
 FRAMES, CLEAR_MM, FULL_DN = 6, 2.0, 255.0
@@ -43,19 +43,19 @@ CASES = {
 
 
 def rows() -> Iterator[str]:
-    from twin.recording.frame_truth import true_stripe
-    from twin.recording.studio import Studio
+    from twin.recording.frame_truth import find_true_stripe
+    from twin.recording.sensor_simulator import SensorSimulator
 
     yield "| scene | surface | image | lines found % | bias px | std px |"
     yield "| --- | --- | --- | --- | --- | --- |"
     for name, (of, surfaces) in CASES.items():
-        studio, sensor = Studio(load_sensor("thesis"), of, Options(spp=64)), load_sensor("thesis")
+        studio, sensor = SensorSimulator(load_sensor("thesis"), of, Options(spp=64)), load_sensor("thesis")
         exposure = studio.exposure_ms["laser"] * np.array(BRACKET)
         errors: dict[tuple[str, str], list[np.ndarray]] = {}
         for number, shot in enumerate(of.motion.shots()):
-            truth = true_stripe(studio.renderer, studio.pose(shot))
-            images = [studio.exposed(shot, 10 * number + k, exposure=BRACKET[k]).image for k in range(len(BRACKET))]
-            image, saturation = fused(images, exposure, full_dn=FULL_DN)
+            truth = find_true_stripe(studio.renderer, studio.pose(shot))
+            images = [studio.expose(shot, 10 * number + k, exposure=BRACKET[k]).image for k in range(len(BRACKET))]
+            image, saturation = fuse_exposures(images, exposure, full_dn=FULL_DN)
             looked = {
                 "exposure 1": (images[0], FULL_DN),
                 "exposure 25": (images[-1], FULL_DN),

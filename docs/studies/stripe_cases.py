@@ -139,18 +139,18 @@ class Spread:
 def measure(case: Case) -> Frames:
     """Render the case's frames, find the stripe in them, and compare with the truth."""
     # Mitsuba looks for its variant when it is imported.
-    from twin.recording.frame_truth import true_stripe
-    from twin.recording.studio import Studio
+    from twin.recording.frame_truth import find_true_stripe
+    from twin.recording.sensor_simulator import SensorSimulator
 
     sensor, scene = case.sensor(), case.scene()
-    studio = Studio(sensor, scene, Options(spp=case.spp, effects=case.effects))
+    studio = SensorSimulator(sensor, scene, Options(spp=case.spp, effects=case.effects))
     if case.level is not None:
         fixed = studio.exposure_ms["laser"] * case.level / sensor.exposure.auto_level
         exposure = sensor.exposure.model_copy(update={"laser_ms": fixed})
-        studio = Studio(sensor.model_copy(update={"exposure": exposure}), scene, studio.options)
+        studio = SensorSimulator(sensor.model_copy(update={"exposure": exposure}), scene, studio.options)
     truths, centres, widths, crop, corner = [], [], [], None, (0, 0)
     for index, shot in enumerate(scene.motion.shots()):
-        truth, image = true_stripe(studio.renderer, studio.pose(shot)), studio.image(shot, index)
+        truth, image = find_true_stripe(studio.renderer, studio.pose(shot)), studio.image(shot, index)
         truths.append(truth)
         found = {name: extract_stripe(image, stripe_along="width", options=wanted) for name, wanted in METHODS.items()}
         widths.append(found[CROSSING].width_px)
@@ -198,15 +198,15 @@ def step_per_px(case: Case, z_mm: np.ndarray) -> np.ndarray:
 @cache
 def _scale(medium: str) -> tuple[np.ndarray, np.ndarray]:
     """Polynomials (degree + 1, L) in Z of every line's row and Y, from the truth of plates all over the volume."""
-    from twin.recording.frame_truth import true_stripe
-    from twin.recording.studio import Studio
+    from twin.recording.frame_truth import find_true_stripe
+    from twin.recording.sensor_simulator import SensorSimulator
 
-    studio = Studio(load_sensor("thesis"), Case(medium=medium).scene(), Options(effects=NONE))
+    studio = SensorSimulator(load_sensor("thesis"), Case(medium=medium).scene(), Options(effects=NONE))
     rows, places = [], []
     for z in _SCALE_Z:
         pose = np.eye(4)
         pose[2, 3] = -z
-        truth = true_stripe(studio.renderer, pose)
+        truth = find_true_stripe(studio.renderer, pose)
         rows.append(truth.centre_px)
         places.append(truth.point_mm[:, 1])
     return tuple(polynomial.polyfit(_SCALE_Z, np.stack(values), _SCALE_DEGREE) for values in (rows, places))

@@ -14,7 +14,7 @@ from stripe_plan import NAME_CORE, PLACES, Plan
 from stripe_tables import table, write_tables
 
 from twin.options import use_variant
-from uwlts.pages.numbers import fixed
+from uwlts.pages.numbers import format_fixed
 from uwlts.runtime.console import progress_bar
 
 PAGE = Path(__file__).parents[1] / "results" / "stripe-errors.md"
@@ -29,7 +29,7 @@ def effects_table(plan: Plan) -> str:
         cells = [name]
         for place in PLACES["plane"]:
             s = measure(cases[name, place]).spread()
-            cells += [fixed(s.bias_px, signed=True), f"{s.std_px:.3f} ± {s.std_px_error:.3f}", f"{s.std_mm:.4f}"]
+            cells += [format_fixed(s.bias_px, signed=True), f"{s.std_px:.3f} ± {s.std_px_error:.3f}", f"{s.std_mm:.4f}"]
         rows.append(cells)
     return table(["effects", *(f"{place}: {column}" for place in PLACES["plane"] for column in columns)], rows)
 

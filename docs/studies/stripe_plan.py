@@ -33,7 +33,7 @@ THESIS_STD = {
 
 def exactly(*names: str) -> Effects:
     """Nothing but some effects."""
-    return ALL.without(*(name for name in ALL.names() if name not in names))
+    return ALL.remove(*(name for name in ALL.names() if name not in names))
 
 
 NAME_ALL, NAME_CORE = "all", "noise + speckle + defocus"
@@ -42,7 +42,7 @@ ROWS = {
     **{f"only {group}": exactly(*names) for group, names in GROUPS.items()},
     NAME_CORE: exactly(*CORE),
     NAME_ALL: ALL,
-    **{f"all but {group}": ALL.without(*names) for group, names in GROUPS.items()},
+    **{f"all but {group}": ALL.remove(*names) for group, names in GROUPS.items()},
 }
 
 

@@ -259,13 +259,13 @@ class _Capture(SimpleNamespace):
 
 
 def rendered(of: Scene, sensor: Sensor, options: Options = Options()) -> Rendered:
-    from twin.recording.frame_truth import crossings
-    from twin.recording.studio import Studio
+    from twin.recording.frame_truth import find_crossings
+    from twin.recording.sensor_simulator import SensorSimulator
 
-    studio, images, lit = Studio(sensor, of, options), [], []
+    studio, images, lit = SensorSimulator(sensor, of, options), [], []
     for number, shot in enumerate(of.motion.shots()):
         images.append(studio.image(shot, number))
-        found = crossings(studio.renderer, studio.pose(shot))
+        found = find_crossings(studio.renderer, studio.pose(shot))
         shone = found.brightness > 0
         lit.append(np.column_stack([np.full(shone.sum(), number), found.line[shone], found.centre_px[shone]]))
     return Rendered(np.stack(images), np.concatenate(lit), direct_light(of, sensor, options), sensor)
@@ -279,12 +279,12 @@ def rendered_small(of: Scene, sensor: Sensor, seed: int) -> Rendered:
 
 def direct_light(of: Scene, sensor: Sensor, options: Options) -> np.ndarray:
     """Image, line and place (M, 3) of the stripes of the light that comes straight from surfaces, without mirrors."""
-    from twin.recording.studio import Studio
+    from twin.recording.sensor_simulator import SensorSimulator
 
-    studio = Studio(sensor, of, replace(options, effects=ALL.without(*LONGER_WAYS)))
+    studio = SensorSimulator(sensor, of, replace(options, effects=ALL.remove(*LONGER_WAYS)))
     full_scale, result = 255 / studio.sensor.detector.full_well_e, []
     for number, shot in enumerate(of.motion.shots()):
-        light = full_scale * studio.exposed(shot, number).direct
+        light = full_scale * studio.expose(shot, number).direct
         own = extract_candidates(light, stripe_along=sensor.camera.stripe_along, options=FAINTEST)
         result.append(np.column_stack([np.full(len(own.line), number), own.line, own.centre_px]))
     return np.concatenate(result)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from cyclopts import App
 
-from twin.design.designs import EvaluatedDesign, Marked
-from twin.design.parameters import followed, parameters_of
+from twin.design.designs import EvaluatedDesign, HighlightedDesign
+from twin.design.parameters import adjust_to_standoff, extract_parameters
 from twin.design.study import Study
-from twin.design.verification import verified
+from twin.design.verification import verify_candidate
 from twin.options import CPU
-from uwlts.model.library import load_sensor, merged, validated
+from uwlts.model.library import load_sensor, merge_tables, validate_description
 from uwlts.model.sensor import Sensor
 
 FOLLOW = ("focus", "waist", "volume")
@@ -43,19 +43,19 @@ def main() -> None:
     )
     print("| --- | --- | --- | --- | --- | --- |")
     for number, (name, medium, changes) in enumerate(CASES):
-        sensor = validated(Sensor, merged(load_sensor("thesis").model_dump(), changes), name)
-        set_by = followed(np, parameters_of([sensor], [sensor.medium(medium)]), FOLLOW)
+        sensor = validate_description(Sensor, merge_tables(load_sensor("thesis").model_dump(), changes), name)
+        set_by = adjust_to_standoff(np, extract_parameters([sensor], [sensor.medium(medium)]), FOLLOW)
         set_up = {
             "camera": {"focus_distance_mm": set_by.focus_mm.item()},
             "laser": {"waist_distance_mm": set_by.waist_distance_mm.item()},
             "volume": {"near_mm": set_by.near_mm.item(), "far_mm": set_by.far_mm.item()},
         }
-        built = validated(Sensor, merged(sensor.model_dump(), set_up), name)
+        built = validate_description(Sensor, merge_tables(sensor.model_dump(), set_up), name)
         study = Study.model_validate(
             {"title": name, "medium": medium, "variables": {"laser.power_mw": {"least": 1.0, "most": 10.0}}}
         )
-        candidate = Marked(name, built, EvaluatedDesign(number, {}, {}, 0.0, ""))
-        found = verified(study, candidate, workers=2, variant=CPU)
+        candidate = HighlightedDesign(name, built, EvaluatedDesign(number, {}, {}, 0.0, ""))
+        found = verify_candidate(study, candidate, workers=2, variant=CPU)
         if found.failure:
             print(f"| {name} | | | | | {found.failure} |", flush=True)
             continue

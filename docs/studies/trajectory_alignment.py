@@ -29,7 +29,7 @@ from uwlts.alignment.drift_model import DriftModel, choose_drift_model
 from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.path_solution import Hypothesis, initial_estimate, settle
-from uwlts.alignment.pieces import Survey, moved
+from uwlts.alignment.pieces import Survey, correct_places
 from uwlts.storage.cloud import PointCloud
 
 PASS_MM = np.array(
@@ -155,8 +155,8 @@ def given_crossings(
     assert cloud.time_s is not None
     options = AlignmentOptions(intervals=50, most_nodes=120)
     model = choose_drift_model(reported, drift.get("drift_mm"), drift.get("drift_deg"))
-    prior = PathPrior.over(cloud.time_s, model, reported, intervals=options.intervals)
-    survey = Survey.along(cloud, cloud.time_s, reported)
+    prior = PathPrior.from_times(cloud.time_s, model, reported, intervals=options.intervals)
+    survey = Survey.from_cloud(cloud, cloud.time_s, reported)
     estimate = initial_estimate(survey, prior, options)
 
     def correction(times_s: np.ndarray) -> np.ndarray:
@@ -164,7 +164,9 @@ def given_crossings(
         turns = Rotation.from_matrix(now[:, :3, :3] @ was[:, :3, :3].transpose(0, 2, 1))
         return np.hstack([now[:, :3, 3] - was[:, :3, 3], turns.as_rotvec()])
 
-    for pair in _true_pairs([moved(correction(p.times_s), p.platform_mm, p.places_mm) for p in estimate.pieces]):
+    for pair in _true_pairs(
+        [correct_places(correction(p.times_s), p.platform_mm, p.places_mm) for p in estimate.pieces]
+    ):
         own = estimate.surfaces[pair[1]].places_mm
         middle = own.mean(axis=0)
         relative = estimate.relative_movement(pair, middle) @ correction(estimate.prior.nodes_s).T.ravel()

@@ -58,7 +58,7 @@ def aligned_pass(path: Path) -> Figures:
     motion, truth = truth_of(path)
     assert isinstance(motion, Vehicle) and truth.pose is not None
     robot = captured(path.parent / path.name.replace("vehicle-pass", "robot-sphere"))
-    mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
+    mount = uwlts.calibrate_mount(robot.select(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
     reported = uwlts.read(trajectory_path(path))
     offset = motion.clock_offset_s
     cloud = uwlts.reconstruct(

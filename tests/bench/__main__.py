@@ -149,7 +149,7 @@ def campaign() -> list[Row]:
 def pipeline() -> list[Row]:
     """Time of stripe extraction and reconstruction on one core: the default method, and the fastest one."""
     from twin.options import Options
-    from twin.recording.studio import Studio
+    from twin.recording.sensor_simulator import SensorSimulator
     from twin.scene.description import load_scene
     from uwlts.model.library import load_sensor
     from uwlts.optics.nominal import nominal_calibration
@@ -174,7 +174,7 @@ def pipeline() -> list[Row]:
         calibration = nominal_calibration(sensor, medium)
         index = medium.refractive_index(sensor.laser.wavelength_nm)
         shots = list(scene.motion.shots())
-        image = Studio(sensor, scene, Options()).image(shots[len(shots) // 2], 0)
+        image = SensorSimulator(sensor, scene, Options()).image(shots[len(shots) // 2], 0)
         extract = partial(
             extract_stripe,
             image,
@@ -192,7 +192,7 @@ def pipeline() -> list[Row]:
     scene = load_scene("target")
     target = parse_target(scene.target)
     lamp = next(shot for shot in scene.motion.shots() if shot.light == "lamp")
-    image = Studio(load_sensor("thesis"), scene, Options()).image(lamp, 0)
+    image = SensorSimulator(load_sensor("thesis"), scene, Options()).image(lamp, 0)
     seconds = median_seconds(lambda k: target.detect(image), runs=11)
     found = len(target.detect(image).pixels)
     return [*rows, at_most(f"the {found} circles of a target in view found, on one core", seconds, "s", 0.3)]

@@ -12,7 +12,7 @@ from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.calibration import Calibration
 from uwlts.model.trajectory import Trajectory
-from uwlts.reconstruction.moving import carried, platform_ride, with_platform
+from uwlts.reconstruction.moving import add_platform_poses, add_platform_uncertainty, find_platform_poses
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
@@ -72,11 +72,11 @@ def measuring_rate(scans: list[Path], calibration: Calibration) -> tuple[float, 
         for images in [_InMemory(each, AS_OFTEN) for each in opened] * 8:
             trajectory = _trajectory(images.time_s)
             start = time.perf_counter()
-            ride = platform_ride(images, trajectory, mount=mount, clock_offset_s=0.0)
-            table, stripes = carried(images, ride, mount), find_stripes(images)
+            ride = find_platform_poses(images, trajectory, mount=mount, clock_offset_s=0.0)
+            table, stripes = add_platform_poses(images, ride, mount), find_stripes(images)
             cloud = reconstruct_stripes(table, stripes, calibration, with_uncertainty=True)
             assert cloud.uncertainty is not None
-            known = with_platform(cloud.uncertainty, cloud.points_mm, cloud.frame, ride, mount)
+            known = add_platform_uncertainty(cloud.uncertainty, cloud.points_mm, cloud.frame, ride, mount)
             assert known.covariance_mm2().shape == (len(cloud), 3, 3)
             by_path.append((time.perf_counter() - start) / np.count_nonzero(images.laser_on))
         return 1.0 / float(np.median(by_stage[1:])), 1.0 / float(np.median(by_path[1:]))

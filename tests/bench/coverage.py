@@ -46,7 +46,7 @@ from uwlts.model.parameter_keys import (
 )
 from uwlts.model.sensor import Sensor
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
-from uwlts.runtime.workers import work_through
+from uwlts.runtime.workers import run_jobs
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import CaptureStripes
@@ -279,7 +279,7 @@ def varied_campaigns(count: int) -> int:
         "parameters",
     )
     jobs = [Campaign(seed, True, variation=each) for each in VARIATIONS for seed in range(count)]
-    outcomes = work_through(attempt, jobs)
+    outcomes = run_jobs(attempt, jobs)
     for number, variation in enumerate(VARIATIONS):
         own = outcomes[number * count : (number + 1) * count]
         kept = [outcome for outcome in own if outcome is not None]
@@ -308,7 +308,7 @@ def main(campaigns: int = CAMPAIGNS, *, varied: Annotated[bool, Parameter(negati
     if varied:
         return varied_campaigns(campaigns)
     jobs = [Campaign(seed, wet) for seed in range(campaigns) for wet in (True, False)]
-    outcomes = work_through(run_campaign, jobs)
+    outcomes = run_jobs(run_campaign, jobs)
     table = Table("scan", "quantity", "number", "within 95 %", "rms error / std", "mean |error|", "mean std")
     for (scan, quantity), measured in judged(outcomes).items():
         error, std = np.array([(m.error_mm, m.std_mm) for m in measured]).T

@@ -104,9 +104,9 @@ _images = {at: _stripe(*at, seed=1) for at in [(128, 160), (224, 288), (400, 512
 def samples() -> Growth:
     """The laser's light in a frame of two spheres in clear water, by samples per lit pixel."""
     use_variant()
-    from twin.recording.studio import Studio
+    from twin.recording.sensor_simulator import SensorSimulator
 
-    studio = Studio(load_sensor("thesis"), load_scene("spheres", water="clear"), Options(), probe="middle")
+    studio = SensorSimulator(load_sensor("thesis"), load_scene("spheres", water="clear"), Options(), probe="middle")
     shot = list(studio.scene.motion.shots())[19]
     sizes = [4, 12, 40, 120, 400]
     return Growth(

@@ -14,7 +14,7 @@ import numpy as np
 
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from uwlts.desk.board import Board
-from uwlts.desk.recording_view import LOOK_S, RecordingView, frames_of
+from uwlts.desk.recording_view import LOOK_S, RecordingView, follow_frames
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.replay import ReplayCamera
@@ -136,7 +136,7 @@ def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multipr
     moments: list[float] = []
     board, view = Board("bench"), None
     ready.set()
-    for seen in frames_of(out):
+    for seen in follow_frames(out):
         if seen is None:
             time.sleep(LOOK_S)
             continue

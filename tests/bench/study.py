@@ -7,7 +7,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from twin.design.screening import Batch, judged_part, read_parts, write_part
+from twin.design.screening import Batch, evaluate_batch, read_parts, write_part
 from twin.design.study import Study, load_study
 from uwlts.runtime.workers import open_workers
 
@@ -28,7 +28,7 @@ if __name__ == "__main__":
 def timed(batch: Batch) -> tuple[float, bytes]:
     """Seconds of a processor that judging a batch takes, and the part."""
     start = time.process_time()
-    content = judged_part(batch)
+    content = evaluate_batch(batch)
     return time.process_time() - start, content
 
 
@@ -43,9 +43,9 @@ def screening() -> tuple[float, float]:
     study = Study.model_validate(study.model_dump() | {"sampling": sampling})
     batches = [Batch(study, None, first, BATCH) for first in range(0, BATCHES * BATCH, BATCH)]
     with tempfile.TemporaryDirectory() as folder, open_workers(workers=WORKERS) as pool:
-        list(pool.completed(timed, batches[: 2 * WORKERS]))
+        list(pool.map_unordered(timed, batches[: 2 * WORKERS]))
         start, judging = time.perf_counter(), 0.0
-        for batch, (seconds, content) in pool.completed(timed, batches):
+        for batch, (seconds, content) in pool.map_unordered(timed, batches):
             write_part(Path(folder), batch.first, content)
             judging += seconds
         wall = time.perf_counter() - start

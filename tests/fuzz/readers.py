@@ -18,7 +18,7 @@ from tests.uwlts.mount_views import sphere_campaign
 from tests.uwlts.storage.test_capture import a_header, interrupted, record, small_sensor
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
-from twin.design.screening import as_part, read_parts
+from twin.design.screening import encode_part, read_parts
 from twin.design.study import load_study
 from twin.scene.campaign import load_campaign
 from twin.scene.description import Mesh, load_scene
@@ -33,14 +33,14 @@ from uwlts.hardware.scan_plan import load_plan
 from uwlts.model.artefacts import read_artefact
 from uwlts.model.library import library_folder, load_sensor
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.report.certificate import certificate_of, check_certificate
+from uwlts.report.certificate import check_certificate, make_certificate
 from uwlts.report.gather import load_reference
 from uwlts.report.inventory import describe
 from uwlts.storage.calibration_file import load_calibration, read_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.image_file import read_image
-from uwlts.storage.import_ import read_intrinsics, with_intrinsics
+from uwlts.storage.import_ import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
 from uwlts.storage.mount_files import read_mount, read_profiles
@@ -96,7 +96,7 @@ def _certified(path: Path) -> Path:
 
 def _certificate(path: Path) -> None:
     calibration = _certified(path)
-    content = certificate_of(read_calibration(calibration), calibration, issued="2026-01-02T03:04:05+00:00")
+    content = make_certificate(read_calibration(calibration), calibration, issued="2026-01-02T03:04:05+00:00")
     path.write_text(json.dumps(content.in_file()))
 
 
@@ -145,7 +145,7 @@ def _las(path: Path) -> None:
 
 def _sensor_with(path: Path) -> None:
     """Read a camera and put it into a sensor."""
-    with_intrinsics(small_sensor(640, 480), read_intrinsics(path), source=path.name)
+    set_intrinsics(small_sensor(640, 480), read_intrinsics(path), source=path.name)
 
 
 def _exported(path: Path) -> None:
@@ -261,7 +261,7 @@ def _glb(path: Path) -> None:
 
 def _part(path: Path) -> None:
     number = np.arange(40)
-    path.write_bytes(as_part({"design": number, "line_mm": 150.0 + number, "failure": np.full(40, "")}))
+    path.write_bytes(encode_part({"design": number, "line_mm": 150.0 + number, "failure": np.full(40, "")}))
 
 
 def _read_part(path: Path) -> None:
@@ -337,7 +337,7 @@ READERS = {
         Reader("mesh-binary", ".glb", "bytes", _glb, _read_mesh),
         Reader("texture", ".png", "image", _picture, read_grey),
         Reader("screened", ".parquet", "bytes", _part, _read_part),
-        Reader("results", ".json", "json", _results, CampaignResults.read),
+        Reader("results", ".json", "json", _results, CampaignResults.read_file),
         Reader("guided-plan", ".toml", "toml", _guided_plan, load_guided_plan),
         Reader("reference", ".toml", "toml", _shipped("references/thesis.toml"), load_reference),
         Reader("published", ".toml", "toml", _shipped("references/thesis-tables.toml"), load_published),

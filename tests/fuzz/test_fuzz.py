@@ -10,8 +10,8 @@ from tests.fuzz.past_failures import PAST
 from tests.fuzz.readers import READERS
 from tests.fuzz.running import MOST_MIB, MOST_S, Outcome, watched
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import parsed_json, parsed_toml, read_bytes
-from uwlts.files.writing import written_aside
+from uwlts.files.reading import parse_json, parse_toml, read_bytes
+from uwlts.files.writing import write_atomically
 from uwlts.storage.calibration_file import load_calibration
 
 CORPUS = Path(__file__).with_name("corpus")
@@ -64,7 +64,7 @@ def test_changed_files_are_read_or_refused(outcomes_of: dict[str, list[Outcome]]
 @settings(max_examples=300, deadline=None)
 @given(st.text(max_size=200) | st.text(alphabet='[]{}",:.=\n0a \\-eE+x', max_size=200))
 def test_any_text_is_parsed_or_refused(text: str):
-    for parse in (parsed_json, parsed_toml):
+    for parse in (parse_json, parse_toml):
         try:
             parse(text)
         except ValueError:
@@ -81,7 +81,7 @@ PLAIN = st.recursive(
 @settings(max_examples=200, deadline=None)
 @given(PLAIN)
 def test_plain_json_comes_back(content):
-    assert parsed_json(json.dumps(content)) == content
+    assert parse_json(json.dumps(content)) == content
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "x" * 300 + ".json"])
@@ -89,7 +89,7 @@ def test_names_that_no_file_can_have(tmp_path: Path, name: str):
     for attempt in (lambda: read_bytes(tmp_path / name, most_bytes=10), lambda: load_calibration(tmp_path / name)):
         with pytest.raises(CaptureError):
             attempt()
-    with pytest.raises(OutputError), written_aside(tmp_path / name):
+    with pytest.raises(OutputError), write_atomically(tmp_path / name):
         pytest.fail("the body must not run")
 
 

@@ -8,7 +8,7 @@ import pytest
 import uwlts
 from twin.options import Flaws, Options
 from twin.recording.record_scene import record_scene
-from twin.scene.description import altered, load_scene
+from twin.scene.description import load_scene, replace_values
 from uwlts.model.library import load_sensor
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import truth_path
@@ -21,10 +21,10 @@ PROFILES = {"start_mm": -18.0, "step_mm": 6.0, "count": 7}
 def test_centre_lines_on_the_board_calibrate_the_sensor_that_scans_spheres(tmp_path: Path):
     """A sensor whose lens is 1 % longer than its drawings say."""
     sensor, options = load_sensor("thesis-small"), Options(spp=4, flaws=Flaws(camera_3d=16))
-    built = altered(sensor, camera={"focal_length_mm": 1.01 * sensor.camera.focal_length_mm})
+    built = replace_values(sensor, camera={"focal_length_mm": 1.01 * sensor.camera.focal_length_mm})
     board = load_scene("target", motion=POSES)
     spheres = load_scene("spheres", placement="standoff", medium="air", motion=PROFILES)
-    for name, scene in (("board", board), ("spheres", altered(spheres, window_mounted=False))):
+    for name, scene in (("board", board), ("spheres", replace_values(spheres, window_mounted=False))):
         record_scene(scene, sensor, tmp_path / f"{name}.h5", as_built=built, options=options)
     with Capture(tmp_path / "board.h5") as capture:
         assert np.array_equal(capture.has_image, ~capture.laser_on) and capture.laser_on.sum() == POSES["count"]

@@ -94,13 +94,13 @@ def true_places(capture: Capture, hill: Hill) -> np.ndarray:
 
 
 def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_path, monkeypatch):
-    usual, said = continuous._compared, []
+    usual, said = continuous._compare_clocks, []
 
     def compared(*about):
         clock = usual(*about)
         return continuous._Clock(clock.offset_s + 0.02, clock.encoder)
 
-    monkeypatch.setattr(continuous, "_compared", compared)
+    monkeypatch.setattr(continuous, "_compare_clocks", compared)
     moving = f"speed_mm_per_s = {SPEED}"
     seen = uwlts.scan(plan(tmp_path, hill, moving), tmp_path / "a.h5", home=True, report=said.append)
     assert not hill.controller.state().laser_on

@@ -12,7 +12,7 @@ import twin
 import uwlts
 from tests.virtual_sensors import altered, cropped, plate, scene_of
 from twin.options import Flaws, Options
-from twin.recording.studio import Studio
+from twin.recording.sensor_simulator import SensorSimulator
 from twin.scene.motion import Shot
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
@@ -41,7 +41,7 @@ COLOUR_SHIFT_PX = 0.02
 its peak is 0.02 px lower, its centre of mass where it was, as for a stripe drawn without noise at any quality."""
 
 
-class Tripod(Studio):
+class Tripod(SensorSimulator):
     """A studio that rotates the sensor before the board instead of moving it by a stage."""
 
     def pose(self, shot: Shot) -> np.ndarray:
@@ -61,7 +61,7 @@ def photographed(sensor: Sensor, folder: Path, *effects: str) -> Sensor:
         window_mounted=False,
         motion={"lights": ("lamp",), "count": len(VIEWS)},
     )
-    studio = Tripod(sensor, scene, Options(flaws=Flaws.of(*effects)))
+    studio = Tripod(sensor, scene, Options(flaws=Flaws.parse(*effects)))
     for number, shot in enumerate(scene.motion.shots()):
         assert cv2.imwrite(str(folder / f"board{number}.png"), studio.image(shot, number))
     (folder / "target.toml").write_text(tomli_w.dumps(TARGET))

@@ -21,9 +21,9 @@ import uwlts
 import uwlts.cli
 from tests.system.in_process import run_program
 from uwlts.errors import OutputError
-from uwlts.files.inputs import OUTPUTS, inputs_kept
+from uwlts.files.inputs import OUTPUTS, protect_inputs
 from uwlts.files.reading import read_text
-from uwlts.files.writing import one_writer, refuse_unsuitable, written_aside
+from uwlts.files.writing import lock_output, refuse_unsuitable, write_atomically
 from uwlts.runtime.command_line import PathText
 from uwlts.storage.cloud import PointCloud
 
@@ -191,13 +191,13 @@ def test_what_is_read_meanwhile_is_not_replaced_but_what_was_made_may_be_read_an
     out, other = tmp_path / "out.txt", tmp_path / "other.txt"
     out.write_text("old", encoding="utf-8")
     os.link(out, other)
-    with inputs_kept():
-        with pytest.raises(OutputError, match="is an input"), written_aside(out, overwrite=True) as aside:
+    with protect_inputs():
+        with pytest.raises(OutputError, match="is an input"), write_atomically(out, overwrite=True) as aside:
             aside.write_text(read_text(other, most_bytes=10), encoding="utf-8")
         assert out.samefile(other)
-    with inputs_kept():
+    with protect_inputs():
         for words in ("new", "newer"):
-            with written_aside(out, overwrite=True) as aside:
+            with write_atomically(out, overwrite=True) as aside:
                 aside.write_text(words, encoding="utf-8")
             assert read_text(out, most_bytes=10) == words
             assert read_text(other, most_bytes=10) == "old"
@@ -246,15 +246,15 @@ def holder(tmp_path) -> Iterator[subprocess.Popen[str]]:
 def test_a_second_writer_is_refused_at_once(tmp_path, holder):
     out = tmp_path / "a.json"
     begun = time.monotonic()
-    with pytest.raises(OutputError, match=rf"a\.json: process {holder.pid} on .* is writing it"), one_writer(out):
+    with pytest.raises(OutputError, match=rf"a\.json: process {holder.pid} on .* is writing it"), lock_output(out):
         pass
     assert time.monotonic() - begun < 1.0
-    with one_writer(tmp_path / "b.json"):
+    with lock_output(tmp_path / "b.json"):
         pass
     holder.stdin.close()
     holder.wait()
     assert list(tmp_path.iterdir()) == []
-    with one_writer(out):
+    with lock_output(out):
         assert [path.name for path in tmp_path.iterdir()] == [".a-json.lock"]
     assert list(tmp_path.iterdir()) == []
 
@@ -262,7 +262,7 @@ def test_a_second_writer_is_refused_at_once(tmp_path, holder):
 def test_a_killed_writer_holds_nothing(tmp_path, holder):
     holder.send_signal(signal.SIGKILL)
     holder.wait()
-    with written_aside(tmp_path / "a.json") as aside:
+    with write_atomically(tmp_path / "a.json") as aside:
         aside.write_text("{}")
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
@@ -285,7 +285,7 @@ def test_without_a_command_asking_claims_nothing(tmp_path):
 
 def test_a_locked_hdf5_output_can_be_written(tmp_path):
     """HDF5 locks its own output; this lock is on another file."""
-    with written_aside(tmp_path / "a.h5") as aside, h5py.File(aside, "w") as file:
+    with write_atomically(tmp_path / "a.h5") as aside, h5py.File(aside, "w") as file:
         file["a"] = 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
@@ -295,19 +295,19 @@ def test_the_works_of_a_program_that_goes_on_are_apart(tmp_path):
     path.write_text("old", encoding="utf-8")
 
     def read_and_replace() -> None:
-        with inputs_kept():
+        with protect_inputs():
             read_text(path, most_bytes=10)
             with pytest.raises(OutputError, match="it is an input of this command"):
                 refuse_unsuitable(path, overwrite=True)
 
     def replace() -> None:
-        with inputs_kept():
+        with protect_inputs():
             refuse_unsuitable(path, overwrite=True)
-            with written_aside(path, overwrite=True) as aside:
+            with write_atomically(path, overwrite=True) as aside:
                 aside.write_text("new", encoding="utf-8")
             assert writer_elsewhere(path) == "another"
 
-    with inputs_kept(), ThreadPoolExecutor(1) as thread:
+    with protect_inputs(), ThreadPoolExecutor(1) as thread:
         thread.submit(read_and_replace).result()
         # A file that one task has read may be replaced by another, and outputs are held until the end of their task
         # only.

@@ -47,10 +47,10 @@ board = Board("attacked")
 screen = BoardScreen(board)
 with DeskServer(board, port=0, switch=screen.switch) as server:
     with GrblStage(sys.argv[1]) as stage:
-        screen.connected(stage)
+        screen.set_stage(stage)
         print(server.address, server.operator_address, screen.switch._process.pid, flush=True)
         sys.stdin.readline()
-        screen.connected(None)
+        screen.set_stage(None)
     print("closed", flush=True)
     sys.stdin.readline()
 print(*(line.text for line in board.lines()), sep="\\n", flush=True)

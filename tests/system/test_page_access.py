@@ -25,7 +25,7 @@ from websockets.sync.client import ClientConnection, connect
 from tests.waiting import within
 from uwlts.desk.access import PageAccess
 from uwlts.desk.board import Board, Picture
-from uwlts.desk.board_page import BoardView, timed
+from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.guided import BoardScreen, answer_buttons
 from uwlts.desk.server import DeskServer
 from uwlts.errors import SetupError
@@ -65,7 +65,7 @@ def guarded(title: str, **options: object) -> Page:
             view.log()
             if operator:
                 answer_buttons(shown, screen.press)
-        timed(view.refresh)
+        update_regularly(view.refresh)
 
     server = DeskServer(board, build=build, switch=screen.switch, **({"port": 0} | options))
     return Page(server.address, server.operator_address, board, screen, server)

@@ -15,7 +15,7 @@ import uwlts
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.camera.target_poses import solve_camera
-from uwlts.calibration.capture_evidence import AirEvidence, air_evidence
+from uwlts.calibration.capture_evidence import AirEvidence, find_air_evidence
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, gather, solve
@@ -72,7 +72,7 @@ def imported(tmp_path: Path, folder: str, description: str) -> Capture:
 def test_the_chessboard_gives_the_authors_camera(tmp_path: Path):
     target = '[target]\nkind = "chessboard"\ncolumns = 11\nrows = 6\nsquare_mm = 13.0\n'
     with imported(tmp_path, "chessboard", 'lamp = "frame*.png"' + SENSOR + target) as capture:
-        found = air_evidence([capture])
+        found = find_air_evidence([capture])
     assert len(found.images) == 16
     camera = solve_camera(
         found.images,

@@ -21,7 +21,7 @@ from twin import cli
 from twin.options import Options
 from twin.recording.campaigns import record as record_one, record_campaigns
 from twin.recording.record_scene import record_scene
-from twin.scene.campaign import load_campaign, takes
+from twin.scene.campaign import list_takes, load_campaign
 from uwlts.errors import DescriptionError
 from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.truth import read_truth, truth_path
@@ -164,7 +164,7 @@ def test_a_campaign_is_recorded(rendered: tuple[Path, Progress], described: Path
     plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
     assert plan["campaign"]["imperfections"]["stage_position_std_mm"] == 0.5
     assert (plan["every"], plan["spp"]) == (1, 4)
-    for take in takes(load_campaign(described / "small.toml"), seed=0):
+    for take in list_takes(load_campaign(described / "small.toml"), seed=0):
         path = folder / "campaign-0" / f"{take.name}.h5"
         with Capture(path) as capture:
             assert capture.finished
@@ -195,7 +195,9 @@ def test_interrupted_takes_are_completed_and_another_seed_adds_a_campaign(
         if done == 2:
             raise KeyboardInterrupt
 
-    for take, path in zip(takes(load_campaign(described / "small.toml"), seed=0)[:2], (part, replaced), strict=True):
+    for take, path in zip(
+        list_takes(load_campaign(described / "small.toml"), seed=0)[:2], (part, replaced), strict=True
+    ):
         old = [file.read_bytes() for file in (path, truth_path(path))]
         path.unlink()
         truth_path(path).unlink()

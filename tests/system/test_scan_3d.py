@@ -151,8 +151,10 @@ def test_a_scan_holds_the_centre_lines_that_the_twin_simulates(served, folder, b
         assert len(scan) == COUNT and not scan.has_image.any() and not simulated.has_image.any()
         # The encoder counts the stage's steps.
         assert np.array_equal(scan.encoder, np.round(scan.stage_mm / RESOLUTION_MM))
-        apart = np.concatenate([scan.seen(k).centre_px - simulated.seen(k).centre_px for k in range(COUNT)])
-        lit = np.concatenate([scan.seen(k).status == StripeStatus.OK for k in range(COUNT)])
+        apart = np.concatenate(
+            [scan.read_observation(k).centre_px - simulated.read_observation(k).centre_px for k in range(COUNT)]
+        )
+        lit = np.concatenate([scan.read_observation(k).status == StripeStatus.OK for k in range(COUNT)])
         assert seen.found == lit.sum() and lit.mean() > 0.3 and np.isfinite(apart).mean() > 0.9 * lit.mean()
         # Steps of 1/16 px, and the noise of both images: about 0.1 px each on a stripe some pixels wide.
         assert abs(np.nanmedian(apart)) <= 1 / 16 and np.nanquantile(np.abs(apart), 0.9) < 0.5
@@ -165,7 +167,7 @@ def test_a_scan_holds_the_centre_lines_that_the_twin_simulates(served, folder, b
         camera.start()
         for k in range(COUNT):
             frame = camera.grab(1.0)
-            assert np.array_equal(frame.seen.centre_px, scan.seen(k).centre_px, equal_nan=True)
+            assert np.array_equal(frame.seen.centre_px, scan.read_observation(k).centre_px, equal_nan=True)
             assert frame.encoder == scan.encoder[k]
         with pytest.raises(HardwareError, match="where an image is needed"):
             _ = frame.image

@@ -176,18 +176,18 @@ def test_the_motion_lies_in_the_middle_of_the_travel_or_where_it_is_wanted(serve
     assert served.track.start_mm == pytest.approx((750 - 8) / 2)
     assert served.controller.state().position_mm == pytest.approx(served.track.start_mm, abs=750)
     assert served.track.offset_mm == pytest.approx(served.track.start_mm + 4)
-    track = Track.on(sensor.stage, board.motion, start_mm=20.0)
+    track = Track.place(sensor.stage, board.motion, start_mm=20.0)
     shots = [track.shot(position_mm, "laser") for position_mm in (20.0, 24.0, 26.0, 40.0)]
     assert [shot.stage_mm for shot in shots] == [-4, 0, 2, 16]
     assert [shot.travelled_mm for shot in shots] == [-4, 0.5, 2.25, 16]
     back = board.motion.model_copy(update={"start_mm": 4.0, "step_mm": -4.0, "position_errors_mm": (0.0, 0.5, 1.0)})
-    assert Track.on(sensor.stage, back).start_mm == pytest.approx((750 + 8) / 2)
-    assert Track.on(sensor.stage, back, start_mm=8.0).shot(0.0, "laser").travelled_mm == -4 + 1
+    assert Track.place(sensor.stage, back).start_mm == pytest.approx((750 + 8) / 2)
+    assert Track.place(sensor.stage, back, start_mm=8.0).shot(0.0, "laser").travelled_mm == -4 + 1
     for start_mm in (-1.0, 743.0):
         with pytest.raises(DescriptionError, match="would run from .* travel is 0 to 750 mm"):
-            Track.on(sensor.stage, board.motion, start_mm=start_mm)
+            Track.place(sensor.stage, board.motion, start_mm=start_mm)
     with pytest.raises(DescriptionError, match="travel is 0 to 750 mm"):
-        Track.on(sensor.stage, board.motion.model_copy(update={"count": 300, "position_errors_mm": ()}))
+        Track.place(sensor.stage, board.motion.model_copy(update={"count": 300, "position_errors_mm": ()}))
 
 
 def test_a_detector_of_more_bits_is_refused(board, sensor):

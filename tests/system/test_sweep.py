@@ -17,7 +17,7 @@ import pytest
 from tests.system.in_process import run_program, shared_workers
 from tests.waiting import within
 from twin import cli
-from twin.design.screening import parts, read_parts, screen
+from twin.design.screening import evaluate_study, list_parts, read_parts
 from twin.design.study import load_study
 from uwlts.model.library import load_sensor
 from uwlts.runtime.workers import Workers
@@ -68,7 +68,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory, workers: Workers) -> dict
     """All designs of the study, evaluated in one run."""
     folder = tmp_path_factory.mktemp("expected")
     (folder / "study.toml").write_text(STUDY, encoding="utf-8")
-    screen(load_study(folder / "study.toml"), folder / "out", workers)
+    evaluate_study(load_study(folder / "study.toml"), folder / "out", workers)
     return read_parts(folder / "out" / "screen")
 
 
@@ -91,7 +91,7 @@ def until(condition: Callable[[], bool], *, seconds: float = 120.0) -> None:
 
 def contents(out: Path) -> dict[str, int]:
     """Parts and when they were written."""
-    return {path.name: path.stat().st_mtime_ns for path in parts(out / "screen")}
+    return {path.name: path.stat().st_mtime_ns for path in list_parts(out / "screen")}
 
 
 def same(out: Path, expected: dict[str, np.ndarray]) -> None:
@@ -105,7 +105,7 @@ def same(out: Path, expected: dict[str, np.ndarray]) -> None:
 def test_a_stopped_sweep_goes_on_without_repeating_or_losing(study, tmp_path, expected, sent):
     out = tmp_path / "out"
     first = begun(study, out)
-    until(lambda: len(parts(out / "screen")) >= 5)
+    until(lambda: len(list_parts(out / "screen")) >= 5)
     first.send_signal(sent)
     _, said = first.communicate(timeout=60)
     kept = contents(out)
@@ -159,7 +159,7 @@ def _scene(folder: Path) -> Path:
 def test_two_machines_share_a_study(study, tmp_path, expected):
     out = tmp_path / "out"
     first = begun(study, out, "--workers", "1")
-    until(lambda: len(parts(out / "screen")) >= 1)
+    until(lambda: len(list_parts(out / "screen")) >= 1)
     second = begun(study, out, "--workers", "1")
     for process in (first, second):
         _, said = process.communicate(timeout=200)
@@ -274,7 +274,7 @@ def test_a_cluster_that_loses_a_worker_loses_nothing(study, tmp_path, expected):
         with Client(address, timeout=60, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=60)
         sweeping = begun(study, out, "--scheduler", address)
-        until(lambda: len(parts(out / "screen")) >= 5)
+        until(lambda: len(list_parts(out / "screen")) >= 5)
         workers[0].kill()
         _, said = sweeping.communicate(timeout=200)
     assert sweeping.returncode == 0, said

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, image_of
-from twin.design.verification import _judged, _run, verify
-from twin.design.verification_scenes import STANDARD_DEPTHS, STEP_DEPTHS, TARGET_POSES, measured_range, recordings
+from twin.design.verification import _evaluate_points, _run, verify
+from twin.design.verification_scenes import (
+    STANDARD_DEPTHS,
+    STEP_DEPTHS,
+    TARGET_POSES,
+    find_measured_range,
+    plan_recordings,
+)
 from twin.scene.description import Scene
 from uwlts.errors import CalibrationError, DescriptionError, DesignError, EvaluationError
 from uwlts.model.placement import camera_from_object
@@ -71,7 +77,7 @@ def pixels_in_air(sensor: Sensor, points: np.ndarray) -> np.ndarray:
 
 
 def test_the_marks_are_in_view_at_every_pose_of_the_target(design):
-    target = recordings(design, "water", reflectance=0.5).target
+    target = plan_recordings(design, "water", reflectance=0.5).target
     plate, lattice = target.scene.objects[0], target.scene.target
     assert target.sensor.medium(target.scene.medium).kind == "air" and not target.scene.window_mounted
     steps = np.array([(0, 0), lattice["marker_x"], lattice["marker_y"]])
@@ -87,7 +93,7 @@ def test_the_marks_are_in_view_at_every_pose_of_the_target(design):
 
 
 def test_circles_are_neither_too_small_nor_out_of_proportion(design):
-    target = recordings(design, "water", reflectance=0.5).target
+    target = plan_recordings(design, "water", reflectance=0.5).target
     plate, pose, camera = target.scene.objects[0], camera_from_object(design), design.camera
     depths = pose[2, 3] + pose[2, 2] * origins(target.scene)
     size_px = plate.diameter_mm * camera.focal_length_px() / depths
@@ -98,9 +104,9 @@ def test_circles_are_neither_too_small_nor_out_of_proportion(design):
 
 
 def test_standards_stay_in_the_measuring_volume(design):
-    planned = recordings(design, "water", reflectance=0.3)
+    planned = plan_recordings(design, "water", reflectance=0.3)
     standard, step = planned.standard.scene, planned.step.scene
-    near, far = measured_range(design, design.medium("water"))
+    near, far = find_measured_range(design, design.medium("water"))
     window = design.camera.window
     pose = camera_from_object(design)
     outside = pose[2, 3] + pose[2, 2] * np.array([near, far]) - window.distance_mm - window.thickness_mm
@@ -118,8 +124,8 @@ def test_standards_stay_in_the_measuring_volume(design):
 
 def test_the_line_is_in_view_at_both_ends_and_the_plate_holds_it(pinhole):
     water, camera = pinhole.medium("water"), pinhole.camera
-    plate = recordings(pinhole, "water", reflectance=0.5).standard.scene.objects[0]
-    near, far = measured_range(pinhole, water)
+    plate = plan_recordings(pinhole, "water", reflectance=0.5).standard.scene.objects[0]
+    near, far = find_measured_range(pinhole, water)
     x, y, _ = plate.position_mm
     size = np.array([camera.width_px, camera.height_px])
     seen = image_of(pinhole, water, np.array([(x, y, near), (x, y, far)]))
@@ -131,22 +137,22 @@ def test_the_line_is_in_view_at_both_ends_and_the_plate_holds_it(pinhole):
 
 
 def test_without_refraction_the_target_stands_in_the_medium_of_use(thesis):
-    planned = recordings(thesis, "air", reflectance=0.5)
+    planned = plan_recordings(thesis, "air", reflectance=0.5)
     assert planned.step is None and planned.target.scene.window_mounted
     bare = altered(thesis, {"camera": {"window": {"mounted": False}}})
-    assert not recordings(bare, "air", reflectance=0.5).target.scene.window_mounted
+    assert not plan_recordings(bare, "air", reflectance=0.5).target.scene.window_mounted
 
 
 def test_a_sensor_without_air_is_calibrated_in_air_all_the_same(thesis):
     media = {"harbour": thesis.media["water"], "air": thesis.media["water"]}
-    planned = recordings(thesis.model_copy(update={"media": media}), "harbour", reflectance=0.5)
+    planned = plan_recordings(thesis.model_copy(update={"media": media}), "harbour", reflectance=0.5)
     assert planned.target.sensor.medium(planned.target.scene.medium).kind == "air"
     assert planned.standard.sensor.media == media
 
 
 def test_exposures_are_free_in_the_calibration_only(thesis):
     fixed = altered(thesis, {"exposure": {"laser_ms": 3.0}})
-    planned = recordings(fixed, "water", reflectance=0.5)
+    planned = plan_recordings(fixed, "water", reflectance=0.5)
     assert planned.standard.sensor.exposure.laser_ms == 3.0
     assert planned.step.sensor.exposure.laser_ms == planned.target.sensor.exposure.laser_ms == "auto"
 
@@ -199,7 +205,7 @@ def test_scatter_error_and_length_of_known_profiles_are_found():
     known = {2: (0.02, 0.03), 0: (0.05, -0.01)}
     points = np.vstack([profile(rng, frame, count, scatter=s, error=e) for frame, (s, e) in known.items()])
     points[100, 2] += 3.0  # one outlier
-    found = _judged(points, np.array([-120.0, -60.0, 10.0]))
+    found = _evaluate_points(points, np.array([-120.0, -60.0, 10.0]))
     assert found.z_mm.tolist() == [-10.0, 60.0, 120.0]
     assert found.points.tolist() == [count, 0, count]
     for place, frame in ((0, 2), (2, 0)):
@@ -215,7 +221,7 @@ def test_scatter_error_and_length_of_known_profiles_are_found():
 def test_a_cloud_with_too_few_points_everywhere_is_refused():
     points = profile(np.random.default_rng(1), 0, 19, scatter=0.02, error=0.0)
     with pytest.raises(EvaluationError, match="19 points at 2 depths"):
-        _judged(points, np.array([-10.0, 10.0]))
+        _evaluate_points(points, np.array([-10.0, 10.0]))
 
 
 # --- the whole way ----------------------------------------------------------------------------------------------------

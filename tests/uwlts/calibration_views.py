@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.oracles.fermat import directions_seen, plate
 from uwlts.calibration.camera.target_images import TargetImage
-from uwlts.model.library import find, read_table
+from uwlts.model.library import find_description, read_table
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
 
@@ -43,7 +43,7 @@ class Lens:
 
 def built_sensor() -> Sensor:
     """The thesis's sensor with the deviations from its drawings that real ones have."""
-    return Sensor.model_validate(read_table(find("thesis-as-built", "sensors"), "sensors"))
+    return Sensor.model_validate(read_table(find_description("thesis-as-built", "sensors"), "sensors"))
 
 
 def lens_of(sensor: Sensor) -> Lens:

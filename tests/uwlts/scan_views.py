@@ -10,7 +10,7 @@ from uwlts.calibration.joint.gathering import ScanStripes
 from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
-from uwlts.optics.brightness import moved_by_blur_px
+from uwlts.optics.brightness import estimate_blur_shift_px
 
 VIEW = ViewMedium(True, 0)
 SLOPE = np.array([0.004, -0.003])
@@ -95,7 +95,9 @@ def scan_of(sensor: Sensor, bodies, artefact, *, stage_mm, count=200, noise=NONE
         pixels[:, 0],
         pixels[:, 1],
         width,
-        moved_by_blur_px(frames, np.rint(pixels[:, 0]).astype(int), pixels[:, 1], np.concatenate(brightness), width),
+        estimate_blur_shift_px(
+            frames, np.rint(pixels[:, 0]).astype(int), pixels[:, 1], np.concatenate(brightness), width
+        ),
         np.zeros(len(pixels)),
         np.asarray(stage_mm, dtype=float),
         np.array([1.0, 0.0, 0.0]),

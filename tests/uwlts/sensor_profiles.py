@@ -11,12 +11,12 @@ from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
 from tests.uwlts.mount_views import MOUNT, SPHERE_MM
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, stored_estimate
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, read_stored_estimate
 from uwlts.calibration.mount.sensor import CapturedProfiles
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.model.sensor import Sensor
-from uwlts.model.stripe import pixels_of
+from uwlts.model.stripe import stack_pixels
 
 RADIUS_MM = 19.05
 LINES = np.arange(120, 1160, 8)
@@ -27,7 +27,7 @@ def joint_estimate(thesis: Sensor) -> StoredEstimate:
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
     series = target_series(built_sensor(), medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise)
     options = CalibrationOptions(poses="stage", correct_circles=False)
-    return stored_estimate(solve_jointly(gathered(thesis, [series]), options=options).calibration, thesis, MEDIUM)
+    return read_stored_estimate(solve_jointly(gathered(thesis, [series]), options=options).calibration, thesis, MEDIUM)
 
 
 def largest_parts(known, by, count=3):
@@ -57,7 +57,7 @@ def captured_by(
         found = stripe_of_sphere(known, values, place)
         stripes.append(found + np.column_stack([np.zeros(len(found)), noise_px * rng.standard_normal(len(found))]))
         platforms.append(base_sensor @ np.linalg.inv(MOUNT))
-    profiles = [known.points_by(*each.T)[0] for each in stripes]
+    profiles = [known.triangulate(*each.T)[0] for each in stripes]
     return CapturedProfiles(profiles, stripes, np.arange(poses, dtype=float), np.array(platforms), None, known)
 
 
@@ -68,7 +68,7 @@ def stripe_of_sphere(known: StoredEstimate, values: np.ndarray, centre_mm: np.nd
     reach = np.arange(150.0, 900.0, 15.0)
 
     def points(line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
-        pixels = pixels_of(line, centre_px, stripe_along=known.calibration.stripe_along)
+        pixels = stack_pixels(line, centre_px, stripe_along=known.calibration.stripe_along)
         seen = parameters.stripe_points(values, known.view, pixels, across=0)
         assert seen is not None
         return (seen.points.T - frame[:3, 3]) @ frame[:3, :3]

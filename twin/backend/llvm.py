@@ -84,7 +84,7 @@ def prepare_llvm() -> LlvmLibrary:
 
 
 @contextmanager
-def threads_kept() -> Iterator[int]:
+def preserve_threads() -> Iterator[int]:
     """Provide the number of Dr.Jit's threads, and restore it afterwards."""
     import drjit as dr
 
@@ -109,7 +109,7 @@ def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
     chosen, faults = os.environ.get(VARIABLE), ""
     for path in [Path(chosen)] if chosen else list_candidates(folders):
         try:
-            library = examine(path)
+            library = check_library(path)
         except SetupError as error:
             faults += f"\n  {error}"
             continue
@@ -133,7 +133,7 @@ def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
     )
 
 
-def examine(path: Path) -> LlvmLibrary:
+def check_library(path: Path) -> LlvmLibrary:
     """Load a library and query its version, as the file name is not reliable.
 
     Raises

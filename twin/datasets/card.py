@@ -31,8 +31,8 @@ from twin.datasets.loading import CARD, CARD_FORMAT, CARD_VERSION, DataCard, Dat
 from twin.scene.paths import Value
 from uwlts._version import __version__
 from uwlts.files.json_files import write_model
-from uwlts.files.writing import sha256_of, written_aside
-from uwlts.pages.toolkit import BLUE, new_figure, plain_text, png_data_uri, render_page, svg_of, write_page
+from uwlts.files.writing import hash_file, write_atomically
+from uwlts.pages.toolkit import BLUE, figure_svg, new_figure, plain_text, png_data_uri, render_page, write_page
 
 README = "README.md"
 PAGE = "dataset.html"
@@ -90,10 +90,10 @@ def write_card(
         drawn={},
         status={},
         description=description.model_dump(mode="json"),
-        shards=tuple(Shard(name=path.name, split=own, frames=n, sha256=sha256_of(path)) for path, own, n in shards),
+        shards=tuple(Shard(name=path.name, split=own, frames=n, sha256=hash_file(path)) for path, own, n in shards),
     )
-    found = _collected(DataSet(folder, card, None, ("info", "status", *_Collected().quality)))
-    names = _stored(DataSet(folder, card, None, None))
+    found = _collect_statistics(DataSet(folder, card, None, ("info", "status", *_Collected().quality)))
+    names = _describe_storage(DataSet(folder, card, None, None))
     card = card.model_copy(
         update={
             "redrawn": len(found.redrawn),
@@ -102,8 +102,8 @@ def write_card(
             "status": {LineStatus(number).name.lower(): count for number, count in sorted(found.status.items())},
         }
     )
-    with written_aside(folder / README, overwrite=True) as aside:
-        aside.write_text(_markdown(card, description), encoding="utf-8")
+    with write_atomically(folder / README, overwrite=True) as aside:
+        aside.write_text(_format_markdown(card, description), encoding="utf-8")
     everything = DataSet(folder, card, None, ("image", "mask", "centre_px", "info"))
     write_page(folder / PAGE, _page(card, description, found, everything), overwrite=True)
     if "mask" in names:
@@ -113,11 +113,11 @@ def write_card(
     return card
 
 
-def _stored(samples: DataSet) -> list[str]:
+def _describe_storage(samples: DataSet) -> list[str]:
     return [name for name in samples[0] if name in MEANINGS]
 
 
-def _collected(samples: DataSet) -> _Collected:
+def _collect_statistics(samples: DataSet) -> _Collected:
     found = _Collected()
     for sample in samples:
         info = sample["info"]
@@ -143,9 +143,9 @@ def _summary(values: Sequence[Value]) -> dict[str, float | str]:
     return {"least": float(numbers.min()), "mean": float(numbers.mean()), "most": float(numbers.max())}
 
 
-def _markdown(card: DataCard, description: DataSetDescription) -> str:
+def _format_markdown(card: DataCard, description: DataSetDescription) -> str:
     splits = [f"| {split} | {card.scenes[split]} | {card.frames[split]} |" for split in SPLITS]
-    varied = [f"| `{path}` | {words} | {drawn} |" for path, words, drawn in _varied(card, description)]
+    varied = [f"| `{path}` | {words} | {drawn} |" for path, words, drawn in _describe_varied(card, description)]
     return "\n".join(
         [
             f"# {card.title}",
@@ -190,7 +190,7 @@ def _size(card: DataCard) -> str:
     return f"{card.image['width_px']} x {card.image['height_px']} px of {card.image['bits']} bit"
 
 
-def _varied(card: DataCard, description: DataSetDescription) -> list[tuple[str, str, str]]:
+def _describe_varied(card: DataCard, description: DataSetDescription) -> list[tuple[str, str, str]]:
     """Return path, distribution and drawn values of all varied paths as texts."""
     rows = []
     for path, distribution in description.vary.items():
@@ -237,7 +237,7 @@ def _page(card: DataCard, description: DataSetDescription, found: _Collected, sa
         notes=[card.notes] if card.notes else [],
         pictures=[_pictures(samples[int(place)], along=description.sensor.camera.stripe_along) for place in places],
         colours=[(str(mask.name).lower(), "#" + bytes(colour).hex()) for mask, colour in _OVERLAY.items()],
-        varied=[list(row) for row in _varied(card, description)],
+        varied=[list(row) for row in _describe_varied(card, description)],
         drawn=_histograms({path: values for path, values in found.drawn.items() if path in description.vary}),
         quality=_histograms({name: values for name, values in found.quality.items() if values}),
         status=[[name, f"{count}", f"{100 * count / lines:.1f} %"] for name, count in status.items()],
@@ -292,4 +292,4 @@ def _histograms(drawn: dict[str, list[Value]] | dict[str, list[float]]) -> Marku
             axes.hist(np.array(values, float), bins=24, color=BLUE)
     for axes in all_axes[len(drawn) :]:
         axes.set_visible(False)
-    return svg_of(figure)
+    return figure_svg(figure)

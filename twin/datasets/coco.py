@@ -14,7 +14,7 @@ import numpy as np
 
 from twin.datasets.data_set import SPLITS, Mask
 from twin.datasets.loading import DataCard, DataSet
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 
 
 def coco_path(folder: Path, split: str) -> Path:
@@ -29,7 +29,7 @@ def write_coco(folder: Path, card: DataCard) -> list[Path]:
     """
     paths = [coco_path(folder, split) for split in SPLITS if card.frames[split]]
     for path, split in zip(paths, (split for split in SPLITS if card.frames[split]), strict=True):
-        with written_aside(path, overwrite=True) as aside, open(aside, "w", encoding="utf-8") as file:
+        with write_atomically(path, overwrite=True) as aside, open(aside, "w", encoding="utf-8") as file:
             head = {
                 "info": {"description": card.title, "version": card.versions.get("uwlts", "")},
                 "licenses": [{"id": 1, "name": card.licence, "url": ""}],
@@ -68,13 +68,13 @@ def _annotations(folder: Path, card: DataCard, split: Any) -> Iterator[dict[str,
             rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
             first = int(columns[0]), int(rows[0])
             box = [*first, int(columns[-1]) + 1 - first[0], int(rows[-1]) + 1 - first[1]]
-            code = {"size": list(mask.shape), "counts": encoded(mask)}
+            code = {"size": list(mask.shape), "counts": encode_mask(mask)}
             where = {"image_id": image, "category_id": int(kind), "iscrowd": 1}
             yield {"id": count} | where | {"segmentation": code, "bbox": box, "area": int(mask.sum())}
             count += 1
 
 
-def encoded(mask: np.ndarray) -> str:
+def encode_mask(mask: np.ndarray) -> str:
     """Return the compressed run-length encoding of a mask (H, W), bool, as in the COCO API's ``maskApi.c``.
 
     Runs are counted along columns and start with unset pixels. From the third run on, the difference from the run two

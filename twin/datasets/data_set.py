@@ -12,11 +12,11 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 from scipy.special import ndtr, ndtri
 
 from twin.options import Effects, Flaws, Options
-from twin.scene.description import AnyMotion, Printed, Scene, load_scene
+from twin.scene.description import AnyMotion, PrintedPlate, Scene, load_scene
 from twin.scene.paths import Value, value_at
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import is_regular_file
-from uwlts.model.library import find, load_sensor, read_table, validated
+from uwlts.model.library import find_description, load_sensor, read_table, validate_description
 from uwlts.model.sensor import Description, Positive, Sensor
 
 FOLDER = "datasets"
@@ -68,10 +68,10 @@ detection requires 5 to 6 (A. Rose, J. Opt. Soc. Am. 38, 196, 1948)."""
 
 
 class Distribution(Description, ABC):
-    """Base of all distributions; `at` is the inverse of the cumulative distribution function."""
+    """Base of all distributions; `quantile` is the inverse of the cumulative distribution function."""
 
     @abstractmethod
-    def at(self, share: float) -> Value:
+    def quantile(self, share: float) -> Value:
         """Return the quantile of a probability from 0 to 1."""
 
 
@@ -81,7 +81,7 @@ class Constant(Distribution):
     kind: Literal["constant"]
     value: Value
 
-    def at(self, share: float) -> Value:
+    def quantile(self, share: float) -> Value:
         """Return the value."""
         return self.value
 
@@ -99,7 +99,7 @@ class OneOf(Distribution):
             raise ValueError(f"{len(self.weights)} weights for {len(self.values)} values: give one for each")
         return self
 
-    def at(self, share: float) -> Value:
+    def quantile(self, share: float) -> Value:
         """Return the value at a cumulative probability."""
         weights = self.weights or (1.0,) * len(self.values)
         left = share * math.fsum(weights)
@@ -128,7 +128,7 @@ class Uniform(Between):
 
     kind: Literal["uniform"]
 
-    def at(self, share: float) -> float:
+    def quantile(self, share: float) -> float:
         """Return the quantile of a probability."""
         return self.least + share * (self.most - self.least)
 
@@ -144,7 +144,7 @@ class LogUniform(Between):
             raise ValueError(f"least of a log_uniform distribution is {self.least:g}; it must be above 0")
         return self
 
-    def at(self, share: float) -> float:
+    def quantile(self, share: float) -> float:
         """Return the quantile of a probability."""
         return self.least * (self.most / self.least) ** share
 
@@ -168,7 +168,7 @@ class Normal(Distribution):
             )
         return self
 
-    def at(self, share: float) -> float:
+    def quantile(self, share: float) -> float:
         """Return the quantile of a probability."""
         low, high = self._ends()
         return float(self.mean + self.std * ndtri(low + share * (high - low)))
@@ -261,7 +261,7 @@ class DataSetDescription(Description):
         whole = set()
         for path, distribution in self.vary.items():
             found = self._base_value(path)
-            ends = [distribution.at(share) for share in (1e-3, 0.5)]
+            ends = [distribution.quantile(share) for share in (1e-3, 0.5)]
             if isinstance(found, int) and not isinstance(found, bool):
                 whole.add(path)
             if isinstance(found, float | int) and not all(isinstance(end, float | int) for end in ends):
@@ -270,7 +270,7 @@ class DataSetDescription(Description):
             if path.partition(".")[2] in _ONE_FOR_ALL:
                 raise ValueError(f"vary '{path}': all frames of a data set have the same size; make two data sets")
         if "target" in self.labels:
-            printed = [thing for thing in self.scene.objects if isinstance(thing, Printed)]
+            printed = [thing for thing in self.scene.objects if isinstance(thing, PrintedPlate)]
             if not printed:
                 raise ValueError("the label 'target' is for scenes with a calibration target: leave it out")
             varied = {path.rpartition(".")[2] for path in self.vary}
@@ -292,11 +292,11 @@ class DataSetDescription(Description):
     def options(self, *, seed: int, strengths: dict[str, Value] | None = None) -> Options:
         """Return the options for rendering a scene; ``strengths`` are the drawn strengths of effects by name."""
         drawn = [f"{name}={value}" for name, value in (strengths or {}).items()]
-        return Options(self.spp, seed, Effects().without(*self.without), Flaws.of(*self.effects, *drawn))
+        return Options(self.spp, seed, Effects().remove(*self.without), Flaws.parse(*self.effects, *drawn))
 
-    def drawn(self, path: str, share: float) -> Value:
+    def draw_value(self, path: str, share: float) -> Value:
         """Return the quantile of a path's distribution at a probability from 0 to 1, rounded for integers."""
-        value = self.vary[path].at(share)
+        value = self.vary[path].quantile(share)
         return round(value) if path in self._whole and not isinstance(value, str) else value
 
     def _base_value(self, path: str) -> Value | None:
@@ -312,7 +312,7 @@ class DataSetDescription(Description):
             case "scene":
                 return value_at(self.scene, rest, f"vary '{path}'", called="scene")
             case "effects":
-                strength = getattr(Flaws.of(rest), rest.replace("-", "_"))
+                strength = getattr(Flaws.parse(rest), rest.replace("-", "_"))
                 if isinstance(strength, bool):
                     raise DescriptionError(f"vary '{path}': {rest} does not have a strength; name it in effects")
                 return strength
@@ -332,11 +332,11 @@ def load_description(
     if isinstance(given, DataSetDescription):
         path, table = Path("the description"), given.model_dump()
     else:
-        path = find(given, FOLDER)
+        path = find_description(given, FOLDER)
         table = dict(read_table(path, FOLDER))
         for key in ("sensor", "as_built", "scene"):
             beside = path.parent / str(table.get(key, ""))
             if beside.suffix == ".toml" and is_regular_file(beside):
                 table[key] = str(beside)
     table |= {key: value for key, value in (("scenes", scenes), ("seed", seed)) if value is not None}
-    return validated(DataSetDescription, table, path)
+    return validate_description(DataSetDescription, table, path)

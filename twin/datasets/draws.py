@@ -13,7 +13,7 @@ from twin.options import Options
 from twin.scene.description import Scene
 from twin.scene.paths import Value, with_values
 from uwlts.errors import Error
-from uwlts.model.library import validated
+from uwlts.model.library import validate_description
 from uwlts.model.sensor import Sensor
 
 _GOLDEN = (5**0.5 - 1) / 2
@@ -39,7 +39,7 @@ class DrawnScene:
     options: Options
 
 
-def split_of(description: DataSetDescription, scene: int) -> Split:
+def choose_split(description: DataSetDescription, scene: int) -> Split:
     """Return the split of a scene; it does not depend on the number of scenes."""
     start = np.random.default_rng([description.seed, *b"splits"]).random()
     place = (start + scene * _GOLDEN) % 1.0
@@ -58,19 +58,21 @@ def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0)
         return float(np.random.default_rng([description.seed, scene, attempt, frame, *path.encode()]).random())
 
     motion = description.scene.motion
-    values = {path: description.drawn(path, share(path)) for path in description.vary if path != EXPOSURE}
+    values = {path: description.draw_value(path, share(path)) for path in description.vary if path != EXPOSURE}
     by_root: dict[str, dict[str, Value]] = {"sensor": {}, "as_built": {}, "scene": {}, "effects": {}}
     for path, value in values.items():
         root, _, rest = path.partition(".")
         by_root[root][rest] = value
     source = f"scene {scene} of '{description.title}'"
     try:
-        described = _changed(description.sensor, by_root["sensor"], source)
-        as_built = _changed(description.as_built or description.sensor, by_root["sensor"], source)
-        as_built = _changed(as_built, by_root["as_built"], source)
+        described = _apply_values(description.sensor, by_root["sensor"], source)
+        as_built = _apply_values(description.as_built or description.sensor, by_root["sensor"], source)
+        as_built = _apply_values(as_built, by_root["as_built"], source)
         table = description.scene.model_dump()
         drawn = (
-            validated(Scene, with_values(table, by_root["scene"]), source) if by_root["scene"] else description.scene
+            validate_description(Scene, with_values(table, by_root["scene"]), source)
+            if by_root["scene"]
+            else description.scene
         )
         seed = int(np.random.SeedSequence([description.seed, scene, attempt]).generate_state(1)[0])
         options = description.options(seed=seed, strengths=by_root["effects"])
@@ -80,11 +82,11 @@ def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0)
     motion = drawn.motion
     exposures = (1.0,) * motion.images()
     if EXPOSURE in description.vary:
-        exposures = tuple(float(description.drawn(EXPOSURE, share(EXPOSURE, k))) for k in range(len(exposures)))
+        exposures = tuple(float(description.draw_value(EXPOSURE, share(EXPOSURE, k))) for k in range(len(exposures)))
     return DrawnScene(
-        scene, attempt, split_of(description, scene), values, exposures, described, as_built, drawn, options
+        scene, attempt, choose_split(description, scene), values, exposures, described, as_built, drawn, options
     )
 
 
-def _changed(sensor: Sensor, values: dict[str, Value], source: str) -> Sensor:
-    return validated(Sensor, with_values(sensor.model_dump(), values), source) if values else sensor
+def _apply_values(sensor: Sensor, values: dict[str, Value], source: str) -> Sensor:
+    return validate_description(Sensor, with_values(sensor.model_dump(), values), source) if values else sensor

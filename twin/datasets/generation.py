@@ -20,21 +20,21 @@ from pydantic import JsonValue
 
 from twin.datasets.card import PAGE, README, write_card
 from twin.datasets.data_set import SPLITS, DataSetDescription, Split, load_description
-from twin.datasets.draws import DrawnScene, draw_scene, split_of
-from twin.datasets.labels import labelled
+from twin.datasets.draws import DrawnScene, choose_split, draw_scene
+from twin.datasets.labels import make_labels
 from twin.datasets.loading import CARD
-from twin.datasets.shards import SUFFIXES, Sample, written_shard
+from twin.datasets.shards import SUFFIXES, Sample, open_shard
 from twin.options import CPU, Variant, use_variant
-from twin.recording.campaigns import PLAN, keep_to_plan, made_folder
+from twin.recording.campaigns import PLAN, keep_to_plan, make_folder
 from uwlts.errors import DescriptionError, DesignError
-from uwlts.files.inputs import inputs_kept
-from uwlts.files.writing import OtherWriterError, one_writer, refuse_other_writer
+from uwlts.files.inputs import protect_inputs
+from uwlts.files.writing import OtherWriterError, lock_output, refuse_other_writer
 from uwlts.model.placement import camera_from_object
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.runtime.workers import work_through
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.workers import run_jobs
 
 if TYPE_CHECKING:
-    from twin.recording.studio import Exposed, Studio
+    from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
     from twin.scene.motion import Shot
 
 MOST_ATTEMPTS = 20
@@ -47,7 +47,7 @@ _OUTPUT = re.compile(
 _UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.(tar|h5|json|md|html)")
 
 
-@inputs_kept()
+@protect_inputs()
 def dataset(
     description: str | Path | DataSetDescription,
     *,
@@ -57,7 +57,7 @@ def dataset(
     workers: int | None = None,
     overwrite: bool = False,
     variant: Variant = CPU,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> Path:
     """Render a data set of labelled images, for training and testing, from a description of its random variations.
 
@@ -106,8 +106,8 @@ def dataset(
     draw_scene(described, 0)
     jobs = _jobs(described, folder, variant)
     plan = _plan(described, variant)
-    made_folder(folder)
-    with one_writer(folder / PLAN, patience_s=_PATIENCE_S):
+    make_folder(folder)
+    with lock_output(folder / PLAN, patience_s=_PATIENCE_S):
         _prepare(folder, jobs, plan, overwrite=overwrite)
     waiting = [job for job in jobs if not job.path.is_file()]
     total = sum(job.frames for job in jobs)
@@ -122,8 +122,8 @@ def dataset(
     # First skip shards that other runs are writing, then wait for them and render those that failed.
     for patience_s in (0.0, math.inf):
         waiting = [job for job in waiting if not job.path.is_file()]
-        work_through(partial(_render_shard, patience_s), waiting, workers=workers, on_message=count)
-    with one_writer(folder / CARD, patience_s=math.inf):
+        run_jobs(partial(_render_shard, patience_s), waiting, workers=workers, on_message=count)
+    with lock_output(folder / CARD, patience_s=math.inf):
         if not (folder / CARD).is_file():
             write_card(folder, described, [(job.path, job.split, job.frames) for job in jobs], plan)
     return folder
@@ -148,7 +148,7 @@ def _jobs(description: DataSetDescription, folder: Path, variant: str) -> list[_
     """Return all shards, sorted by first scene."""
     members: dict[Split, list[int]] = {split: [] for split in SPLITS}
     for scene in range(description.scenes):
-        members[split_of(description, scene)].append(scene)
+        members[choose_split(description, scene)].append(scene)
     suffix, size = SUFFIXES[description.format], description.scenes_per_shard
     jobs = [
         _Job(
@@ -198,7 +198,7 @@ def _render_shard(patience_s: float, job: _Job, report: Callable[[None], None]) 
     The shard is skipped if another process is still writing it after ``patience_s``.
     """
     try:
-        with one_writer(job.path, patience_s=patience_s):
+        with lock_output(job.path, patience_s=patience_s):
             if not job.path.is_file():
                 _render(job, report)
                 return
@@ -217,26 +217,26 @@ def _render(job: _Job, report: Callable[[None], None]) -> None:
     dr.set_thread_count(1)
     # Mitsuba warns of shear in every scene, because of rounding errors of rotated cylinders.
     mi.set_log_level(mi.LogLevel.Error)
-    with written_shard(job.path, job.description.format, frames=job.frames) as writer:
+    with open_shard(job.path, job.description.format, frames=job.frames) as writer:
         for scene in job.scenes:
             drawn, studio = _measurable(job.description, scene)
             for index, shot in enumerate(drawn.scene.motion.shots()):
-                taken = studio.exposed(shot, index, exposure=drawn.exposures[index])
-                arrays = labelled(studio, shot, taken, job.description.labels)
-                info = _known(job.description, drawn, studio, shot, taken, index)
+                taken = studio.expose(shot, index, exposure=drawn.exposures[index])
+                arrays = make_labels(studio, shot, taken, job.description.labels)
+                info = _make_frame_metadata(job.description, drawn, studio, shot, taken, index)
                 writer.add(Sample(f"{scene:06d}-{index:02d}", taken.image, arrays, info))
                 report(None)
 
 
-def _measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene, Studio]:
+def _measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene, SensorSimulator]:
     """Draw a scene until the sensor can measure it; return the scene and its studio."""
-    from twin.recording.studio import Studio
+    from twin.recording.sensor_simulator import SensorSimulator
 
     why = None
     for attempt in range(MOST_ATTEMPTS):
         drawn = draw_scene(description, scene, attempt=attempt)
         try:
-            return drawn, Studio(drawn.as_built, drawn.scene, drawn.options, probe="middle")
+            return drawn, SensorSimulator(drawn.as_built, drawn.scene, drawn.options, probe="middle")
         except DesignError as error:
             why = error
     raise DesignError(
@@ -245,8 +245,13 @@ def _measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene
     ) from why
 
 
-def _known(
-    description: DataSetDescription, drawn: DrawnScene, studio: Studio, shot: Shot, taken: Exposed, index: int
+def _make_frame_metadata(
+    description: DataSetDescription,
+    drawn: DrawnScene,
+    studio: SensorSimulator,
+    shot: Shot,
+    taken: SimulatedImage,
+    index: int,
 ) -> dict[str, Any]:
     """Return the metadata of a frame as a JSON table."""
     known: dict[str, Any] = {

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from twin.datasets.data_set import FAINT_BELOW, Label, LineStatus, Mask
-from twin.scene.description import Printed
+from twin.scene.description import PrintedPlate
 from uwlts.model.sensor import Detector
 
 if TYPE_CHECKING:
-    from twin.recording.studio import Exposed, Studio
+    from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
     from twin.scene.motion import Shot
 
 _WINDOW_PX = 96
@@ -46,9 +46,11 @@ MEANINGS = {
 """Meaning of the arrays of a sample."""
 
 
-def labelled(studio: Studio, shot: Shot, taken: Exposed, wanted: tuple[Label, ...]) -> dict[str, np.ndarray]:
+def make_labels(
+    studio: SensorSimulator, shot: Shot, taken: SimulatedImage, wanted: tuple[Label, ...]
+) -> dict[str, np.ndarray]:
     """Return the wanted arrays of a shot by name."""
-    from twin.recording.frame_truth import seen_surfaces
+    from twin.recording.frame_truth import find_visible_surfaces
 
     arrays: dict[str, np.ndarray] = {}
     noise = noise_std_e(taken, studio.sensor.detector)
@@ -58,33 +60,35 @@ def labelled(studio: Studio, shot: Shot, taken: Exposed, wanted: tuple[Label, ..
         names["points"] = ("point_mm", "normal", "object")
         arrays |= {name: lines[name] for label, group in names.items() if label in wanted for name in group}
     if "masks" in wanted:
-        arrays["mask"] = mask_of(
+        arrays["mask"] = make_mask(
             taken,
             noise,
             saturation=studio.sensor.detector.full_scale_dn(),
             along_width=studio.sensor.camera.stripe_along == "width",
         )
     if "light" in wanted:
-        light = np.stack([taken.direct, taken.scattered_once, taken.longer_ways, taken.particles, taken.even])
+        light = np.stack([taken.direct, taken.scattered_once, taken.indirect, taken.particles, taken.even])
         arrays["light_e"] = np.minimum(light, _LARGEST_HALF).astype(np.float16)
     if "target" in wanted:
         arrays["target_px"] = _target_points(studio, shot)
     if "depth" in wanted:
-        depth, number = seen_surfaces(studio.renderer, studio.pose(shot))
+        depth, number = find_visible_surfaces(studio.renderer, studio.pose(shot))
         arrays |= {"depth_mm": depth, "object_map": np.where(number < 0, NO_OBJECT, number).astype(np.uint8)}
     return arrays
 
 
-def _line_labels(studio: Studio, shot: Shot, taken: Exposed, noise: np.ndarray) -> dict[str, np.ndarray]:
+def _line_labels(
+    studio: SensorSimulator, shot: Shot, taken: SimulatedImage, noise: np.ndarray
+) -> dict[str, np.ndarray]:
     """Return all labels of the profile lines of a shot."""
-    from twin.recording.frame_truth import brightest, crossings, lit_dimmest_first, no_stripe
+    from twin.recording.frame_truth import find_crossings, make_empty_truth, select_brightest, sort_lit_crossings
 
     camera, detector = studio.sensor.camera, studio.sensor.detector
-    count, truth, number = camera.lines(), no_stripe(camera.lines()), np.full(camera.lines(), -1, np.int16)
+    count, truth, number = camera.lines(), make_empty_truth(camera.lines()), np.full(camera.lines(), -1, np.int16)
     status = np.full(count, LineStatus.LASER_OFF, np.uint8)
     if studio.shows(shot, "laser"):
-        found = crossings(studio.renderer, studio.pose(shot), travel=studio.travel(shot))
-        truth, order = brightest(found, count), lit_dimmest_first(found)
+        found = find_crossings(studio.renderer, studio.pose(shot), travel=studio.travel(shot))
+        truth, order = select_brightest(found, count), sort_lit_crossings(found)
         number[found.line[order]] = found.thing[order]
         status[:] = LineStatus.NOT_CROSSED
         status[found.line] = LineStatus.SHADOWED
@@ -99,17 +103,17 @@ def _line_labels(studio: Studio, shot: Shot, taken: Exposed, noise: np.ndarray) 
     return {name: values.astype(np.float32) for name, values in floats.items()} | {"status": status, "object": number}
 
 
-def _target_points(studio: Studio, shot: Shot) -> np.ndarray:
+def _target_points(studio: SensorSimulator, shot: Shot) -> np.ndarray:
     """Return the image points (N, 2), float32, of the scene's first calibration target."""
-    from twin.recording.frame_truth import image_points
+    from twin.recording.frame_truth import project_points
 
     things = zip(studio.scene.objects, studio.scene.object_poses(), strict=True)
-    plate, pose = next((thing, pose) for thing, pose in things if isinstance(thing, Printed))
+    plate, pose = next((thing, pose) for thing, pose in things if isinstance(thing, PrintedPlate))
     points = plate.described_target().points_mm @ pose[:3, :3].T + pose[:3, 3]
-    return image_points(studio.renderer, studio.pose(shot), points).astype(np.float32)
+    return project_points(studio.renderer, studio.pose(shot), points).astype(np.float32)
 
 
-def noise_std_e(taken: Exposed, detector: Detector) -> np.ndarray:
+def noise_std_e(taken: SimulatedImage, detector: Detector) -> np.ndarray:
     """Return the standard deviation (H, W) in electrons of the temporal noise of pixels (EMVA 1288 release 4, Eq. 13).
 
     It includes shot noise of light and dark current, read noise, and quantisation with a variance of 1/12 of a grey
@@ -203,14 +207,14 @@ def stripe_quality(
     )
 
 
-def mask_of(taken: Exposed, noise: np.ndarray, *, saturation: int, along_width: bool) -> np.ndarray:
+def make_mask(taken: SimulatedImage, noise: np.ndarray, *, saturation: int, along_width: bool) -> np.ndarray:
     """Return the bits of `Mask` (H, W), uint8; ``noise`` (H, W) is the pixels' standard deviation in electrons."""
     brightest = taken.direct.max(axis=0 if along_width else 1, keepdims=True)
     bits = {
         Mask.STRIPE: taken.direct >= np.maximum(math.exp(-2) * brightest, 1.0),
         Mask.SATURATED: taken.image >= saturation,
         Mask.HAZE: taken.scattered_once > noise,
-        Mask.SECONDARY: taken.longer_ways > noise,
+        Mask.SECONDARY: taken.indirect > noise,
         Mask.PARTICLES: taken.particles > noise,
     }
     return sum((np.uint8(bit) * held for bit, held in bits.items()), np.zeros(noise.shape, np.uint8))

@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 
 from uwlts.errors import CaptureError
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 
 Format = Literal["webdataset", "hdf5"]
 SUFFIXES: dict[Format, str] = {"webdataset": ".tar", "hdf5": ".h5"}
@@ -52,9 +52,9 @@ class ShardWriter(Protocol):
 
 
 @contextmanager
-def written_shard(path: Path, format: Format, *, frames: int) -> Iterator[ShardWriter]:
+def open_shard(path: Path, format: Format, *, frames: int) -> Iterator[ShardWriter]:
     """Open a shard with a number of frames; it appears at ``path`` if the body ends without an exception."""
-    with written_aside(path, overwrite=True) as aside:
+    with write_atomically(path, overwrite=True) as aside:
         match format:
             case "webdataset":
                 with tarfile.open(aside, "w", format=tarfile.USTAR_FORMAT) as archive:
@@ -72,15 +72,15 @@ class _TarWriter:
 
     def add(self, sample: Sample) -> None:
         """Write a sample."""
-        self._put(f"{sample.key}.png", _png(sample.image))
+        self._write_member(f"{sample.key}.png", _png(sample.image))
         for name, values in sample.arrays.items():
             if name in _PICTURES:
-                self._put(f"{sample.key}.{name}.png", _png(values))
+                self._write_member(f"{sample.key}.{name}.png", _png(values))
             else:
-                self._put(f"{sample.key}.{name}.npy", _npy(values))
-        self._put(f"{sample.key}.json", json.dumps(sample.info, allow_nan=False).encode())
+                self._write_member(f"{sample.key}.{name}.npy", _npy(values))
+        self._write_member(f"{sample.key}.json", json.dumps(sample.info, allow_nan=False).encode())
 
-    def _put(self, name: str, content: bytes) -> None:
+    def _write_member(self, name: str, content: bytes) -> None:
         # Owner and time stay 0, so that equal samples give equal files.
         member = tarfile.TarInfo(name)
         member.size = len(content)
@@ -155,7 +155,7 @@ class ShardReader:
                 name = {"png": "image", "json": "info"}.get(ending, ending.partition(".")[0])
                 if names is None or name in names:
                     file.seek(offset)
-                    sample[name] = _decoded(ending, file.read(size))
+                    sample[name] = _decode(ending, file.read(size))
         return sample
 
     def _found_places(self) -> list[tuple[str, dict[str, tuple[int, int]]]]:
@@ -182,7 +182,7 @@ class ShardReader:
             return sample
 
 
-def _decoded(ending: str, content: bytes) -> Any:
+def _decode(ending: str, content: bytes) -> Any:
     if ending == "json":
         return json.loads(content)
     if ending.endswith("png"):

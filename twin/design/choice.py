@@ -13,16 +13,31 @@ from types import ModuleType
 import numpy as np
 from scipy.optimize import minimize
 
-from twin.design.designs import Columns, Design, Marked, built, described, judged, row_of, sensor_of
-from twin.design.figures_of_merit import DEPTHS, PLACES, Field, depths_in_view, field_of
+from twin.design.designs import (
+    Columns,
+    Design,
+    HighlightedDesign,
+    build_sensor,
+    evaluate_designs,
+    evaluate_sensor,
+    make_sensor,
+    select_design,
+)
+from twin.design.figures_of_merit import DEPTHS, PLACES, Field, evaluate_field, find_depths_in_view
 from twin.design.geometry import Array, standoff_mm
-from twin.design.parameters import PARAMETER_OF, SensorArrays, followed, numbers_of, parameters_alone
+from twin.design.parameters import (
+    PARAMETER_OF,
+    SensorArrays,
+    adjust_to_standoff,
+    extract_numbers,
+    list_independent_paths,
+)
 from twin.design.study import Study
 from twin.options import use_variant
 from uwlts.errors import DesignError, Error, EvaluationError, RangeError
 
 
-def pareto(values: np.ndarray) -> np.ndarray:
+def find_pareto_front(values: np.ndarray) -> np.ndarray:
     """Return a mask (N,) of the designs on the Pareto front of M values to minimise.
 
     A design is on the front if no other design is at least as good in all values and better in one. Equal designs have
@@ -77,7 +92,7 @@ def _front_of_many(values: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class StudyResults:
     """Study and columns of its N evaluated designs, possibly none; EvaluationError for columns of another study."""
 
     study: Study
@@ -127,33 +142,35 @@ class Judged:
     def front(self, among: np.ndarray) -> np.ndarray:
         """Return a mask (N,) of the Pareto front of the objectives ``among`` (N,) some designs."""
         costs = np.column_stack([self.cost(k) for k in range(len(self.study.objectives))])
-        return pareto(np.where(among[:, None], costs, np.nan))
+        return find_pareto_front(np.where(among[:, None], costs, np.nan))
 
     @property
     def of_interest(self) -> np.ndarray:
         """Mask (N,) of the designs that meet all constraints, or of all working designs if none does."""
         return self.feasible if self.feasible.any() else self.works
 
-    def marked(self, place: int, words: str) -> Marked:
+    def highlight(self, place: int, words: str) -> HighlightedDesign:
         """Return a design with its sensor as built and a label that starts with ``words``."""
-        design = row_of(self.columns, place)
-        return Marked(f"{words} (design {design.number})", built(self.study, design.again()), design)
+        design = select_design(self.columns, place)
+        return HighlightedDesign(
+            f"{words} (design {design.number})", build_sensor(self.study, design.without_results()), design
+        )
 
 
 @dataclass(frozen=True)
-class Chosen:
+class Choice:
     """Chosen designs and notes.
 
     ``marked`` contains the base sensor if it works, the best design, and the refined design if it is better; the last
     one is the winner. ``further`` are other designs to render.
     """
 
-    marked: tuple[Marked, ...]
-    further: tuple[Marked, ...]
+    marked: tuple[HighlightedDesign, ...]
+    further: tuple[HighlightedDesign, ...]
     notes: tuple[str, ...]
 
 
-def choose(study: Study, columns: Columns) -> Chosen:
+def choose(study: Study, columns: Columns) -> Choice:
     """Choose the best design by the first objective among those that meet the constraints, and further designs.
 
     If no design meets the constraints, the one with the smallest violation is chosen, with a note. The further designs
@@ -161,9 +178,9 @@ def choose(study: Study, columns: Columns) -> Chosen:
     DesignError if no design works.
     """
     marked, notes = [], []
-    base, found = study.sensor, Judged(study, columns)
+    base, found = study.sensor, StudyResults(study, columns)
     try:
-        marked.append(Marked(f"{base.name} (as described)", base, described(study, "base", base)))
+        marked.append(HighlightedDesign(f"{base.name} (as described)", base, evaluate_sensor(study, "base", base)))
     except Error as error:
         notes.append(f"The base sensor itself cannot work: {error}.")
     if not len(found.best_first):
@@ -175,23 +192,27 @@ def choose(study: Study, columns: Columns) -> Chosen:
         violation = np.where(found.works, columns["violation"], np.inf)
         meets = violation == violation.min()
     best = int(found.best_first[0])
-    winner = found.marked(best, "best of the sweep")
+    winner = found.highlight(best, "best of the sweep")
     marked.append(winner)
 
     def better(design: Design) -> bool:
         """Return whether a design is better than the best one of the sweep."""
-        one, known = Judged(study, judged(study, [design])), found.cost()[best]
+        one, known = StudyResults(study, evaluate_designs(study, [design])), found.cost()[best]
         missed = one.figure("violation")[0]
         return bool(missed <= winner.design.violation and one.cost()[0] < known - 1e-6 * abs(known))
 
-    if study.refine and (end := refined(study, winner.design.again(), better)) is not None:
-        marked.append(Marked("refined along the gradient", built(study, end), row_of(judged(study, [end]), 0)))
+    if study.refine and (end := refine_design(study, winner.design.without_results(), better)) is not None:
+        marked.append(
+            HighlightedDesign(
+                "refined along the gradient", build_sensor(study, end), select_design(evaluate_designs(study, [end]), 0)
+            )
+        )
     front = np.flatnonzero(found.front(meets))
     front = front[np.argsort(found.cost()[front])]
     spread = front[np.unique(np.linspace(0, len(front) - 1, study.verify + 1).round().astype(int))]
     others = [int(place) for place in spread if place != best][: max(study.verify - 1, 0)]
-    further = [found.marked(place, "on the Pareto front") for place in others]
-    return Chosen(tuple(marked), tuple(further), tuple(notes))
+    further = [found.highlight(place, "on the Pareto front") for place in others]
+    return Choice(tuple(marked), tuple(further), tuple(notes))
 
 
 # --- refinement -------------------------------------------------------------------------------------------------------
@@ -218,7 +239,7 @@ def _largest(xp: ModuleType, values: Array) -> Array:
 
 
 def _coverage(xp: ModuleType, p: SensorArrays, f: Field, mean: Mean) -> Array:
-    near, far = depths_in_view(xp, p)
+    near, far = find_depths_in_view(xp, p)
     return (far - near) / (p.far_mm - p.near_mm)
 
 
@@ -253,14 +274,14 @@ class DerivedFigures:
         from drjit.llvm.ad import Float64
 
         self._dr, self._float = dr, Float64
-        sensor = sensor_of(study, design)
-        self.paths = [path for path in parameters_alone(sensor) if path in study.continuous()]
+        sensor = make_sensor(study, design)
+        self.paths = [path for path in list_independent_paths(sensor) if path in study.continuous()]
         self._figures, self._study = figures, study
-        self._parameters = numbers_of(sensor, study.medium_of(sensor))
+        self._parameters = extract_numbers(sensor, study.medium_of(sensor))
         shares, places = np.meshgrid(np.linspace(0, 1, DEPTHS), np.linspace(-1, 1, PLACES), indexing="ij")
         self._shares, self._places = Float64(shares.ravel()), Float64(places.ravel() * (1 - 1e-9))
 
-    def at(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def evaluate(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return figures (F,) and derivatives (F, K) at values (K,) of the free numbers, in the units of the paths."""
         found = [self._differentiate(values, number) for number in range(len(self.paths))]
         return np.array(found[-1][0]), np.array([change for _, change in found]).T
@@ -274,10 +295,10 @@ class DerivedFigures:
         dr.make_opaque(numbers, seeds)
         dr.enable_grad(numbers)
         changed = {PARAMETER_OF[path][0]: leaf for path, leaf in zip(self.paths, numbers, strict=True)}
-        p = followed(dr, replace(self._parameters, **changed), self._study.follow)
-        near, far = depths_in_view(dr, p)
+        p = adjust_to_standoff(dr, replace(self._parameters, **changed), self._study.follow)
+        near, far = find_depths_in_view(dr, p)
         depths = near + (far - near) * self._shares
-        f = field_of(dr, p, depths, self._places, reflectance=self._study.reflectance)
+        f = evaluate_field(dr, p, depths, self._places, reflectance=self._study.reflectance)
 
         def mean(quantity: Array, depth: int | None = None) -> Array:
             weights = np.zeros((DEPTHS, PLACES))
@@ -295,7 +316,7 @@ class DerivedFigures:
         return [float(output.numpy()[0]) for output in outputs], [unit * float(c.numpy()[0]) for c in changes]
 
 
-def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> Design | None:
+def refine_design(study: Study, design: Design, accepts: Callable[[Design], bool]) -> Design | None:
     """Optimise the first objective of a design within ranges and constraints; return None without an improvement.
 
     The method is sequential quadratic programming (Kraft 1988). ``accepts`` returns whether a design is better than the
@@ -318,7 +339,7 @@ def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> 
         """Return figures, and derivatives with respect to the normalised variables (0 to 1)."""
         clipped = np.clip(shares, 0, 1)
         if (key := clipped.tobytes()) not in known:
-            values, gradient = figures.at(low + clipped * wide)
+            values, gradient = figures.evaluate(low + clipped * wide)
             known[key] = values, gradient * wide
         return known[key]
 

@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 from scipy.stats import qmc
 
-from twin.design.figures_of_merit import FIGURES, Figures, figures_of
+from twin.design.figures_of_merit import FIGURES, Figures, compute_figures
 from twin.design.parameters import (
     PARAMETER_OF,
     SensorArrays,
-    followed,
-    numbers_of,
-    parameters_alone,
-    parameters_of,
-    stacked,
+    adjust_to_standoff,
+    extract_numbers,
+    extract_parameters,
+    list_independent_paths,
+    stack_parameters,
 )
 from twin.design.study import OTHER_COLUMNS, Study
 from twin.scene.paths import Value, value_at, with_values
 from uwlts.errors import DesignError, Error
-from uwlts.model.library import validated
+from uwlts.model.library import validate_description
 from uwlts.model.sensor import Sensor
 
 Columns = dict[str, np.ndarray]
@@ -60,7 +60,7 @@ class EvaluatedDesign:
         ends = {"violation": self.violation, "failure": self.failure}
         return {"design": self.number} | self.values | self.figures | ends
 
-    def again(self) -> Design:
+    def without_results(self) -> Design:
         """Return the design without its results."""
         return Design(self.number, {name: value for name, value in self.values.items() if value is not None})
 
@@ -71,7 +71,7 @@ class EvaluatedDesign:
 
 
 @dataclass(frozen=True)
-class Marked:
+class HighlightedDesign:
     """Highlighted design: its label, its sensor as built, and its values and figures."""
 
     label: str
@@ -79,7 +79,7 @@ class Marked:
     design: EvaluatedDesign
 
 
-def sensor_of(study: Study, design: Design, *, described: dict[str, Any] | None = None) -> Sensor:
+def make_sensor(study: Study, design: Design, *, described: dict[str, Any] | None = None) -> Sensor:
     """Return a design's sensor without adjustments to the stand-off; DescriptionError if it is not valid.
 
     ``described`` is the study's sensor as a table, for repeated calls.
@@ -88,38 +88,40 @@ def sensor_of(study: Study, design: Design, *, described: dict[str, Any] | None 
     for name, value in design.values.items():
         changes |= study.choices[name][str(value)] if name in study.choices else {name: value}
     described = study.sensor.model_dump(exclude_none=True) if described is None else described
-    return validated(Sensor, with_values(described, changes), f"design {design.number}")
+    return validate_description(Sensor, with_values(described, changes), f"design {design.number}")
 
 
-def built(study: Study, design: Design) -> Sensor:
+def build_sensor(study: Study, design: Design) -> Sensor:
     """Return a design's sensor as built, with all adjustments to the stand-off."""
-    sensor = sensor_of(study, design)
-    found = followed(np, parameters_of([sensor], [study.medium_of(sensor)]), study.follow)
+    sensor = make_sensor(study, design)
+    found = adjust_to_standoff(np, extract_parameters([sensor], [study.medium_of(sensor)]), study.follow)
     numbers = {
         "focus": {"camera.focus_distance_mm": found.focus_mm},
         "waist": {"laser.waist_distance_mm": found.waist_distance_mm},
         "volume": {"volume.near_mm": found.near_mm, "volume.far_mm": found.far_mm},
     }
     changes: dict[str, Value] = {path: value.item() for name in study.follow for path, value in numbers[name].items()}
-    return validated(Sensor, with_values(sensor.model_dump(exclude_none=True), changes), f"design {design.number}")
+    return validate_description(
+        Sensor, with_values(sensor.model_dump(exclude_none=True), changes), f"design {design.number}"
+    )
 
 
-def judged(study: Study, designs: Sequence[Design]) -> Columns:
+def evaluate_designs(study: Study, designs: Sequence[Design]) -> Columns:
     """Evaluate N designs by formulas; return columns (N,).
 
     The columns are "design" (the number), the free variables, all `Figures`, "violation" and "failure", see
     `EvaluatedDesign`. A design that fails has NaN figures and an infinite violation.
     """
     parameters, places, failures = _parameters(study, designs)
-    columns = failed(study, designs, failures)
+    columns = make_failed_columns(study, designs, failures)
     if parameters is not None:
         options = {"reflectance": study.reflectance, "water_depth_m": study.water_depth_m, "follow": study.follow}
-        figures, reasons = figures_of(parameters, **options)
+        figures, reasons = compute_figures(parameters, **options)
         columns["failure"][places] = reasons
         works = np.array([not reason for reason in reasons])
         for name in FIGURES:
             columns[name][places[works]] = getattr(figures, name)[works]
-        columns["violation"][places[works]] = violations(study, figures)[works]
+        columns["violation"][places[works]] = sum_violations(study, figures)[works]
     return columns
 
 
@@ -130,14 +132,14 @@ def _parameters(study: Study, designs: Sequence[Design]) -> tuple[SensorArrays |
     numbers. This saves time: the validation of one description takes 0.1 ms.
     """
     described = study.sensor.model_dump(exclude_none=True)
-    alone = [path for path in parameters_alone(study.sensor) if path in study.continuous()]
+    alone = [path for path in list_independent_paths(study.sensor) if path in study.continuous()]
     failures = [""] * len(designs)
     rows: list[SensorArrays] = []
     row_of = np.full(len(designs), -1)
 
     def numbers(design: Design) -> SensorArrays:
-        sensor = sensor_of(study, design, described=described)
-        return numbers_of(sensor, study.medium_of(sensor))
+        sensor = make_sensor(study, design, described=described)
+        return extract_numbers(sensor, study.medium_of(sensor))
 
     values = np.empty((len(designs), len(alone)))
     for k, path in enumerate(alone):
@@ -174,10 +176,10 @@ def _parameters(study: Study, designs: Sequence[Design]) -> tuple[SensorArrays |
         column: (values[valid, k] * unit).reshape(-1, 1, 1)
         for k, (column, unit) in enumerate(PARAMETER_OF[path] for path in alone)
     }
-    return replace(stacked(rows).at(row_of[valid]), **columns), valid, failures
+    return replace(stack_parameters(rows).select(row_of[valid]), **columns), valid, failures
 
 
-def failed(study: Study, designs: Sequence[Design], reasons: Sequence[str]) -> Columns:
+def make_failed_columns(study: Study, designs: Sequence[Design], reasons: Sequence[str]) -> Columns:
     """Return the columns (N,) of N failed designs with their reasons: NaN figures and infinite violation."""
     columns = {"design": np.array([design.number for design in designs])}
     columns |= {name: np.array([design.values[name] for design in designs]) for name in study.free()}
@@ -185,21 +187,21 @@ def failed(study: Study, designs: Sequence[Design], reasons: Sequence[str]) -> C
     return columns | {"violation": np.full(len(designs), math.inf), "failure": np.array(reasons, dtype=object)}
 
 
-def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
+def evaluate_sensor(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
     """Evaluate a sensor that is not a design of the study, without adjustments to the stand-off.
 
     Raises DesignError if the sensor cannot work.
     """
-    numbers = parameters_of([sensor], [study.medium_of(sensor)])
-    figures, (reason,) = figures_of(numbers, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
+    numbers = extract_parameters([sensor], [study.medium_of(sensor)])
+    figures, (reason,) = compute_figures(numbers, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
     if reason:
         raise DesignError(f"{label}: {reason}")
     values = {name: label if name in study.choices else value_at(sensor, name, label) for name in study.free()}
     numbers = {name: column.item() for name, column in vars(figures).items()}
-    return EvaluatedDesign(-1, values, numbers, violations(study, figures).item(), "")
+    return EvaluatedDesign(-1, values, numbers, sum_violations(study, figures).item(), "")
 
 
-def row_of(columns: Columns, place: int) -> EvaluatedDesign:
+def select_design(columns: Columns, place: int) -> EvaluatedDesign:
     """Return one design from a study's columns."""
     row = {name: one[place].item() if one.dtype != object else one[place] for name, one in columns.items()}
     values = {name: value for name, value in row.items() if name not in (*FIGURES, *OTHER_COLUMNS)}
@@ -207,7 +209,7 @@ def row_of(columns: Columns, place: int) -> EvaluatedDesign:
     return EvaluatedDesign(row["design"], values, figures, row["violation"], row["failure"] or "")
 
 
-def violations(study: Study, figures: Figures) -> np.ndarray:
+def sum_violations(study: Study, figures: Figures) -> np.ndarray:
     """Return the total violation (N,) of the constraints, each relative to its bound; 0 if all are met."""
     total = np.zeros(len(figures.coverage))
     for name, sign, bound in study.bounds():
@@ -217,19 +219,19 @@ def violations(study: Study, figures: Figures) -> np.ndarray:
     return total
 
 
-def number_of_designs(study: Study) -> int:
+def count_designs(study: Study) -> int:
     """Return the number of designs of a study."""
     if study.sampling.kind != "grid":
         return study.sampling.designs
     return math.prod(len(variable.grid()) for variable in study.free().values())
 
 
-def designs_of(study: Study, first: int, count: int) -> list[Design]:
+def sample_designs(study: Study, first: int, count: int) -> list[Design]:
     """Return designs ``first`` to ``first + count - 1`` of a grid, random or Sobol study.
 
     In a grid, the last variable changes fastest.
     """
-    numbers = range(first, min(first + count, number_of_designs(study)))
+    numbers = range(first, min(first + count, count_designs(study)))
     free = study.free()
     if study.sampling.kind == "grid":
         grids = [variable.grid() for variable in free.values()]
@@ -247,6 +249,6 @@ def designs_of(study: Study, first: int, count: int) -> list[Design]:
                 if numbers.start > 0:
                     sequence.fast_forward(numbers.start)
                 shares = sequence.random(len(numbers))
-        columns = [v.drawn(s) for v, s in zip(free.values(), shares.reshape(-1, variables).T, strict=True)]
+        columns = [v.values_at(s) for v, s in zip(free.values(), shares.reshape(-1, variables).T, strict=True)]
     rows = zip(*columns, strict=True)
     return [Design(number, dict(zip(free, row, strict=True))) for number, row in zip(numbers, rows, strict=True)]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.backend.llvm import prepare_llvm, threads_kept
+from twin.backend.llvm import prepare_llvm, preserve_threads
 from twin.design.geometry import (
     Array,
     ImagePoints,
@@ -19,20 +19,20 @@ from twin.design.geometry import (
     Vector,
     WindowGeometry,
     across_mm,
-    added,
+    add_vectors,
     direction_outside,
     dot,
     length_outside_mm,
-    path_to,
     pixels_per_mm,
-    scaled,
-    seen,
+    project_points,
+    scale_vector,
+    select,
     slopes_per_mm,
     snell_root,
     standoff_mm,
-    where,
+    trace_to_points,
 )
-from twin.design.parameters import Follow, SensorArrays, following
+from twin.design.parameters import Follow, SensorArrays, compute_adjustments
 from twin.sensor.detector import PLANCK_TIMES_LIGHT
 from uwlts.errors import RangeError
 
@@ -79,7 +79,7 @@ class StripeModel:
     background_e_per_ms: Array
 
 
-def stripe_at(
+def model_stripe(
     xp: ModuleType,
     p: SensorArrays,
     pose: LaserFan,
@@ -115,13 +115,13 @@ def stripe_at(
     """
     xa, xb, ya, yb = view.jacobian
     across = p.across((xa, ya)), p.across((xb, yb))
-    from_laser = added(point, scaled(pose.origin, -1.0))
+    from_laser = add_vectors(point, scale_vector(pose.origin, -1.0))
     away = xp.sqrt(dot(from_laser, from_laser))
     rayleigh = math.pi * p.waist_mm * p.waist_mm * p.medium_index / (p.beam_quality * p.wavelength_mm)
     sheet = 0.5 * p.waist_mm * xp.sqrt(1 + ((away - p.waist_distance_mm) / rayleigh) ** 2)
     # Width on a profile line, for a constant pixel along the stripe.
     by_x, by_y = (pixels_per_mm(view, window, direction) for direction in (pose.normal, pose.fan))
-    thick = abs(p.across(by_x) - p.across(by_y) * p.along(by_x) / p.along(by_y)) * sheet
+    thick = abs(p.across(by_x) - p.across(by_y) * p.select_along_stripe(by_x) / p.select_along_stripe(by_y)) * sheet
 
     number = p.working_f_number()
     radius = 0.5 * p.focal_mm / number
@@ -136,7 +136,7 @@ def stripe_at(
     sigma = xp.sqrt(thick * thick + blur * blur + 1 / 12)
 
     laser_window = p.laser_window(pose.axis)
-    fan = path_to(xp, laser_window, from_laser)
+    fan = trace_to_points(xp, laser_window, from_laser)
     side = dot(from_laser, pose.fan)
     angle = xp.atan(fan.slope) * side / xp.sqrt(side * side + 1e-18)
     lit = _relative_power(xp, p, angle)
@@ -187,7 +187,7 @@ def exposure_ms(xp: ModuleType, p: SensorArrays, brightest_e_per_ms: Array) -> t
     level = p.exposure_level * p.full_well_e / (1 + _BRIGHT_LINES * p.pixel_contrast(xp))
     required = level / brightest_e_per_ms
     automatic = xp.minimum(required, p.longest_ms)
-    return required, where(xp, xp.isnan(p.exposure_ms), automatic, p.exposure_ms)
+    return required, select(xp, xp.isnan(p.exposure_ms), automatic, p.exposure_ms)
 
 
 def _relative_power(xp: ModuleType, p: SensorArrays, angle: Array) -> Array:
@@ -236,7 +236,7 @@ class Field:
     required_ms: Array
 
 
-def depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
+def find_depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
     """Return the ends of the part of the measuring volume in the camera's view, in the middle of the line.
 
     The depths are measured from the window's outer face. Newton's method finds the depths at the image's edges. Its
@@ -249,8 +249,8 @@ def depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
         inverse = 1 / standoff
         for _ in range(_EDGE_STEPS):
             depth = 1 / inverse
-            middle = scaled(pose.axis, (depth - standoff) / pose.axis[2])
-            view = seen(xp, lens, window, added((0.0 * standoff, 0.0 * standoff, standoff), middle))
+            middle = scale_vector(pose.axis, (depth - standoff) / pose.axis[2])
+            view = project_points(xp, lens, window, add_vectors((0.0 * standoff, 0.0 * standoff, standoff), middle))
             by_z = pixels_per_mm(view, window, pose.axis)
             change = -(depth**2) / pose.axis[2] * p.across(by_z)
             inverse = inverse + (edge - p.across((view.x, view.y))) / change
@@ -260,7 +260,7 @@ def depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
     return xp.maximum(p.near_mm, near), xp.minimum(p.far_mm, far)
 
 
-def field_of(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
+def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
     """Evaluate designs at depths from the window's outer face and ``places`` (-1 to 1) along the stripe.
 
     An error d of the stripe's centre on its profile line causes the error (dY, dZ) = J^-1 (d, 0) of the point. J is the
@@ -269,20 +269,22 @@ def field_of(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *,
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff = standoff_mm(pose)
     z = (p.outer_mm(xp) + depth_mm - standoff) / pose.axis[2]
-    middle = added((0.0 * standoff, 0.0 * standoff, standoff), scaled(pose.axis, z))
+    middle = add_vectors((0.0 * standoff, 0.0 * standoff, standoff), scale_vector(pose.axis, z))
 
-    def at(y: Array) -> Vector:
-        return added(middle, scaled(pose.fan, y))
+    def evaluate(y: Array) -> Vector:
+        return add_vectors(middle, scale_vector(pose.fan, y))
 
     ends = []
-    for edge in (-0.5, p.along((p.width_px, p.height_px)) - 0.5):
+    for edge in (-0.5, p.select_along_stripe((p.width_px, p.height_px)) - 0.5):
         y = 0.0 * z
         for _ in range(_EDGE_STEPS):
-            view = seen(xp, lens, window, at(y))
-            y = y + (edge - p.along((view.x, view.y))) / p.along(pixels_per_mm(view, window, pose.fan))
+            view = project_points(xp, lens, window, evaluate(y))
+            y = y + (edge - p.select_along_stripe((view.x, view.y))) / p.select_along_stripe(
+                pixels_per_mm(view, window, pose.fan)
+            )
         ends.append(y)
     laser_window = p.laser_window(pose.axis)
-    from_origin = added(middle, scaled(pose.origin, -1.0))
+    from_origin = add_vectors(middle, scale_vector(pose.origin, -1.0))
     offset, height = dot(from_origin, pose.fan), dot(from_origin, pose.axis)
     edges = [across_mm(xp, laser_window, height, xp.tan(angle)) - offset for angle in (p.lit_from_rad, p.lit_to_rad)]
     low = xp.maximum(xp.minimum(ends[0], ends[1]), edges[0])
@@ -290,30 +292,32 @@ def field_of(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *,
     half = 0.5 * (high - low)
     y = 0.5 * (high + low) + half * places
 
-    point = at(y)
-    view = seen(xp, lens, window, point)
+    point = evaluate(y)
+    view = project_points(xp, lens, window, point)
     by_y, by_z = pixels_per_mm(view, window, pose.fan), pixels_per_mm(view, window, pose.axis)
-    determinant = p.across(by_y) * p.along(by_z) - p.across(by_z) * p.along(by_y)
-    stripe = stripe_at(xp, p, pose, window, point, view, reflectance=reflectance)
+    determinant = p.across(by_y) * p.select_along_stripe(by_z) - p.across(by_z) * p.select_along_stripe(by_y)
+    stripe = model_stripe(xp, p, pose, window, point, view, reflectance=reflectance)
     u = p.across((view.x, view.y))
     lit = (half > 0) & (height > laser_window.outer_mm) & xp.isfinite(u)
     inside = lit & (u >= -0.5) & (u <= p.across((p.width_px, p.height_px)) - 0.5)
-    rate = where(xp, lit, stripe.rate_e_per_ms, 0.0)
+    rate = select(xp, lit, stripe.rate_e_per_ms, 0.0)
     # For derivatives of a single design, all points are in one dimension.
     brightest = xp.max(rate, axis=(1, 2))[:, None, None] if len(rate.shape) == 3 else xp.max(rate)
-    brightest = where(xp, brightest > 0, brightest, math.nan)
+    brightest = select(xp, brightest > 0, brightest, math.nan)
     required, used = exposure_ms(xp, p, brightest)
     noise = centre_noise_px(xp, p, stripe, used)
-    from_laser = direction_outside(xp, laser_window, path_to(xp, laser_window, added(point, scaled(pose.origin, -1.0))))
-    chord = added(direction_outside(xp, window, view.path), scaled(from_laser, -1.0))  # of unit vectors
+    from_laser = direction_outside(
+        xp, laser_window, trace_to_points(xp, laser_window, add_vectors(point, scale_vector(pose.origin, -1.0)))
+    )
+    chord = add_vectors(direction_outside(xp, window, view.path), scale_vector(from_laser, -1.0))  # of unit vectors
     return Field(
         y_mm=y,
         z_mm=z,
         half_line_mm=half,
-        sigma_y_mm=noise * abs(p.along(by_z) / determinant),
-        sigma_z_mm=noise * abs(p.along(by_y) / determinant),
-        depth_per_px_mm=abs(p.along(by_y) / determinant),
-        along_per_px_mm=1 / abs(p.along(by_y)),
+        sigma_y_mm=noise * abs(p.select_along_stripe(by_z) / determinant),
+        sigma_z_mm=noise * abs(p.select_along_stripe(by_y) / determinant),
+        depth_per_px_mm=abs(p.select_along_stripe(by_y) / determinant),
+        along_per_px_mm=1 / abs(p.select_along_stripe(by_y)),
         centre_px=noise,
         stripe_px=stripe.sigma_px,
         blur_px=stripe.blur_px,
@@ -382,7 +386,7 @@ FIGURES: dict[str, tuple[str, str]] = {
 """Label and unit of each figure of merit, by name."""
 
 
-def scatter_at(p: SensorArrays, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
+def predict_scatter(p: SensorArrays, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
     """Return the root mean square of sigma Z (K,) along the stripe of one design at ``z_mm`` (K,) from the stand-off.
 
     The stripe is evaluated up to ``half_line_mm`` (K,) on both sides, within the view.
@@ -391,13 +395,13 @@ def scatter_at(p: SensorArrays, z_mm: np.ndarray, half_line_mm: np.ndarray, *, r
         pose = p.pose(np)
         depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)
         places = np.linspace(-1, 1, 2 * PLACES + 1).reshape(1, 1, -1) * (1 - 1e-9)
-        f = field_of(np, p, depth, places, reflectance=reflectance)
+        f = evaluate_field(np, p, depth, places, reflectance=reflectance)
     counts = f.in_view & (np.abs(f.y_mm) <= half_line_mm.reshape(1, -1, 1) + 1e-9)
     squares = np.where(counts, f.sigma_z_mm**2, 0.0)
     return np.sqrt(squares.sum(axis=2) / np.maximum(counts.sum(axis=2), 1))[0]
 
 
-def figures_of(
+def compute_figures(
     p: SensorArrays, *, reflectance: float, water_depth_m: float, follow: Sequence[Follow] = ()
 ) -> tuple[Figures, list[str]]:
     """Return the figures of N designs, and for each the reason why it cannot work ("" if it works).
@@ -412,7 +416,7 @@ def figures_of(
         p, f = replace(p, **followers), Field(**field)
         shape = np.broadcast_shapes(f.sigma_z_mm.shape, (p.near_mm.size, DEPTHS, PLACES))
         full = {name: np.broadcast_to(np.asarray(values, dtype=float), shape) for name, values in vars(f).items()}
-        figures = _reduced(p, full, (far - near) / (p.far_mm - p.near_mm), water_depth_m=water_depth_m)
+        figures = _reduce_fields(p, full, (far - near) / (p.far_mm - p.near_mm), water_depth_m=water_depth_m)
         reasons = _reasons(p, figures, full)
     return figures, reasons
 
@@ -430,10 +434,10 @@ def _over_volume(
     places: Array = _PLACES,
 ) -> tuple[dict[str, Array], Array, Array, dict[str, Array]]:
     """Return the adjusted parameters by name, the near and far ends of the volume in view, and its `Field` by name."""
-    followers = following(xp, p, follow)
+    followers = compute_adjustments(xp, p, follow)
     p = replace(p, **followers)
-    near, far = depths_in_view(xp, p)
-    field = field_of(xp, p, near + (far - near) * shares, places, reflectance=reflectance)
+    near, far = find_depths_in_view(xp, p)
+    field = evaluate_field(xp, p, near + (far - near) * shares, places, reflectance=reflectance)
     return followers, near, far, vars(field)
 
 
@@ -450,15 +454,15 @@ def _compiled_over_volume(
     from drjit.llvm import TensorXf64
 
     def converted(values: Array) -> Array:
-        return tuple(map(converted, values)) if isinstance(values, tuple) else TensorXf64(_aligned(values))
+        return tuple(map(converted, values)) if isinstance(values, tuple) else TensorXf64(_align(values))
 
     designs = p.baseline_mm.size
-    over_volume, at = _frozen(follow, reflectance), (converted(_SHARES), converted(_PLACES))
+    over_volume, at = _freeze(follow, reflectance), (converted(_SHARES), converted(_PLACES))
     blocks: list[tuple[dict[str, Array], ...]] = []
-    with threads_kept():
+    with preserve_threads():
         dr.set_thread_count(1)
         for first in range(0, designs, _BLOCK):
-            block = p.at(np.minimum(np.arange(first, first + _BLOCK), designs - 1))
+            block = p.select(np.minimum(np.arange(first, first + _BLOCK), designs - 1))
             followers, near, far, field = over_volume({n: converted(values) for n, values in vars(block).items()}, *at)
             tables = followers, {"near": near, "far": far}, field
             blocks.append(tuple({name: array.numpy() for name, array in table.items()} for table in tables))
@@ -469,7 +473,7 @@ def _compiled_over_volume(
     return followers, ends["near"], ends["far"], field
 
 
-def _aligned(values: np.ndarray) -> np.ndarray:
+def _align(values: np.ndarray) -> np.ndarray:
     """Return a copy aligned to 64 bytes; Dr.Jit would compile kernels again for each other alignment of its arrays."""
     room = np.empty(values.size + 8)
     first = -room.ctypes.data % 64 // 8
@@ -479,7 +483,7 @@ def _aligned(values: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _frozen(follow: tuple[Follow, ...], reflectance: float) -> Callable[..., Any]:
+def _freeze(follow: tuple[Follow, ...], reflectance: float) -> Callable[..., Any]:
     """Return `_over_volume` as a function that Dr.Jit records at the first call and replays for other values."""
     import drjit as dr
 
@@ -491,7 +495,7 @@ def _each(values: Array, designs: int) -> np.ndarray:
     return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (designs,)).copy()
 
 
-def _reduced(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
+def _reduce_fields(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
     """Return the figures of N designs from their fields (N, DEPTHS, PLACES) and the fraction of the depth in view."""
     n, middle, inside = len(f["z_mm"]), DEPTHS // 2, f["lit"] > 0
     one = partial(_each, designs=n)

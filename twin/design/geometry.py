@@ -28,7 +28,7 @@ _TINY_MM = 1e-9
 """Offset that avoids an undefined direction for a point on the window's normal; negligible."""
 
 
-def where(xp: ModuleType, mask: Array, true: Array, false: Array) -> Array:
+def select(xp: ModuleType, mask: Array, true: Array, false: Array) -> Array:
     """Select elements of two arrays by a mask."""
     return (xp.where if xp is np else xp.select)(mask, true, false)
 
@@ -38,12 +38,12 @@ def dot(a: Vector, b: Vector) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def scaled(a: Vector, factor: Array) -> Vector:
+def scale_vector(a: Vector, factor: Array) -> Vector:
     """Multiply a vector by a number."""
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
-def added(a: Vector, b: Vector) -> Vector:
+def add_vectors(a: Vector, b: Vector) -> Vector:
     """Add two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
@@ -58,7 +58,7 @@ class LaserFan:
     normal: Vector
 
 
-def pose_at(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> LaserFan:
+def place_laser(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> LaserFan:
     """Return the fan of a laser that is placed by baseline and triangulation angle.
 
     ``towards`` is the baseline's direction, (x, y, 0). The result is that of `uwlts.model.placement.laser_pose`, but
@@ -69,9 +69,9 @@ def pose_at(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: A
     across = (cosine * towards[0], cosine * towards[1], sine)
     along = (-towards[1], towards[0], 0.0 * sine)
     turn, keep = xp.sin(roll_rad), xp.cos(roll_rad)
-    normal = added(scaled(across, keep), scaled(along, turn))
-    fan = added(scaled(along, keep), scaled(across, -turn))
-    return LaserFan(scaled(towards, baseline_mm), axis, fan, normal)
+    normal = add_vectors(scale_vector(across, keep), scale_vector(along, turn))
+    fan = add_vectors(scale_vector(along, keep), scale_vector(across, -turn))
+    return LaserFan(scale_vector(towards, baseline_mm), axis, fan, normal)
 
 
 def standoff_mm(pose: LaserFan) -> Array:
@@ -90,7 +90,9 @@ class WindowGeometry:
     medium_index: Array
 
     @classmethod
-    def of(cls, window: Window, medium: Medium, wavelength_nm: float, rotation: np.ndarray) -> WindowGeometry:
+    def from_description(
+        cls, window: Window, medium: Medium, wavelength_nm: float, rotation: np.ndarray
+    ) -> WindowGeometry:
         """Make a mounted window; ``rotation`` (3, 3) rotates from its module's frame to the frame of the result."""
         normal = rotation @ window.normal()
         distance = window.distance_mm * float(rotation[:, 2] @ normal)
@@ -152,7 +154,7 @@ def across_mm(xp: ModuleType, window: WindowGeometry, height_mm: Array, slope: A
     return sum(extent * slope / snell_root(xp, n, slope) for extent, n in window.layers(height_mm))
 
 
-def traced(window: WindowGeometry, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def trace_rays(window: WindowGeometry, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Trace rays (N, 3) from an origin through a window.
 
     Return the points (N, 3, 3) of the rays at the origin and at both faces, and the directions behind the window. Rays
@@ -171,7 +173,7 @@ def traced(window: WindowGeometry, origin: np.ndarray, directions: np.ndarray) -
     return np.stack([np.broadcast_to(origin, directions.shape), *points], axis=1), normal + outside[:, None] * leaning
 
 
-def path_to(xp: ModuleType, window: WindowGeometry, point: Vector) -> Path:
+def trace_to_points(xp: ModuleType, window: WindowGeometry, point: Vector) -> Path:
     """Return the rays from the module's origin, 0, to points beyond a window, by Snell's law.
 
     A ray of slope p in air has the slope p S(n) in a layer of index n. Here S(n) = 1 / sqrt(n^2 + (n^2 - 1) p^2). Its
@@ -179,7 +181,7 @@ def path_to(xp: ModuleType, window: WindowGeometry, point: Vector) -> Path:
     p M = rho. The derivative of p M is the sum of extent times n^2 S^3.
     """
     height = dot(point, window.normal)
-    sideways = added(point, scaled(window.normal, -height))
+    sideways = add_vectors(point, scale_vector(window.normal, -height))
     rho = xp.sqrt(dot(sideways, sideways) + _TINY_MM**2)
     layers = window.layers(height)
 
@@ -195,13 +197,13 @@ def path_to(xp: ModuleType, window: WindowGeometry, point: Vector) -> Path:
         total, growth, _ = reach(p)
         p = p + (rho - p * total) / growth
     total, growth, last = reach(p)
-    return Path(p, p * last, scaled(sideways, 1 / rho), height, total, growth)
+    return Path(p, p * last, scale_vector(sideways, 1 / rho), height, total, growth)
 
 
 def direction_outside(xp: ModuleType, window: WindowGeometry, path: Path) -> Vector:
     """Return the unit vectors of rays in the medium, away from the module."""
     p = path.slope_outside
-    return scaled(added(window.normal, scaled(path.across, p)), 1 / xp.sqrt(1 + p * p))
+    return scale_vector(add_vectors(window.normal, scale_vector(path.across, p)), 1 / xp.sqrt(1 + p * p))
 
 
 def length_outside_mm(xp: ModuleType, window: WindowGeometry, path: Path) -> Array:
@@ -227,7 +229,7 @@ class Lens:
     k6: Array
 
     @classmethod
-    def of(cls, camera: Camera) -> Lens:
+    def from_description(cls, camera: Camera) -> Lens:
         """Make the lens of a camera's description."""
         return cls(*camera.focal_lengths_px(), *camera.principal_point(), *camera.distortion.model_dump().values())
 
@@ -253,7 +255,7 @@ class ImagePoints:
     jacobian: tuple[Array, Array, Array, Array]
 
 
-def distorted(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
+def distort(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
     """Return image points (x, y) of slopes (a, b), and the radial factor; OpenCV's distortion model."""
     r2 = a * a + b * b
     radial, _ = lens.radial(r2)
@@ -262,14 +264,14 @@ def distorted(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
     return x, y, radial
 
 
-def directions_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
+def undistort_pixels(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     """Return the rays (N, 3) of pixels (N, 2), undistorted by fixed-point iteration; NaN without convergence."""
     wanted = (pixels - (lens.cx, lens.cy)) / (lens.fx_px, lens.fy_px)
     found = wanted.copy()
     missed = np.full(len(found), np.inf)
     with np.errstate(all="ignore"):
         for _ in range(_UNDISTORTING_STEPS):
-            x, y, radial = distorted(lens, *found.T)
+            x, y, radial = distort(lens, *found.T)
             image = np.stack([x, y], axis=1)
             missed = np.abs(image - wanted).max(axis=1)
             found += (wanted - image) / radial[:, None]
@@ -277,13 +279,13 @@ def directions_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     return np.column_stack([found, np.ones(len(found))])
 
 
-def seen(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> ImagePoints:
+def project_points(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> ImagePoints:
     """Project points beyond the window into the image."""
-    path = path_to(xp, window, point)
-    ray = added(window.normal, scaled(path.across, path.slope))
+    path = trace_to_points(xp, window, point)
+    ray = add_vectors(window.normal, scale_vector(path.across, path.slope))
     a, b = ray[0] / ray[2], ray[1] / ray[2]
     r2 = a * a + b * b
-    x, y, radial = distorted(lens, a, b)
+    x, y, radial = distort(lens, a, b)
     _, slope = lens.radial(r2)
     mixed = slope * a * b + 2 * lens.p1 * a + 2 * lens.p2 * b
     jacobian = (
@@ -303,11 +305,11 @@ def slopes_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> t
     """
     path = view.path
     up = dot(along, window.normal)
-    sideways = added(along, scaled(window.normal, -up))
+    sideways = add_vectors(along, scale_vector(window.normal, -up))
     radial = dot(sideways, path.across)
     steeper = (radial - path.slope_outside * up) / path.growth_mm
-    turned = scaled(added(sideways, scaled(path.across, -radial)), 1 / path.apparent_mm)
-    change = added(scaled(path.across, steeper), turned)
+    turned = scale_vector(add_vectors(sideways, scale_vector(path.across, -radial)), 1 / path.apparent_mm)
+    change = add_vectors(scale_vector(path.across, steeper), turned)
     ray_z = window.normal[2] + path.across[2] * path.slope
     a, b = view.slopes
     return (change[0] - a * change[2]) / ray_z, (change[1] - b * change[2]) / ray_z

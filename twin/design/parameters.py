@@ -19,10 +19,10 @@ from twin.design.geometry import (
     Vector,
     WindowGeometry,
     dot,
-    path_to,
-    pose_at,
+    place_laser,
+    select,
     standoff_mm,
-    where,
+    trace_to_points,
 )
 from twin.sensor.speckle import coherence, pixel_contrast
 from uwlts.errors import DescriptionError
@@ -133,7 +133,7 @@ class SensorArrays:
     near_mm: Array
     far_mm: Array
 
-    def at(self, places: np.ndarray) -> SensorArrays:
+    def select(self, places: np.ndarray) -> SensorArrays:
         """Select sensors by indices (M,) from arrays (N, 1, 1); return arrays (M, 1, 1)."""
 
         def taken(values: Array) -> Array:
@@ -145,12 +145,12 @@ class SensorArrays:
         """Return the laser's fan in the camera frame."""
         towards = (1.0 - self.along_width, -self.along_width, 0.0 * self.along_width)
         baseline, angle, roll = self.baseline_mm, self.angle_rad, self.roll_rad
-        by_angle = pose_at(xp, baseline_mm=baseline, angle_rad=angle, roll_rad=roll, towards=towards)
+        by_angle = place_laser(xp, baseline_mm=baseline, angle_rad=angle, roll_rad=roll, towards=towards)
         vectors = by_angle.origin, by_angle.axis, by_angle.fan, by_angle.normal
         pairs = (zip(given, found, strict=True) for given, found in zip(self.placed, vectors, strict=True))
-        return LaserFan(*(tuple(where(xp, xp.isfinite(own), own, other) for own, other in pair) for pair in pairs))
+        return LaserFan(*(tuple(select(xp, xp.isfinite(own), own, other) for own, other in pair) for pair in pairs))
 
-    def along(self, pixels: tuple[Array, Array]) -> Array:
+    def select_along_stripe(self, pixels: tuple[Array, Array]) -> Array:
         """Return the element of a pair (x, y) that belongs to the direction along the stripe."""
         return self.along_width * pixels[0] + (1 - self.along_width) * pixels[1]
 
@@ -195,7 +195,7 @@ class SensorArrays:
 
     def pixel_contrast(self, xp: ModuleType) -> Array:
         """Return the speckle contrast of a pixel, averaged over its area and two incoherent polarisations."""
-        return self._averaged(xp, _pixel_series()) * self.speckle_coherence / math.sqrt(2)
+        return self._evaluate_grain_average(xp, _pixel_series()) * self.speckle_coherence / math.sqrt(2)
 
     def centre_contrast(self, xp: ModuleType, sigma_px: Array) -> Array:
         """Return the effective contrast: the one with the same effect for uncorrelated neighbours across the stripe.
@@ -209,14 +209,14 @@ class SensorArrays:
         v = xp.minimum(frequency * self.grain_px(), 0.999)
         lens = 2 / math.pi * (xp.acos(v) - v * xp.sqrt(1 - v * v))
         pixel = xp.sin(math.pi * frequency) / (math.pi * frequency)
-        whole = self._averaged(xp, _line_series()) * self.speckle_coherence / math.sqrt(2)
+        whole = self._evaluate_grain_average(xp, _line_series()) * self.speckle_coherence / math.sqrt(2)
         return whole * xp.sqrt(lens) * pixel
 
     def grain_px(self) -> Array:
         """Return the size of speckle grains, lambda N (1 + m), in px along x; it is also used along y."""
         return self.wavelength_mm * self.working_f_number() / self.pixel_mm
 
-    def _averaged(self, xp: ModuleType, series: Chebyshev) -> Array:
+    def _evaluate_grain_average(self, xp: ModuleType, series: Chebyshev) -> Array:
         """Return the exponential of a Chebyshev series in the logarithm of the grain size."""
         grain = xp.log(self.grain_px())
         shift, scale = map(float, series.mapparms())
@@ -232,18 +232,18 @@ class SensorArrays:
         return self.f_number * (1 + self.focal_mm / (self.focus_mm - self.focal_mm))
 
 
-def parameters_alone(sensor: Sensor) -> list[str]:
+def list_independent_paths(sensor: Sensor) -> list[str]:
     """Return the paths of `PARAMETER_OF` that apply to a sensor's laser."""
     by_axis = sensor.laser.origin_mm is not None
     return [path for path in PARAMETER_OF if not (by_axis and path in _OF_BASELINE)]
 
 
-def parameters_of(sensors: Sequence[Sensor], media: Sequence[Medium]) -> SensorArrays:
-    """Return parameters of N sensors, each in its medium, as float64 arrays (N, 1, 1); errors as in `numbers_of`."""
-    return stacked([numbers_of(sensor, medium) for sensor, medium in zip(sensors, media, strict=True)])
+def extract_parameters(sensors: Sequence[Sensor], media: Sequence[Medium]) -> SensorArrays:
+    """Return parameters of N sensors in their media as float64 arrays (N, 1, 1); errors as in `extract_numbers`."""
+    return stack_parameters([extract_numbers(sensor, medium) for sensor, medium in zip(sensors, media, strict=True)])
 
 
-def stacked(rows: Sequence[SensorArrays]) -> SensorArrays:
+def stack_parameters(rows: Sequence[SensorArrays]) -> SensorArrays:
     """Stack parameters of N sensors, given as numbers, to arrays (N, 1, 1)."""
     columns = {name: [vars(row)[name] for row in rows] for name in vars(rows[0])}
     for name in ("fan_nodes_rad", "fan_powers"):
@@ -260,7 +260,7 @@ def _columns(values: Sequence[Array]) -> Array:
     return np.array(values, dtype=np.float64).reshape(-1, 1, 1)
 
 
-def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
+def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
     """Return the parameters of one sensor in a medium as numbers.
 
     Raises
@@ -386,12 +386,12 @@ def _line_series() -> Chebyshev:
     return Chebyshev.fit(np.log(grains), 0.5 * np.log(sums), 12)
 
 
-def followed(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]) -> SensorArrays:
-    """Return the parameters with bench adjustments to the stand-off, see `following`."""
-    return replace(parameters, **following(xp, parameters, follow))
+def adjust_to_standoff(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]) -> SensorArrays:
+    """Return the parameters with bench adjustments to the stand-off, see `compute_adjustments`."""
+    return replace(parameters, **compute_adjustments(xp, parameters, follow))
 
 
-def following(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]) -> dict[str, Array]:
+def compute_adjustments(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]) -> dict[str, Array]:
     """Return the parameters, by name, that are adjusted to the stand-off as on the bench.
 
     "focus" focuses the lens on the apparent position of the stand-off through window and medium. "waist" focuses the
@@ -402,7 +402,7 @@ def following(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]
     point = (0.0 * depth, 0.0 * depth, depth)
     changes: dict[str, Array] = {}
     if "focus" in follow:
-        changes["focus_mm"] = path_to(xp, window, point).apparent_mm
+        changes["focus_mm"] = trace_to_points(xp, window, point).apparent_mm
     if "waist" in follow:
         away = tuple(p - o for p, o in zip(point, pose.origin, strict=True))
         changes["waist_distance_mm"] = xp.sqrt(dot(away, away))

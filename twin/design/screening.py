@@ -24,13 +24,13 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import Trial, TrialState
 from pydantic import JsonValue
 
-from twin.design.designs import Columns, Design, designs_of, failed, judged, number_of_designs
+from twin.design.designs import Columns, Design, count_designs, evaluate_designs, make_failed_columns, sample_designs
 from twin.design.study import Study
-from twin.recording.campaigns import keep_to_plan, made_folder
+from twin.recording.campaigns import keep_to_plan, make_folder
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_regular_file
-from uwlts.files.writing import written_aside
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.files.writing import write_atomically
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import Lost, Workers
 
 _MOST_PART_BYTES = 2**28
@@ -41,7 +41,7 @@ def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
     return folder / f"{'lost' if lost else 'part'}-{first:09d}.parquet"
 
 
-def as_part(columns: Columns) -> bytes:
+def encode_part(columns: Columns) -> bytes:
     """Return the columns of a batch as the content of a part."""
     sink = pa.BufferOutputStream()
     pq.write_table(pa.table(columns), sink)
@@ -50,19 +50,19 @@ def as_part(columns: Columns) -> bytes:
 
 def write_part(folder: Path, first: int, content: bytes, *, lost: bool = False) -> None:
     """Write a part and replace an older one of the same batch."""
-    with written_aside(part_path(folder, first, lost=lost), overwrite=True) as aside:
+    with write_atomically(part_path(folder, first, lost=lost), overwrite=True) as aside:
         aside.write_bytes(content)
     if not lost:
         part_path(folder, first, lost=True).unlink(missing_ok=True)
 
 
-def parts(folder: Path) -> list[Path]:
+def list_parts(folder: Path) -> list[Path]:
     """Return all parts in a folder, sorted by first design, including placeholders of lost parts."""
     lost = [path for path in folder.glob("lost-*.parquet") if not path.with_name(f"part{path.name[4:]}").exists()]
     return sorted([*folder.glob("part-*.parquet"), *lost], key=lambda path: path.name[5:])
 
 
-def rows_in(path: Path) -> int:
+def count_rows(path: Path) -> int:
     """Return the number of designs in a part; 0 if it is missing or damaged."""
     try:
         return pq.read_metadata(path).num_rows if path.is_file() else 0
@@ -76,7 +76,7 @@ def read_parts(folder: Path) -> Columns:
     Raises CaptureError if a part is damaged or belongs to another study.
     """
     tables = []
-    for path in parts(folder):
+    for path in list_parts(folder):
         require_regular_file(path, most_bytes=_MOST_PART_BYTES, called="part of a sweep")
         try:
             table = pq.read_table(path)
@@ -104,7 +104,7 @@ def _columns(table: pa.Table) -> Columns:
 
 def write_csv(path: Path, columns: Columns) -> None:
     """Write columns as CSV and replace an older file."""
-    with written_aside(path, overwrite=True) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
+    with write_atomically(path, overwrite=True) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
@@ -161,15 +161,17 @@ class Batch:
 
     def all(self) -> list[Design]:
         """Return the designs."""
-        return designs_of(self.study, self.first, self.count) if self.designs is None else list(self.designs)
+        return sample_designs(self.study, self.first, self.count) if self.designs is None else list(self.designs)
 
 
-def judged_part(batch: Batch) -> bytes:
+def evaluate_batch(batch: Batch) -> bytes:
     """Evaluate a batch by formulas; return the content of its part."""
-    return as_part(judged(batch.study, batch.all()))
+    return encode_part(evaluate_designs(batch.study, batch.all()))
 
 
-def screen(study: Study, folder: Path, workers: Workers, *, progress: ProgressListener = unheard) -> None:
+def evaluate_study(
+    study: Study, folder: Path, workers: Workers, *, progress: ProgressListener = ignore_progress
+) -> None:
     """Evaluate all remaining designs of a study and write the parts below ``folder``.
 
     Raises
@@ -181,16 +183,16 @@ def screen(study: Study, folder: Path, workers: Workers, *, progress: ProgressLi
     SetupError
         The workers' cluster does not respond.
     """
-    made_folder(folder)
+    make_folder(folder)
     # Hidden files are temporary files of another machine, running or stopped.
     keep_to_plan(folder, _plan(study), set(), recorded="[!.]*", called="files", overwrite=False)
-    place = made_folder(folder / PARTS)
+    place = make_folder(folder / PARTS)
     if study.sampling.kind == "optimise":
         _optimise(study, folder, place, workers, progress)
         return
-    total, size = number_of_designs(study), study.sampling.batch
+    total, size = count_designs(study), study.sampling.batch
     batches = [Batch(study, None, first, min(size, total - first)) for first in range(0, total, size)]
-    waiting = [batch for batch in batches if rows_in(part_path(place, batch.first)) < batch.count]
+    waiting = [batch for batch in batches if count_rows(part_path(place, batch.first)) < batch.count]
     # Machines work in different orders, and check before each batch whether another machine has done it.
     random.shuffle(waiting)
     done = total - sum(batch.count for batch in waiting)
@@ -199,12 +201,12 @@ def screen(study: Study, folder: Path, workers: Workers, *, progress: ProgressLi
     def left() -> Iterator[Batch]:
         nonlocal done
         for batch in waiting:
-            if rows_in(part_path(place, batch.first)) < batch.count:
+            if count_rows(part_path(place, batch.first)) < batch.count:
                 yield batch
             else:
                 done += batch.count
 
-    for batch, result in workers.completed(judged_part, left()):
+    for batch, result in workers.map_unordered(evaluate_batch, left()):
         write_part(place, batch.first, _content(batch, result), lost=isinstance(result, Lost))
         done += batch.count
         progress(done, total)
@@ -223,14 +225,16 @@ def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progres
         _report(search, study, known)
     total = study.sampling.designs
     # Other machines can add designs, too.
-    while (done := sum(map(rows_in, parts(place)))) < total:
+    while (done := sum(map(count_rows, list_parts(place)))) < total:
         progress(done, total)
         trials = [search.ask(space) for _ in range(min(study.sampling.batch, total - done))]
-        asked = [Design(one.number, {name: free[name].taken(one.params[name]) for name in free}) for one in trials]
+        asked = [
+            Design(one.number, {name: free[name].round_value(one.params[name]) for name in free}) for one in trials
+        ]
         share = -(-len(asked) // workers.count)
         shares = [tuple(asked[i : i + share]) for i in range(0, len(asked), share)]
         batches = [Batch(study, designs, designs[0].number, len(designs)) for designs in shares]
-        for batch, result in workers.completed(judged_part, batches):
+        for batch, result in workers.map_unordered(evaluate_batch, batches):
             content = _content(batch, result)
             write_part(place, batch.first, content)
             _report(search, study, _columns(pq.read_table(pa.BufferReader(content))))
@@ -242,7 +246,7 @@ def _content(batch: Batch, result: bytes | Lost) -> bytes:
     """Return the content of a part; if the worker has died, a placeholder with failed designs and the reason."""
     if not isinstance(result, Lost):
         return result
-    return as_part(failed(batch.study, batch.all(), [result.reason] * batch.count))
+    return encode_part(make_failed_columns(batch.study, batch.all(), [result.reason] * batch.count))
 
 
 def _plan(study: Study) -> dict[str, JsonValue]:

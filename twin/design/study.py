@@ -14,7 +14,7 @@ from twin.design.parameters import Follow
 from twin.scene.paths import Value, value_at
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import is_regular_file
-from uwlts.model.library import find, load_sensor, read_table, validated
+from uwlts.model.library import find_description, load_sensor, read_table, validate_description
 from uwlts.model.sensor import Description, Medium, NotNegative, Sensor
 
 FOLDER = "studies"
@@ -63,7 +63,7 @@ class Variable(Description):
             raise DescriptionError(f"a variable with the values {self.values} is not a range with least and most")
         return self.least, self.most
 
-    def at(self, share: float) -> Value:
+    def value_at(self, share: float) -> Value:
         """Return the value at a fraction from 0 to 1 of the range, not rounded, or of the list."""
         if self.values is not None:
             return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
@@ -72,14 +72,14 @@ class Variable(Description):
             return float(math.exp(math.log(least) + share * math.log(most / least)))
         return least + share * (most - least)
 
-    def taken(self, value: Value) -> Value:
+    def round_value(self, value: Value) -> Value:
         """Return the value for a design: rounded if it must be an integer."""
         return round(float(value)) if self.whole and self.values is None else value
 
-    def drawn(self, shares: np.ndarray) -> list[Value]:
-        """Return the values for designs at fractions (N,), as by `at` and `taken`."""
+    def values_at(self, shares: np.ndarray) -> list[Value]:
+        """Return the values for designs at fractions (N,), as by `value_at` and `round_value`."""
         if self.values is not None or self.scale == "log":
-            return [self.taken(self.at(share)) for share in shares.tolist()]
+            return [self.round_value(self.value_at(share)) for share in shares.tolist()]
         least, most = self.ends()
         values = least + shares * (most - least)
         return np.rint(values).astype(int).tolist() if self.whole else values.tolist()
@@ -88,7 +88,7 @@ class Variable(Description):
         """Return all values of a grid."""
         if self.values is not None:
             return list(self.values)
-        return list(dict.fromkeys(self.taken(self.at(k / (self.steps - 1))) for k in range(self.steps)))
+        return list(dict.fromkeys(self.round_value(self.value_at(k / (self.steps - 1))) for k in range(self.steps)))
 
 
 class Objective(Description):
@@ -131,8 +131,9 @@ class Study(Description):
     ``sensor`` is the base sensor, given by name, path or table. It is stored completely, because remote workers may not
     have its file. ``variables`` are free values of the sensor's description by path (``camera.focal_length_mm``).
     ``choices`` are named alternatives that set several paths at once, such as commercial cameras. ``follow`` lists the
-    adjustments to each design's stand-off, see `twin.design.parameters.following`. ``refine`` enables the refinement of
-    the best design along the gradient. ``verify`` is the number of designs to render, in addition to the base sensor.
+    adjustments to each design's stand-off, see `twin.design.parameters.compute_adjustments`. ``refine`` enables the
+    refinement of the best design along the gradient. ``verify`` is the number of designs to render, in addition to the
+    base sensor.
     """
 
     title: str
@@ -157,7 +158,7 @@ class Study(Description):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Study:
-        if unknown := [name for name in self.wanted() if name not in FIGURES]:
+        if unknown := [name for name in self.figures() if name not in FIGURES]:
             raise ValueError(f"unknown figure {', '.join(unknown)}; known are {', '.join(FIGURES)}")
         if not self.variables and not self.choices:
             raise ValueError("nothing is free: give variables or choices")
@@ -167,7 +168,7 @@ class Study(Description):
             raise ValueError(f"choices.{empty[0]} is empty; give at least one option")
         if taken := [name for name in self.choices if name in (*FIGURES, *OTHER_COLUMNS)]:
             raise ValueError(f"choices.{taken[0]}: a figure has this name; give the choice another")
-        chosen = self.chosen()
+        chosen = self.choice_paths()
         if twice := sorted(chosen.keys() & self.variables):
             raise ValueError(f"{twice[0]} is set by a variable and by a choice")
         for what, path in FOLLOWING.items():
@@ -183,7 +184,7 @@ class Study(Description):
             )
         return self
 
-    def chosen(self) -> dict[str, None]:
+    def choice_paths(self) -> dict[str, None]:
         """Return the paths that options of choices set, in order, as keys."""
         options = (option for options in self.choices.values() for option in options.values())
         return dict.fromkeys(path for option in options for path in option)
@@ -196,7 +197,7 @@ class Study(Description):
         """Return the paths of continuous variables."""
         return [path for path, one in self.variables.items() if one.values is None and not one.whole]
 
-    def wanted(self) -> list[str]:
+    def figures(self) -> list[str]:
         """Return the figures of the objectives and of the constraints, in this order."""
         return list(dict.fromkeys([*(objective.figure for objective in self.objectives), *self.constraints]))
 
@@ -223,7 +224,7 @@ def load_study(study: str | Path | Study, *, designs: int | None = None, verify:
     if isinstance(study, Study):
         path, table = Path("the study"), study.model_dump()
     else:
-        path = find(study, FOLDER)
+        path = find_description(study, FOLDER)
         table = read_table(path, FOLDER)
         beside = path.parent / str(table.get("sensor", ""))
         if beside.suffix == ".toml" and is_regular_file(beside):
@@ -233,9 +234,9 @@ def load_study(study: str | Path | Study, *, designs: int | None = None, verify:
         table["sampling"] = sampling | {"designs": designs}
     if verify is not None:
         table["verify"] = verify
-    found = validated(Study, table, path)
+    found = validate_description(Study, table, path)
     found.medium_of(found.sensor)
-    for name in found.chosen():
+    for name in found.choice_paths():
         value_at(found.sensor, name, path)
     counted = [name for name in found.variables if type(value_at(found.sensor, name, path)) is int]
     whole = {name: found.variables[name].model_copy(update={"whole": True}) for name in counted}

@@ -16,18 +16,18 @@ import tomli_w
 from pydantic import TypeAdapter
 
 from twin.design.choice import choose
-from twin.design.designs import Columns, Marked
+from twin.design.designs import Columns, HighlightedDesign
 from twin.design.report.study_page import page_text
-from twin.design.screening import JOURNAL, PARTS, read_parts, screen, write_csv
+from twin.design.screening import JOURNAL, PARTS, evaluate_study, read_parts, write_csv
 from twin.design.study import Study, load_study
-from twin.design.verification import Agreement, render
+from twin.design.verification import Agreement, verify_candidates
 from twin.options import CPU, Variant
 from twin.recording.campaigns import PLAN
 from uwlts.errors import DescriptionError
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.pages.toolkit import write_page
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import open_workers
 
 RENDERED = "verified"
@@ -60,12 +60,12 @@ class SweepResult(Brief):
     study: Study
     folder: Path
     columns: Columns
-    marked: tuple[Marked, ...]
+    marked: tuple[HighlightedDesign, ...]
     agreements: tuple[Agreement, ...]
     notes: tuple[str, ...]
 
     @property
-    def winner(self) -> Marked:
+    def winner(self) -> HighlightedDesign:
         """Design to build."""
         return self.marked[-1]
 
@@ -77,7 +77,7 @@ class SweepResult(Brief):
     def lines(self) -> list[str]:
         """Return the result as lines of text."""
         lines = ["{} designs, {} work, {} meet all constraints".format(*self.counts()), *self.notes]
-        names = [*self.study.free(), *self.study.wanted()]
+        names = [*self.study.free(), *self.study.figures()]
         for one in self.marked:
             table = one.design.table().items()
             texts = {name: f"{value:.5g}" if isinstance(value, float) else str(value) for name, value in table}
@@ -105,7 +105,7 @@ def sweep(
     scheduler: str | None = None,
     overwrite: bool = False,
     variant: Variant = CPU,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> SweepResult:
     """Find the sensor to build: evaluate many designs by formulas, refine the best, and verify some by rendering.
 
@@ -162,21 +162,23 @@ def sweep(
     folder = Path("runs") / Path(str(study)).stem if out is None else Path(out)
     described = load_study(study, designs=designs, verify=verify)
     if overwrite:
-        clear(folder)
+        remove_results(folder)
     with open_workers(workers=workers, scheduler=scheduler) as pool:
-        screen(described, folder, pool, progress=progress)
+        evaluate_study(described, folder, pool, progress=progress)
         columns = read_parts(folder / PARTS)
         write_csv(folder / TABLE, columns)
         chosen = choose(described, columns)
         winner = chosen.marked[-1]
         notes = f"{winner.label} of the study: {described.title}"
         sensor = winner.sensor.model_copy(update={"name": f"{winner.sensor.name}-winner", "notes": notes})
-        with written_aside(folder / WINNER, overwrite=True) as aside:
+        with write_atomically(folder / WINNER, overwrite=True) as aside:
             aside.write_text(tomli_w.dumps(sensor.model_dump(mode="json", exclude_none=True)), encoding="utf-8")
         agreements: list[Agreement] = []
         if described.verify:
             rendered = [winner, *(one for one in chosen.marked if one.design.number < 0), *chosen.further]
-            agreements = render(described, folder / RENDERED, rendered, pool, variant=variant, progress=progress)
+            agreements = verify_candidates(
+                described, folder / RENDERED, rendered, pool, variant=variant, progress=progress
+            )
     result = SweepResult(described, folder, columns, chosen.marked, tuple(agreements), chosen.notes)
     page = page_text(described, columns, marked=chosen.marked, agreements=agreements, notes=chosen.notes)
     write_page(folder / PAGE, page, overwrite=True)
@@ -184,13 +186,13 @@ def sweep(
     content: dict[str, Any] = {"title": described.title} | counts
     content["marked"] = [{"label": one.label} | one.design.table() for one in result.marked]
     content |= {"verified": result.agreements, "notes": result.notes}
-    with written_aside(folder / SUMMARY, overwrite=True) as aside:
+    with write_atomically(folder / SUMMARY, overwrite=True) as aside:
         # NaN and infinity become null in JSON.
         aside.write_bytes(TypeAdapter(dict[str, Any]).dump_json(content, indent=2) + b"\n")
     return result
 
 
-def clear(folder: Path) -> None:
+def remove_results(folder: Path) -> None:
     """Remove only the files of an earlier sweep from a folder; a folder without a plan is not changed."""
     if not (folder / PLAN).is_file():
         return

@@ -22,20 +22,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from twin.backend.llvm import threads_kept
-from twin.design.designs import Marked
-from twin.design.figures_of_merit import figures_of, scatter_at
-from twin.design.parameters import parameters_of
+from twin.backend.llvm import preserve_threads
+from twin.design.designs import HighlightedDesign
+from twin.design.figures_of_merit import compute_figures, predict_scatter
+from twin.design.parameters import extract_parameters
 from twin.design.study import Study
-from twin.design.verification_scenes import PlannedRecording, recordings
+from twin.design.verification_scenes import PlannedRecording, plan_recordings
 from twin.options import CPU, Options, use_variant
-from twin.recording.campaigns import made_folder
+from twin.recording.campaigns import make_folder
 from uwlts import errors
 from uwlts.errors import Error
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.model.sensor import Sensor
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.runtime.workers import Lost, Workers, work_through
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.workers import Lost, Workers, run_jobs
 from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.truth import truth_path
@@ -48,7 +48,7 @@ _MAD_TO_STD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
+class VerifiedMeasurements:
     """Measurements of a plane normal to the laser's axis at K depths by a rendered sensor.
 
     Outliers, more than five robust standard deviations from the trend, are excluded except in ``points``. At depths
@@ -91,7 +91,7 @@ def verify(
     seed: int = 0,
     variant: str = CPU,
     workers: int = 2,
-) -> Rendered:
+) -> VerifiedMeasurements:
     """Calibrate a sensor and measure a plane with it in one of its media, with rendered images.
 
     Equal arguments give equal results.
@@ -128,9 +128,9 @@ def verify(
     """
     if workers < 1:
         raise errors.DescriptionError(f"workers is {workers}; it must be at least 1")
-    planned = recordings(sensor, medium, reflectance=reflectance)
+    planned = plan_recordings(sensor, medium, reflectance=reflectance)
     calibration, cloud = folder / "calibration.json", folder / "standard.ply"
-    made_folder(folder)
+    make_folder(folder)
     try:
         calibration.unlink(missing_ok=True)  # a calibration of an earlier run must not be used
     except OSError as error:
@@ -142,7 +142,7 @@ def verify(
     ]
     times = [time.perf_counter()]
     try:
-        work_through(partial(_record, folder, variant), jobs, workers=min(workers, len(jobs)))
+        run_jobs(partial(_record, folder, variant), jobs, workers=min(workers, len(jobs)))
         times.append(time.perf_counter())
         steps = [] if planned.step is None else ["--step", str(_capture(folder, planned.step))]
         target = str(_capture(folder, planned.target))
@@ -178,7 +178,7 @@ def _record(
     from twin.recording.record_scene import record_scene
 
     recording, options = job
-    with threads_kept():
+    with preserve_threads():
         dr.set_thread_count(1)
         try:
             path = _capture(folder, recording)
@@ -199,7 +199,7 @@ def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:
     raise errors.SetupError(f"uwlts {command} has ended unexpectedly (exit code {done.returncode}): {said[-1]}")
 
 
-def _evaluate_points(points: np.ndarray, stage_mm: np.ndarray) -> Rendered:
+def _evaluate_points(points: np.ndarray, stage_mm: np.ndarray) -> VerifiedMeasurements:
     """Evaluate points (N, 3), with frame, Y and Z, against the plane Z = 0.
 
     ``stage_mm`` (K,) are the stage positions along Z. The result is sorted by increasing depth.
@@ -215,11 +215,11 @@ def _evaluate_points(points: np.ndarray, stage_mm: np.ndarray) -> Rendered:
     nothing = (math.nan, math.nan, 0.0)
     figures = np.array([_profile(p) if good else nothing for p, good in zip(found, enough, strict=True)])
     scatter, error, line = figures.T
-    return Rendered(-stage_mm[order], np.array([len(profile) for profile in found]), scatter, error, line)
+    return VerifiedMeasurements(-stage_mm[order], np.array([len(profile) for profile in found]), scatter, error, line)
 
 
 def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
-    """Return scatter, mean deviation and length in mm of a profile (N, 2) of the plane Z = 0, as in `Rendered`."""
+    """Return scatter, mean deviation and length, mm, of a profile (N, 2) of Z = 0, as in `VerifiedMeasurements`."""
     used = points_yz
     # The first fit includes outliers; the second one excludes them.
     for _ in range(2):
@@ -267,7 +267,7 @@ class Agreement:
         return max((abs(error) for error in self.error_mm if math.isfinite(error)), default=math.nan)
 
 
-def verified(study: Study, candidate: Marked, *, workers: int, variant: str) -> Agreement:
+def verify_candidate(study: Study, candidate: HighlightedDesign, *, workers: int, variant: str) -> Agreement:
     """Render a candidate of a study in ``workers`` processes and compare its scatter with the prediction."""
     options = {"reflectance": study.reflectance, "variant": variant, "workers": workers}
     try:
@@ -275,14 +275,14 @@ def verified(study: Study, candidate: Marked, *, workers: int, variant: str) -> 
             rendered = verify(candidate.sensor, study.medium, Path(folder), **options)
     except (Error, OSError) as error:
         return Agreement(candidate.label, candidate.design.number, failure=str(error))
-    return compared(study, candidate, rendered)
+    return compare_scatter(study, candidate, rendered)
 
 
-def compared(study: Study, candidate: Marked, rendered: Rendered) -> Agreement:
+def compare_scatter(study: Study, candidate: HighlightedDesign, rendered: VerifiedMeasurements) -> Agreement:
     """Compare the rendered with the predicted scatter of a candidate."""
-    p = parameters_of([candidate.sensor], [study.medium_of(candidate.sensor)])
-    predicted = scatter_at(p, rendered.z_mm, 0.5 * rendered.line_mm, reflectance=study.reflectance)
-    figures, _ = figures_of(p, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
+    p = extract_parameters([candidate.sensor], [study.medium_of(candidate.sensor)])
+    predicted = predict_scatter(p, rendered.z_mm, 0.5 * rendered.line_mm, reflectance=study.reflectance)
+    figures, _ = compute_figures(p, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
     found = np.isfinite(rendered.scatter_mm) & (predicted > 0)
     ratio = math.nan
     if found.any():
@@ -307,14 +307,14 @@ def compared(study: Study, candidate: Marked, rendered: Rendered) -> Agreement:
     )
 
 
-def render(
+def verify_candidates(
     study: Study,
     folder: Path,
-    candidates: Sequence[Marked],
+    candidates: Sequence[HighlightedDesign],
     workers: Workers,
     *,
     variant: str,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> list[Agreement]:
     """Verify candidates by rendering; return the results in the same order and keep each in a file of ``folder``.
 
@@ -342,7 +342,7 @@ def render(
     SetupError
         The workers' cluster does not respond.
     """
-    made_folder(folder)
+    make_folder(folder)
     paths = []
     for candidate in candidates:
         what = "\n".join([candidate.sensor.model_dump_json(), study.medium, repr(study.reflectance), variant])
@@ -353,13 +353,13 @@ def render(
             kept = Agreement(**pq.read_table(path).to_pylist()[0])
             known |= {} if kept.failure else {place: kept}
     waiting = [place for place in range(len(candidates)) if place not in known]
-    work = partial(verified, study, workers=workers.processes_for(len(waiting)), variant=variant)
+    work = partial(verify_candidate, study, workers=workers.processes_for(len(waiting)), variant=variant)
     progress(len(known), len(candidates))
-    for candidate, result in workers.completed(work, [candidates[place] for place in waiting]):
+    for candidate, result in workers.map_unordered(work, [candidates[place] for place in waiting]):
         place = next(place for place in waiting if candidates[place] is candidate)
         if isinstance(result, Lost):
             result = Agreement(candidate.label, candidate.design.number, failure=result.reason)
-        with written_aside(paths[place], overwrite=True) as aside:
+        with write_atomically(paths[place], overwrite=True) as aside:
             pq.write_table(pa.Table.from_pylist([asdict(result)]), aside)
         known[place] = result
         progress(len(known), len(candidates))

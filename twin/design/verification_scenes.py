@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.design.geometry import Array, Lens, WindowGeometry, dot, seen
+from twin.design.geometry import Array, Lens, WindowGeometry, dot, project_points
 from twin.scene.description import Scene
 from uwlts.errors import DesignError
-from uwlts.model.library import validated
+from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object, check_design, laser_pose
 from uwlts.model.sensor import Camera, Exposure, Medium, Sensor, Volume
 
@@ -33,7 +33,7 @@ class LineOfSight:
     fan_slope: float
 
     @classmethod
-    def of(cls, sensor: Sensor, medium: Medium) -> "LineOfSight":
+    def from_sensor(cls, sensor: Sensor, medium: Medium) -> "LineOfSight":
         """Make it for a described sensor; DesignError if the sheet does not cross the camera's axis."""
         wavelength = sensor.laser.wavelength_nm
         index, pose = medium.refractive_index(wavelength), camera_from_object(sensor)
@@ -41,7 +41,7 @@ class LineOfSight:
         laser_mm = (laser_pose(sensor).origin_mm - pose[:3, 3]) @ pose[:3, :3]
         window = WindowGeometry((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
         if sensor.camera.window.mounted:
-            window = WindowGeometry.of(sensor.camera.window, medium, wavelength, np.eye(3))
+            window = WindowGeometry.from_description(sensor.camera.window, medium, wavelength, np.eye(3))
         return cls(sensor.camera, index, window, pose, laser_mm, sine / math.sqrt(1 - sine**2))
 
     def depth_mm(self, z: Array) -> Array:
@@ -65,7 +65,7 @@ class LineOfSight:
         # The formulas are valid only beyond the window's outer face.
         outside = (dot((x, y, z), window.normal) > window.outer_mm) & (z > 0)
         ahead = np.where(outside, x, 0), np.where(outside, y, 0), np.where(outside, z, 1e3)
-        image, within = seen(np, Lens.of(camera), window, ahead), margin_px - 0.5
+        image, within = project_points(np, Lens.from_description(camera), window, ahead), margin_px - 0.5
         in_width = (image.x >= within) & (image.x <= camera.width_px - 1 - within)
         return outside & in_width & (image.y >= within) & (image.y <= camera.height_px - 1 - within)
 
@@ -76,7 +76,7 @@ class LineOfSight:
         y = np.linspace(middle - reach, middle + reach, 1001)
         visible = self.in_image(np.column_stack([np.zeros_like(y), y, np.full_like(y, z)]))
         lit = np.abs(y - self.laser_mm[1]) <= self.fan_slope * (z - self.laser_mm[2])
-        return y[longest_run(visible & lit)]
+        return y[find_longest_run(visible & lit)]
 
     def half_target_mm(self, z: float, y: float) -> np.ndarray:
         """Return half the sides (2,), X and Y, of a target about (0, y, z) that fills the view.
@@ -100,7 +100,7 @@ class LineOfSight:
         return 2 * self.camera.corner_slope()
 
 
-def longest_run(flags: np.ndarray | list[bool]) -> slice:
+def find_longest_run(flags: np.ndarray | list[bool]) -> slice:
     """Return the slice of the longest run of true flags; empty if there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     start, end = max(edges.reshape(-1, 2).tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
@@ -158,7 +158,7 @@ class Recordings:
         return [recording for recording in (self.target, self.standard, self.step) if recording is not None]
 
 
-def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings:
+def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings:
     """Plan the scenes for the calibration of a sensor in one of its media, and a plane with a reflectance to measure.
 
     With refraction at a window, the target is recorded in air without the camera's window, and the step standard in the
@@ -172,8 +172,8 @@ def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings
         The sensor cannot work in the medium.
     """
     of_use = sensor.medium(medium)
-    near, far = measured_range(sensor, of_use)
-    sight = LineOfSight.of(sensor, of_use)
+    near, far = find_measured_range(sensor, of_use)
+    sight = LineOfSight.from_sensor(sensor, of_use)
     # Middle in Y of the line at the near end, and a length that covers the line at the far end.
     at_near, at_far = sight.line_mm(near), sight.line_mm(far)
     y = float(at_near[0] + at_near[-1]) / 2
@@ -198,11 +198,11 @@ def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings
     in_air = calibrated.model_copy(update={"media": media})
     window = in_air.camera.window.model_copy(update={"mounted": False})
     camera = in_air.camera.model_copy(update={"window": window})
-    bare = LineOfSight.of(in_air.model_copy(update={"camera": camera}), in_air.medium(air))
+    bare = LineOfSight.from_sensor(in_air.model_copy(update={"camera": camera}), in_air.medium(air))
     return Recordings(_target(in_air, air, bare, near=near, far=far, y=y), step, standard)
 
 
-def measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
+def find_measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
     """Return the smallest and largest Z in mm, OCS, of the line in view within the measuring volume, with a margin.
 
     Raises
@@ -212,7 +212,7 @@ def measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
         line in the volume is in view.
     """
     standoff = check_design(sensor, medium).standoff_mm
-    sight, volume = LineOfSight.of(sensor, medium), sensor.volume
+    sight, volume = LineOfSight.from_sensor(sensor, medium), sensor.volume
     forward = sight.pose[2, 2]
     if forward <= 0:
         raise DesignError(
@@ -220,7 +220,7 @@ def measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
             "must be below 90 deg: turn the laser"
         )
     depths = (np.linspace(volume.near_mm, volume.far_mm, _DEPTHS_TRIED) - standoff) / forward
-    lit = depths[longest_run([len(sight.line_mm(z)) > 1 for z in depths])]
+    lit = depths[find_longest_run([len(sight.line_mm(z)) > 1 for z in depths])]
     if len(lit) < 2:
         raise DesignError(
             f"the camera does not see the laser line in the volume from {volume.near_mm:g} to {volume.far_mm:g} mm: "
@@ -259,7 +259,7 @@ def _travel(near: float, far: float, count: int) -> dict[str, object]:
 
 
 def _scene(title: str, medium: str, **rest: object) -> Scene:
-    return validated(Scene, {"title": title, "medium": medium} | rest, title)
+    return validate_description(Scene, {"title": title, "medium": medium} | rest, title)
 
 
 def _target(sensor: Sensor, medium: str, sight: LineOfSight, *, near: float, far: float, y: float) -> PlannedRecording:
@@ -269,7 +269,7 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, *, near: float, far
     DesignError if the marks are sharp and in view at fewer than two depths.
     """
     depths = np.linspace(_NEARER * sight.depth_mm(near), _FARTHER * sight.depth_mm(far), _DEPTHS_TRIED)
-    sharp = depths[longest_run(sight.blur_px(depths) <= _LARGEST_BLUR_PX)]
+    sharp = depths[find_longest_run(sight.blur_px(depths) <= _LARGEST_BLUR_PX)]
     # The size of the circles depends on the range, and the range with complete marks on their size. The circles must
     # be large enough in the image at all depths, under oblique view and out of focus.
     roughly = _marks_in_view(sight, sharp, 0.0, y)
@@ -325,7 +325,7 @@ def _marks_in_view(sight: LineOfSight, depths: np.ndarray, diameter: float, y: f
         points = np.column_stack([rims, np.full(len(rims), sight.z_at(depth))])
         return bool(sight.in_image(points, margin_px=_BORDER_PX + sight.blur_px(depth) / 2).all())
 
-    seen = depths[longest_run([whole(depth) for depth in depths])]
+    seen = depths[find_longest_run([whole(depth) for depth in depths])]
     if len(seen) < 2:
         raise DesignError(
             f"a calibration target in air is nowhere in view and blurred by less than {_LARGEST_BLUR_PX:g} px: stop "

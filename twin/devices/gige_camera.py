@@ -387,10 +387,10 @@ class GigeCamera:
     def _develop(self, exposed: ExposedFrame, exposure_ms: float) -> None:
         """Make the image of an exposure and send it; called in order in the second thread."""
         with self._lock:
-            if self._server is None or not self._read(_Register.ACQUISITION):
+            if self._server is None or not self._read_register(_Register.ACQUISITION):
                 return
         try:
-            seen = self._seen(exposed.image(exposure_ms))
+            seen = self._convert_image(exposed.image(exposure_ms))
         except BaseException as error:
             self.failure = error
             raise
@@ -398,9 +398,9 @@ class GigeCamera:
         shot = _Shot(seen, (round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms),), counts)
         if self._of_profiles():
             # Profiles are collected until a frame is full; another port indicates another acquisition.
-            port, (gathered_for, gathered) = self._read(_Register.STREAM_PORT), self._gathered
+            port, (gathered_for, gathered) = self._read_register(_Register.STREAM_PORT), self._gathered
             shot = shot if gathered is None or gathered_for != port else gathered + shot
-            short = len(shot.seen) < self._read(_Register.HEIGHT)
+            short = len(shot.seen) < self._read_register(_Register.HEIGHT)
             self._gathered = port, shot if short else None
             if short:
                 return
@@ -416,14 +416,14 @@ class GigeCamera:
             self._number = self._number % _LAST_NUMBER + 1
             dropped, shortened = self._meets("drop"), self._meets("cut")
             names = (_Register.STREAM_IP, _Register.STREAM_PORT, _Register.PACKET_SIZE)
-            host, port, packet_bytes = map(self._read, names)
-            x, y, width, height = map(self._read, _REGION)
+            host, port, packet_bytes = map(self._read_register, names)
+            x, y, width, height = map(self._read_register, _REGION)
             region = x, y, width, height
             chunks: dict[int, tuple[int, ...]] = {}
-            if shot.counts and self._read(_Register.CHUNKS):
-                if self._read(_Register.ENCODER_CHUNK):
+            if shot.counts and self._read_register(_Register.CHUNKS):
+                if self._read_register(_Register.ENCODER_CHUNK):
                     chunks[ENCODER_CHUNK] = shot.counts
-                if self._read(_Register.TIME_CHUNK):
+                if self._read_register(_Register.TIME_CHUNK):
                     chunks[TIME_CHUNK] = shot.times_ns
         if not dropped:
             size = packet_bytes & 0xFFFF
@@ -457,7 +457,7 @@ class GigeCamera:
     def _send_when_ready(self, made: Future[_Shot]) -> None:
         """Keep a finished image and trigger the library to ask for it; called in the second thread."""
         with self._lock:
-            if self._server is None or not self._read(_Register.ACQUISITION):
+            if self._server is None or not self._read_register(_Register.ACQUISITION):
                 return
             self._answer = self._take(made)
             if self._answer is not None:
@@ -480,16 +480,16 @@ class GigeCamera:
         if image.shape != self._size or image.dtype != np.uint8:
             raise ImageError(f"the image is {image.shape} {image.dtype}; expected {self._size} uint8")
         counts = () if self._encoder is None else (self._encoder(),)
-        return _Shot(self._seen(image), (began_ns,), counts)
+        return _Shot(self._convert_image(image), (began_ns,), counts)
 
-    def _seen(self, image: np.ndarray) -> np.ndarray:
+    def _convert_image(self, image: np.ndarray) -> np.ndarray:
         """Return the image, or a 3D camera's profile (1, L) of it."""
         return self._scan3d.numbers(image)[None] if self._scan3d is not None and self._of_profiles() else image
 
     def _of_profiles(self) -> bool:
-        return self._scan3d is not None and self._read(_Register.PIXEL_FORMAT) == _COORD3D_C16
+        return self._scan3d is not None and self._read_register(_Register.PIXEL_FORMAT) == _COORD3D_C16
 
-    def _read(self, register: int) -> int:
+    def _read_register(self, register: int) -> int:
         number = c_uint32()
         self._library.arv_fake_camera_read_register(self._camera, register, ctypes.byref(number))
         return number.value

@@ -150,7 +150,7 @@ class GrblFirmware:
 
     def stage_at(self, time_s: float) -> tuple[float, float]:
         """Return the true position in mm and signed speed in mm/s at a time of the controller, now or just before."""
-        position, speed = self.axis.at(time_s)
+        position, speed = self.axis.state_at(time_s)
         return position + self.shift_mm, speed
 
     @property
@@ -189,7 +189,7 @@ class GrblFirmware:
     def restart(self) -> None:
         """Restart: switch the laser off, and discard position and queue."""
         now = self._now()
-        self.shift_mm += self.axis.at(now)[0]
+        self.shift_mm += self.axis.state_at(now)[0]
         self.axis.place(0.0)
         self._mode = "Alarm" if self._settings[22] else "Idle"
         self._clear(booted_s=now + self._boot_s)
@@ -281,7 +281,7 @@ class GrblFirmware:
 
     def _report(self, now: float) -> str:
         self.axis.advance(now)
-        position, speed = self.axis.at(now)
+        position, speed = self.axis.state_at(now)
         steps = round(position * self._settings[100]) / self._settings[100]
         if self.axis.held:
             state = f"Hold:{int(self.axis.braking(now))}"
@@ -314,10 +314,10 @@ class GrblFirmware:
             return 0.0
         if self._modal["spindle"] == "M3":
             return s
-        speed = abs(self.axis.at(now)[1])
-        return s * min(speed / self.axis.commanded(now), 1.0) if speed else 0.0
+        speed = abs(self.axis.state_at(now)[1])
+        return s * min(speed / self.axis.commanded_speed(now), 1.0) if speed else 0.0
 
-    def _done(self) -> Generator[None, None, None]:
+    def _wait_until_done(self) -> Generator[None, None, None]:
         """Wait until all movements are done."""
         while self.axis.pending or self.axis.held:
             yield
@@ -385,12 +385,12 @@ class GrblFirmware:
         pull_off = self._settings[27]
         switch = 0.0 if low else travel
         clear = switch + (pull_off if low else -pull_off)
-        if abs(switch - self.shift_mm - self.axis.at(self._now())[0]) > 1.5 * travel:
+        if abs(switch - self.shift_mm - self.axis.state_at(self._now())[0]) > 1.5 * travel:
             self.raise_alarm(9)
             return
         for place_mm, feed in ((switch, 25), (clear, 25), (switch, 24), (clear, 25)):
             self.axis.add(place_mm - self.shift_mm, speed=self._settings[feed] / 60, time_s=self._now())
-            yield from self._done()
+            yield from self._wait_until_done()
             yield from self._pause(self._settings[26] / 1000)
         at_the_switch = pull_off - travel if low else -pull_off
         counted = 0.0 if "Z" in self._options else at_the_switch
@@ -408,19 +408,19 @@ class GrblFirmware:
             raise GrblError(22)
         self._feed_mm_min = feed
         if "S" in values or "spindle" in block.commands:
-            yield from self._done()
+            yield from self._wait_until_done()
             self._s = values.get("S", self._s)
         if block.commands.get("stop") in ("M2", "M30"):
             modal |= {"motion": "G1", "distance": "G90", "spindle": "M5"}
         if block.commands.get("motion", self._modal["motion"]) != self._modal["motion"]:
-            yield from self._done()
+            yield from self._wait_until_done()
         self._modal = {name: modal[name] for name in self._modal}
         if block.commands.get("once") == "G4":
-            yield from self._done()
+            yield from self._wait_until_done()
             yield from self._dwell(values["P"])
         elif block.commands.get("once") in ("G92", "G92.1"):
-            yield from self._done()
-            machine = self.axis.at(self._now())[0]
+            yield from self._wait_until_done()
+            machine = self.axis.state_at(self._now())[0]
             self._offset_mm = machine - values["X"] * scale if block.commands["once"] == "G92" else 0.0
             self._reports_to_offset = 0
         elif moves:
@@ -437,7 +437,7 @@ class GrblFirmware:
             target = x + self._offset_mm
         low = 0 if "Z" in self._options and int(self._settings[23]) & 1 else -self._settings[130]
         if self._settings[20] and not low <= target <= low + self._settings[130]:
-            yield from self._done()
+            yield from self._wait_until_done()
             self.raise_alarm(2)
             return
         fastest = self._settings[110] if self._modal["motion"] == "G0" else min(feed, self._settings[110])

@@ -44,7 +44,7 @@ class Ramp:
         late_s = ((self.peak - self.start_speed) ** 2 + self.peak**2) / (2 * self.acceleration * self.peak)
         return self.start_s + abs(self.end_mm - self.start_mm) / self.peak + late_s
 
-    def at(self, time_s: float) -> tuple[float, float]:
+    def state_at(self, time_s: float) -> tuple[float, float]:
         """Return position and signed speed."""
         way, sign = abs(self.end_mm - self.start_mm), math.copysign(1.0, self.end_mm - self.start_mm)
         if time_s <= self.start_s:
@@ -77,7 +77,7 @@ class Brake:
         """Time of the end."""
         return self.start_s + abs(self.speed) / self.acceleration
 
-    def at(self, time_s: float) -> tuple[float, float]:
+    def state_at(self, time_s: float) -> tuple[float, float]:
         """Return position and signed speed."""
         # Calculated from the end, so that the final position is exact.
         left = self.end_s - min(max(time_s, self.start_s), self.end_s)
@@ -124,7 +124,7 @@ class Axis:
         last = self._moves[-1] if self._moves else None
         if last and last.speed == speed and (end_mm - start_mm) * (start_mm - last.start_mm) > 0:
             clock = max(self._clock(time_s), last.start_s)
-            at_mm, at_speed = last.at(clock)
+            at_mm, at_speed = last.state_at(clock)
             blocks = (*last.blocks, end_mm)
             self._moves[-1] = Ramp(at_mm, blocks, speed, self.acceleration, clock, abs(at_speed))
         else:
@@ -137,31 +137,31 @@ class Axis:
         while self._moves and self._clock(time_s) >= self._moves[0].end_s:
             self.rest_mm = self._moves.popleft().end_mm
         if self._moves and len(self._moves[0].blocks) > 1:
-            move, (at_mm, _) = self._moves[0], self.at(time_s)
+            move, (at_mm, _) = self._moves[0], self.state_at(time_s)
             ahead = math.copysign(1.0, move.end_mm - move.start_mm)
             left = tuple(end_mm for end_mm in move.blocks if (end_mm - at_mm) * ahead > 0)
             self._moves[0] = replace(move, blocks=left or move.blocks[-1:])
 
-    def commanded(self, time_s: float) -> float:
+    def commanded_speed(self, time_s: float) -> float:
         """Return the commanded speed of the present movement; 0 without one."""
         self.advance(time_s)
         return self._moves[0].speed if self._moves else 0.0
 
-    def at(self, time_s: float) -> tuple[float, float]:
+    def state_at(self, time_s: float) -> tuple[float, float]:
         """Return position and signed speed."""
         clock = self._clock(time_s)
         if self._brake:
-            return self._brake.at(clock)
+            return self._brake.state_at(clock)
         for move in self._moves:
             if clock < move.end_s:
-                return move.at(clock)
+                return move.state_at(clock)
         return self.planned_mm, 0.0
 
     def hold(self, time_s: float) -> None:
         """Brake and keep the remaining movements."""
         self.advance(time_s)
         if not self._brake:
-            position, speed = self.at(time_s)
+            position, speed = self.state_at(time_s)
             self._brake = Brake(position, speed, self.acceleration, self._clock(time_s))
 
     def resume(self, time_s: float) -> None:
@@ -169,7 +169,7 @@ class Axis:
         if not self._brake or self.braking(time_s):
             return
         ends = [(end_mm, move.speed) for move in self._moves for end_mm in move.blocks]
-        self.rest_mm, _ = self.at(time_s)
+        self.rest_mm, _ = self.state_at(time_s)
         self._brake = None
         self._moves.clear()
         for end_mm, speed in ends:
@@ -182,7 +182,7 @@ class Axis:
     def stop(self, time_s: float) -> None:
         """Stop immediately and discard the movements; a blocked movement is released."""
         stuck_s = None if self._moves else self._stuck_s
-        self.place(self.at(time_s)[0])
+        self.place(self.state_at(time_s)[0])
         self._stuck_s = stuck_s
 
     def place(self, position_mm: float) -> None:

@@ -20,14 +20,14 @@ from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
 from twin.options import CPU, Options, Variant, use_variant
 from twin.recording.render import AnyScene, AnySensor, choose_scene, choose_sensors
-from twin.scene.description import altered
+from twin.scene.description import replace_values
 from twin.scene.motion import Light, Motion, Shot
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
 
 if TYPE_CHECKING:  # it needs Mitsuba
     from twin.light.pose import Travel
-    from twin.recording.studio import Studio
+    from twin.recording.sensor_simulator import SensorSimulator
 
 # Numbers of Grbl's settings of the X axis.
 _STEPS_PER_MM = 100
@@ -125,7 +125,7 @@ class Track:
     start_mm: float
 
     @classmethod
-    def on(cls, stage: Stage, motion: Motion, *, start_mm: float | None = None) -> "Track":
+    def place(cls, stage: Stage, motion: Motion, *, start_mm: float | None = None) -> "Track":
         """Place a motion at ``start_mm``, by default in the middle of the travel, rounded to a step.
 
         Raises DescriptionError if the motion is not within the travel.
@@ -184,7 +184,7 @@ class Bench:
     With ``lamp``, the lamp is on while the laser is off. Raises DesignError if the detector does not have 8 bits.
     """
 
-    def __init__(self, studio: "Studio", *, state: Callable[[], StageState], track: Track, lamp: bool):
+    def __init__(self, studio: "SensorSimulator", *, state: Callable[[], StageState], track: Track, lamp: bool):
         bits = studio.sensor.detector.bits
         if bits != 8:
             raise DesignError(f"the served camera has 8 bits, the sensor's detector {bits}: set bits = 8")
@@ -197,7 +197,7 @@ class Bench:
         """Compile the kernels for laser images with a trial image, because the compilation exceeds an exposure."""
         state = replace(self._state(), laser_on=True, power=1.0)
         light = self._electrons_per_ms(state, None)
-        self._studio.detected(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=[self._studio.options.seed])
+        self._studio.detect(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=[self._studio.options.seed])
         self._travelled_mm = math.nan
 
     def frame(self, exposure_ms: float, state: StageState | None = None) -> np.ndarray:
@@ -215,7 +215,7 @@ class Bench:
         if travel is not None:
             self._seen.clear()
         noise_seed = [self._studio.options.seed, _NOISE, self.rates.frames]
-        image = self._studio.detected(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
+        image = self._studio.detect(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
         seconds, rates = time.perf_counter() - began, replace(self.rates, frames=self.rates.frames + 1)
         if at_rest and len(self._seen) == known:
             self.rates = replace(rates, repeating_s=rates.repeating_s + seconds)
@@ -358,7 +358,7 @@ def serve(
         Aravis is not installed, or Mitsuba cannot use the variant.
     """
     described = choose_scene(scene, placement=placement, medium=medium, water=water)
-    options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
+    options = Options.from_names(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
     if options.flaws.lamp_and_laser:
         raise DescriptionError("lamp-and-laser cannot be served, because the controller switches the laser: remove it")
     if not speed_up > 0:
@@ -371,13 +371,13 @@ def serve(
     _, built = choose_sensors(sensor, as_built)
     faults = [parse_fault(text) for text in fault]
     use_variant(variant)
-    from twin.recording.studio import Studio
+    from twin.recording.sensor_simulator import SensorSimulator
 
-    track = Track.on(built.stage, motion, start_mm=stage_start)
+    track = Track.place(built.stage, motion, start_mm=stage_start)
     lamp = "lamp" in motion.lights if lamp is None else lamp
     # The controller moves the stage, and a frame can need any light.
     at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
-    studio = Studio(built, altered(described, motion=at_rest), options)
+    studio = SensorSimulator(built, replace_values(described, motion=at_rest), options)
     settings = {
         _STEPS_PER_MM: 1 / built.stage.resolution_mm,
         _SPEED: 60 * built.stage.speed_mm_per_s,

@@ -175,7 +175,7 @@ class CameraView:
         self._to_object = opaque_transform(np.linalg.inv(self._camera_from_object))
         self._grids: dict[int, tuple[Rays, tuple[int, int]]] = {}
 
-    def bundle(self, x: Float, y: Float, pupil: Point2f | None = None) -> Rays:
+    def trace_bundle(self, x: Float, y: Float, pupil: Point2f | None = None) -> Rays:
         """Trace rays of image points to behind the window; pixel (0, 0) is the centre of the first pixel.
 
         ``pupil`` gives points of the unit disc. Without it, the chief rays through the pupil's centre are returned.
@@ -192,7 +192,7 @@ class CameraView:
         if spacing not in self._grids:
             columns, rows = -(-self.camera.width_px // spacing) + 1, -(-self.camera.height_px // spacing) + 1
             x, y = np.meshgrid(np.arange(columns) * spacing - 0.5, np.arange(rows) * spacing - 0.5)
-            bundle = self.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
+            bundle = self.trace_bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
             dr.eval(bundle.origin, bundle.direction, bundle.weight)
             self._grids[spacing] = bundle, (rows, columns)
         return self._grids[spacing]
@@ -227,7 +227,7 @@ class CameraView:
         at = (image[:, None] + shift).reshape(-1, 2)
         through = np.tile(np.concatenate([np.zeros((3, 2)), rim]), (len(image), 1))
         x, y, pupil_x, pupil_y = (to_jit(mi.Float, values) for values in (*at.T, *through.T))
-        bundle = self.bundle(x, y, mi.Point2f(pupil_x, pupil_y))
+        bundle = self.trace_bundle(x, y, mi.Point2f(pupil_x, pupil_y))
         dr.eval(bundle.origin, bundle.direction, bundle.weight)
         transform = self._camera_from_object
         o = to_numpy(bundle.origin).astype(float) @ transform[:3, :3].T + transform[:3, 3]

@@ -252,7 +252,7 @@ class SheetLobe:
         return dr.log(ratio + dr.sqrt(dr.square(ratio) - 1))
 
 
-def lights(
+def make_lights(
     sheets: Iterable[Sheet], pose: SensorPose, mirrors: Iterable[MirrorFace] = ()
 ) -> tuple[list[Light], list[Light]]:
     """Return the direct light of each sheet, and the light of each sheet in each mirror face."""

@@ -79,7 +79,7 @@ class IndirectLight:
         large = np.repeat(np.arange(rows * columns), self._times.ravel())
         small = np.repeat(np.arange(len(row_in_stripe)), self._times_in_stripe)
         self._found = [(FoundLight(rows, columns), FoundLight(1, len(row_in_stripe))) for _ in NOISE_SHARES]
-        for cell, *parts in walked(
+        for cell, *parts in trace_walks(
             view,
             walker,
             np.concatenate([large // columns * WALK_CELL_PX, row_in_stripe[small] * NODE_SPACING_PX]),
@@ -129,7 +129,7 @@ class IndirectLight:
         return cells, inside / (self._walks * self._times_in_stripe)
 
 
-def walked(
+def trace_walks(
     view: CameraView, walker: Walker, rows: np.ndarray, columns: np.ndarray, sides: np.ndarray, *, seed: int, walks: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Trace random walks; yield cells (N,) and both kinds of irradiance (N,) in W/mm2 as `Walker.trace` does.
@@ -147,7 +147,7 @@ def walked(
         keys: list[Any] = [dr.opaque(mi.UInt32, (place_seed + k) % 2**32) for k in (0, 1)]
         u, v = (mi.sample_tea_float32(place, key) for key in keys)
         left, above, width = (dr.gather(mi.Float, values, cell) for values in (x, y, side))
-        bundle = view.bundle(left + u * width, above + v * width)
+        bundle = view.trace_bundle(left + u * width, above + v * width)
         yield from walker.trace(bundle, cell, seed=seed + 1013 * part)
 
 

@@ -94,7 +94,7 @@ def sample_spots(
     def seen(x: np.ndarray, y: np.ndarray, aside: np.ndarray) -> dict[str, np.ndarray]:
         """Return volume (mm3) per pixel, light of the sheet, and area per pixel at image positions ``x`` and ``y``."""
         at = [(to_jit(mi.Float, x + dx), to_jit(mi.Float, y + dy)) for dx, dy in ((0, 0), (1, 0), (0, 1))]
-        bundles = [view.bundle(*each) for each in at]
+        bundles = [view.trace_bundle(*each) for each in at]
         crossed = [light.intersect(*light.to_sheet_frame(each.origin, each.direction)) for each in bundles]
         t, bundle = crossed[0][0], bundles[0]
         points = [each.origin + each.direction * where for each, (where, _) in zip(bundles, crossed, strict=True)]

@@ -24,7 +24,7 @@ import numpy as np
 from twin.backend.arrays import Float, Point3f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
 from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
-from twin.light.illumination import Light, lights
+from twin.light.illumination import Light, make_lights
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
     combine_corners,
@@ -177,7 +177,7 @@ class Renderer:
         """Return the light of the laser on the image sensor; see `irradiance`."""
         begin_kernels()
         pose = SensorPose(scene_from_object, travel)
-        direct, mirrored = lights(self._sheets, pose, self._mirrors)
+        direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
         lit, haze, surfaces = self._laser_nodes(pose, direct, mirrored)
         rows, columns = find_marked(self._expand_cells(lit))
         stripe_means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp)
@@ -223,7 +223,7 @@ class Renderer:
         """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
         if self._own_stripe is None or not pose.equals(self._own_stripe[0]):
             bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
-            direct, _ = lights(self._sheets[:1], pose)
+            direct, _ = make_lights(self._sheets[:1], pose)
             own = np.zeros((shape[0] - 1, shape[1] - 1), bool)
             for moment, (light, *_) in self._moments(pose, direct):
                 segment = next(self._segments(moment, bundle, None))
@@ -233,7 +233,7 @@ class Renderer:
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
         """Return the irradiance in W/mm2 per ray of the first laser on directly visible surfaces, and the rays."""
-        direct, _ = lights(self._sheets[:1], pose)
+        direct, _ = make_lights(self._sheets[:1], pose)
         segment = next(self._segments(pose, bundle, after_s))
         return segment.weight * self._radiance(pose, segment, direct, after_s), segment
 
@@ -303,7 +303,7 @@ class Renderer:
             way_mm = (last - first) * pose.travel.fastest_mm_s(_REACH_SHARE * self.design.standoff_mm)
             for after_s in np.linspace(first, last, 2 + int(way_mm / _TRAVEL_STEP_MM)):
                 moved = pose.displace(float(after_s))
-                direct, mirrored = lights(self._sheets, moved, self._mirrors)
+                direct, mirrored = make_lights(self._sheets, moved, self._mirrors)
                 yield moved, direct + mirrored
 
     def _crossing(self, light: Light, bundle: Rays) -> SheetCrossing:
@@ -490,7 +490,7 @@ class Renderer:
         after_s = None
         if pose.travel is not None:
             after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
-        bundle = self.view.bundle(x + across - 0.5, y + down - 0.5, pupil)
+        bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
         values = light(pose, bundle, after_s, *rest)
         dr.eval(values)  # together: separate sums would trace the rays again
         sums = [dr.block_sum(value, spp) for value in values]

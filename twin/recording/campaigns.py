@@ -9,13 +9,13 @@ from pathlib import Path
 from pydantic import JsonValue
 
 from twin.options import CPU, Flaws, Options, Variant, use_variant
-from twin.scene.campaign import Campaign, Take, load_campaign, takes
+from twin.scene.campaign import Campaign, Take, list_takes, load_campaign
 from uwlts.errors import CaptureError, DescriptionError, Error, OutputError
-from uwlts.files.inputs import note_made, refuse_input
-from uwlts.files.json_files import another, read_json
-from uwlts.files.writing import one_writer, written_aside
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.runtime.workers import work_through
+from uwlts.files.inputs import record_made, refuse_input
+from uwlts.files.json_files import describe_other_plan, read_json
+from uwlts.files.writing import lock_output, write_atomically
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.workers import run_jobs
 from uwlts.storage.capture import part_path
 from uwlts.storage.truth import truth_path
 
@@ -33,7 +33,7 @@ def record(
     workers: int | None = None,
     overwrite: bool = False,
     variant: Variant = CPU,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> Path:
     """Render all recordings of a campaign into a folder, with imperfections drawn from a seed.
 
@@ -71,7 +71,7 @@ def record(
         if value < least:
             raise DescriptionError(f"{name} is {value}; it must be at least {least}")
     described, folder = load_campaign(campaign), Path(out)
-    flaws = Flaws.of(*effects)
+    flaws = Flaws.parse(*effects)
     jobs = _jobs(described, folder, seed=seed, every=every, spp=spp, variant=variant, flaws=flaws)
     plan = _plan(described, every=every, spp=spp, variant=variant) | {"seed": seed, "effects": flaws.names()}
     _record_all(jobs, folder, plan, recorded="*.h5*", workers=workers, overwrite=overwrite, progress=progress)
@@ -106,7 +106,7 @@ def record_campaigns(
     variant: str = CPU,
     workers: int | None = None,
     overwrite: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> list[Path]:
     """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; return these folders.
 
@@ -142,7 +142,7 @@ def _jobs(
 ) -> list[_Job]:
     return [
         _Job(take, place / f"{take.name}.h5", Options(spp=spp, seed=take.seed, flaws=flaws), variant)
-        for take in takes(campaign, seed=seed, every=every)
+        for take in list_takes(campaign, seed=seed, every=every)
     ]
 
 
@@ -161,9 +161,9 @@ def _record_all(
     progress: ProgressListener,
 ) -> None:
     """Render incomplete recordings into a folder that follows a plan; ``recorded`` is the pattern of its captures."""
-    made_folder(folder)
+    make_folder(folder)
     # Concurrent runs would resume each other's unfinished recordings.
-    with one_writer(folder / PLAN):
+    with lock_output(folder / PLAN):
         files = {file for job in jobs for file in job.files}
         keep_to_plan(folder, plan, files, recorded=recorded, called="recordings", overwrite=overwrite)
         for place in {job.path.parent for job in jobs}:
@@ -178,10 +178,10 @@ def _record_all(
         total = sum(job.images for job in jobs)
         counted = count(total - sum(job.images for job in waiting))
         progress(next(counted), total)
-        work_through(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
+        run_jobs(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
 
 
-def made_folder(folder: Path) -> Path:
+def make_folder(folder: Path) -> Path:
     """Create a folder if it does not exist, and return it; OutputError if that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -209,7 +209,7 @@ def keep_to_plan(
     try:
         # The plan is an output: it must not replace an input file.
         refuse_input(path)
-        note_made(path)
+        record_made(path)
         known = read_json(path, called="plan") if path.is_file() else None
     except CaptureError:
         known = None
@@ -217,7 +217,7 @@ def keep_to_plan(
         return
     how = f"that {PLAN} does not describe"
     if known is not None:
-        how = f"made with {another(known, plan)}"
+        how = f"made with {describe_other_plan(known, plan)}"
     if found and not overwrite:
         raise DescriptionError(
             f"{folder} holds {called} {how}: give another folder, the same settings, or `overwrite` to start again"
@@ -226,7 +226,7 @@ def keep_to_plan(
         raise DescriptionError(
             f"{folder} would keep {called} {how}, such as {min(kept)}: give another folder, or remove them first"
         )
-    with written_aside(path, overwrite=True) as aside:
+    with write_atomically(path, overwrite=True) as aside:
         aside.write_text(text, encoding="utf-8")
 
 

@@ -77,7 +77,7 @@ def demo(out: str | Path = "runs/demo") -> Path:
                 (folder / "seconds.json").write_text(json.dumps(seconds, indent=2) + "\n", encoding="utf-8")
             start = time.perf_counter()
             # Commands of one stage are independent.
-            for line, ended in workers.completed(_run, _announce([line for _, line in rows])):
+            for line, ended in workers.map_unordered(_run, _announce([line for _, line in rows])):
                 if isinstance(ended, Lost):
                     raise SetupError(f"{line}: {ended.reason}")
                 code, output, complaints = ended

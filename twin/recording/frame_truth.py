@@ -37,7 +37,7 @@ class FrameTruth:
     crossings: np.ndarray
 
 
-def no_stripe(lines: int) -> FrameTruth:
+def make_empty_truth(lines: int) -> FrameTruth:
     """Return the truth of a frame without laser light."""
     nothing = np.full(lines, np.nan)
     empty = np.zeros(lines, np.uint8)
@@ -63,18 +63,18 @@ class Crossings:
     thing: np.ndarray
 
 
-def true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> FrameTruth:
+def find_true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> FrameTruth:
     """Return the true stripe of a frame: the brightest lit crossing of every profile line.
 
     It applies to chief rays in the middle of the exposure.
     """
-    return brightest(crossings(renderer, scene_from_object, travel=travel), renderer.sensor.camera.lines())
+    return select_brightest(find_crossings(renderer, scene_from_object, travel=travel), renderer.sensor.camera.lines())
 
 
-def brightest(found: Crossings, lines: int) -> FrameTruth:
+def select_brightest(found: Crossings, lines: int) -> FrameTruth:
     """Return the truth of a frame with ``lines`` profile lines from its crossings."""
-    truth = no_stripe(lines)
-    dimmest_first = lit_dimmest_first(found)
+    truth = make_empty_truth(lines)
+    dimmest_first = sort_lit_crossings(found)
     chosen = found.line[dimmest_first]
     np.add.at(truth.crossings, chosen, 1)
     truth.centre_px[chosen] = found.centre_px[dimmest_first]
@@ -84,13 +84,13 @@ def brightest(found: Crossings, lines: int) -> FrameTruth:
     return truth
 
 
-def lit_dimmest_first(found: Crossings) -> np.ndarray:
+def sort_lit_crossings(found: Crossings) -> np.ndarray:
     """Return indices of the lit crossings in ascending brightness, so that the brightest of a line is the last."""
     lit = np.flatnonzero(found.brightness > 0)
     return lit[np.argsort(found.brightness[lit], kind="stable")]
 
 
-def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> Crossings:
+def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> Crossings:
     """Find all crossings of a frame by the false-position method along every profile line."""
     camera = renderer.sensor.camera
     pose = SensorPose(scene_from_object, travel)
@@ -109,7 +109,7 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
         return None if travel is None else travel.compute_times(position(across, at)[1], 0.5)
 
     def distance(across: Float, at: Float) -> Float:
-        bundle = renderer.view.bundle(*position(across, at))
+        bundle = renderer.view.trace_bundle(*position(across, at))
         ray = pose.ray(bundle.origin, bundle.direction, travelled(across, at))
         hit = renderer.objects.scene.ray_intersect_preliminary(ray)
         light = renderer.sheet.evaluate(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
@@ -148,7 +148,7 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
         )
     centre = low + (high - low) * below / (below - above)
     dr.eval(centre)
-    bundle = renderer.view.bundle(*position(centre, at))
+    bundle = renderer.view.trace_bundle(*position(centre, at))
     brightness, seen = renderer.laser(pose, bundle, travelled(centre, at))
     si, offset = seen.si, dr.select(seen.valid, renderer.sheet.evaluate(seen.end()).distance_mm, dr.nan)
     thing = renderer.objects.number(si.shape, seen.valid)
@@ -161,14 +161,14 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
 
 def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
     """Return the camera-frame z in mm (H, W), float32, of the surface at every pixel centre; NaN if there is none."""
-    return seen_surfaces(renderer, scene_from_object)[0]
+    return find_visible_surfaces(renderer, scene_from_object)[0]
 
 
-def seen_surfaces(renderer: Renderer, scene_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_visible_surfaces(renderer: Renderer, scene_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return depth as `depth_map`, and the object number (H, W), -1 for none, at every pixel centre."""
     camera = renderer.sensor.camera
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
-    bundle = renderer.view.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
+    bundle = renderer.view.trace_bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
     ray = SensorPose(scene_from_object).ray(bundle.origin, bundle.direction)
     hit = renderer.objects.scene.ray_intersect_preliminary(ray)
     depth = renderer.view.depth_mm(mi.Point3f(bundle.origin + bundle.direction * hit.t))
@@ -178,7 +178,7 @@ def seen_surfaces(renderer: Renderer, scene_from_object: np.ndarray) -> tuple[np
     return depth.numpy().reshape(x.shape), number.numpy().reshape(x.shape)
 
 
-def image_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
+def project_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
     """Return the image positions (N, 2) in px of scene points (N, 3); NaN for points that are hidden or out of view.
 
     Newton's method minimises the distance of chief rays from the points.
@@ -192,7 +192,7 @@ def image_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm: n
     for _ in range(_POINT_STEPS):
         pixels = np.clip(pixels, -0.1 * size, 1.1 * size)
         at = pixels[:, None] + [(0, 0), (1, 0), (0, 1)]
-        bundle = renderer.view.bundle(to_jit(mi.Float, at[..., 0]), to_jit(mi.Float, at[..., 1]))
+        bundle = renderer.view.trace_bundle(to_jit(mi.Float, at[..., 0]), to_jit(mi.Float, at[..., 1]))
         dr.eval(bundle.origin, bundle.direction)
         origin, direction = (
             to_numpy(v).astype(float).reshape(at.shape[:2] + (3,)) for v in (bundle.origin, bundle.direction)
@@ -202,7 +202,7 @@ def image_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm: n
         slopes = np.stack([miss[:, 1] - miss[:, 0], miss[:, 2] - miss[:, 0]], axis=2)
         steps = np.einsum("nij,nj->ni", np.linalg.pinv(slopes), miss[:, 0])
         pixels = pixels - steps
-    bundle = renderer.view.bundle(*(to_jit(mi.Float, axis) for axis in pixels.T))
+    bundle = renderer.view.trace_bundle(*(to_jit(mi.Float, axis) for axis in pixels.T))
     hit = renderer.objects.scene.ray_intersect_preliminary(
         SensorPose(scene_from_object).ray(bundle.origin, bundle.direction)
     )

@@ -11,17 +11,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.llvm import threads_kept
+from twin.backend.llvm import preserve_threads
 from twin.options import Options
 from twin.recording.frame_truth import FrameTruth, depth_map
-from twin.recording.studio import ShotLight, Studio, medium_of, with_window
+from twin.recording.sensor_simulator import SensorSimulator, ShotLight, medium_of, with_window
 from twin.scene.description import Scene
 from twin.scene.motion import Shot
 from twin.scene.platforms import Platform
 from uwlts.errors import OutputError
 from uwlts.model.sensor import Sensor, Table
 from uwlts.model.trajectory import Trajectory
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import CaptureHeader
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.pose_files import trajectory_path
@@ -37,7 +37,7 @@ def record_scene(
     options: Options = Options(),
     overwrite: bool = False,
     resume: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> None:
     """Render a scene into a capture at ``path`` and its ground truth into a file beside it.
 
@@ -53,7 +53,7 @@ def record_scene(
     report = motion.course().report if isinstance(motion, Platform) else None
     if report is not None and trajectory_path(path).exists() and not (overwrite or resume):
         raise OutputError(f"{trajectory_path(path)} exists already; give another name, or `overwrite` to replace it")
-    studio = Studio(as_built or sensor, scene, options)
+    studio = SensorSimulator(as_built or sensor, scene, options)
     # The header contains only what an operator knows: nominal values.
     header = CaptureHeader(
         name=path.stem,
@@ -91,7 +91,7 @@ def record_scene(
     with (
         CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer,
         ThreadPoolExecutor(1) as camera,
-        threads_kept() as threads,
+        preserve_threads() as threads,
     ):
         done = len(writer)
 
@@ -121,7 +121,7 @@ def record_scene(
         write_truth(truth_path(path), described, truth, overwrite=overwrite or resume)
 
 
-def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
+def truth_of_recording(studio: SensorSimulator, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
     """Combine the truths of a recording's frames, with the depth map of the first shot."""
     stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
     poses = np.stack([studio.pose(shot) for shot in shots])

@@ -15,12 +15,12 @@ import numpy as np
 from twin.options import CPU, Options, Variant, use_variant
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import require_ending
 from uwlts.model.brief import Brief
-from uwlts.model.library import load_sensor, validated
+from uwlts.model.library import load_sensor, validate_description
 from uwlts.model.sensor import Medium, Sensor
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import CAPTURES
 from uwlts.storage.truth import Truth
 
@@ -94,7 +94,7 @@ def render(
     """
     described = choose_scene(scene, placement=placement, medium=medium, water=water)
     _, built = choose_sensors(sensor, as_built)
-    options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
+    options = Options.from_names(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
     # Return images even if a 3D camera would reduce them to centre lines.
     options = replace(options, flaws=replace(options.flaws, camera_3d=0))
     shots = list(enumerate(described.motion.shots()))
@@ -104,9 +104,9 @@ def render(
         shots = [shots[number] for number in frames]
     use_variant(variant)
     from twin.recording.record_scene import truth_of_recording
-    from twin.recording.studio import Studio
+    from twin.recording.sensor_simulator import SensorSimulator
 
-    studio = Studio(built, described, options)
+    studio = SensorSimulator(built, described, options)
     taken = [studio.frame(shot, number) for number, shot in shots]
     truths = [studio.truth(shot) for _, shot in shots]
     return Recording(
@@ -119,7 +119,7 @@ def render(
     )
 
 
-@inputs_kept()
+@protect_inputs()
 def simulate(
     scene: AnyScene,
     *,
@@ -137,7 +137,7 @@ def simulate(
     resume: bool = False,
     overwrite: bool = False,
     variant: Variant = CPU,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
     report: Callable[[str], object] = lambda line: None,
 ) -> list[Path]:
     """Render a scene into a capture, with the ground truth in a file beside it.
@@ -208,7 +208,7 @@ def simulate(
         raise DescriptionError(f"several placements, but one output {out}: put {{placement}} into its name")
     described = [choose_scene(scene, placement=place, medium=medium, water=water) for place in places]
     nominal, built = choose_sensors(sensor, as_built)
-    options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
+    options = Options.from_names(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
     use_variant(variant)
     from twin.recording.record_scene import record_scene
 
@@ -228,7 +228,7 @@ def choose_scene(scene: AnyScene, *, placement: str | None, medium: str | None, 
         return load_scene(scene, placement=placement, medium=medium, water=water)
     given = {"placement": placement, "medium": medium, "water": water}
     changes = {key: value for key, value in given.items() if value is not None}
-    return validated(Scene, scene.model_dump() | changes, scene.title)
+    return validate_description(Scene, scene.model_dump() | changes, scene.title)
 
 
 def choose_sensors(sensor: AnySensor, as_built: AnySensor | None) -> tuple[Sensor, Sensor]:

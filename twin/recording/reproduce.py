@@ -8,7 +8,7 @@ from twin.options import CPU, Variant
 from twin.recording.campaigns import record_campaigns
 from twin.scene.campaign import load_campaign
 from uwlts.errors import CommandFailed, DescriptionError
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 
 _LEAST_TRIALS = 20
 """Smallest number of trials in `uwlts thesis`, checked before anything is rendered."""
@@ -27,7 +27,7 @@ def reproduce(
     workers: int | None = None,
     overwrite: bool = False,
     variant: Variant = CPU,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> Path:
     """Render the campaigns of the thesis, evaluate them by all its methods, and compare the results with its tables.
 

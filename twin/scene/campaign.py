@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from twin.scene.description import Block, Printed, Scene, altered, load_scene
+from twin.scene.description import Block, PrintedPlate, Scene, load_scene, replace_values
 from twin.scene.motion import Motion
 from twin.scene.platforms import Platform
 from uwlts.errors import DescriptionError
-from uwlts.model.library import find, load_sensor, read_table, validated
+from uwlts.model.library import find_description, load_sensor, read_table, validate_description
 from uwlts.model.sensor import Description, NotNegative, Sensor
 
 FOLDER = "campaigns"
@@ -92,18 +92,18 @@ class Take:
 
 def load_campaign(name_or_path: str | Path) -> Campaign:
     """Read a campaign by name (``thesis``) or path; DescriptionError if it does not exist or is invalid."""
-    path = find(name_or_path, FOLDER)
-    campaign = validated(Campaign, read_table(path, FOLDER), path)
+    path = find_description(name_or_path, FOLDER)
+    campaign = validate_description(Campaign, read_table(path, FOLDER), path)
 
     def from_folder(name_or_path: str) -> str:
         return str(path.parent / name_or_path) if name_or_path.endswith(".toml") else name_or_path
 
-    recordings = tuple(altered(each, scene=from_folder(each.scene)) for each in campaign.recordings)
+    recordings = tuple(replace_values(each, scene=from_folder(each.scene)) for each in campaign.recordings)
     sensor, as_built = from_folder(campaign.sensor), from_folder(campaign.as_built)
-    return altered(campaign, sensor=sensor, as_built=as_built, recordings=recordings)
+    return replace_values(campaign, sensor=sensor, as_built=as_built, recordings=recordings)
 
 
-def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
+def list_takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
     """Return all recordings of a campaign with the imperfections of a seed; scans keep every n-th profile.
 
     DescriptionError if a scene, placement or sensor is unknown, or two recordings have the same name.
@@ -131,7 +131,7 @@ def _take(
     built = sensor if recording.as_described else drawn.sensor
     if recording.stripe_along is not None:
         turned = {"stripe_along": recording.stripe_along}
-        sensor, built = altered(sensor, camera=turned), altered(built, camera=turned)
+        sensor, built = replace_values(sensor, camera=turned), replace_values(built, camera=turned)
     # Calibrations keep all images, and scans at least five profiles.
     stage = scene.motion
     if isinstance(stage, Motion) and scene.target is None and stage.count >= 5 * every and every > 1:
@@ -144,7 +144,7 @@ def _take(
 
 
 def _with_motion(scene: Scene, **changes: object) -> Scene:
-    motion = validated(type(scene.motion), scene.motion.model_dump() | changes, scene.title)
+    motion = validate_description(type(scene.motion), scene.motion.model_dump() | changes, scene.title)
     return scene.model_copy(update={"motion": motion})
 
 
@@ -159,7 +159,7 @@ class _SampledImperfections:
         tilt_x, tilt_y = (size.window_tilt_std_deg * rng.standard_normal(2)).tolist()
         bow = size.sheet_bow_std_deg * rng.standard_normal()
         tilts = {"tilt_x_deg": window.tilt_x_deg + tilt_x, "tilt_y_deg": window.tilt_y_deg + tilt_y}
-        self.sensor = altered(built, camera={"window": tilts}, laser={"bow_deg": built.laser.bow_deg + bow})
+        self.sensor = replace_values(built, camera={"window": tilts}, laser={"bow_deg": built.laser.bow_deg + bow})
         self._lead = size.stage_lead_std * rng.standard_normal()
         self._scan_angles = size.stage_misalignment_std_deg * rng.standard_normal(2)
         self._warmer_calibrating, self._warmer_measuring = size.temperature_half_width_c * rng.uniform(-1, 1, 2)
@@ -175,21 +175,21 @@ class _SampledImperfections:
         """Return the sensor in water of the true temperature."""
         warmer = self._warmer_calibrating if calibrating else self._warmer_measuring
         media = {key: each if each.kind == "air" else each.warmer_by(warmer) for key, each in sensor.media.items()}
-        return altered(sensor, media=media)
+        return replace_values(sensor, media=media)
 
     def apply_imperfections(self, scene: Scene, rng: np.random.Generator) -> Scene:
         """Return the scene with the errors of target, step and stage; ``rng`` draws the errors of this recording."""
         size, motion, objects = self._size, scene.motion, list(scene.objects)
         for number, thing in enumerate(objects):
-            if isinstance(thing, Printed):
+            if isinstance(thing, PrintedPlate):
                 tilt = size.target_tilt_std_deg * rng.standard_normal(2)
                 turned = np.array(thing.rotation_deg) + (*tilt, 0.0)
-                objects[number] = altered(thing, **self._target, rotation_deg=tuple(turned.tolist()))
+                objects[number] = replace_values(thing, **self._target, rotation_deg=tuple(turned.tolist()))
         if self._lower_step != 0 and _shows_step(scene):
             number = _find_lower_block(scene)
             x, y, z = objects[number].position_mm
-            objects[number] = altered(objects[number], position_mm=(x, y, z + self._lower_step))
-        scene = altered(scene, objects=tuple(objects))
+            objects[number] = replace_values(objects[number], position_mm=(x, y, z + self._lower_step))
+        scene = replace_values(scene, objects=tuple(objects))
         if isinstance(motion, Platform):
             # Platforms draw their own errors.
             return _with_motion(scene, errors_seed=int(rng.integers(2**31)))

@@ -21,19 +21,19 @@ from twin.scene.robot import Robot
 from twin.scene.scene_object import FlatObject, Pose, Reflectance, SceneObject
 from twin.scene.vehicle import Vehicle
 from uwlts.errors import DescriptionError
-from uwlts.model.library import find, read_table, validated
+from uwlts.model.library import find_description, read_table, validate_description
 from uwlts.model.sensor import Description, NotNegative, Positive, Table
 from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
 
 
-def altered(described: Kind, **changes: object) -> Kind:
+def replace_values(described: Kind, **changes: object) -> Kind:
     """Return a copy with replaced values, unvalidated; a table of changes applies to the nested description."""
     inner = {name: getattr(described, name) for name in changes}
     return described.model_copy(
         update={
-            name: altered(inner[name], **change)
+            name: replace_values(inner[name], **change)
             if isinstance(change, dict) and isinstance(inner[name], Description)
             else change
             for name, change in changes.items()
@@ -79,7 +79,7 @@ class Mesh(SceneObject):
     scale: Positive = 1.0
 
 
-class Printed(SceneObject, ABC):
+class PrintedPlate(SceneObject, ABC):
     """Base of calibration targets on a flat plate that faces -z; its own frame is the target's.
 
     A real target differs from its description: each point (circle or corner) has an error of ``centre_std_mm`` along x
@@ -113,7 +113,7 @@ class Printed(SceneObject, ABC):
         return self.model_copy(update={name: scale * getattr(self, name) for name in names})
 
 
-class CirclePlate(Printed):
+class CirclePlate(PrintedPlate):
     """A lattice of circles; three of them have a dot and mark origin, X and Y.
 
     The lattice has ``columns`` along x and ``rows`` along y. ``origin`` is the column and row of the marked origin, at
@@ -156,11 +156,11 @@ class CirclePlate(Printed):
         return self.circle_reflectance, self.marker_reflectance
 
 
-def _parsed(target: Target | Mapping[str, object]) -> Target:
+def _parse_target(target: Target | Mapping[str, object]) -> Target:
     return target if isinstance(target, Target) else parse_target(target)
 
 
-class TargetPlate(Printed):
+class TargetPlate(PrintedPlate):
     """A calibration target of any kind.
 
     ``target`` is a description as in a scene's ``[target]``, which is the default. ``reflectance`` is that of the
@@ -169,7 +169,7 @@ class TargetPlate(Printed):
     """
 
     kind: Literal["target_plate"]
-    target: Annotated[SerializeAsAny[Target], BeforeValidator(_parsed)]
+    target: Annotated[SerializeAsAny[Target], BeforeValidator(_parse_target)]
     ink_reflectance: Reflectance = 0.05
     rim_mm: NotNegative = 10.0
 
@@ -244,7 +244,7 @@ class Scene(Description):
     def _has_its_placement_and_one_target_with_detection_errors(self) -> "Scene":
         if self.placement not in self.placements:
             raise ValueError(f"placement '{self.placement}' is not one of {', '.join(self.placements)}")
-        plates = [thing for thing in self.objects if isinstance(thing, Printed)]
+        plates = [thing for thing in self.objects if isinstance(thing, PrintedPlate)]
         if len(plates) > 1 and any(plate.detection_std_px > 0 for plate in plates):
             raise ValueError("detection_std_px is for scenes with one target: omit it, or the other targets")
         return self
@@ -264,7 +264,7 @@ def load_scene(
     motion: Motion | Platform | Mapping[str, object] | None = None,
 ) -> Scene:
     """Read a scene by name (``spheres``) or path; the given values replace its own. A motion may be a table."""
-    path = find(name_or_path)
+    path = find_description(name_or_path)
     table: dict[str, object] = dict(read_table(path))
     motion = motion.model_dump() if isinstance(motion, Description) else motion
     given = {"placement": placement, "medium": medium, "water": water, "motion": motion}
@@ -275,7 +275,7 @@ def load_scene(
     if isinstance(moved := table.get("motion"), Mapping) and isinstance(moved.get("trajectory"), str):
         table["motion"] = {**moved, "trajectory": str(path.parent / str(moved["trajectory"]))}
     table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
-    return validated(Scene, table, path)
+    return validate_description(Scene, table, path)
 
 
 def _with_paths_from(folder: Path, thing: Table) -> Table:

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
-from twin.scene.description import AnyObject, FlatObject, Printed, SceneObject
+from twin.scene.description import AnyObject, FlatObject, PrintedPlate, SceneObject
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.model.media import check_range
 from uwlts.storage.image_file import read_image
@@ -93,7 +93,7 @@ def _make_glossy(
 
 def _reflectance(thing: SceneObject, scale: float = 1.0) -> float | mi.Texture:
     """Return the reflectance of an object, a number or a texture, multiplied by ``scale``."""
-    if isinstance(thing, Printed):
+    if isinstance(thing, PrintedPlate):
         return pattern_texture(thing.scale_reflectance(scale))
     if thing.texture is None:
         return scale * thing.reflectance
@@ -160,7 +160,7 @@ def view_along_normal(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     return straight
 
 
-def pattern_texture(plate: Printed) -> mi.Texture:
+def pattern_texture(plate: PrintedPlate) -> mi.Texture:
     """Return the texture of a printed plate; `register_pattern` must have been called for the variant."""
     return mi.load_dict({"type": "target_pattern", "plate": plate.model_dump_json()})
 
@@ -177,7 +177,7 @@ def register_pattern() -> None:
 
         def __init__(self, props: mi.Properties):
             mi.Texture.__init__(self, props)
-            self.plate = cast(Printed, TypeAdapter(AnyObject).validate_json(str(props["plate"])))
+            self.plate = cast(PrintedPlate, TypeAdapter(AnyObject).validate_json(str(props["plate"])))
             target, (first, last) = self.plate.described_target(), self.plate.bounds_mm()
             self.middle, self.size, self.first = ((first + last) / 2).tolist(), (last - first).tolist(), first.tolist()
             self.points_end = target.indices.max(axis=0).tolist()
@@ -236,7 +236,7 @@ def register_pattern() -> None:
     mi.register_texture("target_pattern", TargetPattern)
 
 
-def _patch_table(plate: Printed) -> np.ndarray:
+def _patch_table(plate: PrintedPlate) -> np.ndarray:
     """Return centre, half width, aspect ratio, roundness and reflectance (N + 1, 8) of patches.
 
     The last row is a patch that is never hit.
@@ -275,12 +275,12 @@ def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -
     return lists.reshape(rows, columns, -1), cell_mm
 
 
-def draw_print_errors(plate: Printed) -> np.ndarray:
+def draw_print_errors(plate: PrintedPlate) -> np.ndarray:
     """Return the print errors (rows, columns, 2) in mm of a target's points along x and y."""
     return plate.centre_std_mm * _standard_normal(plate, 0)
 
 
-def shift_points(scene: mi.Scene, plate: Printed, *, mm_per_px: float, image: int) -> None:
+def shift_points(scene: mi.Scene, plate: PrintedPlate, *, mm_per_px: float, image: int) -> None:
     """Shift the points of a scene's only target by their print errors and their detection errors in one image."""
     noise = mm_per_px * plate.detection_std_px * _standard_normal(plate, 1, image)
     parameters = mi.traverse(scene)
@@ -289,7 +289,7 @@ def shift_points(scene: mi.Scene, plate: Printed, *, mm_per_px: float, image: in
     parameters.update()
 
 
-def _standard_normal(plate: Printed, *stream: int) -> np.ndarray:
+def _standard_normal(plate: PrintedPlate, *stream: int) -> np.ndarray:
     """Return random numbers (rows, columns, 2) for the errors of a target's points."""
     columns, rows = plate.described_target().indices.max(axis=0) + 1
     return np.random.default_rng([plate.errors_seed, *stream]).standard_normal((rows, columns, 2))

@@ -40,7 +40,7 @@ class LinearGuide(Route):
         return self
 
     def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
-        commanded = self.commanded()
+        commanded = self.command_poses()
         first, last = (self.waypoints[end].matrix()[:3, 3] for end in (0, -1))
         travel = float(np.linalg.norm(last - first))
         guide = _axes((last - first) / travel)
@@ -85,7 +85,7 @@ class RotaryTable(Platform):
 
     @model_validator(mode="before")
     @classmethod
-    def _paced(cls, table: object) -> object:
+    def _derive_frame_rate(cls, table: object) -> object:
         """Derive the frame rate from speed and angles."""
         if not isinstance(table, dict) or not table.get("speed_deg_per_s") or table.get("frame_rate_hz") is not None:
             return table

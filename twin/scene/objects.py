@@ -164,24 +164,27 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
             matrix = pose.copy()
             if thing.texture is None:
                 matrix[:3, :3] = np.eye(3)  # Mitsuba mistakes rounding errors of a rotated sphere for shear
-            matrix, kind = matrix @ _scaled(*[thing.diameter_mm / 2] * 3), "sphere"
+            matrix, kind = matrix @ _make_scaling(*[thing.diameter_mm / 2] * 3), "sphere"
         case Block():
-            matrix, kind = pose @ _scaled(*(side / 2 for side in thing.size_mm)), "cube"
+            matrix, kind = pose @ _make_scaling(*(side / 2 for side in thing.size_mm)), "cube"
         case Pipe():
-            matrix = _CYLINDER_AXIS_TO_X @ _scaled(thing.diameter_mm / 2, thing.diameter_mm / 2, thing.length_mm)
+            matrix = _CYLINDER_AXIS_TO_X @ _make_scaling(thing.diameter_mm / 2, thing.diameter_mm / 2, thing.length_mm)
             matrix[0, 3] = -thing.length_mm / 2
             matrix, kind = pose @ matrix, "cylinder"
         case CirclePlate() | TargetPlate() if thing.bow_mm != 0:
             return _mesh(thing, pose, bsdf)
         case CirclePlate() | TargetPlate():
             first, last = thing.bounds_mm()
-            matrix = _FACING_SENSOR @ _scaled(*(last - first) / 2, 1)
+            matrix = _FACING_SENSOR @ _make_scaling(*(last - first) / 2, 1)
             matrix[:2, 3] = (first + last) / 2
             matrix, kind = pose @ matrix, "rectangle"
         case Mesh() | FreeForm():
             return _mesh(thing, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}))
         case Plate():
-            matrix, kind = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1), "rectangle"
+            matrix, kind = (
+                pose @ _FACING_SENSOR @ _make_scaling(thing.width_mm / 2, thing.height_mm / 2, 1),
+                "rectangle",
+            )
         case _:
             assert_never(thing)
     return mi.load_dict({"type": kind, "to_world": scalar_transform(matrix), "bsdf": bsdf})
@@ -281,6 +284,6 @@ def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
             assert_never(thing)
 
 
-def _scaled(*factors: float) -> np.ndarray:
+def _make_scaling(*factors: float) -> np.ndarray:
     """Return the transform (4, 4) that scales along x, y and z."""
     return np.diag([*factors, 1.0])

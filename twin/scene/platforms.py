@@ -222,7 +222,7 @@ class Route(Platform):
         """Times (K,) in s, and poses ``T_scene_sensor`` (K, 4, 4), which the path interpolates."""
         return _knots(self)  # pyright: ignore[reportArgumentType]
 
-    def commanded(self) -> Poses:
+    def command_poses(self) -> Poses:
         """Return the nominal poses ``T_scene_platform`` of the path."""
         times, poses = self._knots
         return _path(times, poses @ np.linalg.inv(self.mount.matrix()), stops=self.stops)
@@ -234,7 +234,7 @@ class IdealPath(Route):
     kind: Literal["path"]
 
     def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
-        commanded = self.commanded()
+        commanded = self.command_poses()
         return PlatformMotion(commanded, commanded)
 
 
@@ -272,7 +272,7 @@ def _path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
     velocities = positions.derivative()
     rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
 
-    def at(wanted: np.ndarray) -> np.ndarray:
+    def evaluate(wanted: np.ndarray) -> np.ndarray:
         inside = np.clip(wanted, times[0], times[-1])
         beyond = (np.asarray(wanted) - inside)[:, None]
         found = np.tile(np.eye(4), (len(inside), 1, 1))
@@ -280,7 +280,7 @@ def _path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
         found[:, :3, :3] = (rotations(inside) * Rotation.from_rotvec(beyond * rotations(inside, 1))).as_matrix()
         return found
 
-    return at
+    return evaluate
 
 
 def displace_poses(poses: np.ndarray, errors: np.ndarray) -> np.ndarray:

@@ -52,7 +52,7 @@ class Robot(Route):
         if not self.stops:
             times = np.linspace(-LEAD_S, times[-1] + LEAD_S, 2 + int((times[-1] + 2 * LEAD_S) / _ARC_S))
         base, links = self.base.matrix(), np.array(self.links)
-        angles = _joint_angles(np.linalg.inv(base) @ self.commanded()(times), links)
+        angles = _joint_angles(np.linalg.inv(base) @ self.command_poses()(times), links)
         wrong = links + self.link_std_mm * rng.standard_normal((6, 3)) * (1, 1, 0)
         zero, gear = (
             np.radians(std) * rng.standard_normal(6) for std in (self.joint_zero_std_deg, self.joint_gear_std_deg)

@@ -56,7 +56,7 @@ def sample_waves(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], n
     phases, tilt_phases = rng.uniform(0, 2 * np.pi, _COMPONENTS), rng.uniform(0, 2 * np.pi, (2, _COMPONENTS))
     towards = np.radians(sea.towards_deg)
 
-    def at(times: np.ndarray) -> np.ndarray:
+    def evaluate(times: np.ndarray) -> np.ndarray:
         found = np.zeros((len(times), 6))
         if still:
             return found
@@ -68,7 +68,7 @@ def sample_waves(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], n
             found[:, 3 + axis] = np.sin(turns + tilt_phases[axis]) @ weight
         return found
 
-    return at
+    return evaluate
 
 
 class Navigation(Description):
@@ -172,7 +172,7 @@ class Vehicle(Route):
         return self
 
     def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
-        commanded = self.commanded()
+        commanded = self.command_poses()
         waves, phases = sample_waves(self.sea, rng), rng.uniform(0, 2 * np.pi, 6)
         sizes = np.append(np.full(3, self.vibration_mm), np.full(3, np.radians(self.vibration_deg)))
 

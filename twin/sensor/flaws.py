@@ -13,7 +13,7 @@ from scipy.signal import fftconvolve
 
 from twin.options import Flaws
 from uwlts.errors import DescriptionError
-from uwlts.model.library import merged, validated
+from uwlts.model.library import merge_tables, validate_description
 from uwlts.model.sensor import Camera, Sensor
 
 GLARE_REACH = 0.15
@@ -46,7 +46,9 @@ def as_built(sensor: Sensor, flaws: Flaws) -> Sensor:
     lens = {"p1": camera.distortion.p1 + flaws.tangential}
     shutter = {"shutter": "rolling", "line_time_us": flaws.rolling_shutter} if flaws.rolling_shutter else {}
     changes = {"camera": built | {"distortion": lens}, "detector": shutter}
-    return validated(Sensor, merged(sensor.model_dump(), changes), f"{sensor.name} with {', '.join(flaws.names())}")
+    return validate_description(
+        Sensor, merge_tables(sensor.model_dump(), changes), f"{sensor.name} with {', '.join(flaws.names())}"
+    )
 
 
 def vignette(camera: Camera, loss: float) -> np.ndarray:

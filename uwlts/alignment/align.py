@@ -26,11 +26,11 @@ from uwlts.files.json_files import write_record
 from uwlts.fitting.least_squares import noise_factor
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
-from uwlts.model.trajectory import Trajectory, on_clock
+from uwlts.model.trajectory import Trajectory, convert_to_platform_clock
 from uwlts.reconstruction.path_uncertainty import correct_path_uncertainty
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
 
 
@@ -132,7 +132,7 @@ def align_trajectory(
     clock_drift_ppm: float = 0.0,
     drift_mm: float | None = None,
     drift_deg: float | None = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> AlignedTrajectory:
     """Correct a trajectory so that surfaces scanned twice agree, and move the cloud accordingly.
 
@@ -167,16 +167,16 @@ def align_trajectory(
     EvaluationError
         Points have no times, the drift is unknown, or no crossing determines the correction.
     """
-    cloud = loaded_cloud(cloud)
+    cloud = load_cloud(cloud)
     if not isinstance(trajectory, Trajectory):
         trajectory = read_trajectory(Path(trajectory), pose_format=pose_format, unit=pose_unit)
     if cloud.time_s is None:
         raise EvaluationError("the cloud has no times of its points: reconstruct it with a trajectory")
-    times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
+    times = convert_to_platform_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
     drift = choose_drift_model(trajectory, drift_mm, drift_deg)
     options = AlignmentOptions()
-    prior = PathPrior.over(times, drift, trajectory, intervals=options.intervals)
-    search = accept_crossings(initial_estimate(Survey.along(cloud, times, trajectory), prior, options), progress)
+    prior = PathPrior.from_times(times, drift, trajectory, intervals=options.intervals)
+    search = accept_crossings(initial_estimate(Survey.from_cloud(cloud, times, trajectory), prior, options), progress)
     estimate = settle(search.estimate) if search.estimate.pairs else search.estimate
     left_out = tuple(_pair_times(estimate, pair) for pair in search.doubtful)
     if not estimate.pairs:
@@ -245,7 +245,7 @@ def _make_result(
 
 
 def _make_crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
-    now, held = estimate.compared(pair)
+    now, held = estimate.measure_distances(pair)
     # Distances of the same patches along the original path.
     shift = np.zeros_like(now.places_mm)
     for number, rows, sign in zip(pair, (now.target, now.source), (-1.0, 1.0), strict=True):

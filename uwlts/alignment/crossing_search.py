@@ -23,7 +23,7 @@ from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nod
 from uwlts.fitting.least_squares import rms_distance
 from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Search:
     hypotheses: int
 
 
-def accept_crossings(estimate: PathEstimate, progress: ProgressListener = unheard) -> Search:
+def accept_crossings(estimate: PathEstimate, progress: ProgressListener = ignore_progress) -> Search:
     """Find and accept the crossings of a path, in chronological order."""
     waiting: list[Hypothesis] = []
     doubtful: list[Pair] = []
@@ -90,7 +90,7 @@ def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
             pair = earlier, later
             reach = None if pair in closed else _search_range(estimate, pair)
             if reach is not None and reach.max() < estimate.reach_mm:
-                found, _ = estimate.compared(pair)
+                found, _ = estimate.measure_distances(pair)
                 new += [pair] if len(found.source) >= estimate.options.fewest_patches else []
     if not new:
         return estimate

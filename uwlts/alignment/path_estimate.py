@@ -83,13 +83,13 @@ class PathEstimate:
         found = distances_between(self.surfaces[source], np.eye(4), self.surfaces[target], np.eye(4), reach_mm=reach_mm)
         return found, self.pieces[source].held_out[found.source] | self.pieces[target].held_out[found.target]
 
-    def compared(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
+    def measure_distances(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
         """Measure the distances of the later piece of a pair from the earlier one, within twice the reach."""
         return self.distances(pair[1], pair[0], reach_mm=2 * self.reach_mm)
 
     def agrees(self, pair: Pair) -> bool:
         """Check whether the surfaces of a pair agree, including held-out patches."""
-        found, held_out = self.compared(pair)
+        found, held_out = self.measure_distances(pair)
         options = self.options
         fits = np.abs(found.distance_mm) < options.agreeing_sigmas * found.std_mm
         if np.count_nonzero(fits) < options.fewest_patches or np.mean(fits) < options.least_agreeing:

@@ -30,7 +30,7 @@ class PathPrior:
     trajectory: Trajectory
 
     @classmethod
-    def over(cls, times_s: np.ndarray, drift: DriftModel, trajectory: Trajectory, *, intervals: int) -> PathPrior:
+    def from_times(cls, times_s: np.ndarray, drift: DriftModel, trajectory: Trajectory, *, intervals: int) -> PathPrior:
         """Return the prior with regular nodes over the times (N,) of the points."""
         return cls(np.linspace(times_s.min(), times_s.max(), intervals + 1), drift, trajectory)
 

@@ -77,10 +77,10 @@ def refine_nodes(estimate: PathEstimate) -> PathEstimate:
     """Return the same correction with dense nodes where pairs overlap; `solve` continues from it."""
     survey, options, times = estimate.survey, estimate.options, []
     for earlier, later in estimate.pairs:
-        found, _ = estimate.compared((earlier, later))
+        found, _ = estimate.measure_distances((earlier, later))
         times += [estimate.pieces[later].times_s[found.source], estimate.pieces[earlier].times_s[found.target]]
     step = options.node_spacing * survey.radius_mm / survey.speed_mm_s
-    even = PathPrior.over(
+    even = PathPrior.from_times(
         survey.moments_s, estimate.prior.drift, estimate.prior.trajectory, intervals=options.intervals
     )
     return _change_prior(estimate, even.with_nodes(np.concatenate([[], *times]), step, most=options.most_nodes))

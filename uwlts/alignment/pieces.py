@@ -53,7 +53,7 @@ class Survey:
     speed_mm_s: float
 
     @classmethod
-    def along(cls, cloud: PointCloud, times_s: np.ndarray, trajectory: Trajectory) -> Survey:
+    def from_cloud(cls, cloud: PointCloud, times_s: np.ndarray, trajectory: Trajectory) -> Survey:
         """Divide a cloud into pieces, given the times (N,) of its points on the trajectory's clock."""
         moments, image = np.unique(times_s, return_inverse=True)
         order = np.argsort(image, kind="stable")

@@ -12,8 +12,8 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.errors import DescriptionError
 from uwlts.model.calibration import Calibration
 from uwlts.optics.window import require_index
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.storage.capture import Capture, opened_captures
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.storage.capture import Capture, open_captures
 from uwlts.stripe import StripeSettings
 
 _Captures = Sequence[Capture | str | Path]
@@ -35,7 +35,7 @@ def calibrate(
     pixels: Pixels = "auto",
     index: float | None = None,
     stripe: StripeSettings = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> Calibration:
     """Calibrate camera, window and sheet from images of a target in air or in water, and of a step standard in water.
 
@@ -122,10 +122,10 @@ def calibrate(
         strict=strict,
     )
     with (
-        opened_captures(air) as in_air,
-        opened_captures(step) as steps,
-        opened_captures(water) as in_water,
-        opened_captures(scan) as scans,
+        open_captures(air) as in_air,
+        open_captures(step) as steps,
+        open_captures(water) as in_water,
+        open_captures(scan) as scans,
     ):
         for capture in in_water:
             if capture.header.medium.kind == "air":

@@ -9,16 +9,16 @@ from functools import partial
 import numpy as np
 from pydantic import ValidationError
 
-from uwlts.calibration.camera.image_quality import why_not_found
+from uwlts.calibration.camera.image_quality import explain_missing_target
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.target_stripes import TargetStripe, stripe_on_target
-from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError, problems_of
+from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError, describe_problems
 from uwlts.model.artefacts import StepStandard
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.runtime.workers import in_threads
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.workers import map_in_threads
 from uwlts.storage.capture import Capture
-from uwlts.stripe import Stripe, StripeOptions, StripeSettings, stripe_in, why_no_stripe
-from uwlts.stripe.capture_stripes import shown_stripe
+from uwlts.stripe import Stripe, StripeOptions, StripeSettings, explain_missing_stripe, find_stripe
+from uwlts.stripe.capture_stripes import find_stripe_direction
 from uwlts.targets import Target, TargetView, parse_target
 
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
@@ -75,8 +75,8 @@ class StepEvidence:
         return self.source.rsplit(", frame ", 1)[0]
 
 
-def air_evidence(
-    captures: Sequence[Capture], *, stripe: StripeSettings = None, progress: ProgressListener = unheard
+def find_air_evidence(
+    captures: Sequence[Capture], *, stripe: StripeSettings = None, progress: ProgressListener = ignore_progress
 ) -> AirEvidence:
     """Find the target in images with the laser off, and the stripe in images with it on at the same positions.
 
@@ -98,7 +98,7 @@ def air_evidence(
     for number, capture in enumerate(captures):
         first = len(images)
         detect = partial(_detect_target, capture, targets[0], number)
-        for (frame, _), found in in_threads(detect, capture.frames(laser_on=False)):
+        for (frame, _), found in map_in_threads(detect, capture.frames(laser_on=False)):
             if isinstance(found, str):
                 reasons[found] += 1
                 warnings.append(f"{capture.path.name}, frame {frame}: left out, {found}")
@@ -112,7 +112,7 @@ def air_evidence(
             done = _report(progress, "target", done, total)
         positions = np.array([image.stage_mm for image in images[first:]])
         on_target = partial(_find_target_stripe, capture, stripe, first, views[first:], positions, targets[0])
-        for (frame, _), found in in_threads(on_target, _laser_frames(capture)):
+        for (frame, _), found in map_in_threads(on_target, _laser_frames(capture)):
             if isinstance(found, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {found}")
             else:
@@ -130,7 +130,7 @@ def air_evidence(
     if not images:
         why = _explain_missing_target(captures, targets[0], reasons)
         raise CalibrationError(f"the target was found in no image of {_names(captures)}: {why}")
-    no_stripe = "" if any(map(len, stripes)) else explain_missing_stripe(captures)
+    no_stripe = "" if any(map(len, stripes)) else explain_captures_without_stripe(captures)
     return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, _file_names(captures))
 
 
@@ -139,7 +139,7 @@ def step_evidence(
     *,
     medium_index: float | None = None,
     stripe: StripeSettings = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> tuple[list[StepEvidence], list[str]]:
     """Find stripes on the step standard in all images with the laser on; return them with warnings.
 
@@ -161,14 +161,14 @@ def step_evidence(
         try:
             standard = StepStandard.model_validate(capture.header.artefact)
         except ValidationError as error:
-            problems = problems_of(error).removeprefix(": ")
+            problems = describe_problems(error).removeprefix(": ")
             raise DescriptionError(f"{capture.path.name} does not describe its step standard: {problems}") from error
         wavelength, known = capture.header.sensor.laser.wavelength_nm, capture.header.sensor.uncertainty
         index, index_std = medium_index, known.index
         if index is None:
             index = capture.header.medium.refractive_index(wavelength)
             index_std = capture.header.medium.index_uncertainty(wavelength, known)
-        for (frame, _), pixels in in_threads(partial(_find_stripe, capture, stripe), _laser_frames(capture)):
+        for (frame, _), pixels in map_in_threads(partial(_find_stripe, capture, stripe), _laser_frames(capture)):
             if isinstance(pixels, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {pixels}")
             else:
@@ -179,7 +179,7 @@ def step_evidence(
     return found, warnings
 
 
-def explain_missing_stripe(captures: Sequence[Capture]) -> str:
+def explain_captures_without_stripe(captures: Sequence[Capture]) -> str:
     """Return the reason why no stripe was found in captures; for captures of a target, none on the target."""
     header, count = captures[0].header, sum(int(np.count_nonzero(capture.laser_on)) for capture in captures)
     if not count:
@@ -188,9 +188,9 @@ def explain_missing_stripe(captures: Sequence[Capture]) -> str:
     lit = [image for capture in captures for image in _laser_images(capture, _LOOKED_AT)]
     if not lit:
         return f"no stripe in any of the {count} centre lines of {_names(captures)}: is the laser on?"
-    if any(shown_stripe(image, stripe_along=along) == "along" for image in lit):
+    if any(find_stripe_direction(image, stripe_along=along) == "along" for image in lit):
         return f"the {where} with a stripe were taken at other stage positions than the images with the target"
-    reason = why_no_stripe(lit, stripe_along=along, full_dn=header.saturation_dn)
+    reason = explain_missing_stripe(lit, stripe_along=along, full_dn=header.saturation_dn)
     return f"no stripe in any of the {count} {where}: {reason}"
 
 
@@ -232,7 +232,7 @@ _Seen = tuple[int, np.ndarray | Stripe]
 
 def _laser_frames(capture: Capture) -> Iterator[_Seen]:
     for frame in np.flatnonzero(capture.laser_on).tolist():
-        yield frame, capture.seen(frame)
+        yield frame, capture.read_observation(frame)
 
 
 def _detect_target(
@@ -244,7 +244,7 @@ def _detect_target(
         view = target.detect(image)
         return view, TargetImage(view.points_mm, view.pixels, float(capture.stage_mm[frame]), placement)
     except (TargetError, CalibrationError) as error:
-        return why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
+        return explain_missing_target(image, str(error), full_dn=capture.header.saturation_dn)
 
 
 def _find_target_stripe(
@@ -274,7 +274,7 @@ def _find_stripe(capture: Capture, settings: StripeSettings, numbered: _Seen) ->
     """Find the stripe (N, 2) of a laser frame, or return the reason for rejection."""
     along, options, clip = _stripe_settings(capture, settings)
     try:
-        pixels = stripe_in(numbered[1], stripe_along=along, options=options, saturation=clip).pixels()
+        pixels = find_stripe(numbered[1], stripe_along=along, options=options, saturation=clip).pixels()
     except ImageError as error:
         return str(error)
     return _explain_short_stripe(pixels) or pixels
@@ -282,7 +282,7 @@ def _find_stripe(capture: Capture, settings: StripeSettings, numbered: _Seen) ->
 
 def _stripe_settings(capture: Capture, settings: StripeSettings) -> tuple[str, StripeOptions, float]:
     sensor = capture.header.sensor
-    return sensor.camera.stripe_along, StripeOptions.of(sensor, settings), capture.header.saturation_dn
+    return sensor.camera.stripe_along, StripeOptions.resolve(sensor, settings), capture.header.saturation_dn
 
 
 def _explain_short_stripe(pixels: np.ndarray) -> str:

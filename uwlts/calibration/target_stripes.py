@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from uwlts.fitting.least_squares import MAD_TO_STD
-from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe, stripe_in
+from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe, find_stripe
 from uwlts.targets import Target, TargetView
 
 _DEGREE = 4  # degree for the bends of lens, window, line optics and plate; a higher one would follow outliers
@@ -41,7 +41,7 @@ def stripe_on_target(
     curve, if an image is given. Points off the curve (such as reflections) and outside the plate are rejected.
     Parameters and errors are those of `extract_stripe`.
     """
-    stripe = stripe_in(seen, stripe_along=stripe_along, saturation=saturation, options=options)
+    stripe = find_stripe(seen, stripe_along=stripe_along, saturation=saturation, options=options)
     to_plate, pixels = _to_plate(view), stripe.pixels()
     on_plate = _on_plate(pixels, to_plate, target)
     lines = stripe.lines[on_plate]
@@ -50,12 +50,12 @@ def stripe_on_target(
         return TargetStripe(pixels[on_plate], 0)
     # a 3D camera may not provide the width
     width = float(np.nan_to_num(np.median(stripe.width_px[lines])))
-    curve = _Curve.through(lines, across, tolerance_px=max(2.0, 0.25 * width))
+    curve = _Curve.fit_through(lines, across, tolerance_px=max(2.0, 0.25 * width))
     if curve is None:
         return TargetStripe(np.empty((0, 2)), len(lines))
     near = curve.holds(lines, across)
     along_curve = np.arange(len(stripe.status))
-    expected = _on_plate(_pixels(along_curve, curve.at(along_curve), stripe_along), to_plate, target)
+    expected = _on_plate(_pixels(along_curve, curve.evaluate(along_curve), stripe_along), to_plate, target)
     missing = np.setdiff1d(along_curve[expected], lines[near])
     outliers = int(np.count_nonzero(~near))
     lines, across = lines[near], across[near]
@@ -63,7 +63,7 @@ def stripe_on_target(
         width = float(np.median(stripe.width_px[lines]))
         more_lines, more_across = _near_curve(seen, curve, missing, stripe_along, saturation, options, width)
         lines, across = np.concatenate([lines, more_lines]), np.concatenate([across, more_across])
-        curve = curve.refined(lines, across)
+        curve = curve.refine(lines, across)
         near = curve.holds(lines, across)
         lines, across = lines[near], across[near]
     order = np.argsort(lines)
@@ -87,7 +87,7 @@ def _on_plate(pixels: np.ndarray, to_plate: np.ndarray, target: Target) -> np.nd
     with np.errstate(divide="ignore", invalid="ignore"):
         places = seen[:, :2] / seen[:, 2:]
     # Beyond the plane's horizon, the third coordinate is negative.
-    return (seen[:, 2] > 0) & target.on_plate(places, beyond=_BEYOND)
+    return (seen[:, 2] > 0) & target.is_on_plate(places, beyond=_BEYOND)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class _Curve:
     limit_px: float
 
     @classmethod
-    def through(cls, lines: np.ndarray, across: np.ndarray, *, tolerance_px: float) -> "_Curve | None":
+    def fit_through(cls, lines: np.ndarray, across: np.ndarray, *, tolerance_px: float) -> "_Curve | None":
         """Find the curve with most points near it; None if there are too few."""
         middle, half = 0.5 * (lines.max() + lines.min()), max(0.5 * np.ptp(lines), 1.0)
         powers = ((lines - middle) / half)[:, None] ** np.arange(3)
@@ -114,9 +114,9 @@ class _Curve:
         if best.sum() < _FEWEST:
             return None
         parabola = np.polynomial.Polynomial.fit(lines[best], across[best], 2)
-        return cls(parabola, tolerance_px).refined(lines, across)
+        return cls(parabola, tolerance_px).refine(lines, across)
 
-    def refined(self, lines: np.ndarray, across: np.ndarray) -> "_Curve":
+    def refine(self, lines: np.ndarray, across: np.ndarray) -> "_Curve":
         """Fit the curve with full degree to the points near this one, repeated until they are stable."""
         curve, near = self, self.holds(lines, across)
         for _ in range(10):
@@ -129,13 +129,13 @@ class _Curve:
                 break
         return curve
 
-    def at(self, lines: np.ndarray) -> np.ndarray:
+    def evaluate(self, lines: np.ndarray) -> np.ndarray:
         """Return positions across the stripe."""
         return self.polynomial(lines)
 
     def holds(self, lines: np.ndarray, across: np.ndarray) -> np.ndarray:
         """Return a mask of the points on the curve."""
-        return np.abs(across - self.at(lines)) <= self.limit_px
+        return np.abs(across - self.evaluate(lines)) <= self.limit_px
 
 
 def _near_curve(
@@ -149,9 +149,9 @@ def _near_curve(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return those ``lines`` (M,) with a stripe in a band around the curve, and its centres."""
     while options.half_window_px < min(width_px, options.widest_window_px):
-        options = options.doubled()
+        options = options.double_width()
     profiles = image if stripe_along == "height" else image.T
-    start = np.rint(curve.at(np.arange(len(profiles)))).astype(int) - 2 * options.half_window_px
+    start = np.rint(curve.evaluate(np.arange(len(profiles)))).astype(int) - 2 * options.half_window_px
     columns = start[:, None] + np.arange(4 * options.half_window_px + 1)
     band = np.take_along_axis(profiles, columns.clip(0, profiles.shape[1] - 1), axis=1)
     found: Stripe = extract_stripe(band, stripe_along="height", saturation=saturation, options=options)

@@ -10,12 +10,12 @@ import uwlts
 from uwlts.cli.options import STRIPE, CalibrationOut, Overwrite, a_file, a_page, app, wrote, wrote_page
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import refuse_unsuitable
-from uwlts.runtime.command_line import Call, derived, say, show, warn
+from uwlts.runtime.command_line import Call, command_from, say, show, warn
 
 _EVIDENCE = ("air", "water", "step", "scan")
 
 
-@derived(app, uwlts, "calibrate", also=[(uwlts, "record_guided")], shortcuts=STRIPE)
+@command_from(app, uwlts, "calibrate", also=[(uwlts, "record_guided")], shortcuts=STRIPE)
 def calibrate(
     call: Call,
     *,
@@ -71,7 +71,7 @@ def calibrate(
     wrote([*calibration_lines(calibration), *advice], calibration.origin().warnings, out)
 
 
-@derived(app, uwlts, "calibrate_camera")
+@command_from(app, uwlts, "calibrate_camera")
 def camera(
     call: Call,
     *,
@@ -94,7 +94,7 @@ def camera(
     wrote(camera_lines(found), found.warnings, out, page)
 
 
-@derived(app, uwlts, "calibrate_mount")
+@command_from(app, uwlts, "calibrate_mount")
 def mount(
     call: Call,
     *,
@@ -109,7 +109,7 @@ def mount(
     wrote(mount_lines(found), found.weaknesses, out)
 
 
-@derived(app, uwlts, "refresh", shortcuts=STRIPE)
+@command_from(app, uwlts, "refresh", shortcuts=STRIPE)
 def refresh(
     call: Call,
     *,
@@ -129,7 +129,7 @@ def refresh(
     wrote([*changes, *advice_lines(found.calibration)], found.warnings, path)
 
 
-@derived(app, uwlts, "calibrate_polynomials", shortcuts=STRIPE)
+@command_from(app, uwlts, "calibrate_polynomials", shortcuts=STRIPE)
 def polynomials(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) -> None:
     """Example: uwlts polynomials --target target-water.h5 --out polynomials.json"""
     from uwlts.report.inventory import polynomial_lines
@@ -139,7 +139,7 @@ def polynomials(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False
     wrote(polynomial_lines(found.calibration), found.warnings, out)
 
 
-@derived(app, uwlts, "compare_models", shortcuts=STRIPE)
+@command_from(app, uwlts, "compare_models", shortcuts=STRIPE)
 def models(
     call: Call,
     *,
@@ -147,17 +147,17 @@ def models(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts models --air target-air.h5 --water target-water.h5 --out models.html"""
-    from uwlts.report.model_comparison import content_of, lines_of
+    from uwlts.report.model_comparison import format_lines, make_content
 
     comparison = call()
-    show(lines_of(content_of(comparison)))
+    show(format_lines(make_content(comparison)))
     warn(*comparison.warnings)
     if out is not None:
         uwlts.report.write_models(out, comparison, overwrite=overwrite)
         wrote_page(out)
 
 
-@derived(app, uwlts.report, "write_certificate")
+@command_from(app, uwlts.report, "write_certificate")
 def certificate(
     call: Call,
     *,
@@ -189,7 +189,7 @@ def certificate(
     wrote_page(page)
 
 
-@derived(app, uwlts, "verify")
+@command_from(app, uwlts, "verify")
 def verify(call: Call) -> None:
     """Answer pass or fail: exit code 0 or 1.
 

@@ -4,31 +4,31 @@ from pathlib import Path
 
 import uwlts
 from uwlts.cli.options import CalibrationOut, Overwrite, app, wrote_files
-from uwlts.runtime.command_line import Call, derived, show, warn
+from uwlts.runtime.command_line import Call, command_from, show, warn
 
 
-@derived(app, uwlts, "design")
+@command_from(app, uwlts, "design")
 def design(call: Call) -> None:
     """Example: uwlts design thesis --medium water"""
-    from uwlts.optics.design_table import table_lines
+    from uwlts.optics.design_table import format_table
 
-    show(table_lines(call()))
+    show(format_table(call()))
 
 
-@derived(app, uwlts, "nominal")
+@command_from(app, uwlts, "nominal")
 def nominal(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) -> None:
     """Example: uwlts nominal thesis --medium water --out nominal.json"""
     call().save(out, overwrite=overwrite)
     wrote_files(out)
 
 
-@derived(app, uwlts, "describe")
+@command_from(app, uwlts, "describe")
 def info(call: Call) -> None:
     """Example: uwlts info capture.h5"""
     print(call())
 
 
-@derived(app, uwlts, "import_images")
+@command_from(app, uwlts, "import_images")
 def import_(call: Call) -> None:
     """Example: uwlts import photographs --out target.h5"""
     imported = call()
@@ -36,7 +36,7 @@ def import_(call: Call) -> None:
     print(f"wrote {call.given['out']} with {imported.laser} laser and {imported.lamp} lamp images")
 
 
-@derived(app, uwlts, "export")
+@command_from(app, uwlts, "export")
 def export(call: Call) -> None:
     """Example: uwlts export scan.ply --out scan.laz"""
     out, written = Path(call.given["out"]), call()

@@ -18,13 +18,13 @@ from uwlts.cli.options import (
     wrote_files,
     wrote_page,
 )
-from uwlts.runtime.command_line import Call, derived, show
+from uwlts.runtime.command_line import Call, command_from, show
 
 _INSPECTIONS = [(uwlts, f"inspect_{kind}") for kind in ("pipe", "weld", "flange")]
 """Functions that provide the options of an inspection."""
 
 
-@derived(app, uwlts, "evaluate")
+@command_from(app, uwlts, "evaluate")
 def evaluate(
     call: Call,
     *,
@@ -43,7 +43,7 @@ def evaluate(
     wrote(evaluation_lines(evaluation.record()), [], out)
 
 
-@derived(app, uwlts, "compare_clouds")
+@command_from(app, uwlts, "compare_clouds")
 def compare(
     call: Call,
     *,
@@ -66,7 +66,7 @@ def compare(
     wrote_page(out)
 
 
-@derived(
+@command_from(
     app,
     uwlts,
     "inspect_pipe",
@@ -87,13 +87,13 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts inspect pipe.ply --wall-mm 9.5 --out pipe.json"""
-    from uwlts.inspection.inspect import inspected
+    from uwlts.inspection.inspect import inspect_cloud
     from uwlts.report.plot import surface_limit_mm
     from uwlts.storage.cloud_files import read_cloud
 
     measured = read_cloud(call.given.pop("cloud"))
     options = call.given if datum is None else call.given | {"datum": datum}
-    found = inspected(measured, kind, **options)
+    found = inspect_cloud(measured, kind, **options)
     show(found.lines())
     if coloured:
         write_coloured(
@@ -105,7 +105,7 @@ def inspect(
         wrote_files(coloured, out)
 
 
-@derived(app, uwlts, "gauge_study")
+@command_from(app, uwlts, "gauge_study")
 def gauge(
     call: Call,
     *,
@@ -120,7 +120,7 @@ def gauge(
         wrote_files(out)
 
 
-@derived(app, uwlts.report, "write_findings", also=_INSPECTIONS)
+@command_from(app, uwlts.report, "write_findings", also=_INSPECTIONS)
 def findings_report(
     call: Call, *, section_mm=None, wall_mm=None, false_alarm=None, largest_ovality=None, datum=None
 ) -> None:
@@ -134,7 +134,7 @@ def findings_report(
     print(f"wrote {out}, {', '.join(each.name for each in beside)}")
 
 
-@derived(app, uwlts.report, "write_campaign")
+@command_from(app, uwlts.report, "write_campaign")
 def report(call: Call) -> None:
     """Print a table.
 
@@ -147,7 +147,7 @@ def report(call: Call) -> None:
     print(f"wrote {written.page} and {written.summary}")
 
 
-@derived(app, uwlts, "evaluate_thesis")
+@command_from(app, uwlts, "evaluate_thesis")
 def thesis(call: Call) -> None:
     """`twin reproduce` renders such a folder.
 

@@ -7,10 +7,10 @@ from cyclopts import Parameter
 
 import uwlts
 from uwlts.cli.options import STRIPE, Overwrite, a_cloud, a_file, a_page, app, wrote, wrote_files
-from uwlts.runtime.command_line import Before, Call, derived, show, warn
+from uwlts.runtime.command_line import Before, Call, command_from, show, warn
 
 
-@derived(app, uwlts, "reconstruct", shortcuts=STRIPE)
+@command_from(app, uwlts, "reconstruct", shortcuts=STRIPE)
 def reconstruct(
     call: Call,
     *,
@@ -45,7 +45,7 @@ def _counts(by_status: dict[str, int]) -> str:
     return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in by_status.items() if count)
 
 
-@derived(app, uwlts, "register")
+@command_from(app, uwlts, "register")
 def register(
     call: Call,
     *,
@@ -78,7 +78,7 @@ def register(
     wrote_files(out, poses_out, page)
 
 
-@derived(app, uwlts, "align_trajectory")
+@command_from(app, uwlts, "align_trajectory")
 def align(
     call: Call,
     *,
@@ -104,7 +104,7 @@ def align(
     print(f"wrote {out} and {out.with_suffix('.json').name}" + (f", {aligned}" if aligned else ""))
 
 
-@derived(app, uwlts, "mesh")
+@command_from(app, uwlts, "mesh")
 def mesh(
     call: Call,
     *,

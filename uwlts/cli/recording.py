@@ -4,10 +4,10 @@ import sys
 
 import uwlts
 from uwlts.cli.options import app
-from uwlts.runtime.command_line import Call, derived, warn
+from uwlts.runtime.command_line import Call, command_from, warn
 
 
-@derived(app, uwlts, "scan")
+@command_from(app, uwlts, "scan")
 def scan(call: Call) -> None:
     """Example: uwlts scan plan.toml --camera gige:192.168.1.10 --stage /dev/ttyACM0 --home --out scan.h5"""
     seen = call()
@@ -17,19 +17,19 @@ def scan(call: Call) -> None:
     print(f"wrote {call.given['out']}, {lines}; exposure {exposures or 'as before'}")
 
 
-@derived(app, uwlts, "watch")
+@command_from(app, uwlts, "watch")
 def watch(call: Call) -> None:
     """Example: uwlts watch scan.h5 --calibration calibration.json"""
     call()
 
 
-@derived(app, uwlts, "serve_desk")
+@command_from(app, uwlts, "serve_desk")
 def desk(call: Call) -> None:
     """Example: uwlts desk tank --plan plan.toml"""
     call()
 
 
-@derived(app, uwlts, "examine")
+@command_from(app, uwlts, "examine")
 def doctor(call: Call) -> None:
     """End with exit code 1 if something required, or something named here, is missing or does not work.
 

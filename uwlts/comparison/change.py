@@ -28,8 +28,8 @@ from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface
-from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, turned_pairs
-from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances
+from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.pose_files import Unit
 
 
@@ -252,7 +252,7 @@ def compare_clouds(
     >>> change.significant.mean(), change.distance_mm[change.significant].min()
     >>> uwlts.compare_clouds("pipe.ply", "cylinder").regions()
     """
-    new = loaded_cloud(cloud)
+    new = load_cloud(cloud)
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
@@ -437,5 +437,5 @@ def _move_points(
     patterns = patterns + np.array(followed, np.float32).reshape(patterns.shape)
     poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
     position = known.position_mm @ rotation.T
-    random = turned_pairs(known.random_mm2, rotation)
+    random = rotate_covariances(known.random_mm2, rotation)
     return points, PointUncertainty(random, position, patterns.astype(np.float32), poses, known.shared)

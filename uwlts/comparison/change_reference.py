@@ -13,14 +13,14 @@ from scipy.spatial import KDTree
 
 from uwlts.comparison.ideal_shapes import KINDS, IdealShape, read_shape
 from uwlts.comparison.options import OPTIONS
-from uwlts.errors import CaptureError, DescriptionError, EvaluationError, problems_of
+from uwlts.errors import CaptureError, DescriptionError, EvaluationError, describe_problems
 from uwlts.evaluation.figures import TOWARDS_SENSOR
-from uwlts.files.reading import MOST_TOML_BYTES, parsed_toml, read_text, require_regular_file
+from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text, require_regular_file
 from uwlts.fitting.point_spacing import POINTS_PER_DISC
 from uwlts.model.sensor import Description, Positive, Vector
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 from uwlts.storage.cloud_files import read_cloud
-from uwlts.storage.pose_files import MM_PER_UNIT, Unit, checked_unit
+from uwlts.storage.pose_files import MM_PER_UNIT, Unit, check_unit
 
 _SAMPLES_PER_DISC = 60
 """Samples of a mesh in a disc: twice the points of a cloud, so that the cloud's noise dominates."""
@@ -70,9 +70,9 @@ def read_datums(datums: np.ndarray | str | os.PathLike[str]) -> np.ndarray:
     if isinstance(datums, str | os.PathLike):
         text = read_text(Path(datums), most_bytes=MOST_TOML_BYTES, called="datums", foreign="is not valid TOML")
         try:
-            known = _Datums.model_validate(parsed_toml(text)).datum
+            known = _Datums.model_validate(parse_toml(text)).datum
         except ValidationError as error:
-            raise DescriptionError(f"{datums} contains no valid datums: {problems_of(error)}") from error
+            raise DescriptionError(f"{datums} contains no valid datums: {describe_problems(error)}") from error
         except ValueError as error:
             raise DescriptionError(f"{datums} is not valid TOML: {error}") from error
         datums = np.array([(*each.centre_mm, each.radius_mm) for each in known]).reshape(-1, 4)
@@ -89,7 +89,7 @@ def read_datums(datums: np.ndarray | str | os.PathLike[str]) -> np.ndarray:
 
 def read_reference(reference: Reference, *, unit: Unit, disc_mm: float) -> ReferencePoints | IdealShape:
     """Read a reference as points in mm, or as an ideal shape from its name (plane, sphere, cylinder) or TOML file."""
-    scale = MM_PER_UNIT[checked_unit(unit)]
+    scale = MM_PER_UNIT[check_unit(unit)]
     if isinstance(reference, str) and reference in KINDS:
         reference = KINDS[reference]
     if isinstance(reference, str | os.PathLike):

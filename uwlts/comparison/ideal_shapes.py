@@ -9,10 +9,10 @@ from typing import Annotated, Literal, assert_never
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from uwlts.errors import DescriptionError, problems_of
+from uwlts.errors import DescriptionError, describe_problems
 from uwlts.evaluation.figures import TOWARDS_SENSOR
-from uwlts.files.reading import MOST_TOML_BYTES, parsed_toml, read_text
-from uwlts.fitting.least_squares import evenly_thinned, fit_robustly
+from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
+from uwlts.fitting.least_squares import fit_robustly, thin_evenly
 from uwlts.fitting.shapes import fit_cylinder, fit_plane, fit_sphere
 from uwlts.model.sensor import Description, Positive, Vector
 from uwlts.registration.surface_registration import Nearest, Registration, shape_registration
@@ -89,9 +89,9 @@ def read_shape(path: Path) -> IdealShape:
     """Read an ideal shape from a TOML file; CaptureError or DescriptionError if this fails."""
     text = read_text(path, most_bytes=MOST_TOML_BYTES, called="ideal shape", foreign="is not valid TOML")
     try:
-        return TypeAdapter(Annotated[IdealShape, Field(discriminator="kind")]).validate_python(parsed_toml(text))
+        return TypeAdapter(Annotated[IdealShape, Field(discriminator="kind")]).validate_python(parse_toml(text))
     except ValidationError as error:
-        raise DescriptionError(f"{path} contains no valid ideal shape: {problems_of(error)}") from error
+        raise DescriptionError(f"{path} contains no valid ideal shape: {describe_problems(error)}") from error
     except ValueError as error:
         raise DescriptionError(f"{path} is not valid TOML: {error}") from error
 
@@ -173,7 +173,7 @@ def place_shape(
             placed = PlacedShape("sphere", robust.fit.centre_mm, None, robust.fit.radius_mm)
         case IdealCylinder():
             known = None if shape.diameter_mm is None else shape.diameter_mm / 2
-            start = fit_cylinder(evenly_thinned(points, 2000), radius_mm=known).axis
+            start = fit_cylinder(thin_evenly(points, 2000), radius_mm=known).axis
             robust = fit_robustly(lambda p: fit_cylinder(p, radius_mm=known, axis_start=start), points)
             placed = PlacedShape("cylinder", robust.fit.point_mm, robust.fit.axis, robust.fit.radius_mm)
         case _:

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from scipy.stats import t as t_distribution
 
 from uwlts.comparison.options import OPTIONS
-from uwlts.storage.cloud import PointUncertainty, variance_along
+from uwlts.storage.cloud import PointUncertainty, project_variance
 
 TWO_SIDED = 1.96
 """Standard normal quantile of 97.5 %."""
@@ -121,12 +121,12 @@ def _propagated_variance(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the variance (P,) of each mean by points and by images, and its shift (P, M) by systematic patterns."""
     size, normal, many = len(number), normals[place], np.maximum(number, 1)
-    single = np.bincount(place, variance_along(known.random_mm2[point], normal), minlength=size) / many**2
+    single = np.bincount(place, project_variance(known.random_mm2[point], normal), minlength=size) / many**2
     image = np.arange(len(point)) if frame is None else frame[point].astype(np.int64)
     # Position errors are fully correlated within an image and independent between images.
     group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
     result = np.zeros(size)
-    for part in known.by_image_mm():
+    for part in known.image_errors_mm():
         moved = np.einsum("ni,ni->n", part[point], normal)
         together = np.bincount(owner.ravel(), moved / many[place])
         result += np.bincount(group[:, 0], together**2, minlength=size)

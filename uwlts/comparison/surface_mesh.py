@@ -20,9 +20,9 @@ from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.fitting.local_surface import LocalSurface, SurfacePoints, surface_normals
 from uwlts.fitting.point_spacing import choose_disc_diameter
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.storage.cloud import PointCloud, images_along, variance_along
-from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.storage.cloud import PointCloud, project_image_errors, project_variance
+from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.mesh_file import SurfaceMesh
 
 _BLOCK = 48
@@ -49,7 +49,7 @@ def mesh(
     cube_mm: float | None = None,
     radius_mm: float | None = None,
     towards: Sequence[tuple[float, float, float]] | None = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> SurfaceMesh:
     """Make a mesh with uncertainty and open holes from one or several clouds in one frame.
 
@@ -91,7 +91,7 @@ def mesh(
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
     if not clouds:
         raise EvaluationError("no cloud was given; a mesh needs at least one")
-    read = [loaded_cloud(each) for each in clouds]
+    read = [load_cloud(each) for each in clouds]
     if towards is not None and (np.shape(towards) != (len(read), 3) or not np.all(np.linalg.norm(towards, axis=1) > 0)):
         raise EvaluationError(
             f"the directions are not valid; expected {len(read)} of three numbers, one per cloud, none of them 0 0 0"
@@ -153,7 +153,7 @@ def _split_scans(cloud: PointCloud, towards: np.ndarray | None) -> list[tuple[Po
         raise EvaluationError(f"the cloud's list of scans is not valid: {error!r}") from error
     owner = np.searchsorted(firsts, cloud.frame, side="right") - 1
     return [
-        (cloud.selected(np.flatnonzero(owner == number)), way)
+        (cloud.select(np.flatnonzero(owner == number)), way)
         for number, way in enumerate(ways)
         if np.any(owner == number)
     ]
@@ -168,9 +168,9 @@ def _collect_points(scans: list[tuple[PointCloud, np.ndarray]], radius: float) -
         noise, position, patterns = np.zeros(count), np.zeros(count), np.zeros((most, count))
         weight = np.ones(count)
         if known is not None:
-            noise = np.maximum(variance_along(known.random_mm2, normals), 0.0)
+            noise = np.maximum(project_variance(known.random_mm2, normals), 0.0)
             # Simplification: shift and rotation of an image are combined into one shift that all its points share.
-            position = np.sqrt(np.sum(images_along(known, normals) ** 2, axis=0))
+            position = np.sqrt(np.sum(project_image_errors(known, normals) ** 2, axis=0))
             patterns[: len(known.patterns_mm)] = np.einsum("mni,ni->mn", known.patterns_mm, normals)
             # The lower bound (0.1 um) squared keeps weights finite.
             weight = 1.0 / np.maximum(noise + position**2 + np.sum(patterns**2, axis=0), 1e-8)

@@ -185,10 +185,10 @@ def build_board(board: Board, operator: bool) -> None:
         view.image()
         view.cloud()
         view.log()
-    timed(view.refresh)
+    update_regularly(view.refresh)
 
 
-def timed(refresh: Callable[[], object]) -> None:
+def update_regularly(refresh: Callable[[], object]) -> None:
     """Update a browser's page now, and then several times a second."""
     refresh()
     ui.timer(_REFRESH_S, refresh)

@@ -23,25 +23,25 @@ class CloudView(Element, component="cloud_view.js", esm={"nicegui-scene": str(_T
 
     def show_version(self, version: int) -> None:
         """Make the browser fetch the cloud if its version differs."""
-        self._set("version", version)
+        self._set_parameter("version", version)
 
     def allow_detail(self, allowed: bool) -> None:
         """Set whether more points can be fetched for a closer view."""
-        self._set("closer", allowed)
+        self._set_parameter("closer", allowed)
 
     def colour_by(self, field: str) -> None:
         """Colour the points by depth or a field."""
-        self._set("field", field)
+        self._set_parameter("field", field)
 
     def mark_places(self, places_mm: Sequence[np.ndarray]) -> None:
         """Mark positions (3,) in mm."""
-        self._set("marks", [place.tolist() for place in places_mm])
+        self._set_parameter("marks", [place.tolist() for place in places_mm])
 
     def fit(self) -> None:
         """Fit the whole cloud into the view."""
-        self._set("fit", self._props["fit"] + 1)
+        self._set_parameter("fit", self._props["fit"] + 1)
 
-    def _set(self, name: str, value: object) -> None:
+    def _set_parameter(self, name: str, value: object) -> None:
         if self._props[name] != value:
             self._props[name] = value
             self.update()

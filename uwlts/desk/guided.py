@@ -11,7 +11,7 @@ from nicegui import ui
 
 from uwlts.calibration.guidance.pose_advice import Coverage
 from uwlts.desk.board import Board, Picture, encode_png
-from uwlts.desk.board_page import BoardView, timed
+from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.server import DeskServer
 from uwlts.hardware.grbl import GrblStage
@@ -70,7 +70,7 @@ class BoardScreen:
         if isinstance(self._stage, GrblStage):
             self._board.laser = "on" if self._stage.laser_power > 0 else "flashing"
 
-    def recorded(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
+    def show_coverage(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
         """Show the coverage, with the points (N, 2) of every image."""
         self._board.coverage = encode_png(draw_coverage(coverage, pixels))
 
@@ -78,7 +78,7 @@ class BoardScreen:
         """Add a line to the log."""
         self._board.say(line)
 
-    def connected(self, stage: LaserStage | None) -> None:
+    def set_stage(self, stage: LaserStage | None) -> None:
         """Set the stage that now switches the laser, or None once it is closed."""
         self._stage = stage
         self.switch.lend(stage)
@@ -172,7 +172,7 @@ def record_guided(
         A capture exists, or cannot be written.
     """
     described = plan if isinstance(plan, GuidedPlan) else load_guided_plan(Path(plan))
-    described = described.connected(camera=camera, port=stage)
+    described = described.with_connection(camera=camera, port=stage)
     described.camera_address()
     board = Board(described.title)
     board.phase("guided calibration")
@@ -187,7 +187,7 @@ def record_guided(
                 refresh = answer_buttons(board, screen.press) if operator else lambda: None
                 view.coverage()
             view.log()
-        timed(lambda: (view.refresh(), refresh()))
+        update_regularly(lambda: (view.refresh(), refresh()))
 
     with DeskServer(board, build=build, port=port, switch=screen.switch) as server:
         report(f"open {server.operator_address}; Ctrl-C ends it, accepted images are kept")

@@ -24,7 +24,7 @@ from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import RecordingView
 from uwlts.errors import DescriptionError, Error, HardwareError
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice
@@ -38,7 +38,7 @@ from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.capture import Capture, Frame, part_path, picture_of
+from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
 
 _PREVIEW_S = 0.15
 """Pause between two live images."""
@@ -196,7 +196,7 @@ class Instrument:
 
     def _do(self, work: Callable[[], None]) -> None:
         try:
-            with inputs_kept():
+            with protect_inputs():
                 work()
         except Ended:
             self._board.say("stopped")
@@ -357,7 +357,7 @@ class Instrument:
             pixels = stripe.pixels()
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
         saturated = seen.saturated / max(seen.counted, 1)
-        image = picture_of(frame.seen, connected.sensor.camera)
+        image = drawable_image(frame.seen, connected.sensor.camera)
         self._board.show(Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
 
     def _scan(self, plan: ScanPlan, out: Path, calibration: Path | None, resume: bool, overwrite: bool) -> None:
@@ -399,7 +399,7 @@ class Instrument:
                     progress=progress,
                     report=report,
                     warn=lambda text: board.say(text, "warning"),
-                    between=self._between,
+                    between=self._pause_between_images,
                     recorded=shown.put,
                 )
         finally:
@@ -438,7 +438,7 @@ class Instrument:
         board.say(f"wrote {out.name}")
         board.phase("finished", busy=False)
 
-    def _between(self) -> None:
+    def _pause_between_images(self) -> None:
         """Pause or stop between two images of a scan, if requested."""
         if self._paused.is_set():
             self.state, before = InstrumentState.PAUSED, self._board.progress

@@ -49,7 +49,7 @@ class LaserListener:
     async def serve(self, listening: socket.socket) -> None:
         """Listen until the program ends; sockets alone do not show that, because a forked child may keep them open."""
         loop, parent = asyncio.get_running_loop(), os.getppid()
-        for each, read in ((self._lending, self._lend), (self._presses, self._answered)):
+        for each, read in ((self._lending, self._lend), (self._presses, self._wait_for_answer)):
             each.setblocking(False)
             loop.add_reader(each, read)
         await loop.create_server(lambda: _Request(self), sock=listening, backlog=BACKLOG)
@@ -68,7 +68,7 @@ class LaserListener:
             self._ended = True
             asyncio.get_running_loop().remove_reader(self._lending)
 
-    def _answered(self) -> None:
+    def _wait_for_answer(self) -> None:
         name = self._presses.recv(MESSAGE_BYTES).decode()
         if not name:
             asyncio.get_running_loop().remove_reader(self._presses)
@@ -84,7 +84,7 @@ class LaserListener:
             self._presses.send(name.encode())
         if name.startswith("escape"):
             wait_s = _ESCAPE_S
-        while not await _within(wait_s, answered):
+        while not await _wait_within(wait_s, answered):
             if self._reset():
                 request.answer(HTTPStatus.NO_CONTENT)
             elif time.monotonic() > deadline:
@@ -100,7 +100,7 @@ class LaserListener:
         return False
 
 
-async def _within(wait_s: float, event: asyncio.Event) -> bool:
+async def _wait_within(wait_s: float, event: asyncio.Event) -> bool:
     with suppress(TimeoutError):
         await asyncio.wait_for(event.wait(), wait_s)
     return event.is_set()
@@ -129,9 +129,9 @@ class _Request(asyncio.Protocol):
         if len(head) > HEAD_BYTES:
             self.answer(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE)
         elif end:
-            self._read(head)
+            self._parse(head)
 
-    def _read(self, head: bytes) -> None:
+    def _parse(self, head: bytes) -> None:
         first, *lines = head.split(b"\r\n")
         fields = [line.partition(b":") for line in lines]
         self._headers = Headers(raw=[(name.lower(), value.strip()) for name, _, value in fields])

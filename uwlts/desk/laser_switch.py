@@ -59,13 +59,13 @@ class LaserSwitch:
                 stdout=subprocess.DEVNULL,
             )
         rules = json.dumps({"access": asdict(access), "page_port": page_port})
-        if not self._asked(rules.encode(), [], _START_S):
+        if not self._ask(rules.encode(), [], _START_S):
             self.close()
             raise SetupError("the process that listens for Laser off did not start")
         self._thread = threading.Thread(target=self._listen, name="laser off", daemon=True)
         self._thread.start()
 
-    def _asked(self, message: bytes, descriptors: list[int], wait_s: float) -> bool:
+    def _ask(self, message: bytes, descriptors: list[int], wait_s: float) -> bool:
         """Send a message, and return whether the process answers."""
         self._lending.settimeout(wait_s)
         try:
@@ -94,7 +94,7 @@ class LaserSwitch:
         if self._process is None:
             return
         lent = [stage.descriptor] if isinstance(stage, GrblStage) else []
-        if self._asked(b"port" if lent else b"none", lent, _ANSWER_S):
+        if self._ask(b"port" if lent else b"none", lent, _ANSWER_S):
             return
         # It must not keep the port.
         self._process.kill()

@@ -16,7 +16,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from uwlts.desk.board import Board
-from uwlts.desk.board_page import BoardView, build_board, timed
+from uwlts.desk.board_page import BoardView, build_board, update_regularly
 from uwlts.desk.desk_files import find_file, guess_kind, is_interrupted, list_files, new_path
 from uwlts.desk.guided import answer_buttons
 from uwlts.desk.instrument import Instrument, InstrumentState
@@ -26,8 +26,8 @@ from uwlts.errors import DescriptionError, Error
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
-from uwlts.inspection.picking import Shape, length_between, point_near, shape_near
-from uwlts.model.library import validated
+from uwlts.inspection.picking import Shape, find_nearest_point, fit_shape_near, measure_length
+from uwlts.model.library import validate_description
 from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.report.inventory import describe
 from uwlts.storage.cloud import PointCloud
@@ -162,14 +162,14 @@ class _Desk:
                 found = read_region(path, low, high, _MOST_SHOWN)
             else:
                 inside = np.flatnonzero(np.all((cloud.points_mm >= low) & (cloud.points_mm <= high), axis=1))
-                found = cloud.selected(inside[:: -(-len(inside) // _MOST_SHOWN) or 1])
+                found = cloud.select(inside[:: -(-len(inside) // _MOST_SHOWN) or 1])
             return point_table(found.points_mm, **_fields(found))
 
         self.opened = _Opened(cloud)
         self.board.detail = None
         self.board.cloud.clear()
         self.board.cloud_name = name
-        shown, total = cloud.selected(slice(None, None, -(-len(cloud) // _MOST_SHOWN) or 1)), of or len(cloud)
+        shown, total = cloud.select(slice(None, None, -(-len(cloud) // _MOST_SHOWN) or 1)), of or len(cloud)
         self.board.cloud.add(shown.points_mm, total, **_fields(shown))
         self.board.detail = closer if total > len(shown) else None
 
@@ -205,7 +205,7 @@ class _OperatorPage:
 
     def __init__(self, desk: _Desk):
         self._desk, self._instrument, self._board = desk, desk.instrument, desk.board
-        self._view = BoardView(desk.board, picked=self._picked)
+        self._view = BoardView(desk.board, picked=self._show_picked)
         self._only: list[tuple[ui.button, tuple[InstrumentState, ...]]] = []
         self._refreshed = 0
         self._files: tuple[object, ...] = ()
@@ -226,7 +226,7 @@ class _OperatorPage:
                         with ui.tab_panel(shown[name]).classes("gap-2"):
                             part()
             view.log()
-        timed(self._refresh)
+        update_regularly(self._refresh)
         ui.timer(_LIST_S, self._list)
 
     def _parts(self) -> tuple[Callable[[], None], ...]:
@@ -371,7 +371,7 @@ class _OperatorPage:
         if not self._guided_plan.value:
             raise DescriptionError("choose a plan of a calibration first (docs/how-to/calibrate-live.md)")
         plan = load_guided_plan(Path(self._guided_plan.value))
-        plan = plan.connected(camera=self._camera.value or None, port=self._stage.value or None)
+        plan = plan.with_connection(camera=self._camera.value or None, port=self._stage.value or None)
         out = new_path(self._desk.folder, self._calibration_name.value or "", suffix=".json")
         self._instrument.calibrate(plan, out, resume=resume, overwrite=bool(self._replace.value))
 
@@ -413,7 +413,7 @@ class _OperatorPage:
         if start is None or step is None or count is None:
             raise DescriptionError("give the first position, the step and the number of positions")
         moved = {"start_mm": start, "step_mm": step, "count": count}
-        stage = validated(StagePlan, plan.stage.model_dump() | moved, "the scan")
+        stage = validate_description(StagePlan, plan.stage.model_dump() | moved, "the scan")
         out = new_path(self._desk.folder, self._out.value or "", suffix=".h5")
         overwrite = bool(self._overwrite.value)
         if out.exists() and not overwrite and not resume:
@@ -515,7 +515,7 @@ class _OperatorPage:
                 self._button(shape, partial(self._shape, shape)).props("outline dense")
         self._results = ui.column().classes("w-full gap-1 text-sm font-mono")
 
-    def _picked(self, place: np.ndarray) -> None:
+    def _show_picked(self, place: np.ndarray) -> None:
         picked = self._desk.opened.picked
         if picked and np.array_equal(picked[-1], place):
             return
@@ -533,7 +533,7 @@ class _OperatorPage:
         picked, cloud = self._desk.opened.picked, self._desk.cloud_to_measure()
         if len(picked) < 2:
             raise DescriptionError("click two points in the cloud first")
-        self._result(length_between(cloud, *(point_near(cloud, place) for place in picked)).text())
+        self._show_result(measure_length(cloud, *(find_nearest_point(cloud, place) for place in picked)).text())
 
     async def _shape(self, shape: Shape) -> None:
         picked, cloud = self._desk.opened.picked, self._desk.cloud_to_measure()
@@ -542,9 +542,9 @@ class _OperatorPage:
         radius = float(self._radius.value or 0.0)
         if radius <= 0:
             raise DescriptionError("give the radius about the point, above 0 mm")
-        self._result((await asyncio.to_thread(shape_near, cloud, picked[-1], radius, shape)).text())
+        self._show_result((await asyncio.to_thread(fit_shape_near, cloud, picked[-1], radius, shape)).text())
 
-    def _result(self, text: str) -> None:
+    def _show_result(self, text: str) -> None:
         self._board.say(text)
         with self._results:
             ui.label(text).move(target_index=0)

@@ -13,9 +13,9 @@ from uwlts.desk.server import DeskServer
 from uwlts.errors import CaptureError
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
-from uwlts.storage.calibration_file import loaded_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, part_path, picture_of
-from uwlts.stripe import CaptureStripes, stripe_in, warm_up
+from uwlts.storage.calibration_file import resolve_calibration
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, drawable_image, part_path
+from uwlts.stripe import CaptureStripes, find_stripe, warm_up
 
 LOOK_S = 0.1
 """Interval between checks for new images; a check takes a few ms."""
@@ -64,7 +64,7 @@ class RecordingView:
         caption += f"; stripe on {self._found:,} of {self._lines:,} profile lines so far"
         board.show(
             Picture(
-                picture_of(frame.seen, self._header.sensor.camera),
+                drawable_image(frame.seen, self._header.sensor.camera),
                 full_dn=full,
                 caption=caption,
                 stripe=profile.pixels,
@@ -82,13 +82,13 @@ class RecordingView:
 
 def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | None) -> _Profile:
     along, full = header.sensor.camera.stripe_along, header.saturation_dn
-    stripe = stripe_in(frame.seen, stripe_along=along, saturation=full)
+    stripe = find_stripe(frame.seen, stripe_along=along, saturation=full)
     line, points, intensity = stripe.lines, np.empty((0, 3)), np.empty(0)
     centre = stripe.centre_px[line]
     if calibration is not None and len(line):
         own = np.zeros(len(line), dtype=int)
         stripes = CaptureStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
-        cloud = reconstruct_stripes(FrameTable.of(header, [frame]), stripes, calibration)
+        cloud = reconstruct_stripes(FrameTable.from_frames(header, [frame]), stripes, calibration)
         points, intensity = cloud.points_mm, cloud.intensity
     saturated, remarks = None, []
     if isinstance(frame.seen, np.ndarray):
@@ -156,7 +156,7 @@ def watch(
         The finished capture is damaged; the calibration cannot be read, or does not fit the capture.
     """
     path, count = Path(capture), 0
-    known = None if calibration is None else loaded_calibration(calibration)
+    known = None if calibration is None else resolve_calibration(calibration)
     board = Board(path.name)
     board.phase("waiting for the first image")
     with DeskServer(board, host=host, port=port) as server:

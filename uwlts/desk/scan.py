@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Self
 
 from uwlts.errors import DescriptionError
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.hardware.scanning import ScanProgress, record_scan
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import CAPTURES
 
@@ -29,7 +29,7 @@ _SIGNAL_WHEN_PARENT_ENDS = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""
 
 
-@inputs_kept()
+@protect_inputs()
 def scan(
     plan: str | Path | ScanPlan,
     out: str | Path,
@@ -43,7 +43,7 @@ def scan(
     port: int = 8080,
     resume: bool = False,
     overwrite: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
     report: Callable[[str], None] = lambda line: None,
     warn: Callable[[str], None] = lambda text: None,
 ) -> ScanProgress:

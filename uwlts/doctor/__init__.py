@@ -10,13 +10,17 @@ from pathlib import Path
 
 from uwlts.doctor import devices, machine
 from uwlts.doctor.machine import Finding, print_findings
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 
 __all__ = ["Finding", "examine", "print_findings"]
 
 
 def examine(
-    folder: Path = Path(), *, camera: str | None = None, stage: str | None = None, progress: ProgressListener = unheard
+    folder: Path = Path(),
+    *,
+    camera: str | None = None,
+    stage: str | None = None,
+    progress: ProgressListener = ignore_progress,
 ) -> list[Finding]:
     """Examine libraries, libLLVM, cameras, serial ports, permissions and speed of this machine, with advice.
 

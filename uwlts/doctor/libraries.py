@@ -69,7 +69,7 @@ def examine_required(requirements: Sequence[str]) -> list[Finding]:
 
     Returns one finding for all libraries without a fault, and one for every other.
     """
-    examined = _examined(map(Requirement, requirements))
+    examined = _examine_requirements(map(Requirement, requirements))
     good = ", ".join(f"{requirement.name} {version}" for requirement, version, fault in examined if not fault)
     findings = [Finding("required libraries", "ok", good)] if good else []
     for requirement, _, fault in examined:
@@ -86,7 +86,7 @@ def examine_optional(purposes: Mapping[str, str], *, requirements: Sequence[str]
     A version is checked if one of the ``requirements`` specifies it.
     """
     asked = {canonicalize_name(each.name): each for each in map(Requirement, requirements)}
-    examined = _examined(asked.get(canonicalize_name(name), Requirement(name)) for name in purposes)
+    examined = _examine_requirements(asked.get(canonicalize_name(name), Requirement(name)) for name in purposes)
     findings = []
     for (name, purpose), (requirement, version, fault) in zip(purposes.items(), examined, strict=True):
         advice = f"only for {purpose}:\n{_pip(shlex.quote(str(requirement)))}" if fault else ""
@@ -94,7 +94,7 @@ def examine_optional(purposes: Mapping[str, str], *, requirements: Sequence[str]
     return findings
 
 
-def _examined(requirements: Iterable[Requirement]) -> list[tuple[Requirement, str, str]]:
+def _examine_requirements(requirements: Iterable[Requirement]) -> list[tuple[Requirement, str, str]]:
     """Return every library with its version and its fault, or an empty text."""
     states: list[tuple[Requirement, str, str]] = []
     for requirement in requirements:

@@ -118,12 +118,14 @@ def examine_buffer(limit: Path = _RMEM_MAX) -> Finding:
 
 def examine_computer() -> Finding:
     """Examine the processors that this program may use, and the memory."""
-    from uwlts.runtime.workers import processors
+    from uwlts.runtime.workers import count_processors
 
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     load = os.getloadavg()[0]
-    found = f"{processors()} processors, {load:.1f} of them busy in the last minute, {memory / 1e9:.0f} GB of memory"
-    enough = processors() >= _LEAST_PROCESSORS and memory >= _LEAST_MEMORY
+    found = (
+        f"{count_processors()} processors, {load:.1f} of them busy in the last minute, {memory / 1e9:.0f} GB of memory"
+    )
+    enough = count_processors() >= _LEAST_PROCESSORS and memory >= _LEAST_MEMORY
     advice = f"take a computer of {_LEAST_PROCESSORS} processors and {_LEAST_MEMORY / 1e9:.0f} GB or more"
     return Finding.from_advice("computer", found, "" if enough else advice)
 

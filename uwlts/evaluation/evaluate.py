@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
-from uwlts.errors import EvaluationError, problems_of
+from uwlts.errors import EvaluationError, describe_problems
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
 from uwlts.evaluation.figures import ArtefactEvaluation, Figure, FigureKey, Quantity, figure_keys
@@ -195,7 +195,7 @@ class Evaluation(Brief):
             return EvaluationRecord.model_validate(content)
         except ValidationError as error:
             raise EvaluationError(
-                f"the metadata of the cloud {self.source} is not valid: {problems_of(error)}"
+                f"the metadata of the cloud {self.source} is not valid: {describe_problems(error)}"
             ) from error
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
@@ -203,7 +203,7 @@ class Evaluation(Brief):
         write_model(path, self.record(), format=FORMAT, version=VERSION, overwrite=overwrite)
 
 
-def compared_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
+def compare_cloud_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
     """Compare a cloud with the true surface; EvaluationError if truth and cloud do not match."""
     return compare_with_truth(
         cloud.points_mm,
@@ -261,13 +261,13 @@ def evaluate(
         )
     compared = fitted = None
     if truth is not None:
-        compared = compared_with_truth(cloud, truth)
+        compared = compare_cloud_with_truth(cloud, truth)
         # A calibrated sensor's frame has its own origin and axes. After the best-fit motion, errors of form and size
         # remain.
         measured = cloud.points_mm[compared.matched]
         motion = fit_rigid_transform(measured, measured - compared.error_mm[compared.matched])
         moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
-        fitted = compared_with_truth(replace(cloud, points_mm=moved), truth)
+        fitted = compare_cloud_with_truth(replace(cloud, points_mm=moved), truth)
     found = None if artefact is None else evaluate_cloud(cloud, artefact)
     figures: tuple[Figure, ...] = ()
     deviation = np.full(len(cloud), np.nan) if fitted is None else fitted.distance_mm

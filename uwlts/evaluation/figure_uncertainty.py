@@ -36,7 +36,7 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
         return np.array([figures[name] - value for name, value in plain.items()])
 
     draws = _DRAWS if spheres is None else _QUICK_DRAWS
-    by_noise, by_calibration = PointErrors.of(uncertainty, cloud.frame).propagate(changed, draws=draws)
+    by_noise, by_calibration = PointErrors.from_uncertainty(uncertainty, cloud.frame).propagate(changed, draws=draws)
     assert by_calibration is not None
     return {
         name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)
@@ -55,7 +55,8 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     together = uncertainty.patterns_mm[:, used].sum(axis=1)
     image = np.unique(cloud.frame[used], return_inverse=True)[1]
     by_image = [
-        np.stack([np.bincount(image, moves) for moves in part[used].T], axis=1) for part in uncertainty.by_image_mm()
+        np.stack([np.bincount(image, moves) for moves in part[used].T], axis=1)
+        for part in uncertainty.image_errors_mm()
     ]
     moved = np.vstack([together, *by_image, noise_shifts(uncertainty)[used]])
     return np.sqrt(np.sum(moved**2, axis=0)) / count

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import DEFAULT_K, check_points, evenly_thinned, principal_axes, robust_std
+from uwlts.fitting.least_squares import DEFAULT_K, check_points, principal_axes, robust_std, thin_evenly
 from uwlts.fitting.shapes import fit_line, fit_plane
 from uwlts.runtime.compiled import compiled
 
@@ -87,7 +87,7 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
     """
     points = check_points(points, least=20, what="a step", dimensions=(2, 3))
     least = 10 if points.shape[1] == 2 else 40
-    proposal = _best_proposal(evenly_thinned(points, _THINNED), height_mm, np.random.default_rng(seed))
+    proposal = _best_proposal(thin_evenly(points, _THINNED), height_mm, np.random.default_rng(seed))
     if proposal is None:
         raise EvaluationError(
             f"no two parallel step faces at a distance of about {height_mm:g} mm among {len(points)} points; "

@@ -1,8 +1,8 @@
 """Protection of inputs: no output of a command or function replaces one of its inputs, under whatever name.
 
-Within `inputs_kept` every file opened for reading (`uwlts.files.reading`) is recorded. So is every file to be written,
-before the work and again before it is moved to its place (`uwlts.files.writing`). A file that is recorded as both is
-refused. Files are identified by device and inode, which all their names share.
+Within `protect_inputs` every file opened for reading (`uwlts.files.reading`) is recorded. So is every file to be
+written, before the work and again before it is moved to its place (`uwlts.files.writing`). A file that is recorded as
+both is refused. Files are identified by device and inode, which all their names share.
 """
 
 import os
@@ -35,7 +35,7 @@ _work: ContextVar[_Work | None] = ContextVar("work", default=None)
 
 
 @contextmanager
-def inputs_kept() -> Iterator[None]:
+def protect_inputs() -> Iterator[None]:
     """Protect the inputs of a task, as a context or as a decorator; functions that it calls belong to it.
 
     It applies to this thread. Other threads, such as those of a page, have tasks of their own.
@@ -57,13 +57,13 @@ def refuse_named_inputs(arguments: Mapping[str, object]) -> None:
     for name, value in arguments.items():
         if name not in OUTPUTS:
             for path in _paths(value):
-                note_input(path)
+                record_input(path)
     for name in OUTPUTS.intersection(arguments):
         for path in _paths(arguments[name]):
             refuse_input(path)
 
 
-def note_input(path: str | os.PathLike[str]) -> None:
+def record_input(path: str | os.PathLike[str]) -> None:
     """Record a file that the task reads; raises OutputError if the task will write it and has not made it itself."""
     if (work := _work.get()) and (identity := _identity(path)) and identity not in work.made:
         # A replaced file may have left its inode to another one.
@@ -80,7 +80,7 @@ def refuse_input(target: str | os.PathLike[str]) -> None:
         work.written[identity] = Path(target)
 
 
-def note_made(path: str | os.PathLike[str]) -> None:
+def record_made(path: str | os.PathLike[str]) -> None:
     """Record a file that the task has made: it may read it, and write it again."""
     if (work := _work.get()) and (identity := _identity(path)):
         work.made.add(identity)

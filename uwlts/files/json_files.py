@@ -8,9 +8,9 @@ from typing import TypeVar
 
 from pydantic import BaseModel, JsonValue, ValidationError
 
-from uwlts.errors import CaptureError, Error, problems_of
-from uwlts.files.reading import MOST_JSON_BYTES, parsed_json, read_text, with_article
-from uwlts.files.writing import written_aside
+from uwlts.errors import CaptureError, Error, describe_problems
+from uwlts.files.reading import MOST_JSON_BYTES, add_article, parse_json, read_text
+from uwlts.files.writing import write_atomically
 
 _SHOWN = 3
 """Largest number of different entries that a message names."""
@@ -27,13 +27,13 @@ def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
     """
     text = read_text(path, most_bytes=MOST_JSON_BYTES, called=called)
     try:
-        content = parsed_json(text)
+        content = parse_json(text)
     except json.JSONDecodeError as error:
-        raise CaptureError(f"{path} is not {with_article(called)}, or is truncated: {error}") from error
+        raise CaptureError(f"{path} is not {add_article(called)}, or is truncated: {error}") from error
     except ValueError as error:
         raise CaptureError(f"{path} is not a valid {called}: {error}") from error
     if not isinstance(content, dict):
-        raise CaptureError(f"{path} is JSON but not {with_article(called)}: expected an object with named entries")
+        raise CaptureError(f"{path} is JSON but not {add_article(called)}: expected an object with named entries")
     return content
 
 
@@ -42,10 +42,10 @@ def read_model(
 ) -> AnyModel:
     """Read a JSON file of the program as a model; raises CaptureError if it is missing, foreign, newer or damaged."""
     content = read_json(path, called=called)
-    return model_in(content, path, model, format=format, version=version, called=called, advice=advice)
+    return model_from_json(content, path, model, format=format, version=version, called=called, advice=advice)
 
 
-def model_in(
+def model_from_json(
     content: dict[str, JsonValue],
     path: str | Path,
     model: type[AnyModel],
@@ -58,18 +58,18 @@ def model_in(
     """Convert the result of `read_json` to a model; raises CaptureError like `read_model`."""
     content = dict(content)
     if content.pop("format", None) != format:
-        raise CaptureError(f'{path} is JSON but not {with_article(called)}: expected "format": "{format}"')
+        raise CaptureError(f'{path} is JSON but not {add_article(called)}: expected "format": "{format}"')
     if (found := content.pop("version", None)) != version:
         raise CaptureError(f"{path} has version {found}; this program reads {version}")
-    return validated_content(model, content, f"{path} is not a valid {called}", advice=advice)
+    return validate_content(model, content, f"{path} is not a valid {called}", advice=advice)
 
 
-def validated_content(model: type[AnyModel], content: object, complaint: str, *, advice: str = "") -> AnyModel:
+def validate_content(model: type[AnyModel], content: object, complaint: str, *, advice: str = "") -> AnyModel:
     """Convert content to a model; raises CaptureError, which begins with ``complaint``, if it is not valid."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise CaptureError(f"{complaint}: {problems_of(error)}{advice}") from error
+        raise CaptureError(f"{complaint}: {describe_problems(error)}{advice}") from error
     except (Error, ArithmeticError) as error:
         raise CaptureError(f"{complaint}: {error}{advice}") from error
 
@@ -77,13 +77,13 @@ def validated_content(model: type[AnyModel], content: object, complaint: str, *,
 def write_model(path: str | Path, model: BaseModel, *, format: str, version: int, overwrite: bool) -> None:
     """Write a model with format and version as indented JSON, completely or not; raises OutputError if that fails."""
     content = {"format": format, "version": version} | model.model_dump(mode="json")
-    with written_aside(path, overwrite=overwrite) as aside:
+    with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def write_record(path: str | Path, record: object, *, overwrite: bool) -> None:
     """Write the record of a result as indented JSON, completely or not at all; raises OutputError if that fails."""
-    with written_aside(path, overwrite=overwrite) as aside:
+    with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_text(json_text(record, indent=1), encoding="utf-8")
 
 
@@ -99,7 +99,7 @@ class RecordFile(ABC):
         write_record(path, self.record(), overwrite=overwrite)
 
 
-def differences(there: object, now: object) -> str:
+def describe_differences(there: object, now: object) -> str:
     """Describe the different entries of two JSON values, with both values; empty if they are equal.
 
     ``there`` is the content of a file, ``now`` the wanted one.
@@ -111,9 +111,9 @@ def differences(there: object, now: object) -> str:
     )
 
 
-def another(there: dict[str, JsonValue], now: dict[str, JsonValue]) -> str:
-    """Describe how a file's plan differs from the wanted one: "another" with the different keys, and `differences`."""
-    return f"another {', '.join(key for key in now if there.get(key) != now[key])} ({differences(there, now)})"
+def describe_other_plan(there: dict[str, JsonValue], now: dict[str, JsonValue]) -> str:
+    """Describe how a file's plan differs from the wanted one: the different keys, and `describe_differences`."""
+    return f"another {', '.join(key for key in now if there.get(key) != now[key])} ({describe_differences(there, now)})"
 
 
 def _different(there: object, now: object, entry: str) -> Iterator[tuple[str, object, object]]:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from uwlts.errors import CaptureError, Error
-from uwlts.files.inputs import note_input
+from uwlts.files.inputs import record_input
 
 if TYPE_CHECKING:
     from pydantic import JsonValue
@@ -56,13 +56,13 @@ def is_regular_file(path: str | Path) -> bool:
 def require_regular_file(
     path: str | Path, *, most_bytes: int | None = None, error: type[Error] = CaptureError, called: str = "file"
 ) -> int:
-    """Return the size in bytes of a regular file that can be opened; raises ``error`` like `opened`."""
-    with opened(path, most_bytes=most_bytes, error=error, called=called) as file:
+    """Return the size in bytes of a regular file that can be opened; raises ``error`` like `open_regular`."""
+    with open_regular(path, most_bytes=most_bytes, error=error, called=called) as file:
         return os.fstat(file.fileno()).st_size
 
 
 @contextmanager
-def opened(
+def open_regular(
     path: str | Path, *, most_bytes: int | None = None, error: type[Error] = CaptureError, called: str = "file"
 ) -> Iterator[BufferedReader]:
     """Return a context with a regular file opened for reading bytes, which no output of the task may replace.
@@ -70,11 +70,11 @@ def opened(
     Raises ``error`` if the file is missing, unreadable, not regular (a pipe or device would block) or larger than
     ``most_bytes``, or its name is too long or contains a null character. ``called`` names the expected content.
     """
-    cannot = f"cannot read the {called} {_shown(path)}"
+    cannot = f"cannot read the {called} {_printable_name(path)}"
     try:
         found = os.stat(path)
     except FileNotFoundError as problem:
-        raise error(f"no {called} at {_shown(path)}") from problem
+        raise error(f"no {called} at {_printable_name(path)}") from problem
     except OSError as problem:
         raise error(f"{cannot}: {problem.strerror}") from problem
     except ValueError as problem:
@@ -84,8 +84,8 @@ def opened(
         raise error(f"{cannot}: it is {'a directory' if is_folder else 'not a regular file, but a pipe or device'}")
     if most_bytes is not None and found.st_size > most_bytes:
         sizes = f"{found.st_size / MiB:,.1f} MiB; this program reads up to {most_bytes / MiB:,.1f} MiB"
-        raise error(f"the {called} {_shown(path)} has {sizes}")
-    note_input(path)
+        raise error(f"the {called} {_printable_name(path)} has {sizes}")
+    record_input(path)
     try:
         with open(path, "rb") as file:
             yield file
@@ -93,23 +93,23 @@ def opened(
         raise error(f"{cannot}: {problem.strerror or problem}") from problem
 
 
-def _shown(path: str | Path) -> str:
+def _printable_name(path: str | Path) -> str:
     """Return a name for messages: printable, and not longer than a line."""
-    return shortened(str(path).encode("unicode_escape").decode() if "\0" in str(path) else str(path))
+    return shorten(str(path).encode("unicode_escape").decode() if "\0" in str(path) else str(path))
 
 
-def shortened(text: str, most: int = 300) -> str:
+def shorten(text: str, most: int = 300) -> str:
     """Shorten a text for a message."""
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, error: type[Error] = CaptureError, called: str = "file") -> bytes:
-    """Read a regular file; raises ``error`` like `opened`."""
-    with opened(path, most_bytes=most_bytes, error=error, called=called) as file:
+    """Read a regular file; raises ``error`` like `open_regular`."""
+    with open_regular(path, most_bytes=most_bytes, error=error, called=called) as file:
         content = file.read(most_bytes + 1)
     # Some system files report a size of 0.
     if len(content) > most_bytes:
-        raise error(f"the {called} {_shown(path)} has more than {most_bytes / MiB:,.1f} MiB")
+        raise error(f"the {called} {_printable_name(path)} has more than {most_bytes / MiB:,.1f} MiB")
     return content
 
 
@@ -123,7 +123,7 @@ def read_text(
 ) -> str:
     """Read a regular file of text in UTF-8, without byte order mark.
 
-    Raises ``error`` like `opened`, or if the content is not text.
+    Raises ``error`` like `open_regular`, or if the content is not text.
     ``foreign`` is the beginning of the message for other content, by default "is not a" and ``called``.
     """
     content = read_bytes(path, most_bytes=most_bytes, error=error, called=called)
@@ -131,15 +131,15 @@ def read_text(
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as problem:
         kind = next((kind for mark, kind in _FOREIGN.items() if content.startswith(mark)), "no text in UTF-8")
-        raise error(f"{_shown(path)} {foreign or f'is not {with_article(called)}'}: it is {kind}") from problem
+        raise error(f"{_printable_name(path)} {foreign or f'is not {add_article(called)}'}: it is {kind}") from problem
 
 
-def with_article(called: str) -> str:
+def add_article(called: str) -> str:
     """Return a name with its indefinite article."""
     return f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
 
 
-def parsed_json(text: str) -> "JsonValue":
+def parse_json(text: str) -> "JsonValue":
     """Parse JSON; raises ValueError if it is not valid, too large, or not plain (`require_plain`).
 
     Duplicate keys are refused as well, because readers differ in their choice.
@@ -153,7 +153,7 @@ def parsed_json(text: str) -> "JsonValue":
     return require_plain(content)
 
 
-def parsed_toml(text: str) -> "dict[str, JsonValue]":
+def parse_toml(text: str) -> "dict[str, JsonValue]":
     """Parse TOML; raises ValueError if it is not valid, has a key of too many parts, or is not plain (`require_plain`).
 
     Numbers that are not finite are left to the descriptions, which report all wrong keys at once.
@@ -200,7 +200,7 @@ def _place_of(wanted: object, content: object) -> str:
     while waiting:
         each, place = waiting.pop()
         if each is wanted:
-            return shortened(place.removeprefix(".")) or "it"
+            return shorten(place.removeprefix(".")) or "it"
         inside = each.items() if isinstance(each, dict) else enumerate(each) if isinstance(each, list | tuple) else ()
         waiting.extend((below, f"{place}.{key}") for key, below in inside)
     return "it"
@@ -211,5 +211,5 @@ def _unique(pairs: "list[tuple[str, JsonValue]]") -> "dict[str, JsonValue]":
     if len(table) < len(pairs):
         counts = Counter(key for key, _ in pairs)
         twice = next(key for key, count in counts.items() if count > 1)
-        raise ValueError(f"the key {shortened(twice)!r} occurs twice in a table")
+        raise ValueError(f"the key {shorten(twice)!r} occurs twice in a table")
     return table

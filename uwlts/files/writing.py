@@ -18,8 +18,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from uwlts.errors import OutputError
-from uwlts.files.inputs import hold_until_end, note_made, refuse_input
-from uwlts.files.reading import opened, shortened
+from uwlts.files.inputs import hold_until_end, record_made, refuse_input
+from uwlts.files.reading import open_regular, shorten
 
 try:
     import fcntl
@@ -37,7 +37,7 @@ class OtherWriterError(OutputError):
 
 
 @contextmanager
-def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
     """Give the body a temporary file to write; move it to `path` when the body ends without an exception.
 
     The temporary file is in the folder of `path`, as a rename is atomic only within a file system, and has the same
@@ -51,7 +51,10 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     target = Path(os.path.realpath(path))
     _require_suitable(target, overwrite=overwrite)
     aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
-    with one_writer(target, patience_s=_PATIENCE_S), _unfinished(aside, lambda file: file.unlink(missing_ok=True)):
+    with (
+        lock_output(target, patience_s=_PATIENCE_S),
+        _remove_when_done(aside, lambda file: file.unlink(missing_ok=True)),
+    ):
         try:
             # Not tempfile, whose files are private (mode 0600): the finished file would be, too.
             os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -59,7 +62,7 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
             _flush(aside, os.O_RDWR)
             _require_suitable(target, overwrite=overwrite)
             os.replace(aside, target)
-            note_made(target)
+            record_made(target)
             # Only POSIX systems can open a folder, to flush the renaming itself.
             if os.name == "posix":
                 _flush(target.parent, os.O_RDONLY)
@@ -75,7 +78,7 @@ def refuse_unsuitable(target: Path, *, overwrite: bool, endings: Sequence[str] =
     """
     _require_suitable(target, overwrite=overwrite)
     require_ending(target, endings)
-    hold_until_end(one_writer(target))
+    hold_until_end(lock_output(target))
 
 
 def require_ending(target: Path, endings: Sequence[str]) -> None:
@@ -118,7 +121,7 @@ def _cannot_write(target: Path, error: OSError) -> str:
         errno.EPERM: f"no permission to write in {target.parent}",
         errno.EROFS: f"{target.parent} is on a read-only file system",
     }
-    return f"cannot write {shortened(str(target))}: {advice.get(error.errno or 0, error.strerror or str(error))}"
+    return f"cannot write {shorten(str(target))}: {advice.get(error.errno or 0, error.strerror or str(error))}"
 
 
 def _flush(path: Path, flags: int) -> None:
@@ -129,9 +132,9 @@ def _flush(path: Path, flags: int) -> None:
         os.close(descriptor)
 
 
-def sha256_of(path: str | Path) -> str:
+def hash_file(path: str | Path) -> str:
     """Return the hash of a file in hexadecimal; raises CaptureError if it cannot be read."""
-    with opened(path) as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -140,7 +143,7 @@ _locks: dict[Path, int] = {}
 
 
 @contextmanager
-def one_writer(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
+def lock_output(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
     """Lock a file for writing; raises OtherWriterError if another process still writes it after ``patience_s``."""
     target = Path(os.path.realpath(target))
     path = _lock_of(target)
@@ -148,7 +151,7 @@ def one_writer(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
         yield
         return
     until = time.monotonic() + patience_s
-    with _unfinished(path, _unlock):
+    with _remove_when_done(path, _unlock):
         while not _lock(path):
             # The previous writer may just have ended.
             if time.monotonic() >= until and path.exists():
@@ -162,7 +165,7 @@ def one_writer(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
 def refuse_other_writer(target: Path) -> None:
     """Raise OtherWriterError if another process is writing a file; the lock file of a killed process is removed."""
     if _lock_of(Path(os.path.realpath(target))).exists():
-        with one_writer(target):
+        with lock_output(target):
             pass
 
 
@@ -225,7 +228,7 @@ _removals: dict[Path, Callable[[Path], None]] = {}
 
 
 @contextmanager
-def _unfinished(path: Path, remove: Callable[[Path], None]) -> Iterator[None]:
+def _remove_when_done(path: Path, remove: Callable[[Path], None]) -> Iterator[None]:
     """Remove a file when the body that makes it ends; `remove_unfinished` does so if an interrupt prevents it."""
     _removals[path] = remove
     try:

@@ -246,7 +246,7 @@ def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return extents, axes
 
 
-def evenly_thinned(points: np.ndarray, at_most: int) -> np.ndarray:
+def thin_evenly(points: np.ndarray, at_most: int) -> np.ndarray:
     """Select every k-th point so that at most ``at_most`` remain."""
     return points[:: max(1, -(-len(points) // at_most))]
 

@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.storage.cloud import PointUncertainty, variance_along
+from uwlts.storage.cloud import PointUncertainty, project_variance
 
 _CELLS_PER_RADIUS = 3.0
 """Cubes per disc radius, in which points are averaged: a disc holds 28 averages for 6 coefficients."""
@@ -421,7 +421,7 @@ def _stated_variance(
     """Return the stated variance (P,) of a point along the normals of patches, by noise and image position."""
     at = _first_points(owner)[middle]
     of_image = np.einsum("pi,pi->p", known.position_mm[at], normals)
-    return of_image**2 + variance_along(known.random_mm2[at], normals)
+    return of_image**2 + project_variance(known.random_mm2[at], normals)
 
 
 def _first_points(owner: np.ndarray) -> np.ndarray:

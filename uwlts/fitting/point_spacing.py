@@ -40,7 +40,7 @@ def _between_images(points_mm: np.ndarray, frame: np.ndarray) -> float:
     return float(np.median(least))
 
 
-def footprint_on(cloud: PointCloud, chosen: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, float]:
+def project_footprint(cloud: PointCloud, chosen: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the footprints of chosen (K,) points along tangents (K, 2, 3), and their relative uncertainty.
 
     A footprint is a pair of standard deviations (K, 2) in mm. The uncertainty is that of their squares. Both are zero

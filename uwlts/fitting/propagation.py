@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.storage.cloud import PointCloud, PointUncertainty, images_along, matrices_of, variance_along
+from uwlts.storage.cloud import PointCloud, PointUncertainty, expand_covariances, project_image_errors, project_variance
 
 _SEED = 635
 """Seed of the draws, so that a cloud always has the same uncertainties."""
@@ -40,28 +40,28 @@ class PointErrors:
     patterns_mm: np.ndarray | None
 
     @classmethod
-    def of(cls, known: PointUncertainty, frame: np.ndarray) -> PointErrors:
+    def from_uncertainty(cls, known: PointUncertainty, frame: np.ndarray) -> PointErrors:
         """Return the error components of points with an uncertainty and images (N,)."""
-        return cls(noise_shifts(known), known.by_image_mm(), frame, known.patterns_mm)
+        return cls(noise_shifts(known), known.image_errors_mm(), frame, known.patterns_mm)
 
     @classmethod
-    def along(cls, cloud: PointCloud, chosen: np.ndarray, normals: np.ndarray) -> PointErrors:
+    def along_normals(cls, cloud: PointCloud, chosen: np.ndarray, normals: np.ndarray) -> PointErrors:
         """Return the error components of chosen (K,) points of a cloud along normals (K, 3)."""
         frame = cloud.frame[chosen]
         image = frame if np.any(frame >= 0) else np.arange(len(chosen))
         if (known := cloud.uncertainty) is None:
             return cls(np.zeros(len(chosen)), np.empty((0, len(chosen))), image, None)
         known = known[chosen]
-        single = np.sqrt(np.maximum(variance_along(known.random_mm2, normals), 0))
+        single = np.sqrt(np.maximum(project_variance(known.random_mm2, normals), 0))
         patterns = np.einsum("mni,ni->mn", known.patterns_mm, normals)
-        return cls(single, images_along(known, normals), image, patterns)
+        return cls(single, project_image_errors(known, normals), image, patterns)
 
     def __getitem__(self, chosen: np.ndarray) -> PointErrors:
         """Return the components of a selection of the points."""
         patterns = None if self.patterns_mm is None else self.patterns_mm[:, chosen]
         return PointErrors(self.single_mm[chosen], self.image_mm[:, chosen], self.image[chosen], patterns)
 
-    def drawn(self, count: int, rng: np.random.Generator | None = None) -> list[np.ndarray]:
+    def draw(self, count: int, rng: np.random.Generator | None = None) -> list[np.ndarray]:
         """Draw ``count`` random shifts of all points by noise and image errors; by default with a fixed seed."""
         rng, image = rng or np.random.default_rng(_SEED), _group_numbers(self.image)
         one_each = (1,) * (self.single_mm.ndim - 1)
@@ -88,7 +88,7 @@ class PointErrors:
 
         ``change`` returns the changes (F,) of the figures for given shifts of the points.
         """
-        return np.std([change(move) for move in self.drawn(draws)], axis=0, ddof=1), self.by_patterns(change)
+        return np.std([change(move) for move in self.draw(draws)], axis=0, ddof=1), self.by_patterns(change)
 
     def covariances(
         self, weights: np.ndarray, residuals: np.ndarray, groups: np.ndarray
@@ -120,7 +120,7 @@ class PointErrors:
         return random, moved @ moved.T
 
 
-def neighbours_in_order(count: int) -> np.ndarray:
+def group_neighbours(count: int) -> np.ndarray:
     """Return the group (N,) of each point: eight consecutive points, whose errors may be correlated."""
     return np.arange(count) // 8
 
@@ -140,7 +140,7 @@ def grouped_covariance(weights: np.ndarray, parts_mm: np.ndarray, group: np.ndar
 
 def noise_shifts(uncertainty: PointUncertainty) -> np.ndarray:
     """Return the shift (N, 3) of each point for one standard deviation of its stripe centre, up to its sign."""
-    covariance = matrices_of(uncertainty.random_mm2.astype(np.float64))
+    covariance = expand_covariances(uncertainty.random_mm2.astype(np.float64))
     # The covariance is v v^T: its column with the largest element on the diagonal is v times that of v.
     largest = np.argmax(np.einsum("nii->ni", covariance), axis=1)
     rows = np.arange(len(covariance))

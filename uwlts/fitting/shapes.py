@@ -10,11 +10,11 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import (
     LARGEST_RELATIVE_STD,
     Normalised,
-    evenly_thinned,
     minimise_squares,
     normalise_points,
     parameter_covariance,
     principal_axes,
+    thin_evenly,
 )
 
 _THINNED = 600
@@ -160,7 +160,7 @@ def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
     parameters, cost = minimise_squares(
         lambda x: np.linalg.norm(unit.points - x[:3], axis=1) - (x[3] if known is None else known),
         jacobian,
-        np.hstack(algebraic_centres(unit.points)) if known is None else initial_centre(unit.points, known),
+        np.hstack(fit_algebraic_centres(unit.points)) if known is None else initial_centre(unit.points, known),
     )
     covariance, std = parameter_covariance(jacobian(parameters), cost, what="a sphere")
     centre = unit.centroid_mm + unit.scale_mm * parameters[:3]
@@ -238,7 +238,7 @@ def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = 
         axis is not determined.
     """
     unit, known = _prepare_round(points, radius_mm, least=6, what="a cylinder fit")
-    thinned = evenly_thinned(unit.points, _THINNED)
+    thinned = thin_evenly(unit.points, _THINNED)
     trials = [_refined_cylinder(thinned, *start, known) for start in _cylinder_starts(thinned, known, axis_start)]
     frame, start, _ = min(trials, key=lambda trial: trial[2])
     frame, parameters, cost = _refined_cylinder(unit.points, frame, start, known)
@@ -323,7 +323,7 @@ def _cylinder_starts(points: np.ndarray, known: float | None, axis_start: Any) -
     seen = np.einsum("nd,kcd->knc", points, frames[:, :2])
     middle = seen.mean(axis=1)
     centred = seen - middle[:, None]
-    centres, radii = algebraic_centres(centred)
+    centres, radii = fit_algebraic_centres(centred)
     misfit = np.sum((np.linalg.norm(centred - centres[:, None], axis=2) - radii[:, None]) ** 2, axis=1)
     starts = []
     for best in np.argsort(misfit)[:_TRIED]:
@@ -342,7 +342,7 @@ def _normal_to_normals(points: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(normals.T @ normals)[1][:, 0]
 
 
-def algebraic_centres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_algebraic_centres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit centres (..., D) and radii (...) of circles (D = 2) or spheres (D = 3) to centred points (..., N, D).
 
     Taubin's fit, which is nearly unbiased on short arcs. It is the eigenvector of the smallest eigenvalue of the
@@ -367,7 +367,7 @@ def initial_centre(points: np.ndarray, radius: float) -> np.ndarray:
 
     It has the direction of the algebraic centre, and the depth that follows from the lateral extent of the points.
     """
-    centre, _ = algebraic_centres(points)
+    centre, _ = fit_algebraic_centres(points)
     direction = centre / max(float(np.linalg.norm(centre)), 1e-12)
     across = np.sum(points**2, axis=-1) - (points @ direction) ** 2
     depth = np.sqrt(max(radius**2 - float(across.mean()), (0.1 * radius) ** 2))

@@ -349,11 +349,11 @@ class AravisCamera(CameraDevice):
         if buffer is None:
             return None
         try:
-            return self._delivered(buffer)
+            return self._read_buffer(buffer)
         finally:
             functions.arv_stream_push_buffer(stream, buffer)
 
-    def _delivered(self, buffer: int) -> Delivered:
+    def _read_buffer(self, buffer: int) -> Delivered:
         functions = self._functions
         stamp_ns = functions.arv_buffer_get_timestamp(buffer)
         number, time_s = functions.arv_buffer_get_frame_id(buffer), 1e-9 * stamp_ns if stamp_ns else None
@@ -403,7 +403,7 @@ class AravisCamera(CameraDevice):
             complaint = _text(error.contents.message)
             self._functions.g_error_free(error)
             self._gone = self._gone or "timeout" in complaint
-            raise self._failed(f"'{name.replace('_', ' ')}'", complaint)
+            raise self._make_error(f"'{name.replace('_', ' ')}'", complaint)
         return result
 
 

@@ -380,12 +380,12 @@ class CameraDevice(ABC):
             status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.seen is not None)
             usable = status is FrameStatus.OK or (self._skip and status is not FrameStatus.DUPLICATED)
             if frame.seen is not None and usable:
-                self._later.extend(self._grabbed(each, FrameStatus.OK) for each in frame.later)
-                return self._grabbed(frame, status)
+                self._later.extend(self._make_grabbed_frame(each, FrameStatus.OK) for each in frame.later)
+                return self._make_grabbed_frame(frame, status)
             if not self._skip:
                 raise HardwareError(f"frame {frame.frame_id} of the camera {self.address} is {_MEANING[status]}")
 
-    def _grabbed(self, frame: Delivered, status: FrameStatus) -> GrabbedFrame:
+    def _make_grabbed_frame(self, frame: Delivered, status: FrameStatus) -> GrabbedFrame:
         settings, seen = self.settings, frame.seen
         assert seen is not None
         shape = settings.region.height_px, settings.region.width_px
@@ -418,7 +418,7 @@ class CameraDevice(ABC):
             f"the camera {self.address} gave no frame within {timeout_s:g} s though it answers commands: {advice}"
         )
 
-    def _failed(self, doing: str, error: object) -> HardwareError:
+    def _make_error(self, doing: str, error: object) -> HardwareError:
         """Return the HardwareError for an error of the driver's library."""
         return HardwareError(
             f"the camera {self.address} failed at {doing}: {error}. If it does not answer, check power and cable, and "

@@ -28,7 +28,7 @@ from uwlts.reconstruction.latency import measure_latency
 from uwlts.runtime.progress import ProgressListener
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.stripe import stripe_in
+from uwlts.stripe import find_stripe
 
 _SPARE_MM, _SPARE_S = 1.0, 0.3
 """Travel at constant speed before and after the stored frames: a distance, and in addition a time."""
@@ -143,7 +143,7 @@ def record_continuously(
     if rate_set is None or abs(rate_set / rate_hz - 1) > 0.01:
         warn(f"the camera takes {rate_set} frames/s where the plan needs {rate_hz:.4g}: steps differ from the plan's")
     kinds = {"centre_lines": lines, "moving": True}
-    with CaptureWriter(out, header, dtype=dtype, **kinds, plan=plan.recorded(), overwrite=overwrite) as writer:
+    with CaptureWriter(out, header, dtype=dtype, **kinds, plan=plan.make_record(), overwrite=overwrite) as writer:
         reader = _FrameReader(camera, writer, clock, positions, exposure_ms, sensor, header.saturation_dn)
         reader.frame_s = 1e-3 * exposure_ms + together / rate_hz
         reader.gap_s = _GAP_S - continuous.speed_mm_per_s / stage.settings.acceleration_mm_per_s2
@@ -272,7 +272,7 @@ class _FrameReader:
             stored = Frame(frame.seen, place, True, exposure_ms, middle_s - self._began_s, encoder=encoder)
             self._writer.append(stored)
             along = self._sensor.camera.stripe_along
-            stripe = stripe_in(frame.seen, stripe_along=along, saturation=self._full_dn)
+            stripe = find_stripe(frame.seen, stripe_along=along, saturation=self._full_dn)
             self._stripes.append(stripe.centre_px)
             self._times.append(middle_s)
             self._encoders.append(np.nan if encoder is None else encoder)

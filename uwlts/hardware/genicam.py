@@ -101,7 +101,7 @@ class GenicamCamera(CameraDevice):
         try:
             yield
         except self._faults as error:
-            raise self._failed(doing, error) from error
+            raise self._make_error(doing, error) from error
 
     def _close(self) -> None:
         acquirer, self._acquirer = self._acquirer, None
@@ -221,11 +221,11 @@ class GenicamCamera(CameraDevice):
             except self._timeout:
                 return None
         try:
-            return self._delivered(buffer)
+            return self._read_buffer(buffer)
         finally:
             buffer.queue()
 
-    def _delivered(self, buffer: Any) -> Delivered:
+    def _read_buffer(self, buffer: Any) -> Delivered:
         raw = buffer.module
         try:
             time_s = 1e-9 * raw.timestamp_ns

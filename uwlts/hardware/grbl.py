@@ -272,7 +272,7 @@ class GrblStage:
                     self._go(to_mm, feed_mm_per_min)
                     since_s = time.monotonic() - self._line.asked_s
                     if sent_mm != start_mm and abs(sent_mm - at_mm) < feed_mm_s * (since_s + ramp_s / 2):
-                        raise self._line.failed(
+                        raise self._line.stop_and_make_error(
                             f"the stage slowed down near {sent_mm:.2f} mm because this program sent the next part of "
                             "its travel too late: the computer is too busy"
                         )
@@ -288,7 +288,7 @@ class GrblStage:
             raise
         reaches_speed = abs(position_mm - start_mm) > feed_mm_s * (ramp_s + 3 * POLL_S)
         if reaches_speed and brightest < _FULL * speed:
-            raise self._line.failed(
+            raise self._line.stop_and_make_error(
                 f"the laser's pin does not follow: at most S{brightest:g} is reported, S{speed} was sent: a spindle "
                 "override, or $31 above it"
             )
@@ -328,7 +328,7 @@ class GrblStage:
         reached_mm = self._rest()
         missing = round((reached_mm - position_mm) * self.settings.steps_per_mm)
         if abs(missing) > 1:
-            raise self._line.failed(
+            raise self._line.stop_and_make_error(
                 f"missed steps: the position is {reached_mm:.3f} mm where {position_mm:.3f} mm was requested, "
                 f"{missing:+d} steps; a command or pulses were lost: check the wiring for interference, then home"
             )
@@ -346,7 +346,7 @@ class GrblStage:
             if report.state != "Run" or not math.isclose(position_mm, last_mm, abs_tol=1e-9):
                 last_mm, since = position_mm, now
             elif now - since > patience_s:
-                raise self._line.failed(
+                raise self._line.stop_and_make_error(
                     f"stall: the stage has been at {position_mm:.3f} mm for {now - since:.1f} s although the "
                     "controller reports that it runs: restart the controller, then home"
                 )
@@ -359,7 +359,7 @@ class GrblStage:
         while (report := self._line.status()).state != "Idle":
             self._refuse_stop(report)
             if time.monotonic() > deadline:
-                raise self._line.failed(
+                raise self._line.stop_and_make_error(
                     f"the controller is in the state {report.state} although its movements are done"
                 )
             time.sleep(POLL_S / 5)
@@ -378,7 +378,7 @@ class GrblStage:
                 # The report is rounded to 1 um; the controller counts steps.
                 return round(machine_mm * self.settings.steps_per_mm) / self.settings.steps_per_mm - self._origin_mm
             report = self._line.status()
-        raise self._line.failed("work positions are reported without their offset (WCO): send $10=1")
+        raise self._line.stop_and_make_error("work positions are reported without their offset (WCO): send $10=1")
 
     def _refuse_stop(self, report: Status) -> None:
         """Raise HardwareError if the movement cannot end in this state, or the limit switch is pressed elsewhere."""
@@ -391,13 +391,13 @@ class GrblStage:
             "Jog": "jogging",
         }
         if report.state in advice:
-            raise self._line.failed(f"the controller has stopped: {advice[report.state]}")
+            raise self._line.stop_and_make_error(f"the controller has stopped: {advice[report.state]}")
         if not self.settings.homing or "X" not in report.pins:
             return
         position_mm = self._position_of(report)
         switch_mm = 0.0 if self.settings.homes_to_negative else self.settings.travel_mm
         if abs(position_mm - switch_mm) > self.settings.homing_pull_off_mm + _PIN_MARGIN_MM:
-            raise self._line.failed(
+            raise self._line.stop_and_make_error(
                 f"missed steps: the limit switch at {switch_mm:g} mm is pressed at the position {position_mm:.3f} mm: "
                 "the motor lost steps (feed or acceleration too high, or an obstacle); home"
             )
@@ -501,7 +501,7 @@ class GrblStage:
     def _require_spindle(self, report: Status, power: float) -> None:
         self._refuse_stop(report)
         if not self._follows(report, power):
-            raise self._line.failed(
+            raise self._line.stop_and_make_error(
                 f"the laser's pin does not follow: S{report.spindle:g} is reported, "
                 f"S{power * self.settings.spindle_max:g} was sent (state {report.state}): a hold, a spindle override, "
                 "or $31 above it"
@@ -520,7 +520,9 @@ class GrblStage:
         # Hold:1 is braking, Hold:0 is at rest.
         while (report := self._line.status()).state in ("Run", "Hold", "Jog") and report.substate != 0:
             if time.monotonic() > deadline:
-                raise self._line.failed(f"the stage does not stop after a feed hold, its state is {report.state}")
+                raise self._line.stop_and_make_error(
+                    f"the stage does not stop after a feed hold, its state is {report.state}"
+                )
             time.sleep(POLL_S / 5)
         self._held = True
         if reset:

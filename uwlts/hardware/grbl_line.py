@@ -256,7 +256,7 @@ class GrblLine:
         self.offset_mm: float | None = None
         self.asked_s = self.answered_s = -math.inf
         self._received, self.unacknowledged = bytearray(), 0
-        self._serial = _open(port, baud)
+        self._serial = _open_port(port, baud)
         self._guard: Heartbeat | None = None
         self._lit, self._beaten_s = False, -math.inf
         self.darkened_by_hand, self._writing, self.unreachable = False, threading.Lock(), False
@@ -303,9 +303,9 @@ class GrblLine:
             case "watching":
                 self._beaten_s = time.monotonic()
             case "switched off":
-                raise self.failed(_STOOD_STILL)
+                raise self.stop_and_make_error(_STOOD_STILL)
             case "gone":
-                raise self.failed(
+                raise self.stop_and_make_error(
                     "the guard process, which switches the laser off after a crash, is gone or suspended: open the "
                     "stage again"
                 )
@@ -353,7 +353,9 @@ class GrblLine:
             else:
                 reply = self._next_reply(deadline)
                 if reply is None:
-                    raise self.failed(f"{line!r} was not done in {timeout_s:.1f} s: the controller hangs or is held")
+                    raise self.stop_and_make_error(
+                        f"{line!r} was not done in {timeout_s:.1f} s: the controller hangs or is held"
+                    )
             if isinstance(reply, Reply):
                 answers.append(reply)
         return answers
@@ -394,7 +396,7 @@ class GrblLine:
                 if isinstance(reply, Status):
                     self.answered_s = time.monotonic()
                     return reply
-        raise self.failed(
+        raise self.stop_and_make_error(
             f"silence: {_QUERIES} status queries were not answered: the cable is loose or the controller hangs"
         )
 
@@ -453,9 +455,9 @@ class GrblLine:
             reply = parse_reply(line)
             if isinstance(reply, Reply) and reply.kind == "banner":
                 return
-        raise self.failed("the controller does not restart on Ctrl-X: switch its power off and on")
+        raise self.stop_and_make_error("the controller does not restart on Ctrl-X: switch its power off and on")
 
-    def failed(self, what: str) -> HardwareError:
+    def stop_and_make_error(self, what: str) -> HardwareError:
         """Switch the laser off after a fault, and return the error to raise."""
         laser = "the laser CANNOT be switched off: switch its power off before going near"
         if self._send_reset():
@@ -503,17 +505,17 @@ class GrblLine:
         if self.fault is not None:
             raise HardwareError(f"the stage on {self.port} has stopped after a fault: {self.fault}; home or unlock it")
         if self.darkened_by_hand:
-            raise self.failed(_ASKED_TO_DARKEN)
+            raise self.stop_and_make_error(_ASKED_TO_DARKEN)
 
     def _write(self, data: bytes) -> None:
         try:
             with self._writing:
                 # After the Ctrl-X of another thread a command would switch the laser on again.
                 if self.darkened_by_hand and data != SOFT_RESET:
-                    raise self.failed(_ASKED_TO_DARKEN)
+                    raise self.stop_and_make_error(_ASKED_TO_DARKEN)
                 self._serial.write(data)
         except OSError as error:
-            raise self.failed(f"the connection is lost: {error}; is the cable plugged in?") from error
+            raise self.stop_and_make_error(f"the connection is lost: {error}; is the cable plugged in?") from error
 
     def _next_reply(self, deadline: float) -> Reply | Status | None:
         """Return the next reply that is not a fault, or None at the deadline."""
@@ -526,7 +528,7 @@ class GrblLine:
             return reply
         match reply.kind:
             case "ok" | "error" if self.unacknowledged == 0:
-                raise self.failed(
+                raise self.stop_and_make_error(
                     f"{line!r} was received although nothing was sent: does another program use the port?"
                 )
             case "ok":
@@ -535,14 +537,16 @@ class GrblLine:
                 self.unacknowledged -= 1
                 raise HardwareError(f"the stage on {self.port} rejects: {code_text('error', reply.number)}")
             case "ALARM":
-                raise self.failed(code_text("ALARM", reply.number))
+                raise self.stop_and_make_error(code_text("ALARM", reply.number))
             case "banner":
-                raise self.failed(
+                raise self.stop_and_make_error(
                     "the controller restarted by itself: a dip of its supply, its reset button or interference; "
                     "its position is lost, home again"
                 )
             case "garbage":
-                raise self.failed(f"garbage on the line, {line!r}: interference, or a cable that is too long or loose")
+                raise self.stop_and_make_error(
+                    f"garbage on the line, {line!r}: interference, or a cable that is too long or loose"
+                )
             case "setting" | "message":
                 pass
             case _:
@@ -559,7 +563,7 @@ class GrblLine:
                     return line
             if len(self._received) > _LONGEST_LINE:
                 self._received.clear()
-                raise self.failed(
+                raise self.stop_and_make_error(
                     f"garbage on the line, {_LONGEST_LINE} characters without an end: wrong baud rate or interference"
                 )
             now = time.monotonic()
@@ -570,14 +574,14 @@ class GrblLine:
             try:
                 self._received += self._serial.read(max(1, self._serial.in_waiting))
             except OSError as error:
-                raise self.failed(f"the connection is lost: {error}; is the cable plugged in?") from error
+                raise self.stop_and_make_error(f"the connection is lost: {error}; is the cable plugged in?") from error
 
 
 def _readable(data: bytes | bytearray) -> str:
     return data.decode("ascii", errors="backslashreplace")
 
 
-def _open(port: str, baud: int) -> serial.Serial:
+def _open_port(port: str, baud: int) -> serial.Serial:
     try:
         return serial.Serial(port, baud, timeout=_READ_S, write_timeout=ANSWER_S, exclusive=True)
     except ValueError as error:

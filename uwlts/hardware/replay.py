@@ -43,7 +43,7 @@ class ReplayCamera(CameraDevice):
             self._files = sorted(images, key=lambda path: natural_key(path.name))
             if not self._files:
                 raise HardwareError(f"the folder {self._path} contains no image ({', '.join(SUFFIXES)})")
-            first = _read(self._files[0])
+            first = _read_image(self._files[0])
             (height, width), bits = first.shape, 8 * first.itemsize
         elif is_regular_file(self._path):
             self._capture = Capture(self._path)
@@ -117,7 +117,7 @@ class ReplayCamera(CameraDevice):
         if index >= count and not self._repeat:
             raise HardwareError(f"all {count} images of {self._path} have been shown")
         shown = index % count
-        seen = _read(self._files[shown]) if capture is None else capture.seen(shown)
+        seen = _read_image(self._files[shown]) if capture is None else capture.read_observation(shown)
         exposure_ms = None if capture is None else float(capture.exposure_ms[shown])
         if isinstance(image := seen, Stripe):
             known = math.nan if capture is None else float(capture.encoder[shown])
@@ -134,7 +134,7 @@ class ReplayCamera(CameraDevice):
         """Files need no check: reading a missing one raises an error."""
 
 
-def _read(path: Path) -> np.ndarray:
+def _read_image(path: Path) -> np.ndarray:
     """Read a grey image (H, W) of uint8 or uint16; raises ImageError for any other image."""
     image = read_image(path)
     if image.ndim != 2:

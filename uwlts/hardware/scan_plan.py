@@ -11,7 +11,7 @@ from uwlts.errors import DescriptionError, DesignError, RangeError
 from uwlts.files.reading import is_regular_file
 from uwlts.hardware.grbl import GrblStage
 from uwlts.model.artefacts import parse_artefact
-from uwlts.model.library import load_sensor, read_table, validated
+from uwlts.model.library import load_sensor, read_table, validate_description
 from uwlts.model.placement import check_design
 from uwlts.model.sensor import Bracket, Description, NotNegative, Positive, Sensor, Table, Vector
 from uwlts.storage.capture import CaptureHeader
@@ -97,7 +97,7 @@ class RigPlan(Description):
             "stage_direction": direction,
             "saturation_dn": sensor.detector.full_scale_dn() + zero_dn,
         }
-        return validated(CaptureHeader, table | shown, f"the plan '{self.title}'")
+        return validate_description(CaptureHeader, table | shown, f"the plan '{self.title}'")
 
 
 class StagePlan(StageSettings):
@@ -177,7 +177,7 @@ class ScanPlan(RigPlan):
             artefact=self.artefact,
         )
 
-    def recorded(self) -> Table:
+    def make_record(self) -> Table:
         """Return the part of the plan that determines the images, as JSON, without addresses and motion settings."""
         omitted = {"title", "sensor", "camera", "check_steps"}
         table = self.model_dump(mode="json", exclude=omitted)
@@ -208,7 +208,9 @@ def load_plan(path: Path) -> ScanPlan:
 
     Raises DescriptionError if the file is missing, is not TOML, or has an unknown or wrong key.
     """
-    return validated(ScanPlan, read_plan_table(path, wanted="sensor, medium and stage (docs/how-to/scan.md)"), path)
+    return validate_description(
+        ScanPlan, read_plan_table(path, wanted="sensor, medium and stage (docs/how-to/scan.md)"), path
+    )
 
 
 def read_plan_table(path: Path, *, wanted: str) -> Table:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import DescriptionError, HardwareError
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.continuous import plan_passes, record_continuously
 from uwlts.hardware.grbl import GrblStage
@@ -31,7 +31,7 @@ from uwlts.hardware.scan_watch import (
     shows_laser,
 )
 from uwlts.model.sensor import Sensor
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.import_.grey_values import subtract_background
@@ -76,7 +76,7 @@ class ScanProgress:
         return texts
 
 
-@inputs_kept()
+@protect_inputs()
 def record_scan(
     plan: ScanPlan,
     out: Path,
@@ -85,7 +85,7 @@ def record_scan(
     stage: GrblStage,
     resume: bool = False,
     overwrite: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
     report: Callable[[str], None] = lambda line: None,
     warn: Callable[[str], None] = lambda text: None,
     between: Callable[[], None] = lambda: None,
@@ -150,7 +150,7 @@ def record_scan(
     known_ms, before_s = read_unfinished(out, [multiple for _, multiple in plan.images()]) if resume else ({}, 0.0)
     seen = ScanProgress(exposure_ms=known_ms)
     files = {"overwrite": overwrite, "resume": resume}
-    with CaptureWriter(out, header, dtype=dtype, centre_lines=lines, plan=plan.recorded(), **files) as writer:
+    with CaptureWriter(out, header, dtype=dtype, centre_lines=lines, plan=plan.make_record(), **files) as writer:
         begun = len(writer)
         if begun == len(shots):
             return seen

@@ -256,7 +256,7 @@ class Inspection(Brief, RecordFile):
     level_mm: np.ndarray
     notes: tuple[str, ...] = ()
 
-    def of(self, *kinds: FeatureKind) -> tuple[Feature, ...]:
+    def select(self, *kinds: FeatureKind) -> tuple[Feature, ...]:
         """Return the features of the given kinds."""
         return tuple(feature for feature in self.features if feature.kind in kinds)
 

@@ -20,13 +20,13 @@ from scipy.stats import norm
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.evaluation.step_faces import StepFace, label_step_faces
-from uwlts.fitting.least_squares import evenly_thinned, fit_robustly, robust_std
-from uwlts.fitting.point_spacing import footprint_on
-from uwlts.fitting.propagation import PointErrors, neighbours_in_order
+from uwlts.fitting.least_squares import fit_robustly, robust_std, thin_evenly
+from uwlts.fitting.point_spacing import project_footprint
+from uwlts.fitting.propagation import PointErrors, group_neighbours
 from uwlts.fitting.shapes import fit_plane
 from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, FeatureValue, Inspection, plain_value
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.cloud_files import load_cloud
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,11 +136,11 @@ def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     row = np.concatenate([-lever @ base.rows, np.full(len(upper), 1 / len(upper))])
     distance = cloud.points_mm[used] @ base.axes[2] - base.point_mm @ base.axes[2]
     height = float(row @ distance)
-    errors = PointErrors.along(cloud, used, np.broadcast_to(base.axes[2], (len(used), 3)))
+    errors = PointErrors.along_normals(cloud, used, np.broadcast_to(base.axes[2], (len(used), 3)))
     residuals = np.concatenate([base.residuals_mm, other.residuals_mm])
     turned = base.axes[:2] @ other.axes[:2].T
     slopes = np.hstack([-base.rows[1:], turned @ other.rows[1:]])
-    random, common = errors.covariances(np.vstack([row, slopes]), residuals, neighbours_in_order(len(used)))
+    random, common = errors.covariances(np.vstack([row, slopes]), residuals, group_neighbours(len(used)))
     angle = np.array([base.axes[k] @ other.axes[2] for k in (0, 1)])
     values = (
         _make_value(FeatureKind.STEP, "height", height, random, common, 0),
@@ -173,7 +173,7 @@ def inspect_flange(
     EvaluationError
         The cloud does not contain frames and lines, or a face.
     """
-    cloud, datum = _load_faces(cloud), None if datum is None else loaded_cloud(datum)
+    cloud, datum = _load_faces(cloud), None if datum is None else load_cloud(datum)
     used = _find_largest_plane(cloud.points_mm)[1]
     face = _fit_face(cloud, used)
     values = [_measure_flatness(cloud, face, used)]
@@ -357,7 +357,7 @@ class _Hole:
 
 def _load_faces(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
     """Return the cloud, read if it is a file; raise EvaluationError if it has too few points."""
-    cloud = loaded_cloud(cloud)
+    cloud = load_cloud(cloud)
     if len(cloud) < _RULE.fewest_points:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_RULE.fewest_points} are needed")
     return cloud
@@ -365,7 +365,7 @@ def _load_faces(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
 
 def _find_largest_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal (3,), towards the sensor, and the points' indices of the plane with most points."""
-    thinned = evenly_thinned(points, _RULE.judging_points)
+    thinned = thin_evenly(points, _RULE.judging_points)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     rng = np.random.default_rng(0)
     corners = thinned[rng.integers(len(thinned), size=(_RULE.proposals, 3))]
@@ -465,14 +465,14 @@ def _measure_flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> Featu
         return np.bincount(index[inner], left[inner], len(count))[full] / count[full]
 
     found = means(face.residuals_mm)
-    errors = PointErrors.along(cloud, used, np.broadcast_to(face.axes[2], (len(used), 3)))
+    errors = PointErrors.along_normals(cloud, used, np.broadcast_to(face.axes[2], (len(used), 3)))
     noisy = replace(errors, single_mm=np.maximum(errors.single_mm, face.std_mm))
     value = float(np.ptp(found))
 
     def changed(moves: np.ndarray) -> float:
         return float(np.ptp(found + means(moves))) - value
 
-    drawn = [changed(moves) for moves in noisy.drawn(_RULE.draws)]
+    drawn = [changed(moves) for moves in noisy.draw(_RULE.draws)]
     bias, common = max(float(np.mean(drawn)), 0.0), errors.by_patterns(changed)
     random = float(np.hypot(np.std(drawn), bias))
     shared = None if common is None else float(common)
@@ -545,7 +545,7 @@ def _locate_edges(cloud: PointCloud, own: np.ndarray, row: np.ndarray, face: _Fa
     """
     result = np.full((len(own), 2), 0.5 * spacing)
     bright = cloud.intensity[own].astype(float)
-    size = footprint_on(cloud, own, np.broadcast_to(face.axes[:2], (len(own), 2, 3)))[0]
+    size = project_footprint(cloud, own, np.broadcast_to(face.axes[:2], (len(own), 2, 3)))[0]
     along = np.diff(cloud.points_mm[own] @ face.axes[:2].T, axis=0)[np.diff(row) == 0]
     axis = int(np.argmax(np.median(np.abs(along), axis=0)))
     blur = size[:, axis]
@@ -656,9 +656,9 @@ def _measure_parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum
     slopes = facing * face.axes[:2] @ other.axes[2]
     random, common = np.zeros((2, 2)), None
     for own, plane, chosen in ((cloud, face, used), (datum, other, on_datum)):
-        errors: PointErrors = PointErrors.along(own, chosen, np.broadcast_to(plane.axes[2], (len(chosen), 3)))
+        errors: PointErrors = PointErrors.along_normals(own, chosen, np.broadcast_to(plane.axes[2], (len(chosen), 3)))
         rows = (face.axes[:2] @ plane.axes[:2].T) @ plane.rows[1:]
-        by_noise, by_common = errors.covariances(rows, plane.residuals_mm, neighbours_in_order(len(chosen)))
+        by_noise, by_common = errors.covariances(rows, plane.residuals_mm, group_neighbours(len(chosen)))
         random = random + by_noise
         if by_common is not None:
             common = by_common if common is None else common + by_common
@@ -683,6 +683,6 @@ def _measure_flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], mid
         residuals.append(local[:, 2] - design @ (rows @ local[:, 2]))
     both, weights = np.concatenate(used), np.concatenate(parts)[None]
     offset = float(weights[0] @ ((cloud.points_mm[both] - face.point_mm) @ face.axes[2]))
-    errors = PointErrors.along(cloud, both, np.broadcast_to(face.axes[2], (len(both), 3)))
-    random, common = errors.covariances(weights, np.concatenate(residuals), neighbours_in_order(len(both)))
+    errors = PointErrors.along_normals(cloud, both, np.broadcast_to(face.axes[2], (len(both), 3)))
+    random, common = errors.covariances(weights, np.concatenate(residuals), group_neighbours(len(both)))
     return _make_value(FeatureKind.GAP, "flush", abs(offset), random, common, 0)

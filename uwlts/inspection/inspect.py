@@ -22,7 +22,7 @@ INSPECTIONS: dict[InspectionKind, Callable[..., Inspection]] = {
 }
 
 
-def inspected(cloud: PointCloud | str | os.PathLike[str], kind: InspectionKind, **options: object) -> Inspection:
+def inspect_cloud(cloud: PointCloud | str | os.PathLike[str], kind: InspectionKind, **options: object) -> Inspection:
     """Inspect a cloud as a kind of object; EvaluationError for an option that this kind does not have."""
     function = INSPECTIONS[kind]
     if foreign := [f"`{name}`" for name in options if name not in inspect.signature(function).parameters]:

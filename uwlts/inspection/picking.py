@@ -26,7 +26,7 @@ _DRAWS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Inspected:
+class PickedMeasurement:
     """Measured figures in mm by name, their uncertainties if the cloud has any, and the numbers of points.
 
     For a length, ``points_used`` is 2. For a shape, it counts the points that agree with the fit.
@@ -49,14 +49,14 @@ class Inspected:
         return f"{self.name}: {', '.join(figures)}{of}"
 
 
-def point_near(cloud: PointCloud, place_mm: np.ndarray) -> int:
+def find_nearest_point(cloud: PointCloud, place_mm: np.ndarray) -> int:
     """Return the index of the point nearest to a place (3,)."""
     if len(cloud) == 0:
         raise EvaluationError("the cloud is empty: there are no points to measure")
     return int(np.argmin(np.sum((cloud.points_mm - place_mm) ** 2, axis=1)))
 
 
-def length_between(cloud: PointCloud, first: int, second: int) -> Inspected:
+def measure_length(cloud: PointCloud, first: int, second: int) -> PickedMeasurement:
     """Return the distance between two points of a cloud.
 
     Its uncertainty includes errors that both points share (GUM, Eq. 13): the calibration's patterns, and the position
@@ -71,16 +71,16 @@ def length_between(cloud: PointCloud, first: int, second: int) -> Inspected:
     if (known := cloud.uncertainty) is not None:
         together = (known.patterns_mm[:, second] - known.patterns_mm[:, first]) @ unit
         ends = np.array([first, second])
-        by_image = known[ends].by_image_mm() @ unit
+        by_image = known[ends].image_errors_mm() @ unit
         if cloud.frame[first] == cloud.frame[second]:
             by_image = np.diff(by_image, axis=1)
         noise = noise_shifts(known[ends]) @ unit
         random = float(np.sqrt(noise @ noise + np.sum(by_image**2)))
         stated["distance"] = FigureUncertainty(random, float(np.linalg.norm(together)))
-    return Inspected("length", {"distance": length}, stated, 2, 0)
+    return PickedMeasurement("length", {"distance": length}, stated, 2, 0)
 
 
-def shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, shape: Shape) -> Inspected:
+def fit_shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, shape: Shape) -> PickedMeasurement:
     """Fit a shape robustly to the points within a radius of a place (3,).
 
     Uncertainties are propagated as for artefacts (`uwlts.evaluation.figure_uncertainty`): the fit is repeated with each
@@ -102,12 +102,14 @@ def shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, shape:
             moved = _figures(fit(cloud.points_mm[used] + moves))
             return [moved[name] - figures[name] for name in names]
 
-        random, systematic = PointErrors.of(known[used], cloud.frame[used]).propagate(changed, draws=_DRAWS)
+        random, systematic = PointErrors.from_uncertainty(known[used], cloud.frame[used]).propagate(
+            changed, draws=_DRAWS
+        )
         assert systematic is not None
         stated = {
             name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(names, random, systematic, strict=True)
         }
-    return Inspected(shape, figures, stated, len(used), robust.rejected)
+    return PickedMeasurement(shape, figures, stated, len(used), robust.rejected)
 
 
 def _figures(fit: SphereFit | FlatFit | CylinderFit) -> dict[str, float]:

@@ -9,14 +9,14 @@ import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
-from uwlts.fitting.point_spacing import footprint_on
+from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.blemish_search import BlemishSearch, Indication, UnrolledSurface, search_blemishes
 from uwlts.inspection.blemishes import Blemish, measure_blemish
 from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, Inspection
 from uwlts.inspection.pipe_form import FORM_RULE, LARGEST_OVALITY, PipeForm, fit_pipe, pipe_features, refit_pipe
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.cloud_files import load_cloud
 
 _OVERLAP = 0.6
 """Overlap, rad, of both sides of a pipe that is cut open, unless a gap of this size separates them."""
@@ -71,7 +71,7 @@ def inspect_pipe(
     >>> found = uwlts.inspect_pipe("pipe.ply", wall_mm=9.5)
     >>> print("\\n".join(found.lines()))
     """
-    cloud = loaded_cloud(cloud)
+    cloud = load_cloud(cloud)
     if wall_mm is not None and not 0 < wall_mm < np.inf:
         raise EvaluationError(f"wall_mm is {wall_mm:g}; expected a positive thickness in mm")
     if not 0 < false_alarm < 1:
@@ -112,7 +112,7 @@ def _search_form(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, false_al
         first, last = np.flatnonzero(angle < _OVERLAP), np.flatnonzero(angle > 2 * np.pi - _OVERLAP)
         copied = np.concatenate([copied, first, last])
         angle = np.concatenate([angle, angle[first] + 2 * np.pi, angle[last] - 2 * np.pi])
-    errors = PointErrors.along(cloud, chosen, form.outwards[chosen])[copied]
+    errors = PointErrors.along_normals(cloud, chosen, form.outwards[chosen])[copied]
     surface = _unroll(cloud, form, chosen[copied], angle, errors)
     search = search_blemishes(surface, false_alarm=false_alarm)
     beyond = np.abs(surface.places[:, 1] / form.radius_mm - np.pi) - np.pi
@@ -161,14 +161,14 @@ def _unroll(
     axis = np.broadcast_to(form.frame.axes[2], (len(chosen), 3))
     tangents = np.stack([axis, np.cross(axis, form.outwards[chosen])], axis=1)
     places = np.column_stack([form.along_mm[chosen], form.radius_mm * angle])
-    return UnrolledSurface(places, heights, std, *footprint_on(cloud, chosen, tangents))
+    return UnrolledSurface(places, heights, std, *project_footprint(cloud, chosen, tangents))
 
 
 def _blemish_features(
     cloud: PointCloud, form: PipeForm, chosen: np.ndarray, search: BlemishSearch, wall_mm: float | None
 ) -> tuple[list[Feature], list[str]]:
     """Return the blemishes as features, and a note on each omitted indication."""
-    errors = PointErrors.along(cloud, chosen, form.outwards[chosen])
+    errors = PointErrors.along_normals(cloud, chosen, form.outwards[chosen])
     flat = _unroll(cloud, form, chosen, form.angle[chosen], errors)
     measured: list[tuple[Blemish, float, float]] = []
     notes = [_note_omission(cloud, chosen[[each.point]], each.height_mm, each.reason) for each in search.unresolved]

@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import evenly_thinned, fit_biweight, fit_robustly
-from uwlts.fitting.propagation import PointErrors, neighbours_in_order
+from uwlts.fitting.least_squares import fit_biweight, fit_robustly, thin_evenly
+from uwlts.fitting.propagation import PointErrors, group_neighbours
 from uwlts.fitting.shapes import CylinderFit, fit_cylinder
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, amplitude_value, plain_value
 from uwlts.storage.cloud import PointCloud
@@ -183,9 +183,9 @@ def fit_pipe(cloud: PointCloud, *, largest_ovality: float = LARGEST_OVALITY) -> 
     roundness) and along it (bow, taper) are fitted together with Tukey's biweight. EvaluationError if the points
     determine no pipe.
     """
-    fitted = evenly_thinned(np.arange(len(cloud)), FORM_RULE.most_points)
+    fitted = thin_evenly(np.arange(len(cloud)), FORM_RULE.most_points)
     points = cloud.points_mm[fitted]
-    start = fit_robustly(fit_cylinder, evenly_thinned(points, FORM_RULE.start_points)).fit
+    start = fit_robustly(fit_cylinder, thin_evenly(points, FORM_RULE.start_points)).fit
     return _fit_from(cloud, fitted, PipeFrame.about(start, points), start.radius_mm, largest_ovality)
 
 
@@ -194,7 +194,7 @@ def refit_pipe(cloud: PointCloud, form: PipeForm, *, left_out: np.ndarray) -> Pi
 
     The frame is only shifted and tilted. EvaluationError if the other points determine no pipe.
     """
-    fitted = evenly_thinned(np.flatnonzero(~left_out), FORM_RULE.most_points)
+    fitted = thin_evenly(np.flatnonzero(~left_out), FORM_RULE.most_points)
     return _fit_from(cloud, fitted, form.frame, form.radius_mm, form.largest_ovality)
 
 
@@ -270,7 +270,7 @@ def pipe_features(
         `section_mm` is not positive.
     """
     used = form.used
-    errors = PointErrors.along(cloud, used, form.outwards[used])
+    errors = PointErrors.along_normals(cloud, used, form.outwards[used])
     whole = _whole_values(form, errors)
     extent = np.array([2 * form.radius_mm, 2 * form.radius_mm, np.ptp(form.along_mm[used])])
     features = [Feature(FeatureKind.PIPE, "pipe", whole, form.frame.point_mm, form.frame.axes, extent, used)]
@@ -370,7 +370,7 @@ def _section_values(
     left: np.ndarray,
 ) -> tuple[FeatureValue, ...]:
     kind = FeatureKind.SECTION
-    random, common = errors.covariances(weights, left, neighbours_in_order(len(left)))
+    random, common = errors.covariances(weights, left, group_neighbours(len(left)))
     shared = None if common is None else 2 * float(np.sqrt(common[0, 0]))
     diameter = 2 * (form.radius_mm + coefficients[0])
     values = [plain_value(kind, "diameter", float(diameter), 2 * float(np.sqrt(random[0, 0])), shared)]

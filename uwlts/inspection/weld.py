@@ -17,15 +17,8 @@ from scipy import ndimage, sparse
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
-from uwlts.fitting.least_squares import (
-    MAD_TO_STD,
-    evenly_thinned,
-    fit_biweight,
-    fit_robustly,
-    principal_axes,
-    robust_std,
-)
-from uwlts.fitting.point_spacing import footprint_on
+from uwlts.fitting.least_squares import MAD_TO_STD, fit_biweight, fit_robustly, principal_axes, robust_std, thin_evenly
+from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors
 from uwlts.fitting.shapes import fit_plane
 from uwlts.inspection.features import (
@@ -40,7 +33,7 @@ from uwlts.inspection.features import (
 )
 from uwlts.inspection.noisy_extremes import Largest, largest_mean
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.cloud_files import load_cloud
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +136,7 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
     EvaluationError
         The cloud shows no bead, or `section_mm` is not positive.
     """
-    cloud = loaded_cloud(cloud)
+    cloud = load_cloud(cloud)
     if section_mm is not None and not 0 < section_mm < np.inf:
         raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
     if len(cloud) < _RULE.fewest_points:
@@ -151,7 +144,7 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
             f"the cloud has {len(cloud)} points; at least {_RULE.fewest_points} are needed for a weld"
         )
     bead, notes = _prepare_bead(cloud, section_mm)
-    errors = PointErrors.along(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
+    errors = PointErrors.along_normals(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
     values, extent, left_out = _measure_values(bead, errors)
     feature = Feature(FeatureKind.WELD, "weld", values, bead.middle_mm, bead.axes, extent, bead.chosen[bead.on_bead])
     deviation = np.full(len(cloud), np.nan)
@@ -290,7 +283,7 @@ def _prepare_bead(cloud: PointCloud, section_mm: float | None) -> tuple[_Bead, l
     smooth = _profile_rows(across, section, count, grid, bandwidth)
     part = share[:, None]
     plates = (design * (1 - part), rows[0]), (design * part, rows[1])
-    size, footprint_std = footprint_on(cloud, chosen, np.broadcast_to(axes[:2], (len(chosen), 2, 3)))
+    size, footprint_std = project_footprint(cloud, chosen, np.broadcast_to(axes[:2], (len(chosen), 2, 3)))
     sharp = _interpolation_rows(across, section, count, grid)
     parts = [
         weight * _interpolation_rows(across + node * size[:, 1], section, count, grid)
@@ -328,7 +321,7 @@ def _locate_bead(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.
     Returns its axes (3, 3), middle (3,), approximate half width and ends (2,) along it, in mm, and the number of other
     beads.
     """
-    start = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), evenly_thinned(points, _RULE.start_points))
+    start = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), thin_evenly(points, _RULE.start_points))
     up, heights = start.fit.normal, start.fit.distances_mm(points)
     noise = robust_std(heights - np.median(heights))
     top = float(np.quantile(heights, 0.995))
@@ -458,7 +451,7 @@ def _measure_values(bead: _Bead, errors: PointErrors) -> tuple[tuple[FeatureValu
                 f"the undercut {side} is unknown in {lost} of {len(whole)} sections: profile lines are missing there"
             )
     scattered = replace(errors, single_mm=np.maximum(bead.noise_mm, errors.single_mm))
-    noisy = [_evaluate_figures(bead, bead.raw_mm + moves, whole, toes) for moves in scattered.drawn(_RULE.draws)]
+    noisy = [_evaluate_figures(bead, bead.raw_mm + moves, whole, toes) for moves in scattered.draw(_RULE.draws)]
     # Ripples of the crest are no noise: its noise is taken from the draws. Grooves have no ripples.
     of_crest = float(np.median(np.std([each.crest for each in noisy], axis=0)))
     largest = {

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from uwlts.errors import DescriptionError, EvaluationError, problems_of
-from uwlts.files.reading import MOST_TOML_BYTES, parsed_toml, read_text
+from uwlts.errors import DescriptionError, EvaluationError, describe_problems
+from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
 from uwlts.model.sensor import Description, NotNegative, Positive
 
 _MOST_SPHERES = 6
@@ -72,7 +72,7 @@ def parse_artefact(table: object) -> Artefact:
     try:
         return TypeAdapter(Artefact).validate_python(table)
     except ValidationError as error:
-        raise EvaluationError(f"the artefact's description is not valid: {problems_of(error)}") from error
+        raise EvaluationError(f"the artefact's description is not valid: {describe_problems(error)}") from error
 
 
 def read_artefact(path: str | Path) -> Artefact:
@@ -83,7 +83,7 @@ def read_artefact(path: str | Path) -> Artefact:
     """
     text = read_text(path, most_bytes=MOST_TOML_BYTES, called="artefact", foreign="is not valid TOML")
     try:
-        table = parsed_toml(text)
+        table = parse_toml(text)
     except ValueError as error:
         raise DescriptionError(f"{path} is not valid TOML: {error}") from error
     return parse_artefact(table)

@@ -14,23 +14,27 @@ _MOST = 8
 class Brief:
     """Base of results with a `repr` that fits on a screen and a table for notebooks; names contain the units."""
 
-    def shown(self) -> dict[str, str]:
+    def summarise_fields(self) -> dict[str, str]:
         """Return short texts of the fields' values by name."""
         known = getattr(type(self), "model_fields", None)
         names = known or [each.name for each in dataclasses.fields(self)]  # pyright: ignore[reportArgumentType]
-        return {name: brief(getattr(self, name)) for name in names}
+        return {name: summarise_value(getattr(self, name)) for name in names}
 
     def __repr__(self) -> str:
         """Return the type and one line for each field."""
-        return "\n".join([f"{type(self).__name__}:", *(f"  {name}: {text}" for name, text in self.shown().items())])
+        return "\n".join(
+            [f"{type(self).__name__}:", *(f"  {name}: {text}" for name, text in self.summarise_fields().items())]
+        )
 
     def _repr_html_(self) -> str:
         """Return the fields as an HTML table."""
-        rows = "".join(f"<tr><th>{name}</th><td>{html.escape(text)}</td></tr>" for name, text in self.shown().items())
+        rows = "".join(
+            f"<tr><th>{name}</th><td>{html.escape(text)}</td></tr>" for name, text in self.summarise_fields().items()
+        )
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
 
-def brief(value: object) -> str:
+def summarise_value(value: object) -> str:
     """Return a short text of a value."""
     if (shape := getattr(value, "shape", ())) and (dtype := getattr(value, "dtype", None)):
         return f"{' x '.join(map(str, shape))} {dtype}"

@@ -14,7 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from uwlts.errors import problems_of
+from uwlts.errors import describe_problems
 from uwlts.files.json_files import write_model
 from uwlts.model.brief import Brief
 from uwlts.model.joint_estimate import JointEstimate, Origin
@@ -68,7 +68,7 @@ def _check_provenance(provenance: Table) -> Table:
     try:
         Origin.model_validate(provenance)
     except ValidationError as error:
-        raise ValueError(problems_of(error)) from error
+        raise ValueError(describe_problems(error)) from error
     return provenance
 
 
@@ -89,7 +89,7 @@ class CameraModel(Description):
     distortion: Distortion = Distortion()
 
     @classmethod
-    def described(cls, camera: Camera, *, magnified: float = 1.0) -> "CameraModel":
+    def from_description(cls, camera: Camera, *, magnified: float = 1.0) -> "CameraModel":
         """Return a camera as described, with the focal length times ``magnified`` by refraction.
 
         If the focal length is magnified, the distortion is unknown and set to zero.
@@ -128,7 +128,7 @@ class WindowModel(Description):
     glass_index: Annotated[float, Field(ge=1, lt=4)] = 1.0
 
     @classmethod
-    def described(cls, window: Window, wavelength_nm: float, *, refractions: Literal[1, 2] = 2) -> "WindowModel":
+    def from_description(cls, window: Window, wavelength_nm: float, *, refractions: Literal[1, 2] = 2) -> "WindowModel":
         """Return a window as described, for a wavelength: a pane of glass, or a single interface."""
         x, y, z = window.normal().tolist()
         model = cls(refractions=refractions, distance_mm=window.distance_mm, normal=(x, y, z))
@@ -277,7 +277,7 @@ class Calibration(Brief, Description):
         """Return the evidence of the calibration, from its provenance."""
         return Origin.model_validate(self.provenance)
 
-    def index_of(self, medium: Medium) -> float:
+    def medium_index(self, medium: Medium) -> float:
         """Return the index of a medium at the laser's wavelength, calibrated or from its description.
 
         Raises RangeError if the description is outside the formula's range.

@@ -11,8 +11,8 @@ from typing import TypeVar
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from uwlts.errors import DescriptionError, Error, first_problems
-from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parsed_toml, read_text, shortened
+from uwlts.errors import DescriptionError, Error, list_problems
+from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parse_toml, read_text, shorten
 from uwlts.model.sensor import Description, Sensor, Table
 
 AnyDescription = TypeVar("AnyDescription", bound=Description)
@@ -31,22 +31,22 @@ def library_folder() -> Path:
     return inside if inside.is_dir() else package.parent / "scenes"
 
 
-def names(folder: str = "") -> list[str]:
+def list_names(folder: str = "") -> list[str]:
     """Return the names of the shipped descriptions in a folder of the library."""
     return sorted(path.stem for path in (library_folder() / folder).glob("*.toml"))
 
 
-def find(name_or_path: str | Path, folder: str = "") -> Path:
+def find_description(name_or_path: str | Path, folder: str = "") -> Path:
     """Return the path of a description given by file or name; DescriptionError with the known names."""
     path = Path(name_or_path)
     if path.suffix == ".toml":
         if not is_regular_file(path):
-            raise DescriptionError(f"no description at {shortened(str(path))}")
+            raise DescriptionError(f"no description at {shorten(str(path))}")
         return path
     shipped = library_folder() / folder / f"{name_or_path}.toml"
     if not is_regular_file(shipped):
-        known = f"known are {', '.join(names(folder))}, or give the path of a .toml file"
-        raise DescriptionError(f"nothing is called '{shortened(str(name_or_path))}'; {known}")
+        known = f"known are {', '.join(list_names(folder))}, or give the path of a .toml file"
+        raise DescriptionError(f"nothing is called '{shorten(str(name_or_path))}'; {known}")
     return shipped
 
 
@@ -58,7 +58,7 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
     if len(seen) == _MOST_BASES:
         raise DescriptionError(f"{path}: more than {_MOST_BASES} bases in a chain; use fewer")
     try:
-        table = parsed_toml(text)
+        table = parse_toml(text)
     except ValueError as error:
         raise DescriptionError(f"{path} {_NO_TOML}: {error}") from error
     base = table.pop("base", None)
@@ -68,15 +68,17 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
         raise DescriptionError(f"{path}: base is {base!r}; expected the name or path of another description")
     beside = path.parent / f"{base.removesuffix('.toml')}.toml"
     # A description can have the same name as its shipped base.
-    base_path = beside if is_regular_file(beside) and beside.resolve() != path.resolve() else find(base, folder)
-    return merged(read_table(base_path, folder, seen=(*seen, path.resolve())), table)
+    base_path = (
+        beside if is_regular_file(beside) and beside.resolve() != path.resolve() else find_description(base, folder)
+    )
+    return merge_tables(read_table(base_path, folder, seen=(*seen, path.resolve())), table)
 
 
 _EITHER_OR = (({"baseline_mm", "triangulation_angle_deg"}, {"origin_mm", "axis"}), ({"water"}, {"turbidity"}))
 """Alternative keys for the same information: placement of the laser, and properties of a medium."""
 
 
-def merged(base: Table, changes: Table) -> Table:
+def merge_tables(base: Table, changes: Table) -> Table:
     """Merge ``changes`` into a copy of ``base``, nested tables key by key.
 
     Keys of the base are dropped if the changes give the same information with alternative keys, such as the laser's
@@ -92,17 +94,17 @@ def merged(base: Table, changes: Table) -> Table:
     result = {key: value for key, value in base.items() if key not in replaced}
     for key, value in changes.items():
         below = base.get(key)
-        result[key] = merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        result[key] = merge_tables(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return result
 
 
-def validated(model: type[AnyDescription], table: object, source: str | Path) -> AnyDescription:
+def validate_description(model: type[AnyDescription], table: object, source: str | Path) -> AnyDescription:
     """Validate a table as a description; DescriptionError with each invalid key, its value and the expected one."""
     try:
         return model.model_validate(table)
     except ValidationError as error:
         words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
-        known = [*map(_explain, first_problems(error, _MOST_PROBLEMS))]
+        known = [*map(_explain, list_problems(error, _MOST_PROBLEMS))]
         left = error.error_count() - len(known)
         more = [f"  {left:,} {'more ' if known else ''}values are wrong"] if left else []
         raise DescriptionError("\n".join([f"{source} is not a valid {words}:", *known, *more])) from error
@@ -119,7 +121,7 @@ def _explain(problem: ErrorDetails) -> str:
         return f"  {key}: unknown key (check its spelling and its unit suffix, such as _mm or _deg)"
     if problem["type"] == "missing":
         return f"  {key}: missing"
-    found = "" if isinstance(problem["input"], dict) else f" (found {shortened(repr(problem['input']))})"
+    found = "" if isinstance(problem["input"], dict) else f" (found {shorten(repr(problem['input']))})"
     return f"  {key}: {problem['msg'].removeprefix('Value error, ')}{found}"
 
 
@@ -138,5 +140,5 @@ def load_sensor(name_or_path: str | Path) -> Sensor:
     >>> sensor = uwlts.load_sensor("thesis")
     >>> sensor.medium("water").refractive_index(sensor.laser.wavelength_nm)
     """
-    path = find(name_or_path, "sensors")
-    return validated(Sensor, read_table(path, "sensors"), path)
+    path = find_description(name_or_path, "sensors")
+    return validate_description(Sensor, read_table(path, "sensors"), path)

@@ -173,7 +173,7 @@ class Mount(Brief, Description):
             case _:
                 assert_never(self.artefact)
 
-    def apart_from(self, calibration: str) -> tuple[np.ndarray, np.ndarray | None]:
+    def independent_covariance(self, calibration: str) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the part (6, 6) of the covariance that is independent of a sensor calibration, given by its digest.
 
         If the mount was estimated with that calibration, also return the derivatives (6, P) of the mount with respect

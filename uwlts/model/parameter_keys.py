@@ -149,7 +149,7 @@ ParameterKey = SingleParameter | MediumIndex | StepHeight
 _SINGLE: dict[str, SingleParameter] = {key.text: key for kind in get_args(SingleParameter) for key in kind}
 
 
-def parameter_of(text: str) -> ParameterKey:
+def parse_parameter(text: str) -> ParameterKey:
     """Return the parameter with a text in files; ValueError if there is none."""
     if text in _SINGLE:
         return _SINGLE[text]
@@ -163,7 +163,7 @@ def parameter_of(text: str) -> ParameterKey:
 def _decode(value: object) -> ParameterKey:
     if not isinstance(value, ParameterKey | str):
         raise ValueError(f"a parameter is {value!r}; expected its text")
-    return parameter_of(value) if isinstance(value, str) else value
+    return parse_parameter(value) if isinstance(value, str) else value
 
 
 ParameterInFile = Annotated[ParameterKey, PlainValidator(_decode), PlainSerializer(lambda key: key.text)]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import Residuals
 from uwlts.model.sensor import Description, Medium, Positive, Rows, Table
@@ -74,14 +74,14 @@ class PolynomialCalibration(Brief, Description):
         # One line for each key; with indentation, each of thousands of coefficients would take a line.
         content = {"format": FORMAT, "version": VERSION} | self.model_dump(mode="json")
         lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
-        with written_aside(path, overwrite=overwrite) as aside:
+        with write_atomically(path, overwrite=overwrite) as aside:
             aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
 
     def figures(self, step: str) -> Table:
         """Return the figures of a calibration step; an empty table if there are none."""
         return self.residuals.get(step, {})
 
-    def index_of(self, medium: Medium) -> float:
+    def medium_index(self, medium: Medium) -> float:
         """Return the index of a medium at the laser's wavelength, relative to air; RangeError outside the formula."""
         return medium.refractive_index(self.wavelength_nm)
 

@@ -136,7 +136,7 @@ class Distortion(Description):
         """Return whether the radial factor is a rational function."""
         return self.k4 != 0 or self.k5 != 0 or self.k6 != 0
 
-    def used(self) -> dict[str, float]:
+    def used_coefficients(self) -> dict[str, float]:
         """Return the coefficients of the model in use: five for Brown-Conrady, all eight for the rational model."""
         return self.model_dump(exclude=None if self.is_rational() else {"k4", "k5", "k6"})
 
@@ -364,7 +364,7 @@ class Medium(Description):
     def _particles(self, wavelength_nm: float) -> waters.Particles:
         if self.turbidity is not None:
             return waters.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
-        return waters.named_water(self.water or "pure").particles(wavelength_nm)
+        return waters.find_water(self.water or "pure").particles(wavelength_nm)
 
     def _phase_function(self) -> phase_functions.PhaseFunction:
         if isinstance(self.phase, phase_functions.DescribedPhase):
@@ -372,7 +372,7 @@ class Medium(Description):
         # The turbidity scale interpolates between Petzold's stations.
         name = self.phase or ("molecular" if self.turbidity is None else "petzold")
         if self.phase is None and self.water is not None:
-            name = waters.named_water(self.water).phase
+            name = waters.find_water(self.water).phase
         parameters = {"asymmetry", "particle_index", "particle_slope", "backscatter_share"}
         keys = self.model_dump(include=parameters, exclude_none=True)
         return phase_functions.phase_function_kind(name).of_keys(keys)

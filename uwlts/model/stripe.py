@@ -66,7 +66,7 @@ class Stripe:
         return np.flatnonzero(self.status == _OK)
 
     @classmethod
-    def on_lines(
+    def from_lines(
         cls,
         lines: np.ndarray,
         centre_px: np.ndarray,
@@ -94,7 +94,7 @@ class Stripe:
         centre[lines], height[lines], width[lines] = centre_px, amplitude, width_px
         return cls(centre, height, width, status, stripe_along)
 
-    def without(self, lines: np.ndarray, reason: StripeStatus) -> Stripe:
+    def remove_lines(self, lines: np.ndarray, reason: StripeStatus) -> Stripe:
         """Return the stripe without the centres on lines (M,), whose status becomes ``reason``."""
         centre, amplitude, width, status = (getattr(self, row).copy() for row in ROWS)
         centre[lines], amplitude[lines], width[lines], status[lines] = np.nan, np.nan, np.nan, reason
@@ -102,7 +102,7 @@ class Stripe:
 
     def pixels(self) -> np.ndarray:
         """Return the image coordinates (M, 2), u = column and v = row in px, of the centres of `lines`."""
-        return pixels_of(self.lines, self.centre_px[self.lines], stripe_along=self.stripe_along)
+        return stack_pixels(self.lines, self.centre_px[self.lines], stripe_along=self.stripe_along)
 
 
 @dataclass(frozen=True)
@@ -153,12 +153,12 @@ class StripeCandidates:
         for number in range(sheets):
             own = self[np.searchsorted(self.line, lines) + number]
             columns = own.centre_px, own.amplitude, own.width_px
-            found.append(Stripe.on_lines(lines, *columns, status=status.copy(), stripe_along=self.stripe_along))
+            found.append(Stripe.from_lines(lines, *columns, status=status.copy(), stripe_along=self.stripe_along))
         return found
 
     def pixels(self) -> np.ndarray:
         """Return the image coordinates (M, 2), u = column and v = row in px."""
-        return pixels_of(self.line, self.centre_px, stripe_along=self.stripe_along)
+        return stack_pixels(self.line, self.centre_px, stripe_along=self.stripe_along)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +188,7 @@ class CaptureStripes:
         return CaptureStripes(*(column[some] for column in columns), lines_by_status=self.lines_by_status)
 
 
-def pixels_of(lines: np.ndarray, places_px: np.ndarray, *, stripe_along: str) -> np.ndarray:
+def stack_pixels(lines: np.ndarray, places_px: np.ndarray, *, stripe_along: str) -> np.ndarray:
     """Return image coordinates (N, 2), u = column and v = row in px, of centres (N,) on profile lines (N,)."""
     order = (places_px, lines) if stripe_along == "height" else (lines, places_px)
     return np.column_stack(order).astype(np.float64)
@@ -244,6 +244,6 @@ class Coordinates:
         )
 
 
-def rows_of(stripe: Stripe) -> np.ndarray:
+def stack_rows(stripe: Stripe) -> np.ndarray:
     """Return the values of a stripe's lines as an array (4, L) in the order of `ROWS`."""
     return np.stack([getattr(stripe, row) for row in ROWS]).astype(float)

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from uwlts.errors import DescriptionError
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 
@@ -73,7 +73,7 @@ class Trajectory(Brief):
         if self.covariance is not None:
             names += COVARIANCE_COLUMNS
             table = np.column_stack([table, *(self.covariance[:, i, j] for i, j in COVARIANCE_COLUMNS.values())])
-        with written_aside(path, overwrite=overwrite) as aside:
+        with write_atomically(path, overwrite=overwrite) as aside:
             np.savetxt(aside, table, fmt="%.12g", delimiter=",", header=",".join(names), comments="")
 
     @cached_property
@@ -114,7 +114,7 @@ class Trajectory(Brief):
         return poses
 
 
-def on_clock(times_s: np.ndarray, *, offset_s: float, drift_ppm: float) -> np.ndarray:
+def convert_to_platform_clock(times_s: np.ndarray, *, offset_s: float, drift_ppm: float) -> np.ndarray:
     """Convert times (N,) in s from the camera's clock to the platform's clock.
 
     The platform's clock is ahead by ``offset_s`` at the first time, and runs faster by ``drift_ppm``. Raises

@@ -102,7 +102,7 @@ WATERS = {
 """All named waters. Petzold's: absorption and scattering in 1/m including sea water; Jerlov's: column of the tables."""
 
 
-def named_water(name: str) -> NaturalWater:
+def find_water(name: str) -> NaturalWater:
     """Return a water by name; DescriptionError with the known names."""
     if name not in WATERS:
         raise DescriptionError(f"unknown water '{name}'; known are {', '.join(WATERS)}")

@@ -19,7 +19,7 @@ import numpy as np
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Laser, Sensor, Uncertainty, Vector
-from uwlts.model.stripe import CaptureStripes, pixels_of
+from uwlts.model.stripe import CaptureStripes, stack_pixels
 from uwlts.optics.line_table import LineTable
 from uwlts.optics.triangulation import MeasuredPoints, rays_on_sheet, to_object
 from uwlts.optics.window import RayStatus
@@ -63,7 +63,7 @@ _MOVED_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class LitSheet:
+class SheetPoints:
     """Points on a laser sheet of finite thickness, for N stripe centres.
 
     Attributes
@@ -94,7 +94,7 @@ class LitSheet:
     evaluate: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
     @classmethod
-    def of(
+    def from_calibration(
         cls,
         calibration: Calibration,
         sensor: Sensor,
@@ -103,7 +103,7 @@ class LitSheet:
         *,
         medium_index: float,
         digest: str | None = None,
-    ) -> LitSheet:
+    ) -> SheetPoints:
         """Locate stripe centres on the sheet.
 
         Parameters
@@ -132,7 +132,7 @@ class LitSheet:
         def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
             return known(line, place_px)[0]
 
-        table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE, key=key)
+        table = LineTable.over_range(exact, line, centre_px, tolerance=_TABLE_TOLERANCE, key=key)
         if table is None:
             values, status = known(line, centre_px)
         else:
@@ -140,7 +140,7 @@ class LitSheet:
         found = MeasuredPoints(values[:, :3], status)
         return cls(found, values[:, 3:6], values[:, 6], values[:, 7], calibration, line, centre_px, exact)
 
-    def beside(self, width_px: np.ndarray, slopes: np.ndarray, *, stage_direction: Vector) -> np.ndarray:
+    def brightness_shift(self, width_px: np.ndarray, slopes: np.ndarray, *, stage_direction: Vector) -> np.ndarray:
         """Return the shifts (N, 3) in mm along the camera rays, from the middle of the sheet to the light's centroid.
 
         The sheet's thickness is the described one, limited by the median stripe width.
@@ -150,7 +150,7 @@ class LitSheet:
         width_px : (N,)
             Full width of each stripe at half maximum; NaN where unknown.
         slopes : (N,)
-            Slopes by `slopes_of_brightness`, per mm of the stage.
+            Slopes by `fit_brightness_slopes`, per mm of the stage.
         stage_direction : Vector
             Stage direction as the capture describes it.
         """
@@ -203,7 +203,7 @@ def _make_sheet_function(
     def exact(line: np.ndarray, place_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         count = len(line)
         places = np.concatenate([place_px, place_px + _MOVED_PX])
-        pixels = pixels_of(np.concatenate([line, line]), places, stripe_along=calibration.stripe_along)
+        pixels = stack_pixels(np.concatenate([line, line]), places, stripe_along=calibration.stripe_along)
         found, ray, slope = rays_on_sheet(calibration, pixels, medium_index=medium_index)
         in_camera = found.points_mm[:count]
         sigma = sheet_sigma_mm(laser, np.linalg.norm(in_camera - origin_mm, axis=1), medium_index=medium_index)
@@ -222,7 +222,7 @@ def _make_sheet_function(
     return exact
 
 
-def slopes_of_brightness(
+def fit_brightness_slopes(
     frame: np.ndarray, line: np.ndarray, amplitude: np.ndarray, stage_mm: np.ndarray, exposure_ms: np.ndarray
 ) -> np.ndarray:
     """Return the slopes (N,) of the log stripe amplitude per mm of stage travel, 0 where they are unknown.
@@ -263,11 +263,11 @@ def footprint_std(uncertainty: Uncertainty) -> float:
 
     It combines the uncertainties of the sheet's thickness and of the stripe method.
     """
-    return math.hypot(beside_std(uncertainty), _METHOD_STD)
+    return math.hypot(brightness_shift_std(uncertainty), _METHOD_STD)
 
 
-def beside_std(uncertainty: Uncertainty) -> float:
-    """Return the relative standard uncertainty of `LitSheet.beside`, which is proportional to the squared thickness."""
+def brightness_shift_std(uncertainty: Uncertainty) -> float:
+    """Return the relative uncertainty of `SheetPoints.brightness_shift`, proportional to the squared thickness."""
     return 2.0 * uncertainty.sheet_thickness
 
 
@@ -282,7 +282,7 @@ def sheet_sigma_mm(laser: Laser, distance_mm: np.ndarray, *, medium_index: float
     return 0.5 * waist * np.sqrt(1.0 + ((distance_mm - laser.waist_distance_mm) / rayleigh) ** 2)
 
 
-def moved_by_blur_px(
+def estimate_blur_shift_px(
     frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, width_px: np.ndarray
 ) -> np.ndarray:
     """Estimate the largest shifts (N,) in px that blur can cause, from neighbouring centres in the same image.
@@ -302,7 +302,7 @@ def moved_by_blur_px(
     if np.any((frame[1:] < frame[:-1]) | ((frame[1:] == frame[:-1]) & (line[1:] < line[:-1]))):
         order, moved = np.lexsort((line, frame)), np.empty(len(line))
         columns = frame, line, centre_px, amplitude, width_px
-        moved[order] = moved_by_blur_px(*(column[order] for column in columns))
+        moved[order] = estimate_blur_shift_px(*(column[order] for column in columns))
         return moved
     lean = _slopes_along(frame, line, centre_px, _BEND_LINES)
     bend = _slopes_along(frame, line, lean, _BEND_LINES)
@@ -311,7 +311,7 @@ def moved_by_blur_px(
     return variance * (lean * fading + 0.5 * bend)
 
 
-def sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]:
+def select_sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (M,) of stripe centres that blur shifts by less than 0.1 px, and their largest shifts, px.
 
     If an amplitude or width is not finite, because the 3D camera does not supply it, return all centres with shift 0.
@@ -320,7 +320,7 @@ def sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]:
         return np.empty(0, np.intp), np.empty(0)
     if not (np.isfinite(stripes.amplitude).all() and np.isfinite(stripes.width_px).all()):
         return np.arange(len(stripes.line)), np.zeros(len(stripes.line))
-    moved = moved_by_blur_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
+    moved = estimate_blur_shift_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
     sharp = np.flatnonzero(np.abs(moved) < _MOST_BLUR_PX)
     return sharp, moved[sharp]
 

@@ -250,7 +250,7 @@ def _newton_step(
 
 def _undistort(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Invert `_distort` in its domain about the centre; NaN outside the image of the domain."""
-    allowed = _allowed(x_seen, y_seen)
+    allowed = _is_allowed(x_seen, y_seen)
     with np.errstate(all="ignore"):
         s = x_seen * x_seen + y_seen * y_seen
         start = 1.0 / _radial(d, s)
@@ -275,7 +275,7 @@ def _undistort_damped(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> 
     A step is halved until it stays in the domain and reduces the residual. Because the Jacobian is positive definite in
     the domain, a short enough step always reduces it.
     """
-    largest, allowed = _largest_square(d), _allowed(x_seen, y_seen)
+    largest, allowed = _largest_square(d), _is_allowed(x_seen, y_seen)
     x, y = np.zeros_like(x_seen), np.zeros_like(y_seen)
     x_next, y_next, missing = x, y, np.full_like(x, np.inf)
     for _ in range(_MOST_STEPS):
@@ -296,5 +296,5 @@ def _undistort_damped(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> 
     return np.where(found, x, np.nan), np.where(found, y, np.nan)
 
 
-def _allowed(x_seen: np.ndarray, y_seen: np.ndarray) -> np.ndarray:
+def _is_allowed(x_seen: np.ndarray, y_seen: np.ndarray) -> np.ndarray:
     return _ROUNDING * (1.0 + np.abs(x_seen) + np.abs(y_seen))

@@ -102,7 +102,7 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
     ]
 
 
-def table_lines(rows: list[DesignRow]) -> list[str]:
+def format_table(rows: list[DesignRow]) -> list[str]:
     """Format the table as lines of text."""
     width = max(len(row.name) for row in rows)
     return [f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows]

@@ -82,7 +82,7 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
 
 def _check_same_refraction(header: CaptureHeader, calibration: PolynomialCalibration, *, source: str) -> None:
     own = calibration.medium
-    index, own_index = calibration.index_of(header.medium), calibration.index_of(own)
+    index, own_index = calibration.medium_index(header.medium), calibration.medium_index(own)
     if header.medium.kind != own.kind or abs(index - own_index) > _LARGEST_INDEX_CHANGE:
         raise CalibrationError(
             f"{source} was made in {header.medium_name} ({header.medium.kind}, n {index:.4f}), the "

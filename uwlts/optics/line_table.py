@@ -51,7 +51,7 @@ class LineTable:
     high_px: float
 
     @classmethod
-    def of(
+    def from_function(
         cls,
         exact: Callable[[np.ndarray, np.ndarray], np.ndarray],
         lines: tuple[int, int],
@@ -91,11 +91,11 @@ class LineTable:
                 of_lines = chebyshev.chebvander(at_lines, count[0] - 1)
                 whole = cls(series, of_lines, lines[0], place - half_places, place + half_places)
                 # The truncation error must stay far below the tolerance.
-                return whole.shortened(1e-3 * error)
+                return whole.shorten(1e-3 * error)
         return None
 
     @classmethod
-    def about(
+    def over_range(
         cls,
         exact: Callable[[np.ndarray, np.ndarray], np.ndarray],
         line: np.ndarray,
@@ -105,14 +105,14 @@ class LineTable:
         share: float = 0.0,
         key: Hashable = None,
     ) -> LineTable | None:
-        """Tabulate a function over the range of given lines and centres, as `of`.
+        """Tabulate a function over the range of given lines and centres, as `from_function`.
 
         Return None also if there are fewer than 5000 centres, or if a centre is not finite.
 
         Parameters
         ----------
         exact, tolerance, share
-            As for `of`.
+            As for `from_function`.
         line : (N,) int
             Profile lines.
         place_px : (N,)
@@ -131,21 +131,21 @@ class LineTable:
             )
             known = key, wide, wide_px
             if known not in _tables:
-                _tables[known] = cls.of(exact, wide, wide_px, tolerance=tolerance, share=share)
+                _tables[known] = cls.from_function(exact, wide, wide_px, tolerance=tolerance, share=share)
                 for oldest in [*_tables][:-_KEPT]:
                     _tables.pop(oldest, None)
             if (table := _tables.get(known)) is not None:
                 return table
-        return cls.of(exact, lines, places_px, tolerance=tolerance, share=share)
+        return cls.from_function(exact, lines, places_px, tolerance=tolerance, share=share)
 
-    def combined(self, weights: np.ndarray) -> LineTable:
+    def combine(self, weights: np.ndarray) -> LineTable:
         """Return the table of linear combinations of the values, with weights (K, M)."""
         return replace(self, terms=self.terms @ weights)
 
-    def shortened(self, tolerance: float | np.ndarray) -> LineTable:
+    def shorten(self, tolerance: float | np.ndarray) -> LineTable:
         """Return the table without trailing terms whose absolute sum is within the tolerance, in lines and centres."""
         size = np.abs(self.terms)
-        of_lines, of_places = (_needed(size.sum(axis=axis), tolerance) for axis in (1, 0))
+        of_lines, of_places = (_count_needed_terms(size.sum(axis=axis), tolerance) for axis in (1, 0))
         terms = np.ascontiguousarray(self.terms[:of_lines, :of_places])
         return replace(self, terms=terms, of_lines=np.ascontiguousarray(self.of_lines[:, :of_lines]))
 
@@ -175,7 +175,7 @@ def _into_series(count: int) -> np.ndarray:
     return into_series
 
 
-def _needed(size: np.ndarray, tolerance: float | np.ndarray) -> int:
+def _count_needed_terms(size: np.ndarray, tolerance: float | np.ndarray) -> int:
     """Return the number of leading terms, at least 1, after which sizes (T, K) sum to no more than the tolerance."""
     left = np.cumsum(size[::-1], axis=0)[::-1]
     return max(1, int(np.count_nonzero((left > tolerance).any(axis=1))))

@@ -53,8 +53,10 @@ def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibra
         wavelength_nm=sensor.laser.wavelength_nm,
         # Without a window, the described focal length includes no refraction: it is that in air.
         medium_kind=medium.kind if medium is not None and camera.window.mounted else "air",
-        camera=CameraModel.described(camera),
-        window=WindowModel.described(camera.window, sensor.laser.wavelength_nm) if camera.window.mounted else None,
+        camera=CameraModel.from_description(camera),
+        window=WindowModel.from_description(camera.window, sensor.laser.wavelength_nm)
+        if camera.window.mounted
+        else None,
         sheet=_sheet(sensor, medium),
         camera_from_object=tuple(map(tuple, camera_from_object(sensor))),
         provenance={"source": f"description of the sensor '{sensor.name}'"},
@@ -69,7 +71,7 @@ def _sheet(sensor: Sensor, medium: Medium | None) -> SheetModel:
     half = math.radians(laser.fan_angle_deg / 2)
     angle = np.linspace(-half, half, _RAYS)
     fan = np.stack([np.zeros(_RAYS), np.sin(angle), np.cos(angle)], axis=1)
-    window = WindowModel.described(laser.window, laser.wavelength_nm) if laser.window.mounted else None
+    window = WindowModel.from_description(laser.window, laser.wavelength_nm) if laser.window.mounted else None
     rays = trace_window(fan, window, medium_index=medium.refractive_index(laser.wavelength_nm))
     # Laser frame: x along the sheet's normal, y along the fan, z along the axis.
     module = np.stack([pose.normal, pose.fan, pose.axis])

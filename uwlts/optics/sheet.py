@@ -42,14 +42,14 @@ class FanDistances:
     """
 
     away: np.ndarray
-    all: np.ndarray
+    distance: np.ndarray
     along: np.ndarray
     in_air: np.ndarray
     wet: np.ndarray
 
     def bulges(self) -> tuple[np.ndarray, np.ndarray]:
         """Return n times the sheet's deviation (N,), (N,) per beam tilt b and per window angle t."""
-        return self.all - self.in_air, self.wet * (self.along - self.in_air)
+        return self.distance - self.in_air, self.wet * (self.along - self.in_air)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class SheetSurface:
         found, n = fan_distances(points, fan, medium_index=self.index), self.index
         axis = np.array(fan.axis)[:, None]
         of_air = (n**2 * found.along * axis - (n**2 - 1.0) * found.away) / found.in_air
-        of_bow = found.away / found.all - of_air
+        of_bow = found.away / found.distance - of_air
         of_turn = found.wet * (axis - of_air) + (1.0 - found.wet) * (1.0 - found.in_air / found.along) * axis
         return self.normal[:, None] - (fan.bow_rad * of_bow + fan.window_turn_rad * of_turn) / n
 

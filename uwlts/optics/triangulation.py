@@ -12,7 +12,7 @@ from numpy.polynomial import legendre
 from uwlts.errors import RangeError
 from uwlts.model.calibration import Calibration
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.model.stripe import pixels_of
+from uwlts.model.stripe import stack_pixels
 from uwlts.optics.camera import directions
 from uwlts.optics.line_table import LineTable
 from uwlts.optics.sheet import SheetSurface, sheet_surface
@@ -85,11 +85,11 @@ def _profile_points(
     """Return the points of `points_on_sheet`, from a `LineTable` if one is worth making."""
 
     def exact(line: np.ndarray, place: np.ndarray) -> MeasuredPoints:
-        pixels = pixels_of(line, place, stripe_along=calibration.stripe_along)
+        pixels = stack_pixels(line, place, stripe_along=calibration.stripe_along)
         return points_on_sheet(calibration, pixels, medium_index=medium_index)
 
     lines, centres_px = np.asarray(lines), np.asarray(centres_px)
-    table = LineTable.about(
+    table = LineTable.over_range(
         lambda line, place: exact(line, place).points_mm, lines, centres_px, tolerance=_TABLE_TOLERANCE_MM
     )
     if table is not None:

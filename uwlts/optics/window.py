@@ -124,7 +124,7 @@ def tangent_ratio(index_squared: float, tangent_squared: np.ndarray) -> np.ndarr
     return 1.0 / np.sqrt(index_squared + (index_squared - 1.0) * tangent_squared)
 
 
-def leaning(direction: np.ndarray, across: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tilt_direction(direction: np.ndarray, across: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a direction tilted by slopes (k,) towards vectors (k, 3), and its derivatives (k, 3) by the slopes.
 
     The tilted direction is a unit vector (3,).
@@ -201,7 +201,7 @@ def trace_derivatives(
     by = np.concatenate([rays_by, np.zeros((6, *rays.shape))])
     normal_by = np.zeros((count + 6, 3))
     slopes = np.array(window.normal[:2]) / window.normal[2]
-    normal, normal_by[count + 1 : count + 3] = leaning(np.eye(3)[2], np.eye(3)[:2], slopes)
+    normal, normal_by[count + 1 : count + 3] = tilt_direction(np.eye(3)[2], np.eye(3)[:2], slopes)
     distance_by = window.distance_mm * normal_by[:, 2] + normal[2] * of_distance
     faces = [(window.distance_mm * normal[2], distance_by, medium_index, of_medium)]
     if window.refractions == 2:

@@ -10,7 +10,7 @@ from uwlts.pages.toolkit import MISSING
 _UNITS = {"px": "px", "mm": "mm", "deg": "°", "rad": "rad", "nm": "nm"}
 
 
-def fixed(value: float | None, decimals: int = 3, *, signed: bool = False) -> str:
+def format_fixed(value: float | None, decimals: int = 3, *, signed: bool = False) -> str:
     """Format a number with fixed decimals; a number that rounds to zero has no sign."""
     if value is None or not math.isfinite(value):
         return MISSING
@@ -18,26 +18,26 @@ def fixed(value: float | None, decimals: int = 3, *, signed: bool = False) -> st
     return text if float(text) else text.lstrip("+-")
 
 
-def small_length(value_mm: float | None, *, signed: bool = False) -> str:
+def format_length(value_mm: float | None, *, signed: bool = False) -> str:
     """Format a length with its unit: below 1 mm in µm with one decimal (below 1 µm with two), else in mm with three."""
     if value_mm is None or not math.isfinite(value_mm):
         return MISSING
     if abs(value_mm) < 1:
-        return f"{fixed(1e3 * value_mm, 1 if abs(value_mm) >= 1e-3 else 2, signed=signed)} µm"
-    return f"{fixed(value_mm, signed=signed)} mm"
+        return f"{format_fixed(1e3 * value_mm, 1 if abs(value_mm) >= 1e-3 else 2, signed=signed)} µm"
+    return f"{format_fixed(value_mm, signed=signed)} mm"
 
 
-def plain(value: float) -> str:
+def format_number(value: float) -> str:
     """Format a number with four significant digits, or an integer with all digits."""
     if float(value).is_integer() and abs(value) < 1e9:
         return f"{value:.0f}"
     return f"{value:.4g}"
 
 
-def as_fine_as(value: float, scale: float, *, digits: int = 3) -> str:
+def format_to_scale(value: float, scale: float, *, digits: int = 3) -> str:
     """Format a number with as many decimals as a scale with some significant digits has."""
     decimals = digits - 1 - math.floor(math.log10(scale)) if scale > 0 else 3
-    return fixed(value, max(0, decimals))
+    return format_fixed(value, max(0, decimals))
 
 
 def unit_of(name: str) -> str:
@@ -45,7 +45,7 @@ def unit_of(name: str) -> str:
     return _UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
 
 
-def words_of(name: str) -> str:
+def split_name(name: str) -> str:
     """Return a name as words, without its unit."""
     bare = name.rsplit("_", 1)[0] if unit_of(name) else name
     return re.sub(r"_+", " ", bare)

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from uwlts.errors import OutputError, SetupError
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 
 BROWSERS = ("chromium", "chromium-headless-shell", "google-chrome", "google-chrome-stable", "msedge")
 """Names of browsers on PATH; the environment variable CHROMIUM names another one."""
@@ -23,7 +23,7 @@ def print_pdf(page: str, path: Path, *, overwrite: bool = False) -> None:
     cannot be written.
     """
     browser = find_browser()
-    with written_aside(path, overwrite=overwrite) as aside, tempfile.TemporaryDirectory() as folder:
+    with write_atomically(path, overwrite=overwrite) as aside, tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "page.html"
         source.write_text(page, encoding="utf-8", errors="replace")
         # The page is the program's own and loads nothing; root cannot use the sandbox.

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
-from uwlts.files.writing import refuse_unsuitable, written_aside
+from uwlts.files.writing import refuse_unsuitable, write_atomically
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -88,7 +88,7 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     own = Path(str(files(package)))
     loader = FileSystemLoader([own, own / "templates", templates])
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["minus"] = typographic
+    environment.filters["minus"] = typeset_number
     scripts, plotly = [] if interactive is None else interactive.scripts, ""
     if scripts:
         from plotly.offline import get_plotlyjs
@@ -116,9 +116,9 @@ def write_page(
     """
     with ExitStack() as stack:
         if beside is not None:
-            aside = stack.enter_context(written_aside(json_beside(Path(path), kind), overwrite=overwrite))
+            aside = stack.enter_context(write_atomically(json_beside(Path(path), kind), overwrite=overwrite))
             aside.write_text(beside, encoding="utf-8")
-        aside = stack.enter_context(written_aside(path, overwrite=overwrite))
+        aside = stack.enter_context(write_atomically(path, overwrite=overwrite))
         # A file name on the page may contain bytes that are not text.
         aside.write_text(text, encoding="utf-8", errors="replace")
 
@@ -182,7 +182,7 @@ class ComparisonTable:
     rows: tuple[tuple[str, str, tuple[str, ...]], ...]
 
 
-def figure_of(width: float, height: float, *, layout: Literal["constrained"] | None = "constrained") -> Figure:
+def make_figure(width: float, height: float, *, layout: Literal["constrained"] | None = "constrained") -> Figure:
     """Return an empty matplotlib figure of a size in inches, which is not shown in a window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -204,7 +204,7 @@ def new_figure(
     """Return a matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
     import matplotlib
 
-    figure = figure_of(width, height)
+    figure = make_figure(width, height)
     with matplotlib.rc_context(_STYLE):
         axes = figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios, width_ratios=width_ratios)
         return figure, list(axes.flat)
@@ -221,18 +221,18 @@ def legend_below(figure: Figure, *, columns: int = 4) -> None:
         figure.legend(handles.values(), handles.keys(), ncols=columns, **style)
 
 
-def svg_of(drawn: Drawn) -> Markup:
+def figure_svg(drawn: Drawn) -> Markup:
     """Return a matplotlib figure, or the figure of axes, as an SVG element for a page."""
-    text = _saved(drawn, format="svg", metadata={"Date": None}).decode("utf-8")
+    text = _save_figure(drawn, format="svg", metadata={"Date": None}).decode("utf-8")
     # Ids of groups would be repeated in every figure and are not referenced; SVG in HTML needs no namespaces.
     text = re.sub(r'(?<=<g) id="[^"]*"|<metadata>.*?</metadata>| xmlns(:\w+)?="[^"]*"', "", text, flags=re.S)
     return Markup(text[text.index("<svg") :].replace("xlink:href", "href"))
 
 
-def png_of(drawn: Drawn, *, dpi: int = 100, few_colours: bool = False) -> bytes:
+def figure_png(drawn: Drawn, *, dpi: int = 100, few_colours: bool = False) -> bytes:
     """Return a matplotlib figure, or the figure of axes, as PNG; ``few_colours`` are 256, for a third of the size."""
     # The name and version of the software would change the file.
-    data = _saved(drawn, format="png", dpi=dpi, metadata={"Software": None})
+    data = _save_figure(drawn, format="png", dpi=dpi, metadata={"Software": None})
     if not few_colours:
         return data
     from PIL import Image
@@ -244,7 +244,7 @@ def png_of(drawn: Drawn, *, dpi: int = 100, few_colours: bool = False) -> bytes:
     return smaller.getvalue()
 
 
-def _saved(drawn: Drawn, **options: Any) -> bytes:
+def _save_figure(drawn: Drawn, **options: Any) -> bytes:
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -266,11 +266,11 @@ def plain_text(text: str) -> str:
 
 def png_data_uri(picture: Drawn | bytes, *, dpi: int = 100) -> str:
     """Return a matplotlib figure, or the bytes of a PNG, as an address that contains the whole picture."""
-    data = picture if isinstance(picture, bytes) else png_of(picture, dpi=dpi)
+    data = picture if isinstance(picture, bytes) else figure_png(picture, dpi=dpi)
     return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
 
 
-def typographic(text: str) -> str:
+def typeset_number(text: str) -> str:
     """Replace a minus sign of a number by the typographic one, and a missing value by a dash."""
     if text == MISSING:
         return "\N{EN DASH}"

@@ -65,7 +65,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
             "needed"
         )
     there, back = (frames[np.argsort(stage_mm[frames])] for frames in (there, back))
-    surface = _Surface.of(stage_mm[there], centre_px[there])
+    surface = _Surface.from_centres(stage_mm[there], centre_px[there])
     speed = float(np.median(speed_mm_per_s[there]) - np.median(speed_mm_per_s[back])) / 2
     seen, position = centre_px[back], stage_mm[back]
     # A backward frame at x shows the same as the forward pass at x - 2 v latency.
@@ -84,7 +84,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     shift = float(ways[np.argmin(np.where(comparable, costs, np.inf))])
     away = slope = np.empty(0)
     for _ in range(_ROUNDS):
-        away, slope = surface.at(position - shift, seen)
+        away, slope = surface.evaluate(position - shift, seen)
         scatter = robust_std(away - np.median(away)) if len(away) else 0.0
         near = np.abs(away) <= max(_OUTLIER * scatter, 1e-6)
         if np.count_nonzero(near) < _FEWEST or not (slope[near] ** 2).sum() > 0:
@@ -104,7 +104,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
 
 def _cost(surface: "_Surface", position: np.ndarray, seen: np.ndarray, shift: float) -> tuple[float, float]:
     """Return the mean capped distance, px, of the backward pass at a shift, and the sum of squared slopes."""
-    away, slope = surface.at(position - shift, seen)
+    away, slope = surface.evaluate(position - shift, seen)
     if len(away) < _FEWEST:
         return np.inf, 0.0
     return float(np.mean(np.minimum(np.abs(away), _FAR_PX))), float((slope**2).sum())
@@ -119,7 +119,7 @@ class _Surface:
     slope: np.ndarray
 
     @classmethod
-    def of(cls, position: np.ndarray, centre: np.ndarray) -> "_Surface":
+    def from_centres(cls, position: np.ndarray, centre: np.ndarray) -> "_Surface":
         apart = position[2:] - position[:-2]
         slope = np.full_like(centre, np.nan)
         across = centre[2:] - centre[:-2]
@@ -135,7 +135,7 @@ class _Surface:
         """Median distance between frames, mm."""
         return float(np.median(np.diff(self.position)))
 
-    def at(self, places: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def evaluate(self, places: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the distances (K,), px, of centres ``seen`` (M, L) at places (M,), and slopes (K,), px/mm.
 
         Only places between two visible neighbours are returned.

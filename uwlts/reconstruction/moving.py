@@ -15,7 +15,7 @@ import numpy as np
 from uwlts.calibration.joint.stored_estimate import covariance_root
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount
-from uwlts.model.trajectory import Trajectory, on_clock
+from uwlts.model.trajectory import Trajectory, convert_to_platform_clock
 from uwlts.reconstruction.path_uncertainty import (
     principal_components,
     propagate_pose_errors,
@@ -38,7 +38,7 @@ _LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Ride:
+class PlatformPoses:
     """Poses of a platform at the N images of a capture.
 
     Attributes
@@ -59,14 +59,14 @@ class Ride:
     rates: np.ndarray | None = None
 
 
-def platform_ride(
+def find_platform_poses(
     capture: Capture,
     trajectory: Trajectory | None,
     *,
     mount: Mount | None,
     clock_offset_s: float | None,
     clock_drift_ppm: float = 0.0,
-) -> Ride:
+) -> PlatformPoses:
     """Return the poses of the platform at all images, from the trajectory or from the capture.
 
     Raises
@@ -87,10 +87,10 @@ def platform_ride(
                 "pose of the platform: give a trajectory, or import the images with poses"
             )
         poses[:, :3, 3] *= scale
-        return Ride(poses, capture.pose_covariance, capture.time_s)
+        return PlatformPoses(poses, capture.pose_covariance, capture.time_s)
     found = mount.time_offset_s if mount is not None else None
     offset, laser = clock_offset_s if clock_offset_s is not None else found or 0.0, capture.laser_on
-    times = on_clock(capture.time_s[laser], offset_s=offset, drift_ppm=clock_drift_ppm)
+    times = convert_to_platform_clock(capture.time_s[laser], offset_s=offset, drift_ppm=clock_drift_ppm)
     poses, rates = np.full((len(laser), 4, 4), np.nan), np.full((len(laser), 6), np.nan)
     poses[laser], rates[laser] = trajectory.poses_at(times), trajectory.rates_at(times)
     covariance, stated = None, trajectory.covariance_at(times)
@@ -99,10 +99,10 @@ def platform_ride(
         covariance[laser] = stated
     poses[:, :3, 3] *= scale
     rates[:, :3] *= scale
-    return Ride(poses, covariance, capture.time_s, rates)
+    return PlatformPoses(poses, covariance, capture.time_s, rates)
 
 
-def carried(capture: Capture, ride: Ride, mount: Mount | None) -> FrameTable:
+def add_platform_poses(capture: Capture, ride: PlatformPoses, mount: Mount | None) -> FrameTable:
     """Return the frames of a capture with the poses of the platform and the transform of the mount."""
     header = capture.header
     if mount is not None:
@@ -111,11 +111,11 @@ def carried(capture: Capture, ride: Ride, mount: Mount | None) -> FrameTable:
     return FrameTable(header, capture.path, *known)
 
 
-def with_platform(
+def add_platform_uncertainty(
     uncertainty: PointUncertainty,
     points_mm: np.ndarray,
     frame: np.ndarray,
-    ride: Ride,
+    ride: PlatformPoses,
     mount: Mount | None,
     *,
     mount_covariance: np.ndarray | None = None,
@@ -180,7 +180,7 @@ def _mount_errors(poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarra
     return np.concatenate([shifts - np.cross(turns, (poses[:, :3, :3] @ place_mm)[:, :, None], axis=1), turns], axis=1)
 
 
-def _path_errors(ride: Ride, used: np.ndarray, correlation_s: float | None) -> np.ndarray:
+def _path_errors(ride: PlatformPoses, used: np.ndarray, correlation_s: float | None) -> np.ndarray:
     """Return independent errors (F, 6, K) of the poses of some images (U,) along a path, by temporal modes."""
     covariances, times = ride.covariance, ride.times_s
     assert covariances is not None

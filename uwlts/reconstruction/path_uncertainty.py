@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.runtime.compiled import compiled
-from uwlts.storage.cloud import PointUncertainty, turned_pairs
+from uwlts.storage.cloud import PointUncertainty, rotate_covariances
 
 _MOST_SHAPES = 12
 """Largest number of modes along the path; the remainder counts as independent between images."""
@@ -140,7 +140,7 @@ def correct_path_uncertainty(
     for start in range(0, len(image), _BLOCK):
         here = slice(start, start + _BLOCK)
         matrices = Rotation.from_rotvec(turns[here]).as_matrix()
-        random[here] = turned_pairs(known.random_mm2[here], matrices)
+        random[here] = rotate_covariances(known.random_mm2[here], matrices)
         position[here] = np.einsum("nij,nj->ni", matrices, known.position_mm[here])
         own[:, here] = np.einsum("nij,knj->kni", matrices, np.tensordot(mixing, known.patterns_mm[:, here], axes=1))
     patterns = propagate_pose_errors(shapes, image, levers_mm, after=own)

@@ -13,15 +13,15 @@ from itertools import pairwise
 import numpy as np
 
 from uwlts.calibration.joint.residuals import STRIPE
-from uwlts.calibration.joint.scanned_surfaces import SLOPES, across_of
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, stored_estimate
+from uwlts.calibration.joint.scanned_surfaces import SLOPES, perpendicular_directions
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, read_stored_estimate, require_joint
 from uwlts.errors import CalibrationError
-from uwlts.files.writing import sha256_of
+from uwlts.files.writing import hash_file
 from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import StageParameter
-from uwlts.optics.brightness import BLUR_STD, beside_std
+from uwlts.optics.brightness import BLUR_STD, brightness_shift_std
 from uwlts.optics.line_table import LineTable, sum_terms
 from uwlts.reconstruction.path_uncertainty import principal_components
 from uwlts.runtime.compiled import compiled
@@ -40,7 +40,7 @@ _LEFT_OUT_MM = 1e-9
 """Largest sum of omitted last terms of tables."""
 
 
-def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
+def estimate_stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
     """Estimate the standard deviation (N,) of stripe centres from their second differences in each image.
 
     On a smooth surface, the centre minus the mean of its two neighbours has 3/2 of the variance of one centre. The
@@ -117,12 +117,12 @@ def point_uncertainty(
     header = capture.header
     sensor = header.sensor
     scans = {scan.sha256 for scan in calibration.origin().scan_captures if scan.file == capture.path.name}
-    if scans and sha256_of(capture.path) in scans:
+    if scans and hash_file(capture.path) in scans:
         sensor = sensor.model_copy(update={"uncertainty": sensor.uncertainty.model_copy(update={"drift_k": 0.0})})
-    known = stored_estimate(calibration, sensor, header.medium)
+    known = read_stored_estimate(calibration, sensor, header.medium)
     # Noise is correlated between neighbours, so that second differences show only a part of it.
     shared = require_joint(calibration).shared_variance.get(STRIPE, 1.0)
-    noise = stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
+    noise = estimate_stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
     of_sensor = sensor_poses(capture)
     pose = of_sensor[:, :3, :3]
     posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
@@ -145,8 +145,10 @@ def point_uncertainty(
     exact = partial(_derivatives, known, root, rigid)
     of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
     key = None if digest is None else ("uncertainty", digest, known.view, *of_estimate)
-    table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM, key=key)
-    beside = np.zeros((len(line), 3)) if beside_mm is None else beside_std(header.sensor.uncertainty) * beside_mm
+    table = LineTable.over_range(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM, key=key)
+    beside = (
+        np.zeros((len(line), 3)) if beside_mm is None else brightness_shift_std(header.sensor.uncertainty) * beside_mm
+    )
     blur = np.zeros(len(line)) if blur_px is None else BLUR_STD * blur_px
 
     def moved(some: slice, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -159,7 +161,7 @@ def point_uncertainty(
             values = exact(*where) @ of_axes
             series, row, at = values[:, None], np.arange(len(values)), np.zeros(len(values))
         else:
-            series, row, at = table.combined(of_axes).shortened(_LEFT_OUT_MM).series(*where)
+            series, row, at = table.combine(of_axes).shorten(_LEFT_OUT_MM).series(*where)
         random, sums = np.empty((len(row), 6), np.float32), np.empty((weights.shape[1], len(row), 3), np.float32)
         image, error, by_blur, off = (np.ascontiguousarray(each[some]) for each in (frame, noise, blur, beside))
         of_blur, of_beside, of_stage = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
@@ -245,7 +247,7 @@ def _derivatives(
     ``rigid`` (6, R), translation and rotation. The result is NaN for a centre without a point.
     """
     result = np.empty((len(line), 3, 1 + root.shape[1]))
-    found = known.points_by(line, centre_px)
+    found = known.triangulate(line, centre_px)
     if found is None:
         result[:] = np.nan
     else:
@@ -269,7 +271,9 @@ def stage_components(
     keys = known.parameters.keys
     found = calibration.stage_of(header.stage_direction)
     sign = 1.0 if found is None or found[1] else -1.0
-    ways = dict(zip(SLOPES, sign * across_of(sign * described), strict=True)) | {StageParameter.SCALE: described}
+    ways = dict(zip(SLOPES, sign * perpendicular_directions(sign * described), strict=True)) | {
+        StageParameter.SCALE: described
+    }
     calibrated = [key for key in ways if key in keys and (key not in SLOPES or found is not None)]
     lean = uncertainty.stage_lean()
     std = dict.fromkeys(SLOPES, lean) | {StageParameter.SCALE: uncertainty.stage_scale}

@@ -13,16 +13,16 @@ from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Table
 from uwlts.model.stripe import CaptureStripes
 from uwlts.model.trajectory import Trajectory
-from uwlts.optics.brightness import LitSheet, footprint_std, sharp_lines, slopes_of_brightness
+from uwlts.optics.brightness import SheetPoints, fit_brightness_slopes, footprint_std, select_sharp_lines
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile, stage_travel
 from uwlts.optics.window import RayStatus, require_index
-from uwlts.reconstruction.moving import carried, platform_ride, with_platform
+from uwlts.reconstruction.moving import add_platform_poses, add_platform_uncertainty, find_platform_poses
 from uwlts.reconstruction.point_uncertainty import point_uncertainty
 from uwlts.runtime.compiled import compiled
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.storage.calibration_file import loaded_calibration
-from uwlts.storage.capture import Capture, FrameTable, opened_capture, sensor_poses
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.storage.calibration_file import resolve_calibration
+from uwlts.storage.capture import Capture, FrameTable, open_capture, sensor_poses
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
@@ -43,7 +43,7 @@ def reconstruct(
     stripe: StripeSettings = None,
     index: float | None = None,
     with_uncertainty: bool | None = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> PointCloud:
     """Turn a capture into a point cloud: find the stripes of all laser images and triangulate them.
 
@@ -100,8 +100,8 @@ def reconstruct(
     """
     if pose_correlation_s is not None and not pose_correlation_s >= 0:
         raise DescriptionError(f"pose_correlation_s is {pose_correlation_s:g}; expected zero or a positive number")
-    calibration = loaded_calibration(calibration)
-    with opened_capture(capture) as scan:
+    calibration = resolve_calibration(calibration)
+    with open_capture(capture) as scan:
         check_fits(scan.header, calibration, source=scan.path.name)
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
         alone = scan.header.T_platform_sensor is None and scan.pose_covariance is None
@@ -111,12 +111,12 @@ def reconstruct(
         mount = read_mount(mount) if isinstance(mount, str | Path) else mount
         if isinstance(trajectory, str | Path):
             trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
-        ride = platform_ride(
+        ride = find_platform_poses(
             scan, trajectory, mount=mount, clock_offset_s=clock_offset_s, clock_drift_ppm=clock_drift_ppm
         )
         stripes = find_stripes(scan, options=stripe, progress=progress)
-        table = carried(scan, ride, mount)
-        apart, common = (None, None) if mount is None else mount.apart_from(calibration_digest(calibration))
+        table = add_platform_poses(scan, ride, mount)
+        apart, common = (None, None) if mount is None else mount.independent_covariance(calibration_digest(calibration))
         cloud = reconstruct_stripes(
             table, stripes, calibration, index=index, with_uncertainty=known, mount_by=common if known else None
         )
@@ -126,7 +126,7 @@ def reconstruct(
         own = cloud.uncertainty
         if own is not None:
             where = cloud.points_mm, cloud.frame, ride
-            own = with_platform(own, *where, mount, mount_covariance=apart, correlation_s=pose_correlation_s)
+            own = add_platform_uncertainty(own, *where, mount, mount_covariance=apart, correlation_s=pose_correlation_s)
         return replace(cloud, uncertainty=own, warnings=warnings, time_s=scan.time_s[cloud.frame])
 
 
@@ -172,13 +172,13 @@ def reconstruct_stripes(
         raise CalibrationError(
             "a polynomial calibration is valid only for its own medium, so a refractive index cannot be given; omit it"
         )
-    index = calibration.index_of(capture.header.medium) if index is None else index
+    index = calibration.medium_index(capture.header.medium) if index is None else index
     require_index(index)
     lines = stripes.lines_by_status
     sharp, blur = np.arange(len(stripes.line)), np.zeros(len(stripes.line))
     exact = calibration if isinstance(calibration, Calibration) and calibration.joint is not None else None
     if exact is not None:
-        sharp, blur = sharp_lines(stripes)
+        sharp, blur = select_sharp_lines(stripes)
         blurred = len(stripes.line) - len(sharp)
         lines = lines | {"ok": lines.get("ok", 0) - blurred, "blurred": blurred}
         stripes = stripes[sharp]
@@ -223,12 +223,14 @@ def reconstruct_stripes(
 
 def _lit_sheet(
     capture: Capture | FrameTable, calibration: AnyCalibration, stripes: CaptureStripes, index: float, digest: str
-) -> LitSheet | None:
+) -> SheetPoints | None:
     """Return the part of the sheet at the stripe centres; None with poses or a polynomial calibration."""
     if isinstance(calibration, PolynomialCalibration) or np.isfinite(capture.pose).any():
         return None
     sensor = capture.header.sensor
-    return LitSheet.of(calibration, sensor, stripes.line, stripes.centre_px, medium_index=index, digest=digest)
+    return SheetPoints.from_calibration(
+        calibration, sensor, stripes.line, stripes.centre_px, medium_index=index, digest=digest
+    )
 
 
 def _triangulate(
@@ -236,7 +238,7 @@ def _triangulate(
     calibration: AnyCalibration,
     stripes: CaptureStripes,
     index: float,
-    sheet: LitSheet | None,
+    sheet: SheetPoints | None,
 ) -> MeasuredPoints:
     """Triangulate stripe centres with any kind of calibration to points in the OCS, moved by the stage."""
     direction = np.array(capture.header.stage_direction)
@@ -262,13 +264,15 @@ def _row_delay_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.n
     return 1e-6 * detector.line_time_us * (row - (camera.height_px - 1) / 2)
 
 
-def _brightness_shifts(capture: Capture | FrameTable, sheet: LitSheet, stripes: CaptureStripes) -> np.ndarray:
+def _brightness_shifts(capture: Capture | FrameTable, sheet: SheetPoints, stripes: CaptureStripes) -> np.ndarray:
     """Return the shifts (N, 3), OCS, from points on the central plane of the sheet to the origin of their light."""
-    slopes = slopes_of_brightness(stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm, capture.exposure_ms)
-    return sheet.beside(stripes.width_px, slopes, stage_direction=capture.header.stage_direction)
+    slopes = fit_brightness_slopes(
+        stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm, capture.exposure_ms
+    )
+    return sheet.brightness_shift(stripes.width_px, slopes, stage_direction=capture.header.stage_direction)
 
 
-def _footprint_metadata(capture: Capture | FrameTable, sheet: LitSheet, stripes: CaptureStripes) -> Table:
+def _footprint_metadata(capture: Capture | FrameTable, sheet: SheetPoints, stripes: CaptureStripes) -> Table:
     """Return metadata on the footprint of a point on the surface; empty if unknown."""
     if not np.isfinite(stripes.width_px[sheet.found.status == RayStatus.OK]).any():
         return {}

@@ -12,8 +12,8 @@ from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.sensor import Vector
 from uwlts.reconstruction.reconstruct import reconstruct
-from uwlts.storage.calibration_file import loaded_calibration
-from uwlts.storage.capture import Capture, opened_capture
+from uwlts.storage.calibration_file import resolve_calibration
+from uwlts.storage.capture import Capture, open_capture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,8 +112,8 @@ def verify(
     """
     if limit_mm is not None and not limit_mm > 0:
         raise RangeError(f"`limit_mm` is {limit_mm:g}; expected a positive number")
-    calibration = loaded_calibration(calibration)
-    with opened_capture(capture) as scan:
+    calibration = resolve_calibration(calibration)
+    with open_capture(capture) as scan:
         if calibration.joint is None and limit_mm is None:
             raise EvaluationError("the calibration states no uncertainty: give `limit_mm`, or calibrate jointly")
         if scan.header.artefact is None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from uwlts.registration.joint_registration import JointRegistration
-from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, NO_INDEX, PointCloud, PointUncertainty, turned_pairs
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, NO_INDEX, PointCloud, PointUncertainty, rotate_covariances
 
 _BLOCK = 50_000
 _LEFT_OUT = 1e-4
@@ -28,7 +28,7 @@ def merge_clouds(
         rotation = joint.poses[number, :3, :3]
         points.append(_correct_points(scan, joint.patterns[number]) @ rotation.T + joint.poses[number, :3, 3])
         known = scan.uncertainty
-        random.append(np.zeros((len(scan), 6)) if known is None else turned_pairs(known.random_mm2, rotation))
+        random.append(np.zeros((len(scan), 6)) if known is None else rotate_covariances(known.random_mm2, rotation))
         position.append(np.zeros((len(scan), 3)) if known is None else known.position_mm @ rotation.T)
         frames.append(np.where(scan.frame == NO_INDEX, NO_INDEX, scan.frame + first))
         firsts.append(first)

@@ -30,9 +30,9 @@ from uwlts.registration.joint_registration import (
 )
 from uwlts.registration.marker_spheres import find_markers
 from uwlts.registration.merging import merge_clouds
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.pose_files import PoseFormat, Unit, read_poses, write_poses
 
 _ROUNDS = 60
@@ -100,7 +100,7 @@ class OpenMovement:
     direction: np.ndarray
     point_mm: np.ndarray | None
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Describe the motion in the common frame as text."""
         along = "({:.3f}, {:.3f}, {:.3f})".format(*(self.direction + 0.0))
         if self.point_mm is None:
@@ -160,7 +160,7 @@ class RegisteredScans(Brief):
             ],
             "covariance": self.covariance.tolist(),
             "open_movements": [
-                {"scan": self.names[each.scan], "movement": each.words()} for each in self.open_movements
+                {"scan": self.names[each.scan], "movement": each.describe()} for each in self.open_movements
             ],
             "pairs": [
                 {
@@ -209,7 +209,7 @@ class RegisteredScans(Brief):
             shift, turn = np.linalg.norm(std[:3]), np.degrees(np.linalg.norm(std[3:]))
             lines.append(f"  {name}: standard uncertainty {shift:.4f} mm, {turn:.5f} deg")
         lines += [
-            f"  undetermined, initial value kept: {self.names[each.scan]}: {each.words()}"
+            f"  undetermined, initial value kept: {self.names[each.scan]}: {each.describe()}"
             for each in self.open_movements
         ]
         return lines
@@ -226,7 +226,7 @@ def register(
     search: bool = False,
     sphere_mm: float | None = None,
     reach_mm: float | None = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> RegisteredScans:
     """Register overlapping scans in the frame of the first, and merge them into one cloud with uncertainty.
 
@@ -268,7 +268,7 @@ def register(
     >>> found.cloud.save("pipe.ply")
     """
     names = tuple(_scan_name(each, number) for number, each in enumerate(clouds))
-    scans = [loaded_cloud(each) for each in clouds]
+    scans = [load_cloud(each) for each in clouds]
     if isinstance(poses, str | os.PathLike):
         poses = read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0]
     if len(scans) < 2:

@@ -18,7 +18,7 @@ from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
 from uwlts.fitting.patches import rigid_derivatives
 from uwlts.fitting.propagation import grouped_covariance
 from uwlts.model.calibration import rigid_transform
-from uwlts.storage.cloud import PointUncertainty, images_along, variance_along
+from uwlts.storage.cloud import PointUncertainty, project_image_errors, project_variance
 
 _NAMES = "shift along x", "shift along y", "shift along z", "turn about x", "turn about y", "turn about z"
 
@@ -293,8 +293,8 @@ def _variance_along(known: PointUncertainty | None, normals: np.ndarray, least: 
     if known is None:
         # The robust scatter about the surface scales this variance up.
         return np.full(len(normals), least)
-    of_images = np.sum(images_along(known, normals) ** 2, axis=0)
-    return np.maximum(variance_along(known.random_mm2, normals) + of_images, least)
+    of_images = np.sum(project_image_errors(known, normals) ** 2, axis=0)
+    return np.maximum(project_variance(known.random_mm2, normals) + of_images, least)
 
 
 class _Step(NamedTuple):
@@ -350,13 +350,13 @@ class _CorrelatedErrors:
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
         image = np.arange(answer.shape[1]) if self._frame is None else self._frame
-        return grouped_covariance(answer, images_along(self._known, self._normals), image)
+        return grouped_covariance(answer, project_image_errors(self._known, self._normals), image)
 
     def noise_covariance(self, answer: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Return the covariance (K, K) of the step by noise of points that are used repeatedly, by index (N,)."""
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
-        return grouped_covariance(answer, np.sqrt(variance_along(self._known.random_mm2, self._normals))[None], index)
+        return grouped_covariance(answer, np.sqrt(project_variance(self._known.random_mm2, self._normals))[None], index)
 
 
 def _name_motion(direction: np.ndarray) -> str:

@@ -13,7 +13,7 @@ from uwlts.storage.calibration_file import FORMAT as CALIBRATION, POLYNOMIALS_FO
 from uwlts.storage.capture import FORMAT as CAPTURE, Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import CLOUD_ENDINGS, is_cloud, read_cloud
-from uwlts.storage.hdf5_file import format_of
+from uwlts.storage.hdf5_file import read_format
 from uwlts.storage.mesh_file import READ_FORMATS as MESH_FORMATS, SurfaceMesh, has_faces, read_mesh
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
@@ -78,7 +78,7 @@ def read(
     if is_cloud(path):
         return read_cloud(path)
     if ending == ".h5":
-        found = format_of(path)
+        found = read_format(path)
         if found == TRUTH:
             return read_truth(path)[1]
         if found in (CAPTURE, None):

@@ -14,11 +14,11 @@ from uwlts.pages.toolkit import (
     BLUE,
     MISSING,
     RED,
+    figure_svg,
     new_figure,
     plain_text,
     png_data_uri,
     render_page,
-    svg_of,
     write_page as write_text,
 )
 from uwlts.storage.image_file import read_image
@@ -32,7 +32,7 @@ def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool
     """Write the page of a camera calibration; OutputError if that fails."""
     lens = camera.lens
     left_out = [each for each in camera.photographs if each.reason is not None]
-    used = sorted(_used(camera), key=Photograph.rms_px, reverse=True)
+    used = sorted(_select_used(camera), key=Photograph.rms_px, reverse=True)
     rows = [
         [each.name, "used", str(len(each.pixels)), f"{each.rms_px():.3f}", f"{each.moved:.1f}"]
         if each.reason is None
@@ -89,14 +89,14 @@ def _summary(camera: CameraCalibration) -> list[str]:
     return lines
 
 
-def _used(camera: CameraCalibration) -> list[Photograph]:
+def _select_used(camera: CameraCalibration) -> list[Photograph]:
     return [each for each in camera.photographs if each.reason is None]
 
 
 def _misses(camera: CameraCalibration) -> Markup:
     """Plot the residuals of all points over the image, magnified, and the rms of each image."""
     model = camera.lens.solution.model
-    used = _used(camera)
+    used = _select_used(camera)
     places = np.vstack([each.pixels for each in used])
     misses = np.vstack([each.misses_px for each in used])
     usual = float(np.sqrt(np.mean(np.sum(misses**2, axis=1))))
@@ -110,7 +110,7 @@ def _misses(camera: CameraCalibration) -> Markup:
     each_image.set_yticks(range(len(used)), [plain_text(Path(each.name).stem) for each in used], fontsize=7)
     each_image.invert_yaxis()
     each_image.set(xlabel="rms distance / px", title="by image")
-    return svg_of(figure)
+    return figure_svg(figure)
 
 
 def _thumbnail(camera: CameraCalibration, photograph: Photograph) -> str | None:

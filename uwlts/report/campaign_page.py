@@ -11,19 +11,19 @@ from typing import Any
 from uwlts._version import __version__
 from uwlts.errors import OutputError, RangeError
 from uwlts.evaluation.evaluate import TruthComparisons
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable, require_ending
 from uwlts.model.brief import Brief
-from uwlts.pages.numbers import fixed, is_number, small_length, unit_of, words_of
+from uwlts.pages.numbers import format_fixed, format_length, is_number, split_name, unit_of
 from uwlts.pages.toolkit import (
     HTML,
     MISSING,
     ComparisonTable,
     FigureCollector,
     Tile,
+    figure_svg,
     png_data_uri,
     render_page,
-    svg_of,
     write_page,
 )
 from uwlts.report import plot
@@ -63,7 +63,7 @@ class Report(Brief):
         return summary_table(self.campaign, self.reference)
 
 
-@inputs_kept()
+@protect_inputs()
 def write_campaign(
     folder: str | Path,
     *,
@@ -145,7 +145,7 @@ def report_page(
         measurements=[_measurement(measurement, each, collected) for measurement, each in drawn],
         calibration=_calibrations(campaign) if campaign.calibrations else None,
         true_window=campaign.true_window_mm is not None,
-        seconds=svg_of(plot.seconds(campaign.seconds)) if campaign.seconds else None,
+        seconds=figure_svg(plot.seconds(campaign.seconds)) if campaign.seconds else None,
         seconds_in_all=sum(campaign.seconds.values()),
         provenance=_provenance(campaign),
     )
@@ -165,7 +165,7 @@ def _measurement(
         rows = []
         for name, value in evaluation.figures_mm.items():
             stated = judged.uncertainty[name].expanded_mm if name in judged.uncertainty else None
-            values = small_length(value, signed="error" in name or "SSE" in name), small_length(stated)
+            values = format_length(value, signed="error" in name or "SSE" in name), format_length(stated)
             rows.append((name, "", values if judged.uncertainty else values[:1]))
         figures = ComparisonTable(("value", "U (k = 2)") if judged.uncertainty else ("value",), tuple(rows))
     recorded = measurement.capture is not None
@@ -215,12 +215,12 @@ def _truth_table(compared: TruthComparisons) -> ComparisonTable:
     texts = [
         {
             f"points within {1e3 * truth.tolerance_mm:g} µm": f"{100 * truth.share_within_tolerance:.2f} %",
-            "mean distance": small_length(truth.mean_mm, signed=True),
-            "standard deviation": small_length(truth.std_mm),
-            "rms distance": small_length(truth.rms_mm),
-            "95 % are closer than": small_length(truth.p95_mm),
-            "99 % are closer than": small_length(truth.p99_mm),
-            "largest distance": small_length(truth.largest_mm),
+            "mean distance": format_length(truth.mean_mm, signed=True),
+            "standard deviation": format_length(truth.std_mm),
+            "rms distance": format_length(truth.rms_mm),
+            "95 % are closer than": format_length(truth.p95_mm),
+            "99 % are closer than": format_length(truth.p99_mm),
+            "largest distance": format_length(truth.largest_mm),
             "points compared": f"{truth.matched:,}",
             "points where no stripe is visible": f"{truth.false_points:,}",
             "visible stripe points not found": f"{truth.missed:,}",
@@ -230,7 +230,7 @@ def _truth_table(compared: TruthComparisons) -> ComparisonTable:
     rows = [*zip(texts[0], zip(*(column.values() for column in texts), strict=True), strict=True)]
     stated = compared.shift_expanded_mm
     for number, shift in enumerate(compared.shift_mm or ()):
-        text = small_length(shift, signed=True) + (f" ± {small_length(stated[number])}" if stated else "")
+        text = format_length(shift, signed=True) + (f" ± {format_length(stated[number])}" if stated else "")
         rows.append((f"mean error along {'XYZ'[number]}, k = 2", (text, MISSING)[: len(shown)]))
     return ComparisonTable(tuple(shown), tuple((words, "", values) for words, values in rows))
 
@@ -244,10 +244,10 @@ def _calibrations(campaign: GatheredCampaign) -> dict[str, Any]:
         warnings += [(name, _value(text)) for text in found] if isinstance(found, list) else []
         plots = []
         for each in plot.residual_lists(calibration):
-            words = words_of(each.name)
+            words = split_name(each.name)
             caption = f"{each.group}: {words}." if each.group else f"{words}."
             caption = _CAPTIONS.get(f"{each.group} {each.name}", caption)
-            plots.append((svg_of(plot.residuals(calibration, which=each)), caption))
+            plots.append((figure_svg(plot.residuals(calibration, which=each)), caption))
         groups.append({"name": name, "plots": plots})
     return {
         "parameters": parameter_table(campaign),
@@ -264,7 +264,7 @@ def _group_rows(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
     for row in rows:
         name, quantity, true, *others = row.texts()
         if row.uncertainty:
-            true = f"{true} ± {fixed(row.uncertainty)}"
+            true = f"{true} ± {format_fixed(row.uncertainty)}"
         groups.setdefault(name, []).append((quantity, true, *others))
     return list(groups.items())
 
@@ -283,7 +283,7 @@ def _provenance(campaign: GatheredCampaign) -> list[tuple[str, str]]:
 
 
 def _pairs(table: dict[str, Any]) -> str:
-    return "; ".join(f"{words_of(key)} {_value(value)} {unit_of(key)}".rstrip() for key, value in table.items())
+    return "; ".join(f"{split_name(key)} {_value(value)} {unit_of(key)}".rstrip() for key, value in table.items())
 
 
 def _value(value: Any) -> str:
@@ -342,24 +342,24 @@ def headline_tiles(campaign: GatheredCampaign, reference: Reference | None) -> l
         count, theirs = len(found.by_measurement), None
         if others is not None and others.mean_abs is not None:
             fewer = len(others.by_measurement) < count
-            theirs = small_length(others.mean_abs) + (f" for {len(others.by_measurement)} of them" if fewer else "")
+            theirs = format_length(others.mean_abs) + (f" for {len(others.by_measurement)} of them" if fewer else "")
         note = f"mean absolute value of {count} measurements" if count > 1 else "one measurement"
-        add(name, small_length(found.mean_abs), note, theirs)
+        add(name, format_length(found.mean_abs), note, theirs)
     if truth.share_within_tolerance is not None:
         # After the best-fit motion if there is one: the coordinate system depends on the calibration.
         fitted = truth.after_best_fit.share_within_tolerance
-        note = f"rms distance {small_length(truth.rms_mm)}"
+        note = f"rms distance {format_length(truth.rms_mm)}"
         if fitted is not None:
             note = (
-                f"rms distance {small_length(truth.after_best_fit.rms_mm)} after a best-fit motion; in the sensor's "
-                f"own coordinates {small_length(truth.rms_mm)}"
+                f"rms distance {format_length(truth.after_best_fit.rms_mm)} after a best-fit motion; in the sensor's "
+                f"own coordinates {format_length(truth.rms_mm)}"
             )
         share = truth.share_within_tolerance if fitted is None else fitted
         add(f"Points within {1e3 * (truth.tolerance_mm or 0):g} µm of the truth", f"{100 * share:.2f} %", note)
     if window.estimated is not None:
-        true = "" if window.true is None else f"true {fixed(window.true)} mm"
+        true = "" if window.true is None else f"true {format_fixed(window.true)} mm"
         theirs = "" if published is None else ", ".join(f"{value:g} mm" for value in published.window_distance_mm)
-        add("Window distance", f"{fixed(window.estimated)} mm", true, theirs)
+        add("Window distance", f"{format_fixed(window.estimated)} mm", true, theirs)
     return tiles
 
 
@@ -382,7 +382,7 @@ def introduction(campaign: GatheredCampaign) -> list[tuple[str, str]]:
             model = (
                 "glass plate with two refractions" if window.refractions == 2 else "taken as one refracting interface"
             )
-            seen = f"window {fixed(window.distance_mm)} mm from the entrance pupil, {model}"
+            seen = f"window {format_fixed(window.distance_mm)} mm from the entrance pupil, {model}"
         facts.append(("Calibration", f"{main.name}: {seen}" + (f" ({source})" if source else "")))
     return facts
 

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from uwlts.model.calibration import Calibration
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.pages.numbers import entries_of, fixed, is_number, plain, unit_of, words_of
+from uwlts.pages.numbers import entries_of, format_fixed, format_number, is_number, split_name, unit_of
 from uwlts.pages.toolkit import MISSING, ComparisonTable
 from uwlts.report.certificate import parameter_rows
 from uwlts.report.gather import CALIBRATION, GatheredCalibration, GatheredCampaign, GatheredMeasurement, Reference
@@ -46,13 +46,13 @@ class Row:
     def texts(self) -> tuple[str, str, str, str, str, str, str]:
         """Return the row as text: measurement, quantity, true, measured, error, stated, published."""
         if self.unit == "share":
-            measured = MISSING if self.measured is None else f"{fixed(100 * self.measured, 2)} %"
+            measured = MISSING if self.measured is None else f"{format_fixed(100 * self.measured, 2)} %"
         else:
-            measured = fixed(self.measured)
+            measured = format_fixed(self.measured)
         # Published values below 1 mm keep two decimals: 0.10 states more than 0.1.
-        published = [fixed(v, 2) if abs(v) < 1 and round(v, 2) == v else f"{v:g}" for v in self.published]
-        error, stated = fixed(self.error, signed=True), fixed(self.stated)
-        known = fixed(self.true), measured, error, stated
+        published = [format_fixed(v, 2) if abs(v) < 1 and round(v, 2) == v else f"{v:g}" for v in self.published]
+        error, stated = format_fixed(self.error, signed=True), format_fixed(self.stated)
+        known = format_fixed(self.true), measured, error, stated
         return self.measurement, self.quantity, *known, ", ".join(published) or MISSING
 
 
@@ -155,28 +155,30 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
         value, std = row.texts()
         table[row.words, row.unit] = value if std == MISSING else f"{value} ± {std}"
     sheet, window = calibration.sheet, calibration.window
-    table["stand-off: sheet on the camera's axis", "mm"] = fixed(calibration.object_transform()[2, 3])
-    table["angle between camera and sheet", "°"] = fixed(math.degrees(math.asin(min(1, abs(sheet.normal[2])))), 4)
-    table["sheet's distance from the camera", "mm"] = fixed(sheet.offset_mm)
+    table["stand-off: sheet on the camera's axis", "mm"] = format_fixed(calibration.object_transform()[2, 3])
+    table["angle between camera and sheet", "°"] = format_fixed(
+        math.degrees(math.asin(min(1, abs(sheet.normal[2])))), 4
+    )
+    table["sheet's distance from the camera", "mm"] = format_fixed(sheet.offset_mm)
     if window is not None:
         table["refractions", ""] = str(window.refractions)
         cosine = float(window.normal[2] / np.linalg.norm(window.normal))
-        table["window tilt", "°"] = fixed(math.degrees(math.acos(min(1, cosine))), 3)
+        table["window tilt", "°"] = format_fixed(math.degrees(math.acos(min(1, cosine))), 3)
     return table
 
 
 def _figures(calibration: Calibration) -> Iterator[tuple[tuple[str, str], str]]:
     """Yield name with unit, and text, of every scalar residual figure."""
     for group, name, value in entries_of(calibration.residuals_in_file()):
-        words = f"{group}: {words_of(name)}" if group else words_of(name)
+        words = f"{group}: {split_name(name)}" if group else split_name(name)
         if group == "camera std":
             # Standard deviations of the camera are shown with its parameters.
             continue
         if is_number(value):
-            yield (words, unit_of(name)), plain(value)
+            yield (words, unit_of(name)), format_number(value)
         elif isinstance(value, bool):
             yield (words, unit_of(name)), "yes" if value else "no"
         elif isinstance(value, str):
             yield (words, ""), value
         elif isinstance(value, list) and 0 < len(value) <= SHORT_LIST and all(map(is_number, value)):
-            yield (words, unit_of(name)), ", ".join(map(plain, value))
+            yield (words, unit_of(name)), ", ".join(map(format_number, value))

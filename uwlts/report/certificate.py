@@ -10,18 +10,24 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, JsonValue, PlainSerializer
 
 from uwlts._version import __version__
-from uwlts.calibration.joint.next_shot import Outlook, next_shots
-from uwlts.calibration.joint.observability import Weakness, format_weaknesses, lengths_over, regions, weaknesses
+from uwlts.calibration.joint.next_shot import ShotForecast, rank_next_shots
+from uwlts.calibration.joint.observability import (
+    Weakness,
+    compute_mesh_lengths,
+    find_weaknesses,
+    format_weaknesses,
+    list_regions,
+)
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.errors import CaptureError
 from uwlts.files.json_files import read_json
-from uwlts.files.writing import sha256_of
+from uwlts.files.writing import hash_file
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit
-from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_of
+from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parse_parameter
 from uwlts.model.sensor import Medium
-from uwlts.pages.numbers import as_fine_as, numbers_in
+from uwlts.pages.numbers import format_to_scale, numbers_in
 from uwlts.pages.toolkit import MISSING
 from uwlts.report.certificate_volume import (
     CalibrationInUse,
@@ -76,7 +82,7 @@ def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
     CaptureError
         A file cannot be read, or is not a certificate.
     """
-    content, found = read_certificate(path), sha256_of(calibration)
+    content, found = read_certificate(path), hash_file(calibration)
     against = []
     if content.get(_SEAL) != compute_seal(content):
         against.append(f"{path} was changed after it was issued: its seal does not match its content")
@@ -125,7 +131,7 @@ class ParameterRow(_Stored):
         """Return value and standard uncertainty as text, rounded to two digits of the uncertainty."""
         if self.std is None or not self.std > 0:
             return f"{self.value:.6g}", MISSING
-        return as_fine_as(self.value, self.std, digits=2), as_fine_as(self.std, self.std, digits=2)
+        return format_to_scale(self.value, self.std, digits=2), format_to_scale(self.std, self.std, digits=2)
 
 
 class CalibratedMedium(_Stored):
@@ -209,7 +215,7 @@ class SequentialCertificate(Certificate):
 AnyCertificate = JointCertificate | SequentialCertificate
 
 
-def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -> AnyCertificate:
+def make_certificate(calibration: Calibration, path: str | Path, *, issued: str) -> AnyCertificate:
     """Return the sealed content of the certificate of a calibration file, issued at a time in ISO 8601.
 
     CalibrationError if the joint estimate is damaged.
@@ -222,7 +228,7 @@ def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -
         software=f"uwlts {__version__}",
         calibration=CertifiedFile(
             file=Path(path).name,
-            sha256=sha256_of(path),
+            sha256=hash_file(path),
             digest=calibration_digest(calibration),
             date=calibration.provenance.get("date"),
             software=calibration.provenance.get("software"),
@@ -266,7 +272,7 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
     values = {"f": camera.fx_px} if camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
     values |= {"cx": camera.cx_px, "cy": camera.cy_px}
     values |= {name: value for name, value in camera.distortion.model_dump().items() if value}
-    rows = [_row(parameter_of(name), value, std.get(name)) for name, value in values.items()]
+    rows = [_row(parse_parameter(name), value, std.get(name)) for name, value in values.items()]
     if window is not None:
         rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, known.window_distance_mm))
         if window.refractions == 2:
@@ -304,7 +310,7 @@ def _complete_sequential(base: Certificate, calibration: Calibration) -> Sequent
 
 
 def _complete_joint(base: Certificate, calibration: Calibration) -> JointCertificate:
-    joint, found = require_joint(calibration), regions(calibration)
+    joint, found = require_joint(calibration), list_regions(calibration)
     content = JointCertificate(
         **dict(base),
         validity=tuple(_validity(prepare_use(calibration, region)) for region in found),
@@ -319,20 +325,20 @@ def _complete_joint(base: Certificate, calibration: Calibration) -> JointCertifi
         none = "the calibration does not state which volume its evidence covers: calibrate again"
         return content.model_copy(update={"remark": no_area if found else none})
     use = prepare_use(calibration, found[0])
-    lengths, known = lengths_over(use.known, found[0]), use.known
-    weak = weaknesses(lengths, known.parameters.keys, known.covariance)
+    lengths, known = compute_mesh_lengths(use.known, found[0]), use.known
+    weak = find_weaknesses(lengths, known.parameters.keys, known.covariance)
     return content.model_copy(
         update={
             "lengths": tuple(length_uncertainties(use)),
             "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
             "cannot_tell": tuple(format_weaknesses(weak)),
             "weaknesses": tuple(weak),
-            "next_shots": _shots(next_shots(calibration)),
+            "next_shots": _shots(rank_next_shots(calibration)),
         }
     )
 
 
-def _shots(outlooks: Sequence[Outlook]) -> tuple[NextShot, ...]:
+def _shots(outlooks: Sequence[ShotForecast]) -> tuple[NextShot, ...]:
     """Return the best shots, and the best of each kind, in order."""
     kinds = [outlook.words.split(",")[0] for outlook in outlooks]
     return tuple(

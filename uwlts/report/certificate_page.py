@@ -11,25 +11,25 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from uwlts.calibration.joint.observability import regions
+from uwlts.calibration.joint.observability import list_regions
 from uwlts.calibration.joint.stored_estimate import require_joint
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
-from uwlts.pages.numbers import as_fine_as, fixed
+from uwlts.pages.numbers import format_fixed, format_to_scale
 from uwlts.pages.toolkit import (
     COLOURS,
     INK,
     MISSING,
+    figure_svg,
     legend_below,
     new_figure,
     refuse_unsuitable_page,
     render_page,
-    svg_of,
     write_page,
 )
-from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
+from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, make_certificate, parameter_rows
 from uwlts.report.certificate_volume import (
     LengthUncertainty,
     compare_calibrations,
@@ -43,7 +43,7 @@ from uwlts.storage.calibration_file import read_calibration
 _WORST_IMAGES = 5
 
 
-@inputs_kept()
+@protect_inputs()
 def write_certificate(
     calibration: str | Path, *, out: str | Path | None = None, before: str | Path | None = None, overwrite: bool = False
 ) -> tuple[Path, AnyCertificate]:
@@ -78,7 +78,7 @@ def write_certificate(
     page = Path(out or source.with_name(f"{source.stem}.certificate.html"))
     refuse_unsuitable_page(page, overwrite=overwrite)
     known = read_calibration(source)
-    content = certificate_of(known, source, issued=datetime.now(UTC).isoformat(timespec="seconds"))
+    content = make_certificate(known, source, issued=datetime.now(UTC).isoformat(timespec="seconds"))
     earlier = None if before is None else (Path(before).name, read_calibration(before))
     text = certificate_page(content, known, before=earlier)
     sealed = json.dumps(content.in_file(), indent=2, ensure_ascii=False) + "\n"
@@ -126,7 +126,7 @@ def _pictures(
     }
     if not content.lengths:
         return drawn
-    region = regions(calibration)[0]
+    region = list_regions(calibration)[0]
     mesh, maps = uncertainty_maps(prepare_use(calibration, region))
     drawn["lengths"] = length_chart(content.lengths)
     drawn["maps"] = [heat_map(title, mesh, 1e3 * values) for title, values in maps.items()]
@@ -145,7 +145,7 @@ def _parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibration] | 
     other = {} if before is None else {row.name: row for row in parameter_rows(before[1])}
     shown = []
     for row in rows:
-        known = MISSING if row.std_before is None else as_fine_as(row.std_before, row.std_before, digits=2)
+        known = MISSING if row.std_before is None else format_to_scale(row.std_before, row.std_before, digits=2)
         theirs = other.pop(row.name, None)
         shown.append((row.words, row.unit, *row.texts(), known, *(theirs.texts() if theirs else (MISSING, MISSING))))
     return shown + [(row.words, row.unit, MISSING, MISSING, MISSING, *row.texts()) for row in other.values()]
@@ -153,7 +153,10 @@ def _parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibration] | 
 
 def _length_rows(lengths: Sequence[LengthUncertainty]) -> list[tuple[float, list[tuple[str, str]]]]:
     """Return lengths with expanded uncertainties in µm along X, Y and Z; a dash if the length does not fit."""
-    table = {(r.length_mm, r.axis): (fixed(1e3 * r.calibration_mm, 1), fixed(1e3 * r.point_mm, 1)) for r in lengths}
+    table = {
+        (r.length_mm, r.axis): (format_fixed(1e3 * r.calibration_mm, 1), format_fixed(1e3 * r.point_mm, 1))
+        for r in lengths
+    }
     return [
         (length, [table.get((length, axis), (MISSING, MISSING)) for axis in "XYZ"])
         for length in sorted({row.length_mm for row in lengths})
@@ -175,7 +178,7 @@ def heat_map(title: str, at_mm: np.ndarray, values: np.ndarray, *, signed: bool 
     ax.invert_yaxis()
     ax.grid(visible=False)
     figure.colorbar(drawn, label="µm")
-    return svg_of(figure)
+    return figure_svg(figure)
 
 
 def correlation_picture(keys: Sequence[ParameterKey], covariance: np.ndarray) -> Markup:
@@ -201,7 +204,7 @@ def correlation_picture(keys: Sequence[ParameterKey], covariance: np.ndarray) ->
     ax.grid(color="white", which="minor")
     ax.tick_params(which="minor", length=0)
     ax.spines[:].set_visible(False)
-    return svg_of(figure)
+    return figure_svg(figure)
 
 
 def image_residuals(images: Sequence[ImageFit]) -> Markup:
@@ -217,7 +220,7 @@ def image_residuals(images: Sequence[ImageFit]) -> Markup:
         ax.set_ylim(bottom=0)
     for ax in panels[len(kinds) :]:
         ax.set_axis_off()
-    return svg_of(figure)
+    return figure_svg(figure)
 
 
 def length_chart(lengths: Sequence[LengthUncertainty]) -> Markup:
@@ -232,4 +235,4 @@ def length_chart(lengths: Sequence[LengthUncertainty]) -> Markup:
         ax.set(title=title, xlabel="length / mm", ylabel="expanded uncertainty (k = 2) / µm")
         ax.set_ylim(bottom=0)
     legend_below(figure)
-    return svg_of(figure)
+    return figure_svg(figure)

@@ -7,10 +7,10 @@ import numpy as np
 from uwlts.calibration.joint.observability import (
     Lengths,
     SheetRegion,
-    estimate_in,
-    lengths_between,
-    pixels_at,
-    points_at,
+    compute_lengths,
+    project_sheet_points,
+    read_region_estimate,
+    sample_sheet,
 )
 from uwlts.calibration.joint.residuals import STEP, STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SCANNED
@@ -64,7 +64,7 @@ class CalibrationInUse:
 
 def prepare_use(calibration: Calibration, region: SheetRegion) -> CalibrationInUse:
     """Return a joint calibration for measurements in one of its regions; CalibrationError if it is damaged."""
-    known = estimate_in(calibration, region)
+    known = read_region_estimate(calibration, region)
     uncertainty = calibration.origin().known_before
     covariance, keys = known.covariance.copy(), known.parameters.keys
     if (index := index_key(known)) in keys:
@@ -88,7 +88,8 @@ def length_uncertainties(use: CalibrationInUse) -> list[LengthUncertainty]:
             ends = find_ends(use.region, axis, length)
             if len(ends):
                 std = [
-                    compute_lengths(use, ends).std_mm(use.covariance, noise_px=noise) for noise in (0.0, use.noise_px)
+                    compute_volume_lengths(use, ends).std_mm(use.covariance, noise_px=noise)
+                    for noise in (0.0, use.noise_px)
                 ]
                 found.append(LengthUncertainty(axis, length, *(2 * float(each.max()) for each in std)))
     # Along the stage's motion, the same point of the sheet measures both ends, so only the stage contributes.
@@ -97,11 +98,11 @@ def length_uncertainties(use: CalibrationInUse) -> list[LengthUncertainty]:
     return [LengthUncertainty("X", length, stage, stage) for length, stage in along_x.items()] + found
 
 
-def compute_lengths(use: CalibrationInUse, ends: np.ndarray) -> Lengths:
+def compute_volume_lengths(use: CalibrationInUse, ends: np.ndarray) -> Lengths:
     """Return lengths between points given by Y and Z (M, 2, 2)."""
-    points = points_at(use.known, ends.reshape(-1, 2))
+    points = sample_sheet(use.known, ends.reshape(-1, 2))
     first = 2 * np.arange(len(ends))
-    return lengths_between(points, first, first + 1)
+    return compute_lengths(points, first, first + 1)
 
 
 def find_ends(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
@@ -130,7 +131,7 @@ def uncertainty_maps(use: CalibrationInUse) -> tuple[np.ndarray, dict[str, np.nd
     """
     mesh = use.region.mesh(_ROWS, _COLUMNS)
     at = mesh.reshape(-1, 2)
-    points = points_at(use.known, at)
+    points = sample_sheet(use.known, at)
     moved = remove_rigid_motion(at, (points.by_parameters @ covariance_root(use.covariance)).transpose(2, 0, 1))
     calibration = np.sqrt(np.sum(moved**2, axis=0))
     shown = {"calibration": calibration, "single point": np.hypot(calibration, points.by_px * use.noise_px)}
@@ -168,7 +169,7 @@ def _map_length(use: CalibrationInUse, mesh: np.ndarray, length: np.ndarray) -> 
         left, right = max(a for a, _ in ranges) + half[0], min(b for _, b in ranges) - half[0]
         at[0] = np.clip(at[0], left, right) if left < right else (left + right) / 2
     ends = np.stack([middle - half, middle + half], axis=1)
-    return compute_lengths(use, ends).std_mm(use.covariance).reshape(mesh.shape[:2])
+    return compute_volume_lengths(use, ends).std_mm(use.covariance).reshape(mesh.shape[:2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,11 +205,11 @@ def compare_calibrations(calibration: Calibration, other: Calibration, region: S
     """
     require_same_sensor(calibration, other)
     mesh = region.mesh(_ROWS, _COLUMNS)
-    pixels = pixels_at(estimate_in(calibration, region), mesh.reshape(-1, 2))
+    pixels = project_sheet_points(read_region_estimate(calibration, region), mesh.reshape(-1, 2))
     points = []
     for each in (calibration, other):
         through = each if region.view.window else each.model_copy(update={"window": None})
-        found = points_on_sheet(through, pixels, medium_index=each.index_of(region.medium)).points_mm
+        found = points_on_sheet(through, pixels, medium_index=each.medium_index(region.medium)).points_mm
         if not np.isfinite(found).all():
             raise CalibrationError(
                 "one of the calibrations does not see the sheet in part of the volume: they cannot be compared"

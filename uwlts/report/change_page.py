@@ -10,11 +10,11 @@ from matplotlib.colors import to_rgb
 from uwlts._version import __version__
 from uwlts.comparison.change import SurfaceChange
 from uwlts.files.json_files import json_text
-from uwlts.files.writing import require_ending, written_aside
-from uwlts.pages.toolkit import BLUE, INK, RED, new_figure, png_data_uri, render_page, svg_of, write_page
+from uwlts.files.writing import require_ending, write_atomically
+from uwlts.pages.toolkit import BLUE, INK, RED, figure_svg, new_figure, png_data_uri, render_page, write_page
 from uwlts.report.plot import UNKNOWN, surface_limit_mm
 from uwlts.storage.cloud_files import PLY_COLOURS, write_ply_points
-from uwlts.storage.las_file import las_content
+from uwlts.storage.las_file import encode_las
 
 PLACES_FORMATS = (".ply", ".laz", ".las")
 """Supported endings of the coloured cloud."""
@@ -79,8 +79,8 @@ def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None
         return
     none = np.zeros(len(change.points_mm), np.float32)
     compressed = path.suffix.lower() == ".laz"
-    content = las_content(change.points_mm, none, fields, colours=colours, compressed=compressed)
-    with written_aside(path, overwrite=overwrite) as aside:
+    content = encode_las(change.points_mm, none, fields, colours=colours, compressed=compressed)
+    with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_bytes(content)
 
 
@@ -146,4 +146,4 @@ def _histogram(change: SurfaceChange) -> Markup:
         axes.axvline(side * float(np.median(level)), color=RED, linewidth=1, label=label)
     axes.set(xlabel="distance / mm", ylabel="points")
     axes.legend(frameon=False)
-    return svg_of(figure)
+    return figure_svg(figure)

@@ -14,9 +14,9 @@ import numpy as np
 from uwlts._version import __version__
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.evaluate import read_evaluation
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 from uwlts.files.json_files import json_text
-from uwlts.files.writing import refuse_unsuitable, sha256_of
+from uwlts.files.writing import hash_file, refuse_unsuitable
 from uwlts.inspection.features import (
     COVERAGE,
     COVERAGE_FACTOR,
@@ -26,10 +26,10 @@ from uwlts.inspection.features import (
     FeatureValue,
     Inspection,
 )
-from uwlts.inspection.inspect import InspectionKind, inspected
+from uwlts.inspection.inspect import InspectionKind, inspect_cloud
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.sensor import Table
-from uwlts.pages.numbers import as_fine_as
+from uwlts.pages.numbers import format_to_scale
 from uwlts.pages.pdf import print_pdf, refuse_unsuitable_pdf
 from uwlts.pages.toolkit import (
     INK,
@@ -83,7 +83,7 @@ class _CheckedFigure:
     expanded_mm: float | None
 
 
-@inputs_kept()
+@protect_inputs()
 def write_findings(
     cloud: str | os.PathLike[str],
     kind: InspectionKind = "pipe",
@@ -146,9 +146,9 @@ def write_findings(
     sources = _sources(path, measured, captures, calibration, certificate)
     checks = [_artefact_check(each, measured) for each in verification]
     sources += [
-        Source("verification", Path(each).name, sha256_of(each), "by the same calibration") for each in verification
+        Source("verification", Path(each).name, hash_file(each), "by the same calibration") for each in verification
     ]
-    found = inspected(measured, kind, **options)
+    found = inspect_cloud(measured, kind, **options)
     made = datetime.now(UTC).isoformat(timespec="seconds")
     text = _page(found, measured, sources, checks, title=title or f"Inspection of {path.name}", made=made)
     record: Table = {
@@ -176,10 +176,10 @@ def _sources(
 ) -> list[Source]:
     named = cloud.metadata.get("calibration")
     words = ", ".join(f"{key} {cloud.metadata[key]}" for key in ("sensor", "medium") if cloud.metadata.get(key))
-    sources = [Source("cloud", path.name, sha256_of(path), f"{len(cloud):,} points{', ' + words if words else ''}")]
+    sources = [Source("cloud", path.name, hash_file(path), f"{len(cloud):,} points{', ' + words if words else ''}")]
     for each in captures:
         same = Path(each).name == cloud.metadata.get("capture")
-        sources.append(Source("capture", Path(each).name, sha256_of(each), "named by the cloud" if same else ""))
+        sources.append(Source("capture", Path(each).name, hash_file(each), "named by the cloud" if same else ""))
     if calibration is not None:
         digest = calibration_digest(load_calibration(calibration))
         if named is not None and named != digest:
@@ -188,13 +188,13 @@ def _sources(
                 f"{str(named)[:12]}..., and this one has {digest[:12]}...; give the calibration that it was made with"
             )
         note = "the one that the cloud names" if named == digest else "the cloud names no calibration"
-        sources.append(Source("calibration", Path(calibration).name, sha256_of(calibration), note))
+        sources.append(Source("calibration", Path(calibration).name, hash_file(calibration), note))
     if certificate is not None:
         if calibration is None:
             raise EvaluationError("a certificate belongs to a calibration: give that, too")
         if problems := check_certificate(certificate, calibration):
             raise EvaluationError(f"the certificate {certificate} is not valid: {'; '.join(problems)}")
-        sources.append(Source("certificate", Path(certificate).name, sha256_of(certificate), "its seal is intact"))
+        sources.append(Source("certificate", Path(certificate).name, hash_file(certificate), "its seal is intact"))
     return sources
 
 
@@ -222,8 +222,8 @@ def _check_rows(figures: Sequence[_CheckedFigure]) -> list[tuple[str, ...]]:
     for each in figures:
         fine = each.expanded_mm or _SMALLEST_MM
         calibrated = MISSING if each.calibrated_mm is None else f"{each.calibrated_mm:g}"
-        stated = MISSING if each.expanded_mm is None else as_fine_as(each.expanded_mm, fine, digits=2)
-        rows.append((each.name.replace("_", " "), calibrated, as_fine_as(each.value_mm, fine, digits=2), stated))
+        stated = MISSING if each.expanded_mm is None else format_to_scale(each.expanded_mm, fine, digits=2)
+        rows.append((each.name.replace("_", " "), calibrated, format_to_scale(each.value_mm, fine, digits=2), stated))
     return rows
 
 
@@ -274,17 +274,20 @@ def _format_interval(value: FeatureValue) -> str:
     half = COVERAGE_FACTOR * value.uncertainty
     if half <= _SMALLEST:
         return f"{value.value:.4g}"
-    shown = as_fine_as(value.value, half, digits=2)
+    shown = format_to_scale(value.value, half, digits=2)
     if value.low > value.value - 0.9 * half:
         # The interval of a non-negative value is asymmetric.
-        return f"{shown} ({as_fine_as(value.low, half, digits=2)} to {as_fine_as(value.high, half, digits=2)})"
-    return f"{shown} ± {as_fine_as(half, half, digits=2)}"
+        return (
+            f"{shown} ({format_to_scale(value.low, half, digits=2)} to {format_to_scale(value.high, half, digits=2)})"
+        )
+    return f"{shown} ± {format_to_scale(half, half, digits=2)}"
 
 
 def _value_row(value: FeatureValue) -> tuple[str, ...]:
     parts = value.random, value.systematic
     fine = [
-        MISSING if part is None else as_fine_as(part, part, digits=2) if part > _SMALLEST else "0" for part in parts
+        MISSING if part is None else format_to_scale(part, part, digits=2) if part > _SMALLEST else "0"
+        for part in parts
     ]
     return value.name, value.unit, _format_interval(value), *fine
 

@@ -9,13 +9,13 @@ from typing import Annotated
 import numpy as np
 from pydantic import BeforeValidator, Field, FiniteFloat, Strict, TypeAdapter, ValidationError
 
-from uwlts.errors import CaptureError, problems_of
+from uwlts.errors import CaptureError, describe_problems
 from uwlts.evaluation.evaluate import EvaluationRecord, read_evaluation
 from uwlts.files.json_files import read_json
 from uwlts.files.reading import is_regular_file
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
-from uwlts.model.library import find, read_table, validated
+from uwlts.model.library import find_description, read_table, validate_description
 from uwlts.model.sensor import Description, Sensor
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader
@@ -201,7 +201,7 @@ def _seconds(path: Path) -> dict[str, float]:
         raise CaptureError(f"{error}; expected the seconds of each stage by name") from error
     except ValidationError as error:
         expected = 'the seconds of each stage by name: {"render": 12.3, ...}'
-        raise CaptureError(f"{path} must hold {expected}; {problems_of(error)}") from error
+        raise CaptureError(f"{path} must hold {expected}; {describe_problems(error)}") from error
 
 
 def _several(value: object) -> tuple[object, ...]:
@@ -224,6 +224,6 @@ def load_reference(name_or_path: str | Path) -> Reference:
 
     DescriptionError if the name is unknown, or the file contains anything but numbers by measurement and figure.
     """
-    path = find(name_or_path, "references")
+    path = find_description(name_or_path, "references")
     table = read_table(path, "references")
-    return validated(Reference, {"title": table.pop("title", path.stem), "figures": table}, path)
+    return validate_description(Reference, {"title": table.pop("title", path.stem), "figures": table}, path)

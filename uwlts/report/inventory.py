@@ -134,7 +134,7 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         f"calibration of the sensor '{calibration.sensor_name}' "
         f"({calibration.provenance.get('source', 'unknown source')})",
         f"camera: f {camera.fx_px:.2f} x {camera.fy_px:.2f} px, centre {camera.cx_px:.2f}, {camera.cy_px:.2f} px, "
-        + ", ".join(f"{name} {value:.5f}" for name, value in camera.distortion.used().items()),
+        + ", ".join(f"{name} {value:.5f}" for name, value in camera.distortion.used_coefficients().items()),
         f"sheet: normal {', '.join(f'{x:.6f}' for x in sheet.normal)}, offset {sheet.offset_mm:.4f} mm",
     ]
     if window is None:

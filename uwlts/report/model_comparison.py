@@ -15,9 +15,9 @@ from uwlts.calibration.model_comparison.comparison import (
     STRIPES,
     Choice,
     Comparison,
-    JudgedModel,
     PolynomialScore,
     Score,
+    ScoredModel,
 )
 from uwlts.calibration.model_comparison.held_out import (
     DIMENSIONS,
@@ -25,11 +25,11 @@ from uwlts.calibration.model_comparison.held_out import (
     INSIDE,
     OUTSIDE,
     Candidate,
-    distortion_words,
+    describe_distortion,
 )
 from uwlts.files.json_files import json_text
-from uwlts.pages.numbers import fixed, small_length
-from uwlts.pages.toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
+from uwlts.pages.numbers import format_fixed, format_length
+from uwlts.pages.toolkit import MISSING, figure_svg, legend_below, new_figure, render_page, write_page
 
 _WAYS = (INSIDE, OUTSIDE)
 
@@ -82,15 +82,15 @@ class ModelComparisonContent(_Content):
     warnings: list[str]
 
 
-def content_of(comparison: Comparison) -> ModelComparisonContent:
+def make_content(comparison: Comparison) -> ModelComparisonContent:
     """Return all figures of a comparison."""
     choice, score, polynomials = comparison.choice, comparison.polynomials, comparison.why_none
     if score is not None:
         polynomials = (
-            f"polynomials, fitted to the target in {score.medium} alone, have an error of {small_length(score.all_mm)} "
-            f"± {small_length(score.std_mm)} for stripes in {score.images} images inside the calibrated volume, the "
-            f"simplest model {small_length(score.model_mm)} ± {small_length(score.model_std_mm)}; outside they do not "
-            "measure"
+            f"polynomials, fitted to the target in {score.medium} alone, have an error of "
+            f"{format_length(score.all_mm)} ± {format_length(score.std_mm)} for stripes in {score.images} images "
+            "inside the calibrated volume, the simplest model "
+            f"{format_length(score.model_mm)} ± {format_length(score.model_std_mm)}; outside they do not measure"
         )
     return ModelComparisonContent(
         format="uwlts-models",
@@ -99,28 +99,28 @@ def content_of(comparison: Comparison) -> ModelComparisonContent:
         captures=comparison.captures,
         software=f"uwlts {__version__}",
         date=datetime.now(UTC).isoformat(timespec="seconds"),
-        held_out={where: len(held) for where, held in choice.ways.items()},
+        held_out={where: len(held) for where, held in choice.splits.items()},
         models=[_row(choice, judged) for judged in choice.judged],
-        best=choice.best().words(),
-        simplest=choice.simplest().words(),
+        best=choice.best().describe(),
+        simplest=choice.simplest().describe(),
         polynomials=score,
         verdicts=[*verdicts(choice), polynomials],
         warnings=comparison.warnings,
     )
 
 
-def _row(choice: Choice, judged: JudgedModel) -> ModelRow:
-    row = ModelRow(model=judged.candidate.words(), parameters=judged.parameters)
+def _row(choice: Choice, judged: ScoredModel) -> ModelRow:
+    row = ModelRow(model=judged.candidate.describe(), parameters=judged.parameters)
     if judged.reason:
         return row.model_copy(update={"reason": judged.reason})
     scores: dict[str, object] = {}
     for where, score in judged.scores.items():
-        cost = adds(choice, judged.candidate, choice.best(), where)
+        cost = compute_additional_error(choice, judged.candidate, choice.best(), where)
         scores[where] = HeldOutScore(**vars(score), adds_mm=cost and cost[0], adds_std_mm=cost and cost[1])
-    return row.model_copy(update=scores | {"as_good": judged.candidate in choice.as_good()})
+    return row.model_copy(update=scores | {"as_good": judged.candidate in choice.list_equivalent()})
 
 
-def lines_of(content: ModelComparisonContent) -> list[str]:
+def format_lines(content: ModelComparisonContent) -> list[str]:
     """Return the table and the verdicts as lines of text."""
     width = max(len(row.model) for row in content.models)
     heads = [f"{where} the volume, {content.held_out[where]} images held out" for where in _WAYS]
@@ -143,17 +143,17 @@ def _cells(score: HeldOutScore) -> str:
     everything, cost = _in_um(score.all_mm, score.std_mm), "as good"
     if score.adds_mm is not None and score.adds_std_mm is not None:
         cost = _in_um(score.adds_mm, score.adds_std_mm)
-    points, stripes = (fixed(score.px[kind], 4) if kind in score.px else MISSING for kind in (POINTS, STRIPES))
+    points, stripes = (format_fixed(score.px[kind], 4) if kind in score.px else MISSING for kind in (POINTS, STRIPES))
     return f"{points:>8}{stripes:>9}{everything:>15}{cost:>14}"
 
 
 def _in_um(value_mm: float, std_mm: float) -> str:
-    return f"{fixed(1e3 * value_mm, 1)} ± {fixed(1e3 * std_mm, 1)}"
+    return f"{format_fixed(1e3 * value_mm, 1)} ± {format_fixed(1e3 * std_mm, 1)}"
 
 
 def write_models(path: str | Path, comparison: Comparison, *, overwrite: bool = False) -> None:
     """Write a comparison as a page, with its figures as JSON beside it; OutputError if that fails."""
-    content = content_of(comparison)
+    content = make_content(comparison)
     write_page(path, models_page(content), beside=json_text(content, indent=2, ascii=False), overwrite=overwrite)
 
 
@@ -182,7 +182,7 @@ def _picture(content: ModelComparisonContent) -> Markup | None:
         axes.set(title=f"{where} the calibrated volume", xlabel="model", ylabel="adds / µm", yscale="log")
         axes.set(xlim=(0.5, count + 0.5), xticks=range(1, count + 1))
     legend_below(figure)
-    return svg_of(figure)
+    return figure_svg(figure)
 
 
 _PARTS = {
@@ -197,7 +197,7 @@ _OF_THE_WINDOW = {"refractions", "window_tilt"}
 """Effects on rays in a medium that are negligible in air: only images in a medium show whether they are needed."""
 
 
-def adds(
+def compute_additional_error(
     choice: Choice, candidate: Candidate, other: Candidate, where: str, *, wet: bool = False
 ) -> tuple[float, float] | None:
     """Return the additional error of a model relative to another, in quadrature, in mm, with its standard error.
@@ -205,9 +205,9 @@ def adds(
     It is None if the model is as good. All images held out are used, or with ``wet`` only those in a medium.
     """
     tally = (choice.wet_tallies if wet else choice.tallies)[where]
-    if choice.no_worse(candidate, other, where, wet=wet):
+    if choice.predicts_as_well(candidate, other, where, wet=wet):
         return None
-    difference, std = tally.beyond(choice.number(candidate), choice.number(other))
+    difference, std = tally.compute_excess(choice.number(candidate), choice.number(other))
     root = float(difference**0.5)
     return root, std / (2 * root)
 
@@ -241,20 +241,22 @@ def _describe_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str
     usual = Candidate()
     levels = [c.distortion for c in candidates if replace(c, distortion=usual.distortion) == usual]
     enough = choice.level("distortion", levels)
-    said = f"{distortion_words(enough)} is enough"
+    said = f"{describe_distortion(enough)} is enough"
     least = replace(usual, distortion=enough)
     fewer = max((level for level in levels if len(level) < len(enough)), key=len, default=None)
     if fewer is not None:
         judged = next(each for each in choice.judged if each.candidate == replace(usual, distortion=fewer))
-        said += f": with {distortion_words(fewer)} {judged.reason or _describe_costs(choice, judged, least)}"
+        said += f": with {describe_distortion(fewer)} {judged.reason or _describe_costs(choice, judged, least)}"
     return said
 
 
-def _describe_costs(choice: Choice, without: JudgedModel, usual: Candidate, *, wet: bool = False) -> str:
+def _describe_costs(choice: Choice, without: ScoredModel, usual: Candidate, *, wet: bool = False) -> str:
     """Describe where a model is worse, and by how much; empty if it is as good."""
-    found = {where: adds(choice, without.candidate, usual, where, wet=wet) for where in without.scores}
+    found = {
+        where: compute_additional_error(choice, without.candidate, usual, where, wet=wet) for where in without.scores
+    }
     parts = [
-        f"{small_length(cost[0])} ± {small_length(cost[1])} {'inside' if where == INSIDE else 'outside'}"
+        f"{format_length(cost[0])} ± {format_length(cost[1])} {'inside' if where == INSIDE else 'outside'}"
         for where, cost in found.items()
         if cost is not None
     ]
@@ -263,11 +265,11 @@ def _describe_costs(choice: Choice, without: JudgedModel, usual: Candidate, *, w
 
 
 def _describe_choice(choice: Choice) -> list[str]:
-    best, simplest, good = choice.best(), choice.simplest(), choice.as_good()
-    others = [candidate.words() for candidate in good if candidate not in (best, simplest)]
-    said = f"best prediction: {best.words()}"
+    best, simplest, good = choice.best(), choice.simplest(), choice.list_equivalent()
+    others = [candidate.describe() for candidate in good if candidate not in (best, simplest)]
+    said = f"best prediction: {best.describe()}"
     if simplest != best:
-        said += f"; simplest model that is as good within the standard errors: {simplest.words()}"
+        said += f"; simplest model that is as good within the standard errors: {simplest.describe()}"
     elif others:
         said += ", which is also the simplest of the equally good models"
     return [said + (f"; equally good: {'; '.join(others)}" if others else "")]

@@ -11,13 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from uwlts.files.writing import written_aside
-from uwlts.pages.toolkit import new_figure, png_of, svg_of
+from uwlts.files.writing import write_atomically
+from uwlts.pages.toolkit import figure_png, figure_svg, new_figure
 from uwlts.report import plot
 from uwlts.report.gather import GatheredCampaign, GatheredMeasurement
-from uwlts.runtime.workers import Send, work_through
-from uwlts.storage.capture import Capture, picture_of
-from uwlts.stripe import Stripe, stripe_in
+from uwlts.runtime.workers import Send, run_jobs
+from uwlts.storage.capture import Capture, drawable_image
+from uwlts.stripe import Stripe, find_stripe
 
 # Width of a picture, inches.
 _WIDTH_IN = 11.2
@@ -42,10 +42,10 @@ def stripe_view(capture: Capture) -> StripeView | None:
     laser = np.flatnonzero(capture.laser_on)
     for place in np.argsort(np.abs(np.arange(len(laser)) - (len(laser) - 1) / 2), kind="stable"):
         frame = int(laser[place])
-        seen, camera = capture.seen(frame), header.sensor.camera
-        stripe = stripe_in(seen, stripe_along=camera.stripe_along, saturation=header.saturation_dn)
+        seen, camera = capture.read_observation(frame), header.sensor.camera
+        stripe = find_stripe(seen, stripe_along=camera.stripe_along, saturation=header.saturation_dn)
         if len(stripe.lines) >= _LEAST_LINES:
-            return StripeView(frame, picture_of(seen, camera), stripe)
+            return StripeView(frame, drawable_image(seen, camera), stripe)
     return None
 
 
@@ -89,7 +89,7 @@ def draw_pictures(campaign: GatheredCampaign, *, workers: int = 1) -> list[Measu
 
     CaptureError if an image of a capture is damaged.
     """
-    return work_through(_draw_measurement, campaign.measurements, workers=workers)
+    return run_jobs(_draw_measurement, campaign.measurements, workers=workers)
 
 
 def _draw_measurement(measurement: GatheredMeasurement, send: Send) -> MeasurementPictures:
@@ -99,8 +99,8 @@ def _draw_measurement(measurement: GatheredMeasurement, send: Send) -> Measureme
             view = stripe_view(capture)
     return MeasurementPictures(
         measurement.name,
-        None if view is None else png_of(stripe_picture(view)),
-        None if cloud is None else png_of(plot.cloud(cloud), few_colours=True),
+        None if view is None else figure_png(stripe_picture(view)),
+        None if cloud is None else figure_png(plot.cloud(cloud), few_colours=True),
         None if cloud is None else svg_if_any(plot.deviation_histogram, cloud),
         None if cloud is None else svg_if_any(plot.along_stripe, cloud),
     )
@@ -109,7 +109,7 @@ def _draw_measurement(measurement: GatheredMeasurement, send: Send) -> Measureme
 def svg_if_any(draw: Callable[..., Axes], shown: object, **options: Any) -> Markup | None:
     """Return a plot as SVG; None if there is nothing to draw."""
     try:
-        return svg_of(draw(shown, **options))
+        return figure_svg(draw(shown, **options))
     except plot.NothingToDrawError:
         return None
 
@@ -126,7 +126,7 @@ def write_pictures(
         for kind, picture in (("stripe", each.stripe), ("cloud", each.cloud)):
             if picture is not None:
                 path = Path(folder) / f"{kind}-{each.name}.png"
-                with written_aside(path, overwrite=overwrite) as aside:
+                with write_atomically(path, overwrite=overwrite) as aside:
                     aside.write_bytes(picture)
                 written.append(path)
     return written

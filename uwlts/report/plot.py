@@ -1,7 +1,7 @@
 """Static plots of clouds, stripes and calibrations, with matplotlib axes as input and output.
 
 Every function draws into ``ax``, or into a new figure in the style of the pages, and returns the axes;
-``ax.figure.savefig(...)`` saves them. `uwlts.pages.toolkit.svg_of` converts a figure for a page.
+``ax.figure.savefig(...)`` saves them. `uwlts.pages.toolkit.figure_svg` converts a figure for a page.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D, proj3d
 
 from uwlts.model.calibration import Calibration
-from uwlts.pages.numbers import as_fine_as, entries_of, number_list, unit_for, unit_of, words_of
-from uwlts.pages.toolkit import BLUE, COLOURS, FAINT, INK, RED, figure_of, new_figure, plain_text, typographic
+from uwlts.pages.numbers import entries_of, format_to_scale, number_list, split_name, unit_for, unit_of
+from uwlts.pages.toolkit import BLUE, COLOURS, FAINT, INK, RED, make_figure, new_figure, plain_text, typeset_number
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
@@ -106,7 +106,7 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
     """
     if ax is None:
         # The axes are square, as wide as the space beside the colour bar, and clipped by the figure vertically.
-        figure, side, room = figure_of(11.2, 6.0, layout=None), 0.86, (0.84, 0.84 * 6.0 / (0.86 * 11.2))
+        figure, side, room = make_figure(11.2, 6.0, layout=None), 0.86, (0.84, 0.84 * 6.0 / (0.86 * 11.2))
         height = side * 11.2 / 6.0
         ax = Axes3D(figure, (0.02, 0.5 - height / 2, side, height))
         figure.add_axes(ax)
@@ -360,7 +360,7 @@ def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     NothingToDrawError
         No point of the cloud has a deviation.
     """
-    _, finite = _evaluated(cloud)
+    _, finite = _select_evaluated(cloud)
     if not len(finite):
         raise NothingToDrawError("no point of the cloud has a deviation: evaluate it first")
     ax = _axes(ax)
@@ -375,7 +375,7 @@ def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     if std > 0:
         normal = len(finite) * width / (std * np.sqrt(2 * np.pi)) * np.exp(-0.5 * ((middles - mean) / std) ** 2)
         ax.plot(factor * middles, normal, color=INK, linewidth=1.2, label="normal distribution")
-    shown = [typographic(as_fine_as(factor * value, factor * std)) for value in (mean, std)]
+    shown = [typeset_number(format_to_scale(factor * value, factor * std)) for value in (mean, std)]
     ax.axvline(factor * mean, color=RED, linewidth=1.2, label=f"mean {shown[0]} {unit}")
     for sign, text in ((-1, f"standard deviation {shown[1]} {unit}"), (1, None)):
         ax.axvline(factor * (mean + sign * std), color=RED, linewidth=1.2, linestyle=":", label=text)
@@ -392,7 +392,7 @@ def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     NothingToDrawError
         No interval has enough points.
     """
-    points, deviation = _evaluated(cloud)
+    points, deviation = _select_evaluated(cloud)
     y = points[:, 1]
     edges = np.linspace(y.min(), y.max(), _INTERVALS + 1) if len(y) else np.zeros(_INTERVALS + 1)
     place = np.clip(np.searchsorted(edges, y, side="right") - 1, 0, _INTERVALS - 1)
@@ -418,7 +418,7 @@ def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _evaluated(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+def _select_evaluated(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
     """Return points (N, 3) with a deviation, and their deviations (N,)."""
     deviation = np.full(len(cloud), np.nan) if cloud.deviation_mm is None else cloud.deviation_mm.astype(np.float64)
     known = np.isfinite(deviation)
@@ -466,7 +466,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: Residu
     else:
         ax.bar(places, heights, color="#7fa6cc")
         ax.axhline(0, color=INK, linewidth=0.8)
-    words, unit = words_of(which.name), unit_of(which.name)
+    words, unit = split_name(which.name), unit_of(which.name)
     ax.set(
         xlabel="image" if which.images or "image" in which.name else "number",
         ylabel=plain_text(f"{words} / {unit}" if unit else words),

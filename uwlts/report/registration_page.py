@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from uwlts._version import __version__
 from uwlts.files.json_files import json_text
-from uwlts.pages.toolkit import BLUE, COLOURS, RED, new_figure, png_data_uri, render_page, svg_of, write_page
+from uwlts.pages.toolkit import BLUE, COLOURS, RED, figure_svg, new_figure, png_data_uri, render_page, write_page
 from uwlts.registration.register import RegisteredScans
 from uwlts.report.plot import surface_limit_mm
 
@@ -36,7 +36,7 @@ def write_registration(
         software=f"uwlts {__version__}",
         first=registered.names[0],
         summary=[line for line in registered.lines() if not line.startswith("  open")],
-        open_movements=[(registered.names[each.scan], each.words()) for each in registered.open_movements],
+        open_movements=[(registered.names[each.scan], each.describe()) for each in registered.open_movements],
         scans=_scans(registered),
         overlaps=_overlaps(registered),
         histograms=_histograms(registered),
@@ -104,4 +104,4 @@ def _histograms(registered: RegisteredScans) -> Markup:
         ax.set(xlabel="distance / mm", ylabel="patches")
     for ax in axes[count:]:
         ax.set_visible(False)
-    return svg_of(figure)
+    return figure_svg(figure)

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from uwlts.evaluation.evaluate import TruthComparisons, TruthFigures
 from uwlts.evaluation.figures import Quantity
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.report.gather import CALIBRATION, GatheredCampaign, GatheredMeasurement, Reference
 
 KEY_FIGURES = {
@@ -141,7 +141,7 @@ def summary(campaign: GatheredCampaign, reference: Reference | None = None) -> S
         other_calibrations={
             name: CalibrationSummary(**_key_figures(found), truth=_truth(found)) for name, found in others.items()
         },
-        published=None if reference is None else _published(main, reference),
+        published=None if reference is None else _find_published(main, reference),
     )
 
 
@@ -150,7 +150,7 @@ def write_summary(
 ) -> None:
     """Write the summary as indented JSON, completely or not at all; OutputError if that fails."""
     text = json.dumps(summary(campaign, reference).model_dump(), indent=2, allow_nan=False)
-    with written_aside(path, overwrite=overwrite) as aside:
+    with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_text(text + "\n", encoding="utf-8")
 
 
@@ -203,7 +203,7 @@ def _pool(compared: Sequence[TruthFigures]) -> PooledTruth:
     )
 
 
-def _published(measurements: Sequence[GatheredMeasurement], reference: Reference) -> PublishedSummary:
+def _find_published(measurements: Sequence[GatheredMeasurement], reference: Reference) -> PublishedSummary:
     figures = {}
     for key, (_, _, figure) in KEY_FIGURES.items():
         values = {m.name: found for m in measurements if (found := reference.values(m.known_as, figure))}

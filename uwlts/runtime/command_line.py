@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from cyclopts import App, Parameter
 
-from uwlts.runtime.console import as_options, progress_bar
+from uwlts.runtime.console import progress_bar, replace_by_options
 
 _LISTENERS = ("progress", "report", "warn")
 """Parameters through which functions report; a command prints the reports."""
@@ -50,7 +50,7 @@ class Shortcuts:
     """Annotations of the options by the names of the entries."""
 
 
-def derived(
+def command_from(
     app: App,
     package: ModuleType,
     function: str,
@@ -58,7 +58,7 @@ def derived(
     also: Sequence[tuple[ModuleType, str]] = (),
     shortcuts: Shortcuts | None = None,
     summary: str | None = None,
-) -> Callable[[Callable[..., None]], "Derived"]:
+) -> Callable[[Callable[..., None]], "DerivedCommand"]:
     """Make a command from a public function of a package; the decorated function is the body and names the command.
 
     The body takes a `Call`, and the command's additional options as parameters. Parameters without an annotation are
@@ -67,8 +67,8 @@ def derived(
     docstring.
     """
 
-    def register(body: Callable[..., None]) -> Derived:
-        made = Derived(package, function, body, tuple(also), shortcuts, summary)
+    def register(body: Callable[..., None]) -> DerivedCommand:
+        made = DerivedCommand(package, function, body, tuple(also), shortcuts, summary)
         name = body.__name__.strip("_").replace("_", "-")
         app.command(f"{body.__module__}:{body.__name__}", name=name, help=made.__doc__)
         return made
@@ -102,7 +102,7 @@ class Call:
             return self.function(*given.pop("*", ()), **given)
 
 
-class Derived:
+class DerivedCommand:
     """A command in the form that cyclopts needs: a callable with a signature and a docstring."""
 
     def __init__(
@@ -178,7 +178,7 @@ class Derived:
             given |= {name: value for name, value in explicit.items() if name in self._own}
         if self._shortcuts is not None:
             entries = {name: explicit[name] for name in self._shortcuts.options if name in explicit}
-            if settings := settings_of(self._shortcuts.setting, explicit.get(self._shortcuts.setting, ())) | entries:
+            if settings := parse_settings(self._shortcuts.setting, explicit.get(self._shortcuts.setting, ())) | entries:
                 given[self._shortcuts.setting] = settings
         for name, one in self._taken.items():
             if one.kind is one.VAR_POSITIONAL and name in given:
@@ -200,7 +200,7 @@ def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Paramet
     taken, described = getattr(package, function), descriptions(package, function)
     hints, options = get_type_hints(taken), {}
     for name, one in inspect.signature(taken).parameters.items():
-        kind = None if name in _LISTENERS or one.kind is one.VAR_KEYWORD else typed(hints[name])
+        kind = None if name in _LISTENERS or one.kind is one.VAR_KEYWORD else option_type(hints[name])
         if kind is None:
             continue
         text, default = _as_help(described[name], described), one.default
@@ -238,7 +238,7 @@ def _members(hint: Any) -> Iterator[Any]:
         yield hint
 
 
-def typed(hint: Any) -> Any:
+def option_type(hint: Any) -> Any:
     """Return the type of an option for a parameter of some type, or None if it cannot be given as text."""
     kinds = list(_members(hint))
     if Path in kinds:
@@ -246,7 +246,7 @@ def typed(hint: Any) -> Any:
     words = [kind for kind in _WORDS if kind in kinds] or [kind for kind in kinds if kind is Path]
     literals = [kind for kind in kinds if get_origin(kind) is Literal]
     for kind in kinds:
-        element = typed(get_args(kind)[0]) if get_origin(kind) in (Sequence, tuple) else None
+        element = option_type(get_args(kind)[0]) if get_origin(kind) in (Sequence, tuple) else None
         if element is None or (words and element not in words):
             continue
         if get_origin(kind) is tuple and get_args(kind)[-1] is not ...:
@@ -265,10 +265,10 @@ def _or_none(kind: Any, kinds: Iterable[Any]) -> Any:
     return kind | None if NoneType in kinds else kind
 
 
-def settings_of(option: str, texts: Sequence[str]) -> dict[str, Any]:
+def parse_settings(option: str, texts: Sequence[str]) -> dict[str, Any]:
     """Return settings from texts NAME=VALUE; raises DescriptionError for another text."""
     from uwlts.errors import DescriptionError
-    from uwlts.files.reading import parsed_json
+    from uwlts.files.reading import parse_json
 
     settings: dict[str, Any] = {}
     for text in texts:
@@ -276,7 +276,7 @@ def settings_of(option: str, texts: Sequence[str]) -> dict[str, Any]:
         if not (name and equals and value):
             raise DescriptionError(f"`{option}` {text}: expected NAME=VALUE, such as half_window_px=32")
         try:
-            settings[name] = parsed_json(value)
+            settings[name] = parse_json(value)
         except ValueError:
             settings[name] = value
     return settings
@@ -300,7 +300,7 @@ def descriptions(package: ModuleType, function: str) -> dict[str, str]:
 
 def _as_help(text: str, names: Collection[str]) -> str:
     """Return docstring text as a command's help: options instead of parameters, and no backticks."""
-    return as_options(text, names).replace("`", "")
+    return replace_by_options(text, names).replace("`", "")
 
 
 def _sections(text: str) -> list[str]:

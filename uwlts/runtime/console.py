@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uwlts.errors import Error
-from uwlts.files.inputs import inputs_kept, refuse_named_inputs
-from uwlts.runtime.interrupts import interrupts_kept
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.files.inputs import protect_inputs, refuse_named_inputs
+from uwlts.runtime.interrupts import preserve_interrupts
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 
 USER_ERROR, INTERRUPTED = 2, 130
 
@@ -30,7 +30,7 @@ def progress_bar(title: str) -> Iterator[ProgressListener]:
     console = Console(stderr=True)
     if not console.is_terminal:
         # In rich before 14.3 a disabled bar prints an empty line.
-        yield unheard
+        yield ignore_progress
         return
     times = TimeElapsedColumn(), TimeRemainingColumn()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times
@@ -59,9 +59,9 @@ def run(app: App) -> int:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     command: object = None
     try:
-        with interrupts_kept():
+        with preserve_interrupts():
             command, bound, _ = app.parse_args(sys.argv[1:], exit_on_error=False, print_error=True)
-            with inputs_kept():
+            with protect_inputs():
                 refuse_named_inputs(bound.arguments)
                 command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
@@ -69,7 +69,7 @@ def run(app: App) -> int:
         return USER_ERROR
     except Error as error:
         names = inspect.signature(command).parameters if callable(command) else ()
-        print(f"error: {as_options(str(error), names)}", file=sys.stderr)
+        print(f"error: {replace_by_options(str(error), names)}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
         print("interrupted; what is complete is kept: run it again, recordings with --resume", file=sys.stderr)
@@ -83,7 +83,7 @@ def run(app: App) -> int:
     return 0
 
 
-def as_options(text: str, names: Collection[str]) -> str:
+def replace_by_options(text: str, names: Collection[str]) -> str:
     """Replace parameters in backticks by the command's options, for parameters with these names."""
     return re.sub(
         r"(`+)(\w+)\1", lambda found: f"--{found[2].replace('_', '-')}" if found[2] in names else found[0], text

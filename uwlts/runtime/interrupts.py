@@ -12,7 +12,7 @@ _AGAIN_S = 0.01
 
 
 @contextmanager
-def interrupts_kept() -> Iterator[None]:
+def preserve_interrupts() -> Iterator[None]:
     """Deliver an interrupt that Python or a library has converted to something else.
 
     Python reports and drops an interrupt in the callback of a weak reference. An interrupt in a loop that Dr.Jit

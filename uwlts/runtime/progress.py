@@ -11,5 +11,5 @@ class ProgressListener(Protocol):
         ...
 
 
-def unheard(done: int, total: int, stage: str = "") -> None:
+def ignore_progress(done: int, total: int, stage: str = "") -> None:
     """Ignore the progress."""

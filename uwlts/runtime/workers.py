@@ -1,6 +1,6 @@
 """Worker processes on this machine, or workers of a Dask cluster, for many jobs in parallel.
 
-`work_through` runs a list of jobs in processes that it starts and ends. `open_workers` keeps processes (or the workers
+`run_jobs` runs a list of jobs in processes that it starts and ends. `open_workers` keeps processes (or the workers
 of a Dask scheduler) for several rounds of jobs, and survives jobs whose process dies. These processes
 always end with their command. `concurrent.futures` completes running and queued jobs before a command ends, and leaves
 processes behind if the command is killed.
@@ -28,7 +28,7 @@ from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.errors import Error, SetupError
 from uwlts.files.writing import remove_unfinished
-from uwlts.runtime.interrupts import interrupts_kept
+from uwlts.runtime.interrupts import preserve_interrupts
 
 Item = TypeVar("Item")
 Job = TypeVar("Job")
@@ -64,7 +64,9 @@ class Workers(ABC):
         """Return the number of processes that each of ``jobs`` jobs may start itself."""
 
     @abstractmethod
-    def completed(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
+    def map_unordered(
+        self, function: Callable[[Job], Result], jobs: Iterable[Job]
+    ) -> Iterator[tuple[Job, Result | Lost]]:
         """Iterate over jobs and results of ``function(job)``, in the order of completion.
 
         Jobs are taken from ``jobs`` shortly before they start. A job whose process dies is run again; if its process
@@ -89,12 +91,12 @@ def open_workers(
         with _cluster(scheduler, patience_s) as cluster:
             yield cluster
         return
-    count = workers or processors()
-    with _Processes(count, threads=max(1, processors() // count)) as pool:
+    count = workers or count_processors()
+    with _Processes(count, threads=max(1, count_processors() // count)) as pool:
         yield pool
 
 
-def work_through(
+def run_jobs(
     work: Callable[[Job, Send], Result],
     jobs: Sequence[Job],
     *,
@@ -113,7 +115,7 @@ def work_through(
     if workers == 1:
         return [work(job, on_message) for job in jobs]
     results: dict[int, Result] = {}
-    with _Processes(max(1, min(len(jobs), workers or processors())), threads=1) as pool:
+    with _Processes(max(1, min(len(jobs), workers or count_processors())), threads=1) as pool:
         for number, _, result in pool.run(work, jobs, on_message):
             if isinstance(result, Lost):
                 raise SetupError(result.reason)
@@ -121,13 +123,13 @@ def work_through(
     return [results[number] for number in range(len(jobs))]
 
 
-def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
+def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
     """Iterate over items and ``function(item)``, in order, computed in one thread per processor.
 
     For functions that spend their time outside the interpreter, in OpenCV, NumPy or compiled code. Items are taken in
     this thread, shortly before their turn. Exceptions of the function are raised here.
     """
-    threads = processors()
+    threads = count_processors()
     with ThreadPoolExecutor(threads) as pool:
         waiting: deque[tuple[Item, Future[Result]]] = deque()
         for item in items:
@@ -139,7 +141,7 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
             yield done, result.result()
 
 
-def processors() -> int:
+def count_processors() -> int:
     """Return the number of processors that this process may use."""
     # Only Linux reports a restriction of the process to some processors.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -169,8 +171,10 @@ class _Processes(Workers):
         """Return more than one if there are more processes than jobs."""
         return max(1, self.count // max(jobs, 1))
 
-    def completed(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
-        """See `Workers.completed`."""
+    def map_unordered(
+        self, function: Callable[[Job], Result], jobs: Iterable[Job]
+    ) -> Iterator[tuple[Job, Result | Lost]]:
+        """See `Workers.map_unordered`."""
         silent, lost = partial(_without_messages, function), []
         for _, job, result in self.run(silent, jobs):
             if isinstance(result, Lost):
@@ -320,7 +324,7 @@ def _serve(connection: Connection) -> None:
     try:
         signal.signal(signal.SIGTERM, stop)
         threading.Thread(target=_end_when_stopped, args=(_signals(),), daemon=True).start()
-        with interrupts_kept():
+        with preserve_interrupts():
             while (given := connection.recv()) is not None:
                 kind, content = given
                 if kind == "work":
@@ -379,8 +383,10 @@ class _Cluster(Workers):
         """Return 1: a worker of a cluster may not start processes."""
         return 1
 
-    def completed(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
-        """See `Workers.completed`."""
+    def map_unordered(
+        self, function: Callable[[Job], Result], jobs: Iterable[Job]
+    ) -> Iterator[tuple[Job, Result | Lost]]:
+        """See `Workers.map_unordered`."""
         waiting, running = iter(jobs), dict[Future[Result], Job]()
         while True:
             for job in islice(waiting, self.count * _AHEAD - len(running)):

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TypedDict
 
-from uwlts.files.json_files import model_in, read_json, read_model
+from uwlts.files.json_files import model_from_json, read_json, read_model
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import FORMAT, VERSION, Calibration
 from uwlts.model.polynomial_calibration import (
@@ -43,10 +43,10 @@ def load_calibration(path: str | Path) -> AnyCalibration:
     """Read a calibration of any kind; raises CaptureError if the file is missing, foreign, newer or damaged."""
     content = read_json(path, called="calibration")
     if content.get("format") == POLYNOMIALS_FORMAT:
-        return model_in(content, path, PolynomialCalibration, **_POLYNOMIALS)
-    return model_in(content, path, Calibration, **_CALIBRATION)
+        return model_from_json(content, path, PolynomialCalibration, **_POLYNOMIALS)
+    return model_from_json(content, path, Calibration, **_CALIBRATION)
 
 
-def loaded_calibration(calibration: AnyCalibration | str | Path) -> AnyCalibration:
+def resolve_calibration(calibration: AnyCalibration | str | Path) -> AnyCalibration:
     """Return a calibration unchanged, or read it from a file; raises the errors of `load_calibration`."""
     return load_calibration(calibration) if isinstance(calibration, str | Path) else calibration

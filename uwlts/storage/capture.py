@@ -29,7 +29,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError, ImageError
 from uwlts.files.reading import require_regular_file
-from uwlts.files.writing import sha256_of
+from uwlts.files.writing import hash_file
 from uwlts.model.calibration import is_rigid
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import Camera, CaptureHeader, Table
@@ -52,7 +52,7 @@ Seen = np.ndarray | Stripe
 """Content of a frame: an image (H, W) of uint8 or uint16, or the stripe extracted by a 3D camera."""
 
 
-def image_of(seen: Seen, called: str) -> np.ndarray:
+def require_image(seen: Seen, called: str) -> np.ndarray:
     """Return an image (H, W) unchanged; raises ImageError for a centre line."""
     if isinstance(seen, Stripe):
         raise ImageError(
@@ -62,7 +62,7 @@ def image_of(seen: Seen, called: str) -> np.ndarray:
     return seen
 
 
-def picture_of(seen: Seen, camera: Camera) -> np.ndarray:
+def drawable_image(seen: Seen, camera: Camera) -> np.ndarray:
     """Return an image (H, W) to draw on; it is black for a centre line."""
     return np.zeros((camera.height_px, camera.width_px), np.uint8) if isinstance(seen, Stripe) else seen
 
@@ -91,7 +91,7 @@ class Frame:
     @property
     def image(self) -> np.ndarray:
         """The image (H, W); raises ImageError if the frame is a centre line."""
-        return image_of(self.seen, f"the frame at {self.time_s:g} s")
+        return require_image(self.seen, f"the frame at {self.time_s:g} s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class FrameTable:
     speed_mm_per_s: np.ndarray
 
     @classmethod
-    def of(cls, header: CaptureHeader, frames: Sequence[Frame]) -> "FrameTable":
+    def from_frames(cls, header: CaptureHeader, frames: Sequence[Frame]) -> "FrameTable":
         """Return the table of frames in memory."""
         none = np.full((4, 4), np.nan)
         return cls(
@@ -316,7 +316,7 @@ class Capture(AbstractContextManager["Capture"]):
         """Return the plan of an unfinished recording, or None."""
         return read_plan(self.file)
 
-    def seen(self, index: int) -> Seen:
+    def read_observation(self, index: int) -> Seen:
         """Return the image (H, W) or centre line of a frame; raises CaptureError if its data are damaged."""
         if not 0 <= index < self._count:
             raise IndexError(f"frame {index} of {self._count}")
@@ -343,12 +343,12 @@ class Capture(AbstractContextManager["Capture"]):
 
     def image(self, index: int) -> np.ndarray:
         """Return the image (H, W) of a frame; raises ImageError for a centre line, CaptureError for damaged data."""
-        return image_of(self.seen(index), f"frame {index} of {self.path.name}")
+        return require_image(self.read_observation(index), f"frame {index} of {self.path.name}")
 
     def __getitem__(self, index: int) -> Frame:
         """Return a frame with its metadata; raises CaptureError if its data are damaged."""
         index = index + self._count if index < 0 else index
-        seen = self.seen(index)
+        seen = self.read_observation(index)
         columns = (self.stage_mm, self.laser_on, self.exposure_ms, self.time_s)
         pose = self.pose[index] if np.isfinite(self.pose[index]).all() else None
         own = None if self.pose_covariance is None else self.pose_covariance[index]
@@ -376,18 +376,18 @@ class Capture(AbstractContextManager["Capture"]):
 
 
 @contextmanager
-def opened_captures(captures: Iterable[Capture | str | Path]) -> Iterator[list[Capture]]:
-    """Open several captures as a context, each as by `opened_capture`."""
+def open_captures(captures: Iterable[Capture | str | Path]) -> Iterator[list[Capture]]:
+    """Open several captures as a context, each as by `open_capture`."""
     with ExitStack() as stack:
-        yield [stack.enter_context(opened_capture(each)) for each in captures]
+        yield [stack.enter_context(open_capture(each)) for each in captures]
 
 
-def opened_capture(capture: Capture | str | Path) -> AbstractContextManager[Capture]:
+def open_capture(capture: Capture | str | Path) -> AbstractContextManager[Capture]:
     """Return a context with a capture: a path is opened and closed, an open capture stays open."""
     return nullcontext(capture) if isinstance(capture, Capture) else Capture(capture)
 
 
-def source_of(capture: Capture) -> CaptureSource:
+def describe_source(capture: Capture) -> CaptureSource:
     """Return name, SHA-256, numbers of images, medium, window and subject of a capture."""
     header, laser = capture.header, int(np.count_nonzero(capture.laser_on))
     medium = header.medium
@@ -395,6 +395,6 @@ def source_of(capture: Capture) -> CaptureSource:
     if medium.kind in ("fresh", "sea"):
         known |= {"temperature_c": medium.temperature_c, "salinity_g_kg": medium.salinity_g_kg}
     known |= {key: thing for key in ("target", "artefact") if (thing := getattr(header, key)) is not None}
-    identity: Table = {"file": capture.path.name, "name": header.name, "sha256": sha256_of(capture.path)}
+    identity: Table = {"file": capture.path.name, "name": header.name, "sha256": hash_file(capture.path)}
     counts: Table = {"lamp_images": len(capture) - laser, "laser_images": laser}
     return CaptureSource.model_validate(identity | counts | known)

@@ -12,12 +12,12 @@ import hdf5plugin
 import numpy as np
 
 from uwlts.errors import CaptureError, ImageError, OutputError
-from uwlts.files.inputs import note_made, refuse_input
-from uwlts.files.json_files import differences
-from uwlts.files.writing import one_writer, refuse_unsuitable
+from uwlts.files.inputs import record_made, refuse_input
+from uwlts.files.json_files import describe_differences
+from uwlts.files.writing import lock_output, refuse_unsuitable
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import CaptureHeader, Table
-from uwlts.model.stripe import ROWS, Stripe, rows_of
+from uwlts.model.stripe import ROWS, Stripe, stack_rows
 from uwlts.storage.capture import (
     COVARIANCE,
     FORMAT,
@@ -91,7 +91,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
         with self._storage(), ExitStack() as claimed:
             refuse_unsuitable(self.path, overwrite=overwrite)
-            claimed.enter_context(one_writer(self.path))
+            claimed.enter_context(lock_output(self.path))
             if not resume:
                 refuse_input(self._part)
             if self._part.exists() and not (resume or overwrite):
@@ -116,7 +116,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         there = _recording_table(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
         kinds = {"lines": bool(self._lines), "moving": self._moving}
         wanted = _recording_table(self.header, self._dtype, self._plan, **kinds)
-        if others := differences(there, wanted):
+        if others := describe_differences(there, wanted):
             unfinished.close()
             raise CaptureError(
                 f"{self._part} belongs to another recording: {others}. Continue with the plan of that one, give "
@@ -244,7 +244,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             values |= {"has_image": not isinstance(frame.seen, Stripe), "encoder": encoder}
             values |= {"speed_mm_per_s": frame.speed_mm_per_s}
         if isinstance(frame.seen, Stripe):
-            kept, seen = "centre_lines", rows_of(frame.seen)
+            kept, seen = "centre_lines", stack_rows(frame.seen)
         else:
             kept, seen = "frames", frame.seen
         if COVARIANCE in self._per_frame:
@@ -298,7 +298,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 _truncate(self._part)
                 refuse_input(self.path)
                 os.replace(self._part, self.path)
-                note_made(self.path)
+                record_made(self.path)
 
 
 def _truncate(path: Path) -> None:

@@ -68,7 +68,7 @@ class PointUncertainty:
         patterns = self.patterns_mm[:, selection]
         return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses, self.shared)
 
-    def by_image_mm(self) -> np.ndarray:
+    def image_errors_mm(self) -> np.ndarray:
         """Return the displacements (1 + K, N, 3) common to an image's points and independent between images."""
         position = self.position_mm[None]
         return position if self.poses_mm is None else np.concatenate([position, self.poses_mm])
@@ -82,8 +82,8 @@ class PointUncertainty:
         result = np.empty((len(self.random_mm2), 3, 3), self.random_mm2.dtype)
         for start in range(0, len(result), _BLOCK):
             some = self[start : start + _BLOCK]
-            pairs = _pairs_of(some.by_image_mm()) + (some.random_mm2 + some.systematic_mm2())
-            result[start : start + _BLOCK] = matrices_of(pairs)
+            pairs = _pairs_of(some.image_errors_mm()) + (some.random_mm2 + some.systematic_mm2())
+            result[start : start + _BLOCK] = expand_covariances(pairs)
         return result
 
     def std_mm(self) -> np.ndarray:
@@ -97,23 +97,23 @@ def _pairs_of(parts_mm: np.ndarray) -> np.ndarray:
     return np.stack([np.einsum("mn,mn->n", axes[i], axes[j]) for i, j in PAIRS], axis=1)
 
 
-def matrices_of(pairs: np.ndarray) -> np.ndarray:
+def expand_covariances(pairs: np.ndarray) -> np.ndarray:
     """Return the symmetric matrices (N, 3, 3) of six numbers each (N, 6), in the order of `PAIRS`."""
     return pairs[:, [PAIRS.index((min(i, j), max(i, j))) for i in range(3) for j in range(3)]].reshape(-1, 3, 3)
 
 
-def turned_pairs(pairs: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+def rotate_covariances(pairs: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Return covariances (N, 6), in the order of `PAIRS`, after rotations (3, 3) or (N, 3, 3)."""
-    matrices = rotations @ matrices_of(pairs) @ np.swapaxes(rotations, -1, -2)
+    matrices = rotations @ expand_covariances(pairs) @ np.swapaxes(rotations, -1, -2)
     return np.stack([matrices[:, i, j] for i, j in PAIRS], axis=1)
 
 
-def images_along(known: PointUncertainty, normals: np.ndarray) -> np.ndarray:
+def project_image_errors(known: PointUncertainty, normals: np.ndarray) -> np.ndarray:
     """Return the displacements (1 + K, N) along normals (N, 3) for one standard deviation of each error of an image."""
-    return np.einsum("kni,ni->kn", known.by_image_mm(), normals)
+    return np.einsum("kni,ni->kn", known.image_errors_mm(), normals)
 
 
-def variance_along(pairs: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def project_variance(pairs: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return the variance (N,) along unit directions (N, 3) for covariances (N, 6) in the order of `PAIRS`."""
     parts = [(1 if i == j else 2) * directions[:, i] * directions[:, j] for i, j in PAIRS]
     return np.einsum("ni,in->n", pairs, np.stack(parts))
@@ -205,7 +205,7 @@ class PointCloud(Brief):
         """
         self.writer(path, self, overwrite=overwrite)
 
-    def selected(self, selection: slice | np.ndarray) -> "PointCloud":
+    def select(self, selection: slice | np.ndarray) -> "PointCloud":
         """Return the cloud of selected points, by a slice, indices or a mask."""
         known, deviation = self.uncertainty, self.deviation_mm
         return PointCloud(
@@ -222,7 +222,7 @@ class PointCloud(Brief):
         return None if self.uncertainty is None else self.uncertainty.covariance_mm2()
 
 
-def cloud_of(
+def make_foreign_cloud(
     points_mm: np.ndarray,
     *,
     intensity: np.ndarray | None = None,
@@ -243,7 +243,7 @@ def cloud_of(
     )
 
 
-def joined(parts: Sequence[PointCloud]) -> PointCloud:
+def concatenate_clouds(parts: Sequence[PointCloud]) -> PointCloud:
     """Concatenate the parts of one cloud."""
     known = [part.uncertainty for part in parts if part.uncertainty is not None]
     poses = [each.poses_mm for each in known if each.poses_mm is not None]

@@ -15,10 +15,19 @@ from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import opened, parsed_json, require_regular_file, shortened
-from uwlts.files.writing import refuse_unsuitable, require_ending, written_aside
+from uwlts.files.reading import open_regular, parse_json, require_regular_file, shorten
+from uwlts.files.writing import refuse_unsuitable, require_ending, write_atomically
 from uwlts.model.sensor import Description, Table
-from uwlts.storage.cloud import KINDS, NO_INDEX, PAIRS, PER_POINT, PointCloud, PointUncertainty, joined, metadata_json
+from uwlts.storage.cloud import (
+    KINDS,
+    NO_INDEX,
+    PAIRS,
+    PER_POINT,
+    PointCloud,
+    PointUncertainty,
+    concatenate_clouds,
+    metadata_json,
+)
 from uwlts.storage.copc_file import is_copc, read_copc
 from uwlts.storage.foreign_clouds import (
     FOREIGN_FORMATS,
@@ -27,7 +36,7 @@ from uwlts.storage.foreign_clouds import (
     require_libraries,
     write_foreign,
 )
-from uwlts.storage.hdf5_file import DAMAGE, find_dataset, format_of, read_array, read_label, write_label
+from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
 
 FORMAT = "uwlts-cloud"
 VERSION = 1
@@ -123,7 +132,7 @@ def write_ply_points(
     for name, values in columns.items():
         vertices[name] = values
     ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=list(comments))
-    with written_aside(path, overwrite=overwrite) as aside:
+    with write_atomically(path, overwrite=overwrite) as aside:
         ply.write(str(aside))
 
 
@@ -156,7 +165,7 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
     return read_thinned_cloud(path)[0]
 
 
-def loaded_cloud(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
+def load_cloud(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
     """Return a cloud unchanged, or read it from a file; raises the errors of `read_cloud`."""
     return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
 
@@ -171,7 +180,7 @@ def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None)
             return read_copc(path, at_most=at_most)
         if _is_foreign(path):
             whole = read_foreign(Path(path))
-            return whole.selected(_every(len(whole), at_most)), len(whole)
+            return whole.select(_every(len(whole), at_most)), len(whole)
         return _read_rows(Path(path), lambda count: _every(count, at_most))
 
 
@@ -189,21 +198,21 @@ def read_region(
         with _naming(path):
             return read_copc(path, box_mm=(low, high), at_most=at_most)[0]
     found = [
-        part.selected(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
-        for part in cloud_parts(path)
+        part.select(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
+        for part in read_parts(path)
     ]
-    whole = joined(found)
-    return whole.selected(_every(len(whole), at_most))
+    whole = concatenate_clouds(found)
+    return whole.select(_every(len(whole), at_most))
 
 
-def cloud_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Iterator[PointCloud]:
+def read_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Iterator[PointCloud]:
     """Read a cloud's file in parts of at most ``most`` points, in order.
 
     For HDF5 and binary PLY only one part is held in memory.
     """
     if is_copc(path) or _is_foreign(path):
         whole = read_cloud(path)
-        yield from (whole.selected(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
+        yield from (whole.select(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
         return
     start, total = 0, 1
     while start < total:
@@ -229,7 +238,7 @@ def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
 def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     """Read selected rows of a file, and the number of all; ``rows`` selects them by that number."""
     if path.suffix.lower() not in (".ply", ".h5"):
-        with opened(path, called="cloud") as file:
+        with open_regular(path, called="cloud") as file:
             if not file.read(4).startswith(b"ply"):
                 raise CaptureError(f"{path} ends with none of {', '.join(CLOUD_ENDINGS)}, the formats of clouds")
     return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
@@ -243,7 +252,7 @@ def _every(count: int, at_most: int | None) -> slice:
 def is_cloud(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is a cloud, by its ending, or by its label if captures have the same ending."""
     if _in_hdf5(path):
-        return format_of(Path(path)) == FORMAT
+        return read_format(Path(path)) == FORMAT
     return is_copc(path) or Path(path).suffix.lower() in _CLOUDS_ALONE
 
 
@@ -321,7 +330,7 @@ def _metadata(comments: list[str]) -> Table:
     if [piece and piece.groups()[:2] for piece in pieces] != wanted:
         raise CaptureError("its metadata is incomplete; write the file again or remove those comments")
     try:
-        metadata = parsed_json("".join(piece.group(3) for piece in pieces if piece))
+        metadata = parse_json("".join(piece.group(3) for piece in pieces if piece))
     except ValueError as error:
         raise CaptureError(f"its metadata is damaged: {error}") from error
     if not isinstance(metadata, dict):
@@ -387,7 +396,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
 
 def require_ply_size(path: Path, *, called: str) -> None:
     """Raise CaptureError if a PLY file is shorter than its header declares; the reader finds other faults."""
-    with opened(path, called=called) as file:
+    with open_regular(path, called=called) as file:
         start, size = file.read(_LONGEST_PLY_HEADER), os.fstat(file.fileno()).st_size
     header, end, _ = start.partition(b"end_header")
     if not end:
@@ -398,7 +407,7 @@ def require_ply_size(path: Path, *, called: str) -> None:
             case ["element", _, number] if number.isdecimal() and len(number) <= 18:
                 count = int(number)
             case ["element", *_]:
-                raise CaptureError(f"{path} is not a complete PLY file: {shortened(repr(line))} is not an element")
+                raise CaptureError(f"{path} is not a complete PLY file: {shorten(repr(line))} is not an element")
             case ["property", kind, *_]:
                 # In text a number takes at least a digit and a separator; a list takes at least its length.
                 least += count * (2 if in_text else _TYPE_BYTES.get(kind, 1))
@@ -430,7 +439,7 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
         write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
         for name, data in arrays.items():
             file.create_dataset(name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True)
-    with written_aside(path, overwrite=overwrite) as aside:
+    with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_bytes(content.getbuffer())
 
 

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import opened
-from uwlts.files.writing import written_aside
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.storage.cloud import PointCloud, cloud_of
+from uwlts.files.reading import open_regular
+from uwlts.files.writing import write_atomically
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.storage.cloud import PointCloud, make_foreign_cloud
 from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, las_middle, load_library, shorten_error
 
 SUFFIX = ".copc.laz"
@@ -58,7 +58,7 @@ class _Sorter:
         """Assign the records of one node to another."""
         self.runs.setdefault(into, []).extend(self.runs.pop(node))
 
-    def read(self, node: int) -> np.ndarray:
+    def read_node(self, node: int) -> np.ndarray:
         """Read all records of a node."""
         parts = []
         for start, count in self.runs[node]:
@@ -72,7 +72,7 @@ def write_copc(
     parts: Callable[[], Iterable[PointCloud]],
     *,
     overwrite: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> int:
     """Write the parts of a cloud as COPC, completely or not at all, and return the number of points.
 
@@ -97,7 +97,7 @@ def write_copc(
     depth = int(np.clip(np.ceil(np.log(max(0.75 * total / _POINTS_OF_NODE, 1)) / np.log(4)), 0, _DEEPEST))
     share = np.cumsum(4.0 ** np.arange(depth + 1)) / np.sum(4.0 ** np.arange(depth + 1))
     shape, rng, done = (depth + 1,) + (2**depth,) * 3, np.random.default_rng(0), 0
-    with written_aside(path, overwrite=overwrite) as aside, tempfile.TemporaryFile(dir=aside.parent) as file:
+    with write_atomically(path, overwrite=overwrite) as aside, tempfile.TemporaryFile(dir=aside.parent) as file:
         header = _header(middle)
         kind = header.point_format.dtype()
         sorter = _Sorter(file, kind)
@@ -118,7 +118,7 @@ def write_copc(
                 sorter.merge(node, above)
         writer = _writer(copc, header, aside, low=1e-3 * low, high=1e-3 * high, centre=centre, half=half)
         for node in sorted(sorter.runs):
-            table = sorter.read(node)
+            table = sorter.read_node(node)
             key = [int(n) for n in np.unravel_index(node, shape)]
             writer.AddNode(copc.VoxelKey(*key), copc.VectorChar(table.view(np.int8).ravel()))
             done += len(table)
@@ -181,7 +181,7 @@ def read_copc(
     """
     laspy, path = load_library("laspy", "COPC"), Path(path)
     try:
-        with opened(path, called="cloud") as file:
+        with open_regular(path, called="cloud") as file:
             reader = laspy.CopcReader(file)
             total = int(reader.header.point_count)
             box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
@@ -192,7 +192,7 @@ def read_copc(
     intensity = columns.pop("amplitude", found["intensity"])
     if np.isnan(columns.get("deviation_mm", np.nan)).all():
         columns.pop("deviation_mm", None)
-    return cloud_of(1e3 * np.column_stack([found.x, found.y, found.z]), intensity=intensity, **columns), total
+    return make_foreign_cloud(1e3 * np.column_stack([found.x, found.y, found.z]), intensity=intensity, **columns), total
 
 
 def _query(reader: Any, box: Any, at_most: int | None) -> Any:

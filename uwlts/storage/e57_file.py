@@ -11,7 +11,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import require_regular_file
-from uwlts.storage.cloud import PointCloud, cloud_of
+from uwlts.storage.cloud import PointCloud, make_foreign_cloud
 from uwlts.storage.las_file import load_library, shorten_error
 
 PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"
@@ -128,7 +128,7 @@ def read_e57(path: Path) -> PointCloud:
     points = 1e3 * np.concatenate([np.column_stack([scan[f"cartesian{axis}"] for axis in "XYZ"]) for scan in scans])
     lit = all("intensity" in scan for scan in scans)
     timed = all(scan["time_s"] is not None for scan in scans)
-    return cloud_of(
+    return make_foreign_cloud(
         points,
         intensity=np.concatenate([scan["intensity"] for scan in scans]) if lit else None,
         time_s=np.concatenate([scan["time_s"] for scan in scans]) if timed else None,

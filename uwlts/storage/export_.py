@@ -12,17 +12,17 @@ import numpy as np
 import tomli_w
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import require_possible_name
-from uwlts.model.stripe import rows_of
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.model.stripe import stack_rows
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import (
     CLOUD_FORMATS,
-    cloud_parts,
     is_cloud,
     read_cloud,
+    read_parts,
     read_region,
     read_thinned_cloud,
     refuse_unsuitable_cloud,
@@ -39,7 +39,7 @@ _COLUMNS = ("file", "light", "stage_mm", "exposure_ms", "time_s")
 Corner = tuple[float, float, float]
 
 
-@inputs_kept()
+@protect_inputs()
 def export(
     file: str | Path,
     out: str | Path,
@@ -48,7 +48,7 @@ def export(
     region_mm: tuple[Corner, Corner] | None = None,
     at_most: int | None = None,
     overwrite: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> int:
     """Write a capture as a folder of images that uwlts import reads back, or a cloud in another format.
 
@@ -93,7 +93,7 @@ def export(
         _write(cloud, out, overwrite=overwrite)
         return len(cloud)
     if is_cloud(file) and is_copc(out):
-        return write_copc(out, lambda: cloud_parts(file), overwrite=overwrite, progress=progress)
+        return write_copc(out, lambda: read_parts(file), overwrite=overwrite, progress=progress)
     if is_cloud(file):
         cloud = read_cloud(file)
         _write(cloud, out, overwrite=overwrite)
@@ -119,7 +119,7 @@ def export_capture(
     folder: Path,
     *,
     image_format: Literal["png", "tiff"] = "png",
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> None:
     """Write a capture's frames without loss as images of the same depth into a new folder, completely or not at all.
 
@@ -143,7 +143,7 @@ def export_capture(
             light = "laser" if frame.laser_on else "lamp"
             if isinstance(frame.seen, Stripe):
                 name = f"{index:05d}-{light}.npy"
-                np.save(aside / name, rows_of(frame.seen)[None])
+                np.save(aside / name, stack_rows(frame.seen)[None])
             else:
                 name = f"{index:05d}-{light}.{image_format}"
                 _, encoded = cv2.imencode(f".{image_format}", frame.seen)

@@ -6,11 +6,11 @@ from typing import Literal
 import numpy as np
 
 from uwlts.errors import CaptureError, DescriptionError, OutputError
-from uwlts.files.writing import written_aside
-from uwlts.storage.cloud import PointCloud, cloud_of
+from uwlts.files.writing import write_atomically
+from uwlts.storage.cloud import PointCloud, make_foreign_cloud
 from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
-from uwlts.storage.las_file import las_content, load_library, read_las
+from uwlts.storage.las_file import encode_las, load_library, read_las
 from uwlts.storage.mcap_clouds import covariance_columns, mcap_content
 from uwlts.storage.pose_files import read_columns
 
@@ -50,7 +50,7 @@ def _read_text(path: Path) -> PointCloud:
     points = np.column_stack(axes)
     seen = np.isfinite(points).all(axis=1)
     intensity = columns.get("intensity")
-    return cloud_of(points[seen], intensity=None if intensity is None else intensity[seen])
+    return make_foreign_cloud(points[seen], intensity=None if intensity is None else intensity[seen])
 
 
 def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np.ndarray | None = None) -> None:
@@ -64,7 +64,7 @@ def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np
     if is_copc(path):
         write_copc(path, lambda: [cloud], overwrite=overwrite)
         return
-    with written_aside(path, overwrite=overwrite) as aside:
+    with write_atomically(path, overwrite=overwrite) as aside:
         match path.suffix.lower():
             case ".xyz":
                 rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
@@ -77,7 +77,7 @@ def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np
                 if cloud.deviation_mm is not None:
                     fields["deviation_mm"] = cloud.deviation_mm
                 fields |= covariance_columns(cloud)
-                content = las_content(
+                content = encode_las(
                     cloud.points_mm,
                     cloud.intensity,
                     fields,

@@ -14,8 +14,8 @@ import h5py
 import numpy as np
 
 from uwlts.errors import CaptureError, Error
-from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parsed_json
-from uwlts.model.library import validated
+from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json
+from uwlts.model.library import validate_description
 from uwlts.model.sensor import Description, Table
 
 AnyHeader = TypeVar("AnyHeader", bound=Description)
@@ -55,11 +55,11 @@ def read_label(file: h5py.File, model: type[AnyHeader], *, path: str | Path, for
     if (header := _text(file, "header")) is None:
         raise CaptureError(f"{path} is damaged: its header is missing")
     try:
-        content = parsed_json(header)
+        content = parse_json(header)
     except ValueError as error:
         raise CaptureError(f"{path} is damaged: its header is not JSON: {error}") from error
     try:
-        return validated(model, content, f"the header of {path}")
+        return validate_description(model, content, f"the header of {path}")
     except Error as error:
         raise CaptureError(str(error)) from error
 
@@ -74,7 +74,7 @@ def read_plan(file: h5py.File) -> Table | None:
     if (text := _text(file, "plan")) is None:
         return None
     try:
-        plan = parsed_json(text)
+        plan = parse_json(text)
     except ValueError as error:
         raise CaptureError(f"{file.filename} is damaged: its plan is not JSON: {error}") from error
     if not isinstance(plan, dict):
@@ -90,7 +90,7 @@ def forget_plan(path: str | Path) -> None:
         del file.attrs["plan"]
 
 
-def format_of(path: str | Path) -> str | None:
+def read_format(path: str | Path) -> str | None:
     """Return the format in an HDF5 file's label; None if the file cannot be opened or has no label."""
     if not is_regular_file(path):
         return None

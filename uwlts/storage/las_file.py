@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import opened
+from uwlts.files.reading import open_regular
 from uwlts.runtime.optional_library import optional_library
-from uwlts.storage.cloud import PointCloud, cloud_of
+from uwlts.storage.cloud import PointCloud, make_foreign_cloud
 
 LAZ_STEP_M = 1e-7
 """Resolution of coordinates in LAZ, integers relative to the middle of the cloud: up to 214 m to either side."""
@@ -27,7 +27,7 @@ _RECORD = 54
 """Smallest size of such a record in bytes: its header (LAS 1.4, 2.5)."""
 
 
-def las_content(
+def encode_las(
     points_mm: np.ndarray,
     intensity: np.ndarray,
     fields: dict[str, np.ndarray],
@@ -80,7 +80,7 @@ def las_middle(low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
 def read_las(path: Path) -> PointCloud:
     """Read all points of a LAS file; raises CaptureError if it is damaged or compressed, SetupError without laspy."""
     laspy = load_library("laspy", "LAS")
-    with opened(path, called="cloud") as file:
+    with open_regular(path, called="cloud") as file:
         start = file.read(_START)
     try:
         # The library reads as many records before the points as the header declares, without a limit.
@@ -109,7 +109,9 @@ def read_las(path: Path) -> PointCloud:
         raise CaptureError(f"{path} is not a complete LAS file: {shorten_error(error)}") from error
     times = column.pop("gps_time", None)
     # Programs write 0 if times are unknown.
-    return cloud_of(points, intensity=intensity, time_s=None if times is None or not times.any() else times, **column)
+    return make_foreign_cloud(
+        points, intensity=intensity, time_s=None if times is None or not times.any() else times, **column
+    )
 
 
 def load_library(name: Literal["laspy", "lazrs", "copclib", "pye57"], format: str) -> ModuleType:

@@ -13,8 +13,8 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import opened, require_regular_file
-from uwlts.files.writing import written_aside
+from uwlts.files.reading import open_regular, require_regular_file
+from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.storage.cloud_files import require_ply_size
@@ -99,11 +99,11 @@ class SurfaceMesh(Brief):
         path = Path(path)
         match path.suffix.lower():
             case ".ply":
-                with written_aside(path, overwrite=overwrite) as aside:
+                with write_atomically(path, overwrite=overwrite) as aside:
                     _ply(self).write(str(aside))
             case ".stl" | ".glb":
                 content = _stl(self) if path.suffix.lower() == ".stl" else _glb(self)
-                with written_aside(path, overwrite=overwrite) as aside:
+                with write_atomically(path, overwrite=overwrite) as aside:
                     aside.write_bytes(content)
             case _:
                 raise OutputError(
@@ -113,7 +113,7 @@ class SurfaceMesh(Brief):
 
 def has_faces(path: Path) -> bool:
     """Return whether a PLY file contains a mesh rather than a cloud, by its header."""
-    with opened(path, called="mesh or cloud") as file:
+    with open_regular(path, called="mesh or cloud") as file:
         header = file.read(2**20).partition(b"end_header")[0]
     found = re.search(rb"^element +face +0*[1-9]", header, flags=re.MULTILINE)
     return header.startswith(b"ply") and found is not None

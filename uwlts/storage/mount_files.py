@@ -9,8 +9,8 @@ import numpy as np
 
 from uwlts.errors import DescriptionError
 from uwlts.files.json_files import read_model
-from uwlts.files.writing import sha256_of
-from uwlts.model.library import read_table, validated
+from uwlts.files.writing import hash_file
+from uwlts.model.library import read_table, validate_description
 from uwlts.model.mount import FORMAT, VERSION, Mount
 from uwlts.model.sensor import Description, Positive
 from uwlts.storage.cloud_files import is_cloud, read_cloud
@@ -19,12 +19,12 @@ from uwlts.storage.pose_files import (
     FARTHEST_MM,
     MM_PER_UNIT,
     Unit,
-    checked_matrices,
-    checked_unit,
-    matrices_of,
+    check_matrices,
+    check_unit,
     pose_rows,
+    poses_from_rows,
     read_columns,
-    scaled,
+    scale_positions,
 )
 
 Artefact = Literal["sphere", "plane", "step", "ring"]
@@ -101,7 +101,7 @@ def read_mount_evidence(
         path = Path(profiles)
         if poses is not None:
             raise DescriptionError(f"{path} names the poses already: leave the other ones out")
-        given = validated(MountDescription, read_table(path), path)
+        given = validate_description(MountDescription, read_table(path), path)
         profiles, poses = path.parent / given.profiles, path.parent / given.poses
         artefact, radius_mm, height_mm = given.artefact, given.radius_mm, given.height_mm
         pose_format = given.pose_format
@@ -120,10 +120,10 @@ def read_mount_evidence(
         profile_times_s = times if profile_times_s is None else profile_times_s
     if isinstance(poses, str | Path):
         rows, times = pose_rows(Path(poses), digests)
-        poses = scaled(matrices_of(rows, pose_format, Path(poses)), pose_unit)
+        poses = scale_positions(poses_from_rows(rows, pose_format, Path(poses)), pose_unit)
         pose_times_s = times if pose_times_s is None else pose_times_s
     checked = [_checked_profile(profile, number) for number, profile in enumerate(profiles)]
-    matrices = checked_matrices(np.asarray(poses, dtype=np.float64), "poses")
+    matrices = check_matrices(np.asarray(poses, dtype=np.float64), "poses")
     if axis is not None:
         if artefact != "sphere" or scale:
             raise DescriptionError(
@@ -207,7 +207,7 @@ def read_profiles(
     frame n. Raises DescriptionError for anything else.
     """
     path, digests = Path(path), {} if digests is None else digests
-    scale = MM_PER_UNIT[checked_unit(unit)]
+    scale = MM_PER_UNIT[check_unit(unit)]
     if path.is_dir():
         files = sorted(
             (each for each in path.iterdir() if each.suffix.lower() == ".csv"), key=lambda p: natural_key(p.name)
@@ -221,7 +221,7 @@ def read_profiles(
             profiles.append(_points_of(columns, file) * scale)
             times.append(_one_time(columns))
     elif path.suffix.lower() in (".ply", ".h5") and is_cloud(path):
-        digests[path.name] = sha256_of(path)
+        digests[path.name] = hash_file(path)
         cloud = read_cloud(path)
         frames = np.unique(cloud.frame)
         return [str(frame) for frame in frames], [cloud.points_mm[cloud.frame == frame] for frame in frames], None

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import read_bytes
-from uwlts.files.writing import sha256_of, written_aside
+from uwlts.files.writing import hash_file, write_atomically
 from uwlts.model.calibration import is_rigid
 from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
 from uwlts.storage.ros_bags import read_bag_poses
@@ -32,7 +32,7 @@ _FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, eu
 _MOST_POSES = 20_000
 
 
-def checked_unit(unit: Unit) -> Unit:
+def check_unit(unit: Unit) -> Unit:
     if unit not in get_args(Unit):
         raise DescriptionError(f"the unit is {unit!r}; expected mm or m")
     return unit
@@ -48,7 +48,7 @@ def read_columns(path: Path, digests: dict[str, str], *, named: bool = True) -> 
     names, two columns are x and z, and others are numbered.
     """
     content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
-    digests[path.name] = sha256_of(path)
+    digests[path.name] = hash_file(path)
     lines = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").split(b"\n")
     lines = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
     if not lines:
@@ -107,7 +107,7 @@ def read_poses(
     """
     path = Path(path)
     rows, times = pose_rows(path, {})
-    return scaled(matrices_of(rows, pose_format, path), unit), times
+    return scale_positions(poses_from_rows(rows, pose_format, path), unit), times
 
 
 def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit = "mm") -> Trajectory:
@@ -128,9 +128,11 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
         if covariance is not None:
             units = np.array([1e3] * 3 + [1.0] * 3)
             covariance = covariance * units[:, None] * units
-        return _trajectory(path, times, scaled(matrices_of(rows, "quaternion-xyzw", path), "m"), covariance)
+        return _trajectory(
+            path, times, scale_positions(poses_from_rows(rows, "quaternion-xyzw", path), "m"), covariance
+        )
     columns = read_columns(path, {}, named=False)
-    covariance = _covariances(columns, path, MM_PER_UNIT[checked_unit(unit)])
+    covariance = _covariances(columns, path, MM_PER_UNIT[check_unit(unit)])
     rows, times = _rows_of(columns, path)
     if pose_format == "tum":
         if rows.shape[1] != 8:
@@ -138,7 +140,7 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
         times, rows, pose_format, unit = rows[:, 0], rows[:, 1:], "quaternion-xyzw", "m"
     if times is None:
         raise DescriptionError(f"{path} has no column time_s: a trajectory needs the time of each pose")
-    return _trajectory(path, times, scaled(matrices_of(rows, pose_format, path), unit), covariance)
+    return _trajectory(path, times, scale_positions(poses_from_rows(rows, pose_format, path), unit), covariance)
 
 
 def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False) -> None:
@@ -149,7 +151,7 @@ def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False)
     """
     names = [f"m{row}{column}" for row in range(3) for column in range(4)]
     rows = np.asarray(poses, dtype=np.float64)[:, :3].reshape(-1, 12)
-    with written_aside(path, overwrite=overwrite) as aside:
+    with write_atomically(path, overwrite=overwrite) as aside:
         lines = [",".join(names), *(",".join(map(repr, row)) for row in rows.tolist())]
         aside.write_text("\n".join(lines) + "\n", encoding="ascii")
 
@@ -199,12 +201,12 @@ def _rows_of(columns: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np
     return rows, times
 
 
-def scaled(matrices: np.ndarray, unit: Unit) -> np.ndarray:
-    matrices[:, :3, 3] *= MM_PER_UNIT[checked_unit(unit)]
+def scale_positions(matrices: np.ndarray, unit: Unit) -> np.ndarray:
+    matrices[:, :3, 3] *= MM_PER_UNIT[check_unit(unit)]
     return matrices
 
 
-def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
+def poses_from_rows(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
     euler = _EULER.fullmatch(pose_format)
     counts = {
         "matrix": (12, 16),
@@ -226,7 +228,7 @@ def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
     result = np.tile(np.eye(4), (len(rows), 1, 1))
     if pose_format == "matrix":
         result[:, : rows.shape[1] // 4] = rows.reshape(len(rows), -1, 4)
-        return checked_matrices(result, path)
+        return check_matrices(result, path)
     if pose_format.startswith("angle"):
         # The object turns with the table; relative to it, the sensor turns in the opposite direction.
         angles = rows[:, 0] if pose_format.endswith("rad") else np.radians(rows[:, 0])
@@ -252,7 +254,7 @@ def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
     return result
 
 
-def checked_matrices(matrices: np.ndarray, source: object) -> np.ndarray:
+def check_matrices(matrices: np.ndarray, source: object) -> np.ndarray:
     """Return rigid matrices (P, 4, 4) with exact rotations; raises DescriptionError if they are not rigid."""
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
         raise DescriptionError(f"{source}: the poses have the shape {matrices.shape}; expected (P, 4, 4)")

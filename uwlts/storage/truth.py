@@ -9,7 +9,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_regular_file
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Description, Medium, Sensor, Table
 from uwlts.storage.hdf5_file import DAMAGE, read_array, read_label, write_label
@@ -64,7 +64,7 @@ def truth_path(capture: str | Path) -> Path:
 def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrite: bool = False) -> None:
     """Write a truth file completely or not at all; raises OutputError if that fails."""
     # HDF5's latest format protects all its metadata by checksums.
-    with written_aside(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
+    with write_atomically(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
         write_label(file, format=FORMAT, version=VERSION, header=header)
         for name, values in vars(truth).items():
             if values is None:

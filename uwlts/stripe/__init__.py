@@ -9,8 +9,8 @@ processes all laser images of a capture and explains missing stripes.
 """
 
 from uwlts.model.stripe import CaptureStripes, Stripe, StripeCandidates, StripeStatus
-from uwlts.stripe.capture_stripes import find_stripes, why_no_stripe
-from uwlts.stripe.extract import extract_candidates, extract_stripe, stripe_in, warm_up
+from uwlts.stripe.capture_stripes import explain_missing_stripe, find_stripes
+from uwlts.stripe.extract import extract_candidates, extract_stripe, find_stripe, warm_up
 from uwlts.stripe.methods import method_names
 from uwlts.stripe.options import PeakRule, StripeOptions, StripeSettings
 
@@ -22,11 +22,11 @@ __all__ = [
     "StripeOptions",
     "StripeSettings",
     "StripeStatus",
+    "explain_missing_stripe",
     "extract_candidates",
     "extract_stripe",
+    "find_stripe",
     "find_stripes",
     "method_names",
-    "stripe_in",
     "warm_up",
-    "why_no_stripe",
 ]

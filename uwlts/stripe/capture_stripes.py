@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError, ImageError
 from uwlts.model.stripe import CaptureStripes, StripeStatus
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.stripe.exposures import BracketImages, fuse_brackets
 from uwlts.stripe.extract import direct_stripe_in, extract_stripe
 from uwlts.stripe.options import StripeOptions, StripeSettings
@@ -28,7 +28,7 @@ side has a ratio of about 0.2, from its steep places."""
 
 
 def find_stripes(
-    capture: BracketImages, *, options: StripeSettings = None, progress: ProgressListener = unheard
+    capture: BracketImages, *, options: StripeSettings = None, progress: ProgressListener = ignore_progress
 ) -> CaptureStripes:
     """Find the stripe in all laser images of a recording, such as an open `uwlts.storage.capture.Capture`.
 
@@ -53,7 +53,7 @@ def find_stripes(
         The recording contains no laser image, or no laser image shows a stripe.
     """
     along, full_dn = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
-    chosen = StripeOptions.of(capture.header.sensor, options)
+    chosen = StripeOptions.resolve(capture.header.sensor, options)
     found: list[tuple[np.ndarray, ...]] = []
     numbers: list[int] = []
 
@@ -78,7 +78,7 @@ def find_stripes(
                 "camera's threshold low enough, the object in view?"
             )
         lit = (capture.image(number) for number in np.flatnonzero(capture.laser_on).tolist())
-        reason = why_no_stripe(lit, stripe_along=along, full_dn=full_dn)
+        reason = explain_missing_stripe(lit, stripe_along=along, full_dn=full_dn)
         raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")
     frame = np.repeat(numbers, [len(good) for _, good, *_ in found])
     return CaptureStripes(frame, *columns, lines_by_status=by_status)
@@ -89,12 +89,12 @@ def is_black(image: np.ndarray, full_dn: float) -> bool:
     return bool(cv2.medianBlur(image, 3).max() < BLACK * full_dn)
 
 
-def white_share(image: np.ndarray, full_dn: float) -> float:
+def measure_clipped_share(image: np.ndarray, full_dn: float) -> float:
     """Return the fraction of clipped pixels of an image (H, W)."""
     return float(np.mean(image >= full_dn))
 
 
-def shown_stripe(image: np.ndarray, *, stripe_along: str) -> Literal["along", "across"] | None:
+def find_stripe_direction(image: np.ndarray, *, stripe_along: str) -> Literal["along", "across"] | None:
     """Return the direction of the stripes in an image (H, W): along the given side, across it, or None."""
     along = _lines_with_stripe(image, stripe_along)
     across = _lines_with_stripe(image, "height" if stripe_along == "width" else "width")
@@ -103,17 +103,17 @@ def shown_stripe(image: np.ndarray, *, stripe_along: str) -> Literal["along", "a
     return "along" if along >= FEWEST_LINES else None
 
 
-def why_no_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: int) -> str:
+def explain_missing_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: int) -> str:
     """Return the reason why images (H, W) show no stripe, and advice; pixels clip at ``full_dn``."""
     count = black = white = across = 0
     for image in images:
         count += 1
         if is_black(image, full_dn):
             black += 1
-        elif white_share(image, full_dn) > WHITE:
+        elif measure_clipped_share(image, full_dn) > WHITE:
             white += 1
         else:
-            across += shown_stripe(image, stripe_along=stripe_along) == "across"
+            across += find_stripe_direction(image, stripe_along=stripe_along) == "across"
 
     def count_of(some: int) -> str:
         return "all are" if some == count else f"{some} of {count} are"

@@ -104,7 +104,7 @@ def direct_stripe(
     status = stripe.status.copy()
     status[line], status[line[taken]] = StripeStatus.AMBIGUOUS, StripeStatus.OK
     found = line[taken], centre[taken], amplitude[taken], width[taken]
-    return Stripe.on_lines(*found, status=status, stripe_along=stripe.stripe_along)
+    return Stripe.from_lines(*found, status=status, stripe_along=stripe.stripe_along)
 
 
 def _path_margins(

@@ -83,7 +83,7 @@ class BracketImages(Protocol):
     @property
     def has_image(self) -> np.ndarray: ...
 
-    def seen(self, index: int) -> np.ndarray | Stripe: ...
+    def read_observation(self, index: int) -> np.ndarray | Stripe: ...
 
     def image(self, index: int) -> np.ndarray: ...
 
@@ -120,19 +120,21 @@ def group_brackets(capture: BracketImages) -> list[np.ndarray]:
 def fuse_brackets(capture: BracketImages) -> Iterator[tuple[int, np.ndarray | Stripe, float]]:
     """Yield number, image (H, W) and grey value of saturation for each place with the laser on.
 
-    A single image or centre line is returned unchanged. A bracket gives its `fused` image with the number of the
-    longest exposure.
+    A single image or centre line is returned unchanged. A bracket gives its `fuse_exposures` image with the number of
+    the longest exposure.
     """
     full_dn = float(capture.header.saturation_dn)
     for numbers in group_brackets(capture):
         if len(numbers) == 1:
-            yield int(numbers[0]), capture.seen(int(numbers[0])), full_dn
+            yield int(numbers[0]), capture.read_observation(int(numbers[0])), full_dn
         else:
             images = [capture.image(number) for number in numbers.tolist()]
-            yield int(numbers[-1]), *fused(images, capture.exposure_ms[numbers], full_dn=full_dn)
+            yield int(numbers[-1]), *fuse_exposures(images, capture.exposure_ms[numbers], full_dn=full_dn)
 
 
-def fused(images: Sequence[np.ndarray], exposure_ms: np.ndarray, *, full_dn: float) -> tuple[np.ndarray, float]:
+def fuse_exposures(
+    images: Sequence[np.ndarray], exposure_ms: np.ndarray, *, full_dn: float
+) -> tuple[np.ndarray, float]:
     """Fuse K images (H, W) of one place, and return the float32 image and its grey value of saturation.
 
     ``exposure_ms`` (K,) is increasing. A pixel with grey value y at exposure t corresponds to o + (y - o) T / t at the

@@ -116,7 +116,7 @@ def extract_candidates(
     return found.find_candidates(np.arange(len(found.stripe.status)))
 
 
-def stripe_in(
+def find_stripe(
     seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions = StripeOptions(), saturation: float | None
 ) -> Stripe:
     """Return the stripe of an image (`extract_stripe`) or of a 3D camera's centre line, without its ends.
@@ -131,9 +131,9 @@ def stripe_in(
 def direct_stripe_in(
     seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions, saturation: float
 ) -> Stripe:
-    """Return the stripe as `stripe_in`, under the rule `PeakRule.DIRECT` without reflections."""
+    """Return the stripe as `find_stripe`, under the rule `PeakRule.DIRECT` without reflections."""
     if isinstance(seen, Stripe) or options.peak is not PeakRule.DIRECT:
-        return stripe_in(seen, stripe_along=stripe_along, options=options, saturation=saturation)
+        return find_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
     found = _search_image(seen, stripe_along, options, None, saturation)
     stripe, rivals = found.stripe, found.find_rivals()
     if rivals is not None:
@@ -165,7 +165,7 @@ def leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
     beside = np.zeros(len(found) + 2 * lines, np.bool_)
     for each in breaks:
         beside[each : each + 2 * lines] = True
-    return stripe.without(found[beside[lines : lines + len(found)]], StripeStatus.END)
+    return stripe.remove_lines(found[beside[lines : lines + len(found)]], StripeStatus.END)
 
 
 def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOptions()) -> None:
@@ -225,7 +225,7 @@ def _search_image(
     # A wider window is used only if it measures the wide stripes.
     wider, widest = options, min(options.widest_window_px, length // 4)
     while found.is_too_wide() and 2 * wider.half_window_px <= widest:
-        wider = wider.doubled()
+        wider = wider.double_width()
         found_wider = _search_profiles(profiles, wider, clip, stripe_along)
         if not found_wider.is_too_wide():
             found = found_wider
@@ -237,7 +237,7 @@ def _search_image(
             _, low = block_extremes(_as_profiles(image, stripe_along=stripe_along), found.options.half_window_px // 2)
             white = low.max(axis=0) >= clip
         if (none & white).any():
-            found = replace(found, stripe=found.stripe.without(none & white, StripeStatus.SATURATED))
+            found = replace(found, stripe=found.stripe.remove_lines(none & white, StripeStatus.SATURATED))
     return found
 
 
@@ -335,7 +335,7 @@ def _search_profiles(profiles: np.ndarray, options: StripeOptions, clip: float, 
     white = low.max(axis=0) >= clip if low.max() >= clip else np.zeros(len(status), np.bool_)
     centre, amplitude = place_centre(options.method, peak)
     columns = peak.start + centre.astype(np.float64), amplitude, peak.sigma * FWHM_PER_SIGMA
-    stripe = Stripe.on_lines(np.flatnonzero(status == _OK), *columns, status=status, stripe_along=along)
+    stripe = Stripe.from_lines(np.flatnonzero(status == _OK), *columns, status=status, stripe_along=along)
     return _SearchedImage(stripe, profiles, options, several, wide, white, board, left, noise, rules)
 
 
@@ -347,8 +347,8 @@ def _search_by_network(profiles: np.ndarray, options: StripeOptions, clip: float
     peak = measure_at(profiles, lines, centre[lines], options)
     amplitude = amplitudes(peak, (centre[lines] - peak.start).astype(np.float32))
     columns = centre[lines], amplitude, peak.sigma * FWHM_PER_SIGMA
-    stripe = Stripe.on_lines(lines, *columns, status=status, stripe_along=along)
-    stripe = stripe.without(lines[~((peak.height > 0) & (amplitude > 0))], StripeStatus.AMBIGUOUS)
+    stripe = Stripe.from_lines(lines, *columns, status=status, stripe_along=along)
+    stripe = stripe.remove_lines(lines[~((peak.height > 0) & (amplitude > 0))], StripeStatus.AMBIGUOUS)
     nothing, empty = np.zeros(len(status), bool), np.empty((0, 0))
     return _SearchedImage(stripe, profiles, options, nothing, nothing, nothing, empty, empty, 0.0, None)
 

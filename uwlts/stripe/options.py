@@ -118,7 +118,7 @@ class StripeOptions:
             raise RangeError(f"smoothing_lines is {self.smoothing_lines}; use an odd number, 1 for no averaging")
 
     @classmethod
-    def of(cls, sensor: Sensor, settings: StripeSettings = None) -> StripeOptions:
+    def resolve(cls, sensor: Sensor, settings: StripeSettings = None) -> StripeOptions:
         """Return the options for a sensor's images: the given ones, or the sensor's own with changed settings.
 
         DescriptionError for a setting that is unknown, of the wrong type or out of range.
@@ -139,7 +139,7 @@ class StripeOptions:
         """Distance between centres on neighbouring lines above which they belong to two stripes."""
         return self.half_window_px / 2
 
-    def doubled(self) -> StripeOptions:
+    def double_width(self) -> StripeOptions:
         """Return the options for stripes twice as wide."""
         return replace(self, half_window_px=2 * self.half_window_px, smoothing_px=2 * self.smoothing_px)
 

@@ -75,7 +75,7 @@ class ChessboardTarget(Target):
             reason = find_chessboard_fault(grey, grid)
             if reason is not None:
                 reasons.append(f"{reason} (as found by {name})")
-            elif self.findable(np.isfinite(grid[..., 0]).ravel()) and (
+            elif self.is_findable(np.isfinite(grid[..., 0]).ravel()) and (
                 part is None or count_corners(grid) > count_corners(part)
             ):
                 part = grid

@@ -88,8 +88,8 @@ class CircleTarget(Target):
         """Return the places of the three dotted circles: origin, in +X, in +Y."""
         return [(self.origin[0] + i, self.origin[1] + j) for i, j in ((0, 0), self.marker_x, self.marker_y)]
 
-    def findable(self, in_view: np.ndarray) -> bool:
-        return super().findable(in_view) and all(in_view[j * self.columns + i] for i, j in self.marked())
+    def is_findable(self, in_view: np.ndarray) -> bool:
+        return super().is_findable(in_view) and all(in_view[j * self.columns + i] for i, j in self.marked())
 
     def patches(self) -> list[Patch]:
         dots = self.points_at(np.array(self.marked()))

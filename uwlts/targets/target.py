@@ -131,7 +131,7 @@ class Target(Description, ABC):
         corners = self.extent_mm
         return rectangle_corners(corners.min(axis=0) - margin[:2], corners.max(axis=0) + margin[2:])
 
-    def on_plate(self, places_mm: np.ndarray, *, beyond: float = 0.0) -> np.ndarray:
+    def is_on_plate(self, places_mm: np.ndarray, *, beyond: float = 0.0) -> np.ndarray:
         """Return a mask (N,) of places (N, 2) in the target's plane that are on the flat plate; False for NaN.
 
         ``beyond`` enlarges the plate by this fraction of its size.
@@ -141,7 +141,7 @@ class Target(Description, ABC):
         low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
         return ((places_mm >= low) & (places_mm <= high)).all(axis=1)
 
-    def findable(self, in_view: np.ndarray) -> bool:
+    def is_findable(self, in_view: np.ndarray) -> bool:
         """Return True if `detect` finds the target from the points in view (N,), in the order of `indices`."""
         return bool(in_view.sum() >= max(min(_FEWEST_POINTS, len(in_view)), _SMALLEST_SHARE * len(in_view)))
 
@@ -172,11 +172,11 @@ def parse_target(mapping: Mapping[str, object]) -> Target:
     try:
         return _KINDS[kind].model_validate(dict(mapping))
     except ValidationError as error:
-        lines = [_explained(problem) for problem in error.errors()]
+        lines = [_explain_problem(problem) for problem in error.errors()]
         raise DescriptionError("the target cannot be read: " + "; ".join(lines)) from error
 
 
-def _explained(problem: Any) -> str:
+def _explain_problem(problem: Any) -> str:
     name = ".".join(str(part) for part in problem["loc"])
     text = problem["msg"].removeprefix("Value error, ")
     match problem["type"]:

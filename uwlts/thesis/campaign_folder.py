@@ -33,11 +33,11 @@ class CampaignFolder:
 
     def target(self, kind: str) -> Path:
         """Return the recording of the target "air", "bare" or "water"; CaptureError if it is missing."""
-        return self._needed(f"target-{kind}.h5")
+        return self._require_file(f"target-{kind}.h5")
 
     def steps(self) -> list[Path]:
         """Return the recordings of the step standard, nearest first."""
-        return [self._needed(f"step-{place}-water.h5") for place in STEP_PLACES]
+        return [self._require_file(f"step-{place}-water.h5") for place in STEP_PLACES]
 
     def line(self, side: str) -> Path | None:
         """Return the recording of the stripe on the pipe along an image side, or None."""
@@ -53,7 +53,7 @@ class CampaignFolder:
                 found.append(ScanFile(path, thing, "-".join(placement), medium))
         return found
 
-    def _needed(self, name: str) -> Path:
+    def _require_file(self, name: str) -> Path:
         path = self.path / name
         if not path.is_file():
             raise CaptureError(f"{self.path} has no {name}: record the campaign's calibration first")

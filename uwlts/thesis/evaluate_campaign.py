@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, gather
-from uwlts.errors import CaptureError, problems_of
+from uwlts.errors import CaptureError, describe_problems
 from uwlts.files.json_files import read_json
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
@@ -18,8 +18,8 @@ from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_by_polynomials
 from uwlts.reconstruction.reconstruct import reconstruct
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.runtime.workers import work_through
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.workers import run_jobs
 from uwlts.storage.capture import Capture
 from uwlts.thesis.campaign_folder import CampaignFolder, ScanFile, up_to_date
 from uwlts.thesis.measurements import PROPOSED, THESIS, TWO, calibrations, measure_scan
@@ -54,7 +54,7 @@ def evaluate_campaign(
     trials: int = TRIALS,
     workers: int | None = None,
     overwrite: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> CampaignResults:
     """Evaluate a campaign and save the results in results.json; read them from there if no recording is newer.
 
@@ -69,7 +69,7 @@ def evaluate_campaign(
     """
     path = folder.path / RESULTS
     if not overwrite and up_to_date(path):
-        kept = CampaignResults.read(path)
+        kept = CampaignResults.read_file(path)
         if trials in (0, kept.trials):
             return kept
         scans = _sphere_scans(folder, _require_camera_model(calibrations(folder)[PROPOSED, "water"]))
@@ -111,7 +111,7 @@ def _measure_scans(
     clouds = folder.path / "clouds"
     clouds.mkdir(exist_ok=True)
     scans, numbers = folder.scans(), count(1)
-    found = work_through(
+    found = run_jobs(
         partial(_measure, calibrated, clouds),
         scans,
         workers=workers,
@@ -186,7 +186,9 @@ def _monte_carlo(
         campaign = read_json(plan, called="plan").get("campaign") if plan.exists() else {"imperfections": {}}
         knowledge = _Known.model_validate(campaign).imperfections
     except ValidationError as error:
-        raise CaptureError(f"{plan} does not contain the campaign's imperfections: {problems_of(error)}") from error
+        raise CaptureError(
+            f"{plan} does not contain the campaign's imperfections: {describe_problems(error)}"
+        ) from error
     shown = partial(progress, stage="Monte Carlo")
     return [
         SpacingInterval(each.placement, each.observed_mm, each.std_mm(), each.interval_mm(), each.contains_truth())

@@ -22,18 +22,18 @@ from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.evaluate import compared_with_truth
+from uwlts.evaluation.evaluate import compare_cloud_with_truth
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
 from uwlts.files.json_files import json_text
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
 from uwlts.optics.design import nominal_setup, speckle_limit_um
-from uwlts.pages.toolkit import COLOURS, legend_below, new_figure, render_page, svg_of
+from uwlts.pages.toolkit import COLOURS, figure_svg, legend_below, new_figure, render_page
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.runtime.workers import Send, work_through
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.workers import Send, run_jobs
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import find_stripes
@@ -99,7 +99,7 @@ def compare_campaigns(
     *,
     workers: int | None = None,
     again: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> list[JointResults]:
     """Evaluate scans of spheres and planes with all calibrations, with the joint calibrations' uncertainties.
 
@@ -113,13 +113,13 @@ def compare_campaigns(
     SetupError
         A worker process was ended from outside.
     """
-    total, numbers = sum(len(_compared(folder)) for folder in folders), count(1)
-    return work_through(
+    total, numbers = sum(len(_list_compared_scans(folder)) for folder in folders), count(1)
+    return run_jobs(
         partial(_compare, again), folders, workers=workers, on_message=lambda _: progress(next(numbers), total)
     )
 
 
-def _compared(folder: CampaignFolder) -> list[ScanFile]:
+def _list_compared_scans(folder: CampaignFolder) -> list[ScanFile]:
     return [scan for scan in folder.scans() if scan.thing in ("spheres", "plane") and not _is_used(scan)]
 
 
@@ -127,16 +127,16 @@ def _compare(again: bool, folder: CampaignFolder, send: Send) -> JointResults:
     """Evaluate a campaign; ``send`` is called for every scan."""
     path = folder.path / RESULTS
     if not again and up_to_date(path):
-        for _ in _compared(folder):
+        for _ in _list_compared_scans(folder):
             send(None)
-        return JointResults.read(path)
+        return JointResults.read_file(path)
     sequential = calibrations(folder)
     joint: dict[JointMethod, Calibration] = {}
     solve_s: dict[JointMethod, float] = {}
     for way in JOINT:
         joint[way], solve_s[way] = joint_calibration(folder, way)
     spheres, planes = [], []
-    for scan in _compared(folder):
+    for scan in _list_compared_scans(folder):
         if scan.thing == "spheres":
             ways: dict[Method, tuple[str, str]] = {
                 "one_refraction": (PROPOSED, scan.medium),
@@ -161,7 +161,7 @@ def _evaluate_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) ->
         for method, calibration in known.items():
             cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=method in JOINT)
             evaluation = evaluate_cloud(cloud, artefact)
-            compared = compared_with_truth(cloud, truth)
+            compared = compare_cloud_with_truth(cloud, truth)
             errors[method] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
             errors[method] |= zip(SHIFTS, compared.shift_mm.tolist(), strict=True)
             if method in JOINT:
@@ -280,13 +280,14 @@ def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, ove
     """
     summary = joint_summary(results)
     media = [
-        (medium, part, _rows(part), svg_of(_errors_figure(results, medium))) for medium, part in summary.media().items()
+        (medium, part, _rows(part), figure_svg(_errors_figure(results, medium)))
+        for medium, part in summary.media().items()
     ]
     software = f"uwlts {__version__}"
     text = render_page("uwlts.thesis", "joint.html.j2", software=software, summary=summary, media=media, words=_WORDS)
     with (
-        written_aside(folder / "report.html", overwrite=overwrite) as page,
-        written_aside(folder / "summary.json", overwrite=overwrite) as aside,
+        write_atomically(folder / "report.html", overwrite=overwrite) as page,
+        write_atomically(folder / "summary.json", overwrite=overwrite) as aside,
     ):
         page.write_text(text, encoding="utf-8")
         aside.write_text(json_text(summary, indent=1), encoding="utf-8")

@@ -25,7 +25,7 @@ from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
@@ -41,7 +41,7 @@ METHODS = {"air": (PROPOSED, POLYNOMIALS, FORGOTTEN), "water": (PROPOSED, TWO, P
 
 
 def calibrations(
-    folder: CampaignFolder, *, progress: ProgressListener = unheard
+    folder: CampaignFolder, *, progress: ProgressListener = ignore_progress
 ) -> dict[tuple[str, str], AnyCalibration]:
     """Return calibrations by method and medium; up-to-date ones are read from the folder ``calibrations``.
 

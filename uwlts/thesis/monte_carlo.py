@@ -18,8 +18,8 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.model.sensor import Medium
 from uwlts.optics.camera import project
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.runtime.workers import work_through
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.workers import run_jobs
 from uwlts.thesis.sphere_spacing import SphereScan, spacing_error
 
 COVERAGE = 0.95
@@ -65,7 +65,7 @@ def propagate(
     trials: int,
     seed: int = 0,
     workers: int | None = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> list[Propagated]:
     """Propagate the uncertainties of the inputs to the sphere spacing of every scan.
 
@@ -109,7 +109,7 @@ def propagate(
         evidence = replace(evidence, air=replace(evidence.air, images=images))
         options = replace(options, correct_circles=False)
     trial, numbers = partial(_trial, _Draw(evidence, start, medium, knowledge), scans, options, seed), count(1)
-    made = work_through(trial, range(trials), workers=workers, on_message=lambda _: progress(next(numbers), trials))
+    made = run_jobs(trial, range(trials), workers=workers, on_message=lambda _: progress(next(numbers), trials))
     spacing = np.array([errors for errors in made if errors is not None])
     if trials - len(spacing) > trials // 10:
         raise CalibrationError(f"{trials - len(spacing)} of {trials} trials give no calibration or no spheres")

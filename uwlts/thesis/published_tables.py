@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import DescriptionError
-from uwlts.model.library import find, read_table
+from uwlts.model.library import find_description, read_table
 from uwlts.thesis.campaign_folder import MEDIA, STEP_PLACES
 from uwlts.thesis.measurements import FORGOTTEN, OURS, POLYNOMIALS, PROPOSED, SINGLE, THESIS, TWO, VARIANTS
 from uwlts.thesis.results import CampaignResults
@@ -40,7 +40,7 @@ class Published:
 
 def load_published(name_or_path: str | Path = "thesis-tables") -> Published:
     """Read published tables by name or path; DescriptionError if the file contains none."""
-    path = find(name_or_path, "references")
+    path = find_description(name_or_path, "references")
     table = read_table(path, "references")
     positions = table.get("positions")
     if not isinstance(positions, dict) or not {"spheres", "plane"} <= positions.keys():

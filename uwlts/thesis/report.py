@@ -15,22 +15,22 @@ from matplotlib.figure import Figure
 
 from uwlts._version import __version__
 from uwlts.errors import DescriptionError
-from uwlts.files.writing import refuse_unsuitable, written_aside
+from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.pages.toolkit import (
     BLUE,
     COLOURS,
     INK,
     RED,
+    figure_svg,
     legend_below,
     new_figure,
     plain_text,
     png_data_uri,
     render_page,
-    svg_of,
 )
 from uwlts.report import plot
 from uwlts.report.pictures import stripe_picture, stripe_view
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.thesis.campaign_folder import campaign_folders
@@ -71,7 +71,7 @@ def evaluate_thesis(
     joint: bool = False,
     again: bool = False,
     overwrite: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> ThesisReport:
     """Evaluate campaigns with all methods of the thesis, and compare the results with its tables.
 
@@ -125,7 +125,7 @@ def evaluate_thesis(
         evaluate_campaign(campaign, trials=trials, workers=workers, overwrite=again, progress=progress)
         for campaign in campaigns
     ]
-    return ThesisReport(files, markdown(write_comparison(folder, results, tables, overwrite=overwrite), results))
+    return ThesisReport(files, format_markdown(write_comparison(folder, results, tables, overwrite=overwrite), results))
 
 
 def differences(rows: Sequence[TableRow]) -> list[str]:
@@ -158,16 +158,16 @@ def write_comparison(
     found = {
         "summary.json": json.dumps(plain, indent=1, allow_nan=False) + "\n",
         "tables.csv": lines.getvalue(),
-        "summary.md": markdown(rows, results),
+        "summary.md": format_markdown(rows, results),
         "report.html": report_page(folder, results, rows, published),
     }
     for name, text in found.items():
-        with written_aside(folder / name, overwrite=overwrite) as aside:
+        with write_atomically(folder / name, overwrite=overwrite) as aside:
             aside.write_text(text, encoding="utf-8")
     return rows
 
 
-def markdown(rows: Sequence[TableRow], results: Sequence[CampaignResults]) -> str:
+def format_markdown(rows: Sequence[TableRow], results: Sequence[CampaignResults]) -> str:
     """Format the headline as a Markdown table."""
     campaigns = f"{len(results)} campaign{'s' if len(results) != 1 else ''}"
     lines = [
@@ -217,7 +217,7 @@ def report_page(
             for name, group in groupby(rows, lambda row: row.table)
         ],
         differences=differences(rows),
-        figures=[(name, caption, svg_of(figure)) for name, caption, figure in figures],
+        figures=[(name, caption, figure_svg(figure)) for name, caption, figure in figures],
         intervals=intervals,
         held_by_budget=sum(abs(each.observed_mm) <= results[n].budget.get("expanded", -1.0) for n, each in intervals),
         failures=[(number, m) for number, result in enumerate(results) for m in result.measurements if m.failure],

@@ -7,8 +7,8 @@ from typing import Literal, Self
 from pydantic import BaseModel, ConfigDict
 
 from uwlts.errors import CaptureError
-from uwlts.files.json_files import json_text, read_json, validated_content
-from uwlts.files.writing import written_aside
+from uwlts.files.json_files import json_text, read_json, validate_content
+from uwlts.files.writing import write_atomically
 
 Points = list[tuple[float, float]]
 """Y and Z of points on a profile, mm."""
@@ -26,7 +26,7 @@ class _Kept(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     @classmethod
-    def read(cls, path: Path) -> Self:
+    def read_file(cls, path: Path) -> Self:
         """Read the file.
 
         Raises
@@ -39,11 +39,11 @@ class _Kept(BaseModel):
             content = read_json(path, called="file of results")
         except CaptureError as error:
             raise CaptureError(f"{error}{advice}") from error
-        return validated_content(cls, content, f"{path} contains no results that this program can read", advice=advice)
+        return validate_content(cls, content, f"{path} contains no results that this program can read", advice=advice)
 
     def keep(self, path: Path) -> Self:
         """Write the file atomically; ValueError if a number is not finite."""
-        with written_aside(path, overwrite=True) as aside:
+        with write_atomically(path, overwrite=True) as aside:
             aside.write_text(json_text(self.model_dump()), encoding="utf-8")
         return self
 

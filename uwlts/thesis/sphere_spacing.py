@@ -15,7 +15,7 @@ from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import SphereStandard
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Medium
-from uwlts.model.stripe import pixels_of
+from uwlts.model.stripe import stack_pixels
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture
@@ -68,7 +68,7 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str
     line, centre = stripes.line[kept], stripes.centre_px[kept]
     return SphereScan(
         placement=placement,
-        pixels=pixels_of(line, centre, stripe_along=capture.header.sensor.camera.stripe_along),
+        pixels=stack_pixels(line, centre, stripe_along=capture.header.sensor.camera.stripe_along),
         stage_mm=capture.stage_mm[stripes.frame[kept]],
         sphere=np.argmin(away, axis=1),
         stage_direction=np.array(capture.header.stage_direction),
@@ -125,7 +125,7 @@ def window_choices(
         with Capture(path) as capture:
             evidence, _ = step_evidence([capture])
             camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
-        described = WindowModel.described(camera.window, laser.wavelength_nm, refractions=nominal.refractions)
+        described = WindowModel.from_description(camera.window, laser.wavelength_nm, refractions=nominal.refractions)
         images[place] = [label_step(calibration, described, step) for step in evidence]
     subsets = {f"{place} {number}": [image] for place in images for number, image in enumerate(images[place], start=1)}
     subsets |= images | {"all": [image for place in images for image in images[place]]}

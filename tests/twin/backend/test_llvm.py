@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from twin.backend import llvm
-from twin.backend.llvm import LlvmLibrary, examine, find_llvm, list_candidates, main
+from twin.backend.llvm import LlvmLibrary, check_library, find_llvm, list_candidates, main
 from uwlts.errors import SetupError
 
 NEEDED, ABSENT = b"libm.so.6\0", b"libQ.so.6\0"
@@ -84,19 +84,19 @@ def loaded(monkeypatch):
 def test_versions_that_abort_are_refused(loaded, major):
     loaded((major, 0, 6))
     with pytest.raises(SetupError, match=rf"version {major}\.0\.6; version 17 or newer is needed"):
-        examine(Path("libLLVM.so"))
+        check_library(Path("libLLVM.so"))
 
 
 def test_library_without_version_function_is_refused_as_too_old(loaded):
     loaded(None)
     with pytest.raises(SetupError, match="too old"):
-        examine(Path("libLLVM.so"))
+        check_library(Path("libLLVM.so"))
 
 
 @pytest.mark.parametrize("major", [17, 19, 22, 23])
 def test_newer_versions_are_accepted(loaded, major):
     loaded((major, 1, 2))
-    assert examine(Path("libLLVM.so")).version == (major, 1, 2)
+    assert check_library(Path("libLLVM.so")).version == (major, 1, 2)
 
 
 def test_the_first_suitable_is_chosen_whatever_its_name_claims(tmp_path, monkeypatch):
@@ -111,7 +111,7 @@ def test_the_first_suitable_is_chosen_whatever_its_name_claims(tmp_path, monkeyp
             raise SetupError(f"{path}: too old")
         return LlvmLibrary(path, (version, 1, 0))
 
-    monkeypatch.setattr(llvm, "examine", state)
+    monkeypatch.setattr(llvm, "check_library", state)
     assert find_llvm([tmp_path / "first", tmp_path / "second"]).path.name == "libLLVM-16.so.1"
     assert find_llvm([tmp_path / "second", tmp_path / "first"]).path.name == "libLLVM.so.20.1"
 
@@ -156,11 +156,11 @@ def test_version_comes_from_the_library_not_from_its_name(tmp_path, machine_libr
 
 def test_foreign_library_and_text_file_are_refused(tmp_path, foreign_library):
     with pytest.raises(SetupError, match="no libLLVM"):
-        examine(foreign_library)
+        check_library(foreign_library)
     script = tmp_path / "libLLVM.so"
     script.write_text("INPUT(libLLVM.so.19.1)\n")
     with pytest.raises(SetupError, match="does not load"):
-        examine(script)
+        check_library(script)
 
 
 def test_missing_dependency_is_reported_by_name(tmp_path, foreign_library):

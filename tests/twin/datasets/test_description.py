@@ -8,9 +8,9 @@ import pytest
 from scipy import stats
 
 from twin.datasets.data_set import SPLITS, DataSetDescription, LogUniform, Normal, OneOf, Uniform, load_description
-from twin.datasets.draws import draw_scene, split_of
+from twin.datasets.draws import choose_split, draw_scene
 from uwlts.errors import DescriptionError
-from uwlts.model.library import names
+from uwlts.model.library import list_names
 
 TINY = {"title": "tiny", "scene": "plane", "sensor": "thesis-small"}
 POWER = "sensor.laser.power_mw"
@@ -33,15 +33,15 @@ EXPECTED = {
 @pytest.mark.parametrize("name", EXPECTED)
 def test_distributions_are_the_inverse_of_scipys(name):
     distribution, reference = EXPECTED[name]
-    values = [float(distribution.at(share)) for share in SHARES]
+    values = [float(distribution.quantile(share)) for share in SHARES]
     np.testing.assert_allclose(reference.cdf(values), SHARES, atol=1e-9)
 
 
 def test_choices_come_as_often_as_their_weights_say():
     choice = OneOf(kind="choice", values=("a", "b", "c"), weights=(1.0, 2.0, 1.0))
-    drawn = [choice.at(share) for share in (np.arange(400) + 0.5) / 400]
+    drawn = [choice.quantile(share) for share in (np.arange(400) + 0.5) / 400]
     assert [drawn.count(value) for value in "abc"] == [100, 200, 100]
-    assert OneOf(kind="choice", values=(1, 2)).at(0.5) == 2
+    assert OneOf(kind="choice", values=(1, 2)).quantile(0.5) == 2
 
 
 def test_every_path_of_every_scene_has_numbers_of_its_own():
@@ -84,12 +84,12 @@ def test_values_go_where_their_paths_lead():
 def test_splits_are_by_scene_and_keep_their_members_as_scenes_are_added():
     few, many = described(scenes=20), described(scenes=2000)
     for scene in range(20):
-        assert split_of(few, scene) == split_of(many, scene)
-    members = [split_of(many, scene) for scene in range(2000)]
+        assert choose_split(few, scene) == choose_split(many, scene)
+    members = [choose_split(many, scene) for scene in range(2000)]
     for split, share in zip(SPLITS, (0.8, 0.1, 0.1), strict=True):
         # Multiples of the golden section fill every interval evenly but for a few.
         assert members.count(split) == pytest.approx(2000 * share, abs=5)
-    assert {split_of(described(splits={"train": 0, "validation": 0, "test": 1}), k) for k in range(50)} == {"test"}
+    assert {choose_split(described(splits={"train": 0, "validation": 0, "test": 1}), k) for k in range(50)} == {"test"}
 
 
 WRONG = {
@@ -160,7 +160,7 @@ def test_scene_and_sensor_beside_a_description_are_found(tmp_path):
     assert load_description(DataSetDescription.model_validate(found.model_dump())) == found
 
 
-@pytest.mark.parametrize("name", names("datasets"))
+@pytest.mark.parametrize("name", list_names("datasets"))
 def test_presets_draw_valid_scenes_over_all_of_their_ranges(name):
     preset = load_description(name)
     drawn = [draw_scene(preset, scene) for scene in range(12)]
@@ -168,6 +168,6 @@ def test_presets_draw_valid_scenes_over_all_of_their_ranges(name):
     assert len({str(each.values) for each in drawn}) == 12
     for path, distribution in preset.vary.items():
         if not isinstance(distribution, OneOf):
-            ends = [preset.drawn(path, share) for share in (0.001, 0.5, 0.999)]
+            ends = [preset.draw_value(path, share) for share in (0.001, 0.5, 0.999)]
             assert all(isinstance(end, str) or math.isfinite(end) for end in ends)
             assert all(a <= b for a, b in pairwise(ends)), path

@@ -20,7 +20,7 @@ from tests.virtual_sensors import altered
 from twin.datasets.data_set import SPLITS, DataSetDescription
 from twin.datasets.draws import draw_scene
 from uwlts.errors import CaptureError, DescriptionError, DesignError, OutputError
-from uwlts.files.writing import sha256_of
+from uwlts.files.writing import hash_file
 from uwlts.model.library import load_sensor
 
 SMALL = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}}
@@ -57,7 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    return {path.name: sha256_of(path) for path in sorted(folder.glob("*.tar"))}
+    return {path.name: hash_file(path) for path in sorted(folder.glob("*.tar"))}
 
 
 def test_files_are_the_same_for_any_number_of_workers(folder, tmp_path):

@@ -7,15 +7,15 @@ from scipy.special import erf
 
 from tests.virtual_sensors import altered, block, clear, plate, scene_of, stripe_on_plate
 from twin.datasets.data_set import FAINT_BELOW, LineStatus, Mask
-from twin.datasets.labels import labelled, noise_std_e, stripe_quality
+from twin.datasets.labels import make_labels, noise_std_e, stripe_quality
 from twin.options import Effects, Options
-from twin.recording.studio import Exposed, Studio
+from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
 from twin.scene.forms.pitted_pipe import PittedPipe, pitted_radius
 from twin.scene.motion import Motion, Shot
 from uwlts.model.sensor import Sensor
 
 ALL_LABELS = ("centre", "quality", "points", "masks", "light", "depth", "sensor")
-SINGLE = Effects().without("multiple-scattering", "secondary-light")
+SINGLE = Effects().remove("multiple-scattering", "secondary-light")
 
 
 def small(thesis: Sensor, **changes: object) -> Sensor:
@@ -90,8 +90,8 @@ def test_stripes_cut_by_the_image_and_lines_without_one_have_no_width():
 def test_centres_are_where_light_of_least_time_shows_the_sheet(thesis):
     for along in ("width", "height"):
         sensor = small(thesis, camera={"stripe_along": along})
-        studio = Studio(sensor, scene_of(plate(20.0)), Options(spp=8, effects=SINGLE))
-        arrays = labelled(studio, SHOT, studio.exposed(SHOT, 0), ALL_LABELS)
+        studio = SensorSimulator(sensor, scene_of(plate(20.0)), Options(spp=8, effects=SINGLE))
+        arrays = make_labels(studio, SHOT, studio.expose(SHOT, 0), ALL_LABELS)
         lines = np.arange(30.0, sensor.camera.lines() - 30, 10.0)
         y, across = stripe_on_plate(sensor, studio.medium, lines, 20.0)
         chosen = lines.astype(int)
@@ -113,33 +113,33 @@ def test_lines_say_why_they_show_no_stripe(thesis):
     # The block of the twin's own test of shadows: thin, in the sheet, before a plate.
     thin = block((4.0, 30.0, 10.0), (0.0, 15.0, -40.0), reflectance=0.5)
     scene = scene_of(plate(20.0, side=100.0), thin, motion={"lights": ["lamp", "laser"]})
-    studio = Studio(small(thesis), scene, Options(spp=8, effects=SINGLE))
-    arrays = labelled(studio, SHOT, studio.exposed(SHOT, 0), ("centre", "points"))
+    studio = SensorSimulator(small(thesis), scene, Options(spp=8, effects=SINGLE))
+    arrays = make_labels(studio, SHOT, studio.expose(SHOT, 0), ("centre", "points"))
     status, centre = arrays["status"], arrays["centre_px"]
     seen = {LineStatus(number) for number in status}
     assert {LineStatus.VISIBLE, LineStatus.SHADOWED, LineStatus.NOT_CROSSED} <= seen
     np.testing.assert_array_equal(np.isnan(centre), np.isin(status, [LineStatus.SHADOWED, LineStatus.NOT_CROSSED]))
     np.testing.assert_array_equal(arrays["object"] == -1, np.isnan(centre))
     assert set(arrays["object"][np.isfinite(centre)]) == {0, 1}
-    faint = labelled(studio, SHOT, studio.exposed(SHOT, 0, exposure=1e-3), ("centre", "quality"))
+    faint = make_labels(studio, SHOT, studio.expose(SHOT, 0, exposure=1e-3), ("centre", "quality"))
     assert set(faint["status"][np.isfinite(centre)]) == {LineStatus.FAINT}
     assert np.nanmax(faint["snr"]) < FAINT_BELOW
-    burnt = labelled(studio, SHOT, studio.exposed(SHOT, 0, exposure=30.0), ("centre",))
+    burnt = make_labels(studio, SHOT, studio.expose(SHOT, 0, exposure=30.0), ("centre",))
     assert (burnt["status"] == LineStatus.SATURATED).sum() > 100
     np.testing.assert_array_equal(burnt["centre_px"], centre)
     lamp = Shot(stage_mm=0.0, travelled_mm=0.0, light="lamp")
-    dark = labelled(studio, lamp, studio.exposed(lamp, 0), ("centre", "masks"))
+    dark = make_labels(studio, lamp, studio.expose(lamp, 0), ("centre", "masks"))
     assert set(dark["status"]) == {LineStatus.LASER_OFF} and np.isnan(dark["centre_px"]).all()
     assert not (dark["mask"] & Mask.STRIPE).any()
 
 
 def test_the_light_of_all_ways_makes_the_image(thesis):
-    quiet = Effects().without("speckle", "noise", "fixed-pattern")
+    quiet = Effects().remove("speckle", "noise", "fixed-pattern")
     sensor = small(thesis, lamp={"ambient_w_per_m2": 0.02}, detector={"bits": 12})
-    studio = Studio(sensor, scene_of(plate(20.0)), Options(spp=8, effects=quiet))
-    taken = studio.exposed(SHOT, 0)
+    studio = SensorSimulator(sensor, scene_of(plate(20.0)), Options(spp=8, effects=quiet))
+    taken = studio.expose(SHOT, 0)
     np.testing.assert_array_equal(taken.image, studio.image(SHOT, 0))
-    light = labelled(studio, SHOT, taken, ("light",))["light_e"].astype(float)
+    light = make_labels(studio, SHOT, taken, ("light",))["light_e"].astype(float)
     detector = sensor.detector
     dark = 1e-3 * taken.exposure_ms * detector.dark_current_e_per_s * detector.dark_current_growth()
     grey = (light.sum(axis=0) + dark) * detector.gain_dn_per_e() + detector.black_level_dn
@@ -162,15 +162,15 @@ def test_masks_follow_from_light_and_noise(thesis):
     image[1, 3] = 255
     parts.insert(3, np.zeros(shape, np.float32))
     parts[3][0] = [0.0, 0.0, 0.0, 0.0, 400.0, 4.0]
-    taken = Exposed(image, 1.0, *parts)
+    taken = SimulatedImage(image, 1.0, *parts)
     detector = small(thesis).detector.model_copy(update={"read_noise_e": 22.0, "dark_current_e_per_s": 0.0})
     noise = noise_std_e(taken, detector)
     step = detector.full_well_e / 255
     assert noise[0, 0] == pytest.approx(np.sqrt(22.0**2 + step**2 / 12))
     assert noise[3, 2] == pytest.approx(np.sqrt(400.0 + 22.0**2 + step**2 / 12))
-    from twin.datasets.labels import mask_of
+    from twin.datasets.labels import make_mask
 
-    mask = mask_of(taken, noise, saturation=255, along_width=True)
+    mask = make_mask(taken, noise, saturation=255, along_width=True)
     stripe = np.zeros(shape, bool)
     stripe[1, 1:], stripe[2, 2:4] = True, True  # 13 of 100 are below 1/e2, and less than an electron counts nowhere
     np.testing.assert_array_equal((mask & Mask.STRIPE) > 0, stripe)
@@ -184,9 +184,9 @@ def test_target_points_are_labelled(thesis):
     from twin.scene.description import load_scene
 
     scene = load_scene("target-through-window", medium="water", motion=Motion(lights=("lamp",), direction=(0, 0, 1)))
-    studio = Studio(small(thesis), scene, Options(spp=4, effects=SINGLE))
+    studio = SensorSimulator(small(thesis), scene, Options(spp=4, effects=SINGLE))
     lamp = Shot(stage_mm=10.0, travelled_mm=10.0, light="lamp")
-    found = labelled(studio, lamp, studio.exposed(lamp, 0), ("target",))["target_px"]
+    found = make_labels(studio, lamp, studio.expose(lamp, 0), ("target",))["target_px"]
     points = scene.objects[0].described_target().points_mm - [0.0, 0.0, 10.0]
     expected = seen_at(studio.sensor, studio.medium, points)
     known = np.isfinite(found).all(axis=1)
@@ -196,11 +196,11 @@ def test_target_points_are_labelled(thesis):
 
 def test_labelled_points_lie_on_a_pitted_pipe(thesis):
     pipe = {"kind": "pitted_pipe", "ovality": 0.03, "pits": 25, "seed": 4, "position_mm": (0.0, 0.0, 50.0)}
-    studio = Studio(small(thesis), scene_of(pipe), Options(spp=4, effects=SINGLE))
+    studio = SensorSimulator(small(thesis), scene_of(pipe), Options(spp=4, effects=SINGLE))
     described, depths = PittedPipe.model_validate(pipe), []
     for x in (-30.0, -10.0, 10.0, 30.0):
         shot = Shot(stage_mm=x, travelled_mm=x, light="laser")
-        arrays = labelled(studio, shot, studio.exposed(shot, 0), ("centre", "points"))
+        arrays = make_labels(studio, shot, studio.expose(shot, 0), ("centre", "points"))
         point = arrays["point_mm"][np.isfinite(arrays["centre_px"])].astype(float)
         assert len(point) > 60
         radius, angle = np.hypot(point[:, 1], point[:, 2] - 50.0), np.arctan2(point[:, 1], 50.0 - point[:, 2])

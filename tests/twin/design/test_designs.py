@@ -6,12 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.design.designs import Design, built, described, designs_of, judged, number_of_designs, row_of, sensor_of
+from twin.design.designs import (
+    Design,
+    build_sensor,
+    count_designs,
+    evaluate_designs,
+    evaluate_sensor,
+    make_sensor,
+    sample_designs,
+    select_design,
+)
 from twin.design.figures_of_merit import FIGURES
-from twin.design.screening import as_part, read_parts, write_csv, write_part
+from twin.design.screening import encode_part, read_parts, write_csv, write_part
 from twin.design.study import Study, load_study
 from uwlts.errors import CaptureError, DescriptionError, DesignError
-from uwlts.model.library import load_sensor, names
+from uwlts.model.library import list_names, load_sensor
 
 BASELINE, ANGLE = "laser.baseline_mm", "laser.triangulation_angle_deg"
 STUDY = """
@@ -56,10 +65,10 @@ def sampled(study: Study, **sampling: object) -> Study:
 # --- description ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", names("studies"))
+@pytest.mark.parametrize("name", list_names("studies"))
 def test_shipped_studies_can_be_judged(name):
     study = load_study(name)
-    columns = judged(study, designs_of(study, 0, 300))
+    columns = evaluate_designs(study, sample_designs(study, 0, 300))
     assert np.isfinite(columns["violation"]).any()
 
 
@@ -108,8 +117,8 @@ def test_the_command_line_overrules_the_study(tmp_path):
 
 
 def test_a_grid_holds_every_combination_once(study):
-    assert number_of_designs(study) == 12
-    designs = designs_of(study, 0, 12)
+    assert count_designs(study) == 12
+    designs = sample_designs(study, 0, 12)
     assert [design.number for design in designs] == list(range(12))
     assert len({tuple(design.values.values()) for design in designs}) == 12
     assert {design.values[BASELINE] for design in designs} == {200.0, 300.0, 400.0}
@@ -119,15 +128,15 @@ def test_a_grid_holds_every_combination_once(study):
 @pytest.mark.parametrize("kind", ["grid", "random", "sobol"])
 def test_a_design_depends_on_its_number_only(study, kind):
     study = sampled(study, kind=kind, designs=12, seed=4)
-    whole = designs_of(study, 0, 12)
-    assert [*designs_of(study, 0, 5), *designs_of(study, 5, 5), *designs_of(study, 10, 99)] == whole
+    whole = sample_designs(study, 0, 12)
+    assert [*sample_designs(study, 0, 5), *sample_designs(study, 5, 5), *sample_designs(study, 10, 99)] == whole
     if kind != "grid":
-        assert designs_of(sampled(study, kind=kind, designs=12, seed=5), 0, 12) != whole
+        assert sample_designs(sampled(study, kind=kind, designs=12, seed=5), 0, 12) != whole
 
 
 def test_a_sobol_sequence_fills_the_range_evenly(study):
     study = sampled(study, kind="sobol", designs=1024)
-    values = np.array([design.values[BASELINE] for design in designs_of(study, 0, 1024)])
+    values = np.array([design.values[BASELINE] for design in sample_designs(study, 0, 1024)])
     counts, _ = np.histogram(values, bins=32, range=(200, 400))
     # A (0, m, s) net has exactly 1024 / 32 points in each of 32 even parts of every coordinate.
     assert (counts == 32).all()
@@ -137,13 +146,15 @@ def test_a_log_scale_is_even_in_the_logarithm():
     study = Study.model_validate(
         {"title": "t", "variables": {"laser.power_mw": {"least": 1.0, "most": 100.0, "steps": 3, "scale": "log"}}}
     )
-    assert [design.values["laser.power_mw"] for design in designs_of(study, 0, 3)] == pytest.approx([1.0, 10.0, 100.0])
+    assert [design.values["laser.power_mw"] for design in sample_designs(study, 0, 3)] == pytest.approx(
+        [1.0, 10.0, 100.0]
+    )
 
 
 def test_numbers_that_are_counted_are_whole(tmp_path):
     text = 'title = "t"\n[variables."camera.width_px"]\nleast = 1000.2\nmost = 1004.8\nsteps = 9\n'
     study = load_study(written(tmp_path, text))
-    assert [design.values["camera.width_px"] for design in designs_of(study, 0, 99)] == [
+    assert [design.values["camera.width_px"] for design in sample_designs(study, 0, 99)] == [
         1000,
         1001,
         1002,
@@ -152,7 +163,7 @@ def test_numbers_that_are_counted_are_whole(tmp_path):
         1005,
     ]
     random = sampled(study, kind="random", designs=50)
-    assert {type(design.values["camera.width_px"]) for design in designs_of(random, 0, 50)} == {int}
+    assert {type(design.values["camera.width_px"]) for design in sample_designs(random, 0, 50)} == {int}
 
 
 # --- designs ----------------------------------------------------------------------------------------------------------
@@ -160,7 +171,7 @@ def test_numbers_that_are_counted_are_whole(tmp_path):
 
 def test_values_and_choices_reach_the_sensor(study):
     design = Design(0, {BASELINE: 333.0, "camera.window.glass": "N-BK7", "camera": "small"})
-    sensor = sensor_of(study, design)
+    sensor = make_sensor(study, design)
     assert (sensor.laser.baseline_mm, sensor.camera.window.glass) == (333.0, "N-BK7")
     assert (sensor.camera.width_px, sensor.camera.height_px) == (640, 512)
     # What is not free stays, and the base itself is not touched.
@@ -170,9 +181,9 @@ def test_values_and_choices_reach_the_sensor(study):
 
 def test_a_design_as_built_is_judged_as_in_the_sweep(study):
     design = Design(0, {BASELINE: 333.0, "camera.window.glass": "N-BK7", "camera": "large"})
-    sensor = built(study, design)
+    sensor = build_sensor(study, design)
     assert sensor.camera.focus_distance_mm != load_sensor("thesis").camera.focus_distance_mm
-    swept, alone = row_of(judged(study, [design]), 0), described(study, "built", sensor)
+    swept, alone = select_design(evaluate_designs(study, [design]), 0), evaluate_sensor(study, "built", sensor)
     for name in FIGURES:
         assert swept.figures[name] == pytest.approx(alone.figures[name], rel=1e-12, nan_ok=True)
 
@@ -181,7 +192,7 @@ def test_designs_that_fail_are_reported_with_their_reason(study):
     good = Design(0, {BASELINE: 300.0, "camera.window.glass": "N-BK7", "camera": "large"})
     absurd = Design(1, good.values | {BASELINE: -5.0})
     close = Design(2, good.values | {BASELINE: 60.0})
-    columns = judged(study, [absurd, good, close])
+    columns = evaluate_designs(study, [absurd, good, close])
     assert columns["design"].tolist() == [1, 0, 2]
     assert "laser.baseline_mm" in columns["failure"][0] and columns["failure"][1] == ""
     assert "begin" in columns["failure"][2]
@@ -193,7 +204,7 @@ def test_violation_is_what_lacks_of_the_bounds(study):
         study.model_dump() | {"constraints": {"line_mm": {"least": 300.0}, "sigma_z_rms_mm": {"most": 0.5}}}
     )
     design = Design(0, {BASELINE: 300.0, "camera.window.glass": "N-BK7", "camera": "large"})
-    columns = judged(strict, [design])
+    columns = evaluate_designs(strict, [design])
     assert columns["violation"].item() == pytest.approx(1 - columns["line_mm"].item() / 300.0)
 
 
@@ -201,19 +212,19 @@ def test_a_base_that_cannot_work_says_why(study):
     base = load_sensor("thesis")
     near = base.model_copy(update={"volume": base.volume.model_copy(update={"near_mm": 800.0, "far_mm": 900.0})})
     with pytest.raises(DesignError, match="reach no point"):
-        described(study, "near", near)
+        evaluate_sensor(study, "near", near)
 
 
-@pytest.mark.parametrize("name", names("studies"))
+@pytest.mark.parametrize("name", list_names("studies"))
 def test_many_designs_are_judged_as_each_by_itself(name):
     study = load_study(name)
-    designs = designs_of(sampled(study, kind="sobol", designs=1200), 0, 1200)
+    designs = sample_designs(sampled(study, kind="sobol", designs=1200), 0, 1200)
     # Few at a time are judged without compiled formulas, and checked one by one where they differ in words.
     places = [*range(30), *range(220, 250), *range(1170, 1200)]
-    parts = [judged(study, [designs[place] for place in places[k : k + 3]]) for k in range(0, len(places), 3)]
+    parts = [evaluate_designs(study, [designs[place] for place in places[k : k + 3]]) for k in range(0, len(places), 3)]
     # What was compiled for some number of designs holds for fewer and for more.
     for count in (250, 1200, 250):
-        for column, values in judged(study, designs[:count]).items():
+        for column, values in evaluate_designs(study, designs[:count]).items():
             found = values[[place for place in places if place < count]]
             apart = np.concatenate([part[column] for part in parts])[: len(found)]
             if values.dtype.kind == "f":
@@ -226,7 +237,7 @@ def test_many_designs_are_judged_as_each_by_itself(name):
 def test_a_design_beyond_its_description_s_bounds_fails_alone():
     ranges = {BASELINE: {"least": 200.0, "most": 400.0}, "volume.near_mm": {"least": 100.0, "most": 500.0}}
     study = sampled(Study.model_validate({"title": "t", "variables": ranges}), kind="random", designs=64)
-    columns = judged(study, designs_of(study, 0, 64))
+    columns = evaluate_designs(study, sample_designs(study, 0, 64))
     beyond = columns["volume.near_mm"] >= study.sensor.volume.far_mm
     assert 0 < beyond.sum() < 64
     assert all(
@@ -242,10 +253,10 @@ def test_parts_are_read_in_order_and_once(study, tmp_path):
     folder = tmp_path / "parts"
     folder.mkdir()
     for first in (6, 0, 3):
-        write_part(folder, first, as_part(judged(study, designs_of(study, first, 5))))
+        write_part(folder, first, encode_part(evaluate_designs(study, sample_designs(study, first, 5))))
     columns = read_parts(folder)
     assert columns["design"].tolist() == list(range(11))
-    expected = judged(study, designs_of(study, 0, 11))
+    expected = evaluate_designs(study, sample_designs(study, 0, 11))
     np.testing.assert_array_equal(columns["sigma_z_rms_mm"], expected["sigma_z_rms_mm"])
     assert columns["camera"].tolist() == expected["camera"].tolist()
     write_csv(tmp_path / "designs.csv", columns)
@@ -254,7 +265,7 @@ def test_parts_are_read_in_order_and_once(study, tmp_path):
 
 
 def test_a_damaged_part_is_named(study, tmp_path):
-    write_part(tmp_path, 0, as_part(judged(study, designs_of(study, 0, 5)))[:-20])
+    write_part(tmp_path, 0, encode_part(evaluate_designs(study, sample_designs(study, 0, 5)))[:-20])
     with pytest.raises(CaptureError, match="part-000000000"):
         read_parts(tmp_path)
 
@@ -262,7 +273,7 @@ def test_a_damaged_part_is_named(study, tmp_path):
 def test_no_parts_are_no_columns(tmp_path):
     assert read_parts(tmp_path) == {}
     assert math.isnan(
-        judged(
+        evaluate_designs(
             load_study(written(tmp_path)),
             [Design(0, {BASELINE: -1.0, "camera.window.glass": "N-BK7", "camera": "small"})],
         )["line_mm"].item()

@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import brentq
 
 from tests.virtual_sensors import altered
-from twin.design.figures_of_merit import CLASS_NAMES, Figures, figures_of
-from twin.design.parameters import followed, parameters_of
+from twin.design.figures_of_merit import CLASS_NAMES, Figures, compute_figures
+from twin.design.parameters import adjust_to_standoff, extract_parameters
 from uwlts.model.media import water_absorption_per_m, water_scattering_per_m
 from uwlts.model.placement import view_of_sheet
 from uwlts.model.sensor import Sensor
@@ -25,8 +25,8 @@ QUIET = {
 
 
 def judged(sensor: Sensor, medium: str = "water", *, follow=(), reflectance: float = 0.5) -> Figures:
-    p = parameters_of([sensor], [sensor.media[medium]])
-    found, (reason,) = figures_of(p, reflectance=reflectance, water_depth_m=100.0, follow=follow)
+    p = extract_parameters([sensor], [sensor.media[medium]])
+    found, (reason,) = compute_figures(p, reflectance=reflectance, water_depth_m=100.0, follow=follow)
     assert reason == ""
     return found
 
@@ -40,8 +40,8 @@ def at_standoff(sensor: Sensor, baseline_mm: float) -> Sensor:
 
 
 def reason_of(sensor: Sensor, *, follow=()) -> str:
-    p = parameters_of([sensor], [sensor.media["water"]])
-    _, (reason,) = figures_of(p, reflectance=0.5, water_depth_m=100.0, follow=follow)
+    p = extract_parameters([sensor], [sensor.media["water"]])
+    _, (reason,) = compute_figures(p, reflectance=0.5, water_depth_m=100.0, follow=follow)
     return reason
 
 
@@ -144,7 +144,7 @@ def test_photon_noise_of_a_gaussian_line_is_sigma_over_the_root_of_n(thesis):
 
 
 def test_speckle_contrast_in_a_pixel_is_below_that_of_two_polarisations(thesis):
-    contrast = parameters_of([thesis], [thesis.media["water"]]).pixel_contrast(np).item()
+    contrast = extract_parameters([thesis], [thesis.media["water"]]).pixel_contrast(np).item()
     assert 0.2 < contrast < 1 / math.sqrt(2)
 
 
@@ -202,8 +202,8 @@ def test_absorption_costs_what_beer_and_lambert_say(thesis):
 def test_laser_classes(thesis, power_mw, fan_deg, expected):
     # An eye's 7 mm at 100 mm are 4.0 deg, 8.9 % of 45 deg; 0.5 deg pass whole.
     sensor = altered(thesis, {"laser": {"power_mw": power_mw, "fan_angle_deg": fan_deg}})
-    p = parameters_of([sensor], [sensor.media["water"]])
-    found, _ = figures_of(p, reflectance=0.5, water_depth_m=100.0)
+    p = extract_parameters([sensor], [sensor.media["water"]])
+    found, _ = compute_figures(p, reflectance=0.5, water_depth_m=100.0)
     assert CLASS_NAMES[int(found.laser_class.item())] == expected
 
 
@@ -237,5 +237,5 @@ def test_why_designs_cannot_work(thesis, changes, says):
 def test_a_volume_that_would_begin_inside_the_housing(thesis):
     close = altered(thesis, {"laser": {"baseline_mm": 110.0}})
     assert "would begin" in reason_of(close, follow=("volume",))
-    p = followed(np, parameters_of([close], [close.media["water"]]), ("volume",))
+    p = adjust_to_standoff(np, extract_parameters([close], [close.media["water"]]), ("volume",))
     assert p.near_mm.item() < 0

@@ -9,8 +9,8 @@ import pytest
 from tests.oracles import fermat
 from tests.virtual_sensors import altered
 from twin.design import geometry as g
-from twin.design.figures_of_merit import FIGURES, figures_of, scatter_at
-from twin.design.parameters import followed, parameters_of
+from twin.design.figures_of_merit import FIGURES, compute_figures, predict_scatter
+from twin.design.parameters import adjust_to_standoff, extract_parameters
 from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Sensor
 from uwlts.optics.design import depth_per_pixel_mm, line_length_mm, nominal_setup, pixel_of_depth
@@ -22,7 +22,7 @@ RATIONAL = {"camera": {"distortion": {"p1": 0.004, "k3": 0.05, "k4": 0.6, "k5": 
 
 
 def numbers(sensor: Sensor, medium: str = "water"):
-    return parameters_of([sensor], [sensor.media[medium]])
+    return extract_parameters([sensor], [sensor.media[medium]])
 
 
 def column(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -58,7 +58,7 @@ def test_points_appear_where_light_of_least_time_comes_from(thesis_as_built, cha
     window, index = sensor.camera.window, sensor.media["water"].refractive_index(635.0)
     faces = fermat.plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=window.normal())
     rays = fermat.directions_seen(points, faces, [1.0, window.index(635.0), index])
-    view = g.seen(np, p.lens(), p.window(np), column(points))
+    view = g.project_points(np, p.lens(), p.window(np), column(points))
     # The oracle ends its search at 1e-10 mm or so of path; Newton's last step here is far below that.
     np.testing.assert_allclose(view.slopes[0].ravel(), rays[:, 0] / rays[:, 2], atol=1e-8)
     np.testing.assert_allclose(view.slopes[1].ravel(), rays[:, 1] / rays[:, 2], atol=1e-8)
@@ -66,14 +66,14 @@ def test_points_appear_where_light_of_least_time_comes_from(thesis_as_built, cha
 
 def test_the_lens_is_opencvs(thesis_as_built):
     camera = altered(thesis_as_built, {"camera": OBLONG["camera"] | RATIONAL["camera"]}).camera
-    (fx, fy), (cx, cy), lens = camera.focal_lengths_px(), camera.principal_point(), g.Lens.of(camera)
+    (fx, fy), (cx, cy), lens = camera.focal_lengths_px(), camera.principal_point(), g.Lens.from_description(camera)
     points, coefficients = points_of_sheet(thesis_as_built), np.array(list(camera.distortion.model_dump().values()))
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
     none = g.WindowGeometry((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
-    seen = g.seen(np, lens, none, column(points))
+    seen = g.project_points(np, lens, none, column(points))
     np.testing.assert_allclose(np.stack([seen.x, seen.y], axis=1), expected, atol=1e-9)
-    np.testing.assert_allclose(g.directions_of(lens, expected), points / points[:, 2:], atol=1e-6)
+    np.testing.assert_allclose(g.undistort_pixels(lens, expected), points / points[:, 2:], atol=1e-6)
 
 
 @pytest.mark.parametrize("changes", [{}, TILTED, OBLONG, RATIONAL])
@@ -81,11 +81,11 @@ def test_pixels_per_mm_are_the_differences_of_pixels(thesis_as_built, changes):
     sensor = altered(thesis_as_built, changes)
     points, p, step = points_of_sheet(sensor), numbers(sensor), 1e-3
     window = p.window(np)
-    view = g.seen(np, p.lens(), window, column(points))
+    view = g.project_points(np, p.lens(), window, column(points))
     rng = np.random.default_rng(5)
     for direction in rng.normal(size=(4, 3)):
         direction /= np.linalg.norm(direction)
-        ahead, behind = (g.seen(np, p.lens(), window, column(points + s * step * direction)) for s in (1, -1))
+        ahead, behind = (g.project_points(np, p.lens(), window, column(points + s * step * direction)) for s in (1, -1))
         dx, dy = g.pixels_per_mm(view, window, tuple(direction))
         # Central differences leave f''' step^2 / 6, below 1e-9 px/mm here, and 1e-13 * 1000 px / step of rounding.
         np.testing.assert_allclose(dx, (ahead.x - behind.x) / (2 * step), atol=1e-6)
@@ -97,7 +97,9 @@ def test_pixels_per_mm_are_the_differences_of_pixels(thesis_as_built, changes):
 def test_the_line_of_pixels_that_are_not_square(thesis, along, shorter):
     square = altered(thesis, {"camera": {"stripe_along": along}, "volume": {"near_mm": 300.0, "far_mm": 350.0}})
     oblong = altered(square, OBLONG)
-    lengths = [figures_of(numbers(s), reflectance=0.5, water_depth_m=100.0)[0].line_mm.item() for s in (square, oblong)]
+    lengths = [
+        compute_figures(numbers(s), reflectance=0.5, water_depth_m=100.0)[0].line_mm.item() for s in (square, oblong)
+    ]
     views = [view_of_sheet(s, s.media["water"]).line_length_mm for s in (square, oblong)]
     # Snell's law makes angles out of slopes, which are 0.3 at most.
     assert lengths[0] / lengths[1] == pytest.approx(shorter, rel=5e-3)
@@ -108,7 +110,7 @@ def test_the_line_of_pixels_that_are_not_square(thesis, along, shorter):
 def test_figures_agree_with_the_design_equations(thesis, medium):
     sensor = altered(thesis, {"volume": {"near_mm": 250.0, "far_mm": 400.0}})
     p = numbers(sensor, medium)
-    found, (reason,) = figures_of(p, reflectance=0.5, water_depth_m=100.0)
+    found, (reason,) = compute_figures(p, reflectance=0.5, water_depth_m=100.0)
     assert reason == ""
     setup, leaning = nominal_setup(sensor, sensor.media[medium])
     middle = 325.0 + setup.window.outer_mm
@@ -126,10 +128,10 @@ def test_designs_are_judged_alike_alone_and_together(thesis, thesis_as_built):
     tabulated = altered(thesis, {"laser": {"fan_profile": ((-20.0, 0.2), (0.0, 1.0), (22.0, 0.5))}})
     sensors = [thesis, thesis_as_built, height, tabulated]
     media = [sensor.media["water"] for sensor in sensors]
-    together, reasons = figures_of(parameters_of(sensors, media), reflectance=0.5, water_depth_m=10.0)
+    together, reasons = compute_figures(extract_parameters(sensors, media), reflectance=0.5, water_depth_m=10.0)
     assert reasons == [""] * len(sensors)
     for place, (sensor, medium) in enumerate(zip(sensors, media, strict=True)):
-        alone, _ = figures_of(parameters_of([sensor], [medium]), reflectance=0.5, water_depth_m=10.0)
+        alone, _ = compute_figures(extract_parameters([sensor], [medium]), reflectance=0.5, water_depth_m=10.0)
         for name in FIGURES:
             np.testing.assert_allclose(getattr(together, name)[place], getattr(alone, name)[0], rtol=1e-12)
 
@@ -147,15 +149,15 @@ def test_a_laser_placed_by_its_axis_is_the_same_sensor(thesis):
             }
         },
     )
-    ours, _ = figures_of(numbers(placed), reflectance=0.5, water_depth_m=10.0)
-    theirs, _ = figures_of(numbers(thesis), reflectance=0.5, water_depth_m=10.0)
+    ours, _ = compute_figures(numbers(placed), reflectance=0.5, water_depth_m=10.0)
+    theirs, _ = compute_figures(numbers(thesis), reflectance=0.5, water_depth_m=10.0)
     for name in FIGURES:
         np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-9, equal_nan=True)
 
 
 def test_what_follows_the_standoff(thesis):
     wide = altered(thesis, {"laser": {"baseline_mm": 300.0}})
-    p = followed(np, numbers(wide), ("focus", "waist", "volume"))
+    p = adjust_to_standoff(np, numbers(wide), ("focus", "waist", "volume"))
     standoff = camera_from_object(wide)[2, 3]
     window, index = wide.camera.window, wide.media["water"].refractive_index(635.0)
     outside = standoff - window.distance_mm - window.thickness_mm
@@ -172,8 +174,8 @@ def test_scatter_at_a_depth_is_what_the_volume_has_there(thesis):
     transform = camera_from_object(sensor)
     outer = sensor.camera.window.distance_mm + sensor.camera.window.thickness_mm
     z = (outer + np.array([250.0, 325.0, 400.0]) - transform[2, 3]) / transform[2, 2]
-    scatter = scatter_at(p, z, np.full(3, 1e3), reflectance=0.5)
-    found, _ = figures_of(p, reflectance=0.5, water_depth_m=10.0)
+    scatter = predict_scatter(p, z, np.full(3, 1e3), reflectance=0.5)
+    found, _ = compute_figures(p, reflectance=0.5, water_depth_m=10.0)
     expected = [found.sigma_z_near_mm.item(), found.sigma_z_middle_mm.item(), found.sigma_z_far_mm.item()]
     # Root mean squares over 15 and over 7 places of a curve that changes by some 10 % along the stripe.
     np.testing.assert_allclose(scatter, expected, rtol=0.05)

@@ -11,12 +11,21 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from matplotlib.tri import LinearTriInterpolator
 
-from twin.design.choice import Judged, pareto
-from twin.design.designs import Design, EvaluatedDesign, Marked, built, described, judged, row_of
-from twin.design.figures_of_merit import FIGURES, figures_of
-from twin.design.parameters import parameters_of
+from twin.design.choice import StudyResults, find_pareto_front
+from twin.design.designs import (
+    Design,
+    EvaluatedDesign,
+    HighlightedDesign,
+    build_sensor,
+    evaluate_designs,
+    evaluate_sensor,
+    select_design,
+)
+from twin.design.figures_of_merit import FIGURES, compute_figures
+from twin.design.parameters import extract_parameters
 from twin.design.report.charts import (
     bars,
+    choose_pareto_axes,
     contours,
     curves,
     map_places,
@@ -24,16 +33,15 @@ from twin.design.report.charts import (
     parallel_chart,
     pareto_chart,
     sample,
-    trade_off,
 )
-from twin.design.report.drawing import views_of
+from twin.design.report.drawing import make_views
 from twin.design.report.study_page import page_text
 from twin.design.report.study_tables import (
     agreement_text,
     label_of,
     misses,
     number_text,
-    rounded,
+    round_for_json,
     value_text,
     without_numbers,
     words_of,
@@ -68,27 +76,27 @@ def grid(study: Study) -> tuple[list[Design], dict[str, np.ndarray]]:
         Design(number, {n: g[k] for n, g, k in zip(names, grids, row, strict=True)})
         for number, row in enumerate(mesh.tolist())
     ]
-    return designs, judged(study, designs)
+    return designs, evaluate_designs(study, designs)
 
 
 def scattered(study: Study, count: int) -> tuple[list[Design], dict[str, np.ndarray]]:
     rng = np.random.default_rng(5)
-    designs = [Design(k, {name: v.at(rng.random()) for name, v in study.free().items()}) for k in range(count)]
-    return designs, judged(study, designs)
+    designs = [Design(k, {name: v.value_at(rng.random()) for name, v in study.free().items()}) for k in range(count)]
+    return designs, evaluate_designs(study, designs)
 
 
-def marked_of(study: Study, designs: list[Design], columns: dict[str, np.ndarray]) -> list[Marked]:
+def marked_of(study: Study, designs: list[Design], columns: dict[str, np.ndarray]) -> list[HighlightedDesign]:
     base = study.sensor
-    best = int(Judged(study, columns).best_first[0])
+    best = int(StudyResults(study, columns).best_first[0])
     return [
-        Marked("base", base, described(study, "base", base)),
-        Marked(f"best (design {best})", built(study, designs[best]), row_of(columns, best)),
+        HighlightedDesign("base", base, evaluate_sensor(study, "base", base)),
+        HighlightedDesign(f"best (design {best})", build_sensor(study, designs[best]), select_design(columns, best)),
     ]
 
 
-def point(values: dict[str, float]) -> Marked:
+def point(values: dict[str, float]) -> HighlightedDesign:
     """The base sensor as a marked design of these values."""
-    return Marked("base", BASE, EvaluatedDesign(-1, values, {}, 0.0, ""))
+    return HighlightedDesign("base", BASE, EvaluatedDesign(-1, values, {}, 0.0, ""))
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +156,7 @@ def angle_to(normal: np.ndarray, ray: np.ndarray) -> float:
 @pytest.mark.parametrize("name", ["thesis", "height", "tilted window", "placed by its axis", "distorted"])
 def test_drawn_rays_obey_snell_at_both_faces(name):
     sensor, medium = SENSORS[name]
-    side, front = views_of(sensor, sensor.medium(medium))
+    side, front = make_views(sensor, sensor.medium(medium))
     indices = [1.0, sensor.camera.window.index(635.0), sensor.medium(medium).refractive_index(635.0)]
     # Both windows here are tilted within the pictures' planes at most, so that rays stay in them.
     modules = [(ray, side.camera.window) for ray in side.edges] + [(ray, front.laser.window) for ray in front.fan]
@@ -171,7 +179,7 @@ def test_drawn_rays_obey_snell_at_both_faces(name):
 @pytest.mark.parametrize("name", SENSORS)
 def test_drawn_volume_has_the_description_s_ends_and_lies_on_the_sheet(name):
     sensor, medium = SENSORS[name]
-    side, front = views_of(sensor, sensor.medium(medium))
+    side, front = make_views(sensor, sensor.medium(medium))
     window = sensor.camera.window
     outer = window.distance_mm + window.thickness_mm / math.cos(math.radians(window.tilt_x_deg))
     depths = outer + np.array([sensor.volume.near_mm, sensor.volume.far_mm])
@@ -189,9 +197,9 @@ def test_drawn_volume_has_the_description_s_ends_and_lies_on_the_sheet(name):
 @pytest.mark.parametrize("name", SENSORS)
 def test_drawn_lines_are_as_long_as_the_figures_say_and_end_at_the_drawn_borders(name):
     sensor, medium = SENSORS[name]
-    _, front = views_of(sensor, sensor.medium(medium))
-    figures, (reason,) = figures_of(
-        parameters_of([sensor], [sensor.medium(medium)]), reflectance=0.5, water_depth_m=100.0
+    _, front = make_views(sensor, sensor.medium(medium))
+    figures, (reason,) = compute_figures(
+        extract_parameters([sensor], [sensor.medium(medium)]), reflectance=0.5, water_depth_m=100.0
     )
     assert not reason
     lengths = np.array([figures.line_near_mm[0], figures.line_mm[0], figures.line_far_mm[0]])
@@ -213,7 +221,7 @@ def distance_to(point: np.ndarray, polyline: np.ndarray) -> float:
 
 def test_a_rolled_laser_is_drawn_with_its_sheet_as_a_line():
     sensor = changed(laser__roll_deg=10.0)
-    side, _ = views_of(sensor, sensor.medium("water"))
+    side, _ = make_views(sensor, sensor.medium("water"))
     assert side.baseline_mm == pytest.approx(265.0)
     assert 200 < side.laser.origin[0] < 265
     slope = (side.sheet[-1] - side.laser.origin) / (side.crossing - side.laser.origin)
@@ -223,7 +231,7 @@ def test_a_rolled_laser_is_drawn_with_its_sheet_as_a_line():
 def test_a_sheet_that_never_crosses_the_axis_ahead_is_refused():
     sensor = changed(laser__baseline_mm=20.0, laser__triangulation_angle_deg=60.0)
     with pytest.raises(DesignError, match=r"11\.5 mm from the entrance pupil"):
-        views_of(sensor, sensor.medium("water"))
+        make_views(sensor, sensor.medium("water"))
 
 
 # --- the Pareto front -------------------------------------------------------------------------------------------------
@@ -247,12 +255,12 @@ numbers = st.one_of(st.integers(-3, 3).map(float), st.sampled_from([math.nan, ma
 @given(st.integers(1, 4).flatmap(lambda m: st.lists(st.lists(numbers, min_size=m, max_size=m), max_size=25)))
 def test_the_front_is_the_one_of_the_definition(rows):
     values = np.array(rows, dtype=float).reshape(len(rows), len(rows[0]) if rows else 2)
-    assert pareto(values).tolist() == front_by_definition(values.tolist())
+    assert find_pareto_front(values).tolist() == front_by_definition(values.tolist())
 
 
 def test_the_front_of_many_designs():
     values = np.random.default_rng(1).random((100_000, 2))
-    front = pareto(values)
+    front = find_pareto_front(values)
     found = values[front][np.argsort(values[front, 0])]
     # Along the front one value rises while the other falls, and nothing lies below it.
     assert len(found) > 5 and (np.diff(found[:, 1]) < 0).all()
@@ -263,7 +271,7 @@ def test_the_front_of_many_designs():
 @pytest.mark.parametrize("values", [np.zeros(3), np.zeros((3, 0))])
 def test_values_that_are_no_table_are_refused(values):
     with pytest.raises(RangeError, match="shape"):
-        pareto(values)
+        find_pareto_front(values)
 
 
 # --- names ------------------------------------------------------------------------------------------------------------
@@ -301,7 +309,7 @@ def test_numbers_in_words():
     ]
     assert value_text("laser_class", 4.0) == "3B"
     assert value_text("laser.triangulation_angle_deg", np.float64(35)) == "35°"
-    assert rounded([1.2345678, math.inf, math.nan, 0.000123456]) == [1.2346, None, None, 0.00012346]
+    assert round_for_json([1.2345678, math.inf, math.nan, 0.000123456]) == [1.2346, None, None, 0.00012346]
     assert without_numbers("begins -12.5 mm and 3e-4 mm behind x2") == "begins … mm and … mm behind x2"
 
 
@@ -310,7 +318,7 @@ def test_numbers_in_words():
 
 def test_a_map_is_linear_between_designs_that_work(swept):
     study, _, columns = swept
-    judged_designs = Judged(study, columns)
+    judged_designs = StudyResults(study, columns)
     places = map_places(judged_designs, *study.variables)
     assert places.tolist() == list(range(30))
     mesh = mesh_between(judged_designs, places, *study.variables)
@@ -327,7 +335,7 @@ def test_a_map_is_linear_between_designs_that_work(swept):
 
 def test_a_map_draws_bounds_designs_and_failures(swept):
     study, _, columns = swept
-    figure, caption = contours(Judged(study, columns), [], *study.variables)
+    figure, caption = contours(StudyResults(study, columns), [], *study.variables)
     panel = next(axes for axes in figure.axes if axes.get_title() == "line length in the middle (mm)")
     dots, crosses = (next(line for line in panel.lines if line.get_marker() == kind) for kind in (".", "x"))
     assert len(dots.get_xdata()) == (columns["failure"] == "").sum() > 5
@@ -341,7 +349,7 @@ def test_what_else_varies_is_shown_at_its_best(swept):
     study, _, _ = swept
     wider = small(choices={"lens": {"f/4": {"camera.f_number": 4.0}, "f/8": {"camera.f_number": 8.0}}})
     _, columns = grid(wider)
-    found = Judged(wider, columns)
+    found = StudyResults(wider, columns)
     places = map_places(found, *study.variables)
     sigma = np.where(columns["violation"] == 0, columns["sigma_z_rms_mm"], np.inf).reshape(30, 2).min(axis=1)
     assert np.isfinite(sigma).sum() > 5 and len(places) == 30
@@ -352,21 +360,21 @@ def test_what_else_varies_is_shown_at_its_best(swept):
 
 def test_the_front_in_the_chart_is_that_of_the_designs_that_meet_the_constraints(swept):
     study, _, columns = swept
-    table = Judged(study, columns)
-    assert trade_off(table) == (("sigma_z_rms_mm", 1), ("line_mm", -1))
+    table = StudyResults(study, columns)
+    assert choose_pareto_axes(table) == (("sigma_z_rms_mm", 1), ("line_mm", -1))
     figure = pareto_chart(table, [point({"sigma_z_rms_mm": 0.03, "line_mm": 160.0})])[0]
     front = next(trace for trace in figure.data if trace.name.startswith("Pareto"))
     meets = columns["violation"] == 0
     values = np.column_stack([columns["sigma_z_rms_mm"], -columns["line_mm"]])[meets]
     expected = values[front_by_definition(values.tolist())]
-    assert sorted(front.x) == rounded(np.sort(expected[:, 0]))
+    assert sorted(front.x) == round_for_json(np.sort(expected[:, 0]))
     assert [trace.text for trace in figure.data if not trace.name] == [("<b>base</b>",)]
 
 
 def test_parallel_axes_hold_choices_by_name():
     study = small(choices={"lens": {"<fast>": {"camera.f_number": 4.0}, "slow": {"camera.f_number": 8.0}}})
     _, columns = grid(study)
-    (trace,) = parallel_chart(Judged(study, columns))[0].data
+    (trace,) = parallel_chart(StudyResults(study, columns))[0].data
     axis = next(one for one in trace.dimensions if one.label == "lens")
     assert list(axis.ticktext) == ["<fast>", "slow"] and set(axis["values"]) == {0, 1}
     assert len(axis["values"]) == (columns["violation"] == 0).sum() > 5
@@ -385,7 +393,7 @@ def test_one_variable_gives_curves_and_none_gives_bars():
     study = small(variables={"laser.power_mw": {"least": 1, "most": 20, "steps": 4}}, choices={"lens": lens}, follow=())
     _, columns = grid(study)
     base = point({"laser.power_mw": 7.0, "line_mm": 9.0})
-    panels = curves(Judged(study, columns), [base], "laser.power_mw")[0].axes
+    panels = curves(StudyResults(study, columns), [base], "laser.power_mw")[0].axes
     assert [line.get_label() for line in panels[0].lines][:2] == ["f/4", "f/8"]
     assert panels[0].lines[0].get_xdata().tolist() == pytest.approx([1, 22 / 3, 41 / 3, 20])
     lengths = next(axes for axes in panels if axes.get_title() == "line length in the middle (mm)")
@@ -393,7 +401,7 @@ def test_one_variable_gives_curves_and_none_gives_bars():
     assert (list(marked.get_xdata()), list(marked.get_ydata())) == ([7.0], [9.0])
     study = small(variables={}, choices={"lens": lens})
     _, columns = grid(study)
-    axes = bars(Judged(study, columns))[0].axes[0]
+    axes = bars(StudyResults(study, columns))[0].axes[0]
     best = columns["sigma_z_rms_mm"].argmin()
     assert axes.get_yticklabels()[0].get_text() == list(lens)[best] and len(axes.patches) == 2
     assert axes.patches[0].get_width() == columns["sigma_z_rms_mm"][best]
@@ -506,7 +514,7 @@ def test_labels_are_escaped():
     lens = {'<script>alert("1")</script>': {"camera.f_number": 4.0}, "f & 8": {"camera.f_number": 8.0}}
     study = small(title="<b>bold</b>", choices={"<i>lens</i>": lens})
     designs, columns = grid(study)
-    marked = [Marked("<u>me</u>", m.sensor, m.design) for m in marked_of(study, designs, columns)]
+    marked = [HighlightedDesign("<u>me</u>", m.sensor, m.design) for m in marked_of(study, designs, columns)]
     row = verification(label="<u>me</u>", failure="no <marks>", agrees=False)
     raw = page_text(study, columns, marked=marked, agreements=[row], notes=["<hr>"])
     page = Page(raw)
@@ -555,7 +563,7 @@ def test_a_page_of_one_design(kind):
     designs, columns = grid(study) if kind == "grid" else scattered(study, 40)
     place = int(np.flatnonzero(columns["violation"] == 0)[0])
     one = {name: values[place : place + 1] for name, values in columns.items()}
-    marked = [Marked("only", built(study, designs[place]), row_of(columns, place))]
+    marked = [HighlightedDesign("only", build_sensor(study, designs[place]), select_design(columns, place))]
     page = Page(page_text(study, one, marked=marked, agreements=[]))
     assert "1 evaluated" in page.text() and not page.open
 
@@ -569,7 +577,7 @@ def test_designs_in_a_row_span_no_area():
             Design(design.number, design.values | {"laser.triangulation_angle_deg": angle})
             for design, angle in zip(designs, angles, strict=True)
         ]
-        page = Page(page_text(study, judged(study, row), marked=[], agreements=[]))
+        page = Page(page_text(study, evaluate_designs(study, row), marked=[], agreements=[]))
         assert not page.open
     assert "are on a line in these two variables" in page.text()
 
@@ -578,7 +586,7 @@ def test_a_chosen_design_that_cannot_be_drawn_is_said():
     study = small()
     _, columns = grid(study)
     sensor = changed(laser__baseline_mm=20.0, laser__triangulation_angle_deg=60.0)
-    marked = [Marked("bad", sensor, EvaluatedDesign(-1, {}, dict.fromkeys(FIGURES, math.nan), 0.0, ""))]
+    marked = [HighlightedDesign("bad", sensor, EvaluatedDesign(-1, {}, dict.fromkeys(FIGURES, math.nan), 0.0, ""))]
     page = Page(page_text(study, columns, marked=marked, agreements=[]))
     assert "The design cannot be drawn: the sheet crosses" in page.text()
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from twin.design.choice import SMOOTH, DerivedFigures, refined
-from twin.design.designs import Design, judged
+from twin.design.choice import SMOOTH, DerivedFigures, refine_design
+from twin.design.designs import Design, evaluate_designs
 from twin.design.parameters import PARAMETER_OF
 from twin.design.study import Study
 
@@ -44,13 +44,13 @@ def test_every_derivative_is_the_limit_of_differences():
     design = Design(0, VALUES)
     figures = DerivedFigures(study, design, names)
     start = np.array([VALUES[path] for path in figures.paths])
-    found, gradient = figures.at(start)
-    direct = judged(study, [design])
+    found, gradient = figures.evaluate(start)
+    direct = evaluate_designs(study, [design])
     for value, name in zip(found, names, strict=True):
         assert value == pytest.approx(direct[name].item(), rel=1e-9), name
     for k, path in enumerate(figures.paths):
         step = 1e-5 * abs(start[k])
-        ends = [judged(study, [Design(0, VALUES | {path: start[k] + s * step})]) for s in (1, -1)]
+        ends = [evaluate_designs(study, [Design(0, VALUES | {path: start[k] + s * step})]) for s in (1, -1)]
         for row, name in zip(gradient, names, strict=True):
             difference = (ends[0][name].item() - ends[1][name].item()) / (2 * step)
             # Rounding leaves 1e-11 of the value over the step's length, 1e-6 of the derivative or less.
@@ -65,22 +65,22 @@ def test_a_design_follows_the_gradient_to_the_best_of_its_range():
         constraints={"line_mm": {"least": 160.0}},
     )
     start = Design(0, {"laser.baseline_mm": 280.0, "laser.triangulation_angle_deg": 33.0})
-    before = judged(study, [start])
+    before = evaluate_designs(study, [start])
 
     def better(design: Design) -> bool:
-        found = judged(study, [design])
+        found = evaluate_designs(study, [design])
         return bool(found["violation"][0] == 0 and found["sigma_z_rms_mm"][0] < before["sigma_z_rms_mm"][0])
 
-    end = refined(study, start, better)
+    end = refine_design(study, start, better)
     assert end is not None
-    after = judged(study, [end])["sigma_z_rms_mm"].item()
+    after = evaluate_designs(study, [end])["sigma_z_rms_mm"].item()
     # A fine grid about the end finds nothing better that keeps all constraints and as much in view.
     around = [
         Design(0, {"laser.baseline_mm": b, "laser.triangulation_angle_deg": a})
         for b in np.linspace(185.5, 344.5, 41)
         for a in np.linspace(24.5, 45.5, 61)
     ]
-    columns = judged(study, around)
+    columns = evaluate_designs(study, around)
     allowed = (columns["violation"] == 0) & (columns["coverage"] >= before["coverage"][0])
     assert allowed.sum() > 50
     assert after < 0.995 * before["sigma_z_rms_mm"].item()
@@ -89,9 +89,9 @@ def test_a_design_follows_the_gradient_to_the_best_of_its_range():
 
 def test_nothing_to_derive_is_no_refinement():
     study = Study.model_validate({"title": "t", "variables": {"laser.wavelength_nm": {"least": 500.0, "most": 650.0}}})
-    assert refined(study, Design(0, {"laser.wavelength_nm": 600.0}), lambda design: True) is None
+    assert refine_design(study, Design(0, {"laser.wavelength_nm": 600.0}), lambda design: True) is None
 
 
 def test_a_refinement_that_is_not_accepted_is_none():
     study = study_of({"laser.power_mw": 7.0})
-    assert refined(study, Design(0, {"laser.power_mw": 7.0}), lambda design: False) is None
+    assert refine_design(study, Design(0, {"laser.power_mw": 7.0}), lambda design: False) is None

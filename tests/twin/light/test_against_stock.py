@@ -58,7 +58,7 @@ def twin_irradiance(
     sensor: Sensor, medium: Medium, scene: Scene, *without: str, spp: int, runs: int, pixel_px: int = BLOCK_PX
 ) -> np.ndarray:
     """Return block means (runs, H, W) of the twin's image in W/mm2, without defocus like the stock pinhole."""
-    renderer = Renderer(sensor, medium, scene, effects=ALL.without("defocus", *without))
+    renderer = Renderer(sensor, medium, scene, effects=ALL.remove("defocus", *without))
     images = (renderer.irradiance("laser", sensor_at(), spp=spp, seed=run) for run in range(runs))
     return np.stack([blocks(image, pixel_px) for image in images])
 

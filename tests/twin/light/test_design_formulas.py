@@ -11,7 +11,7 @@ import pytest
 
 from tests.virtual_sensors import altered, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.recording.frame_truth import true_stripe
+from twin.recording.frame_truth import find_true_stripe
 from uwlts.optics.design import (
     depth_mm,
     depth_per_pixel_mm,
@@ -44,7 +44,7 @@ def test_the_stripe_on_a_plate_is_where_the_formulas_say(thesis, medium_name, al
 
     def stripe(z: float) -> tuple[np.ndarray, np.ndarray]:
         """Image coordinate u and place Y along the stripe of every line, on a plate at Z in the object's frame."""
-        truth = true_stripe(renderer, sensor_at(-z))
+        truth = find_true_stripe(renderer, sensor_at(-z))
         assert (truth.status == TruthStatus.VISIBLE).all()
         return away * (truth.centre_px - middle), truth.point_mm[:, 1]
 

@@ -8,7 +8,7 @@ import pytest
 from tests.virtual_sensors import altered, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
 from twin.options import ALL, NONE, Effects, Options
-from twin.recording.studio import Studio
+from twin.recording.sensor_simulator import SensorSimulator
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Sensor
 
@@ -18,9 +18,9 @@ NAMES = [field.name for field in fields(Effects)]
 def test_names_are_those_of_the_command_line():
     assert ALL.names() == [name.replace("_", "-") for name in NAMES]
     assert NONE.names() == []
-    assert ALL.without("speckle", "multiple-scattering") == replace(ALL, speckle=False, multiple_scattering=False)
+    assert ALL.remove("speckle", "multiple-scattering") == replace(ALL, speckle=False, multiple_scattering=False)
     with pytest.raises(DescriptionError, match="unknown effect 'speckles'; known are defocus, haze"):
-        ALL.without("speckles")
+        ALL.remove("speckles")
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def groove(**motion: float):
 
 
 def image(sensor: Sensor, effects: Effects) -> np.ndarray:
-    studio = Studio(sensor, groove(), Options(spp=16, seed=3, effects=effects))
+    studio = SensorSimulator(sensor, groove(), Options(spp=16, seed=3, effects=effects))
     return studio.image(next(iter(studio.scene.motion.shots())), 0).astype(float)
 
 

@@ -89,7 +89,7 @@ def opencv_pixels(camera: Camera, rays: np.ndarray) -> np.ndarray:
 def hits(renderer: Renderer, pixels: np.ndarray, z: float) -> np.ndarray:
     """Return the points (N, 3) in the OCS where image points see the plate at ``z``, by Mitsuba."""
     pose = SensorPose(sensor_at(-z))
-    bundle = renderer.view.bundle(to_jit(mi.Float, pixels[:, 0]), to_jit(mi.Float, pixels[:, 1]))
+    bundle = renderer.view.trace_bundle(to_jit(mi.Float, pixels[:, 0]), to_jit(mi.Float, pixels[:, 1]))
     si = renderer.objects.scene.ray_intersect(pose.ray(bundle.origin, bundle.direction))
     seen = si.is_valid() & (bundle.weight > 0)
     dr.eval(si.p, seen)

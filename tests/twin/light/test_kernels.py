@@ -10,11 +10,11 @@ import pytest
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
 from twin.datasets.data_set import DataSetDescription, load_description
 from twin.datasets.draws import draw_scene
-from twin.datasets.labels import labelled
+from twin.datasets.labels import make_labels
 from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer
-from twin.recording.frame_truth import true_stripe
-from twin.recording.studio import Studio
+from twin.recording.frame_truth import find_true_stripe
+from twin.recording.sensor_simulator import SensorSimulator
 from twin.scene.description import load_scene
 from uwlts.model.sensor import Medium, Sensor
 
@@ -52,7 +52,7 @@ def test_a_laser_scan_compiles_nothing_after_its_first_frame(thesis, new_kernels
 
     def frame(index: int, pose: np.ndarray) -> int:
         image = renderer.irradiance("laser", pose, spp=4 + index % 2)
-        true_stripe(renderer, pose)
+        find_true_stripe(renderer, pose)
         return len(renderer.lit_pixels(SensorPose(pose))[0]) + 0 * len(image)
 
     for index in range(2):
@@ -122,9 +122,9 @@ def test_scenes_of_a_data_set_share_their_kernels(thesis, new_kernels):
 
     def scene(number: int) -> None:
         drawn = draw_scene(described, number)
-        studio = Studio(drawn.as_built, drawn.scene, drawn.options, probe="middle")
+        studio = SensorSimulator(drawn.as_built, drawn.scene, drawn.options, probe="middle")
         for index, shot in enumerate(drawn.scene.motion.shots()):
-            labelled(studio, shot, studio.exposed(shot, index), described.labels)
+            make_labels(studio, shot, studio.expose(shot, index), described.labels)
 
     scene(0)
     assert new_kernels()[1] >= 4

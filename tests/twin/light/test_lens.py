@@ -9,7 +9,7 @@ import pytest
 from tests.virtual_sensors import altered, camera_axes, clear, cropped, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
 from twin.options import NONE
-from twin.recording.frame_truth import true_stripe
+from twin.recording.frame_truth import find_true_stripe
 from uwlts.model.sensor import Medium, Sensor
 
 SPP = 1024
@@ -120,7 +120,7 @@ def test_a_tilted_window_shifts_the_blurred_stripe_from_its_chief_rays(thesis):
     for effects in (NONE, BLURRED):
         renderer = Renderer(sensor, medium, scene_of(plate()), effects=effects)
         image = renderer.irradiance("laser", sensor_at(), spp=SPP).astype(float)
-        truth = true_stripe(renderer, sensor_at())
+        truth = find_true_stripe(renderer, sensor_at())
         offsets.append(np.mean((row * image).sum(axis=0) / image.sum(axis=0) - truth.centre_px))
     assert abs(offsets[0]) < 3e-3
     assert 0.01 < abs(offsets[1] - offsets[0]) < 1.0, "the window's coma is in the picture"

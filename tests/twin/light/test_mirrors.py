@@ -10,7 +10,7 @@ from tests.virtual_sensors import block, clear, image_of, plate, scene_of, senso
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
 from twin.options import NONE
-from twin.recording.frame_truth import true_stripe
+from twin.recording.frame_truth import find_true_stripe
 from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus
@@ -29,7 +29,7 @@ def mirror(share: float, **rest: object) -> dict[str, object]:
 def test_a_perfect_mirror_shows_no_stripe_of_its_own(thesis):
     renderer = Renderer(thesis, clear(), scene_of(mirror(1.0)), effects=EFFECTS)
     assert renderer.irradiance("laser", sensor_at(), spp=16).max() == 0
-    assert (true_stripe(renderer, sensor_at()).status != TruthStatus.VISIBLE).all()
+    assert (find_true_stripe(renderer, sensor_at()).status != TruthStatus.VISIBLE).all()
 
 
 def hidden(share: float) -> Scene:
@@ -85,7 +85,7 @@ def test_the_straight_stripe_is_the_same_with_a_mirror(thesis):
     scenes = [scene_of(BLOCK, mirror(share)) for share in (SHARE, 0.0)]
     renderers = [Renderer(thesis, clear(), scene, effects=EFFECTS) for scene in scenes]
     with_mirror, without = (renderer.irradiance("laser", sensor_at(), spp=64) for renderer in renderers)
-    truth = true_stripe(renderers[1], sensor_at())
+    truth = find_true_stripe(renderers[1], sensor_at())
     line = np.flatnonzero(truth.status == TruthStatus.VISIBLE)[20:-20]
     row = np.rint(truth.centre_px[line]).astype(int)
     assert len(line) > 200

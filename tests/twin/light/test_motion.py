@@ -10,8 +10,8 @@ from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sens
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
 from twin.options import NONE, Options
-from twin.recording.frame_truth import true_stripe
-from twin.recording.studio import Studio
+from twin.recording.frame_truth import find_true_stripe
+from twin.recording.sensor_simulator import SensorSimulator
 from uwlts.errors import DesignError
 
 ALONG_X = np.array([1.0, 0.0, 0.0])
@@ -37,7 +37,7 @@ def travel(exposure_mm: float = 0.0, row_mm: float = 0.0) -> Travel:
 
 @pytest.mark.parametrize("exposure_mm", [3.0, 12.0])
 def test_travel_during_the_exposure_blurs_the_stripe_evenly(renderer, exposure_mm):
-    centres = [true_stripe(renderer, sensor_at(x=x)).centre_px for x in (-1.0, 1.0)]
+    centres = [find_true_stripe(renderer, sensor_at(x=x)).centre_px for x in (-1.0, 1.0)]
     px_per_mm = (centres[1] - centres[0]) / 2
     assert (np.abs(px_per_mm) > 1).all()
     still = renderer.irradiance("laser", sensor_at(), spp=512).astype(float)
@@ -51,12 +51,14 @@ def test_travel_during_the_exposure_blurs_the_stripe_evenly(renderer, exposure_m
 
 def test_a_rolling_shutter_shifts_each_row_by_its_delay(renderer):
     pose, delay = sensor_at(), 0.005
-    centre = true_stripe(renderer, pose).centre_px
-    rolled = true_stripe(renderer, pose, travel=travel(row_mm=delay))
+    centre = find_true_stripe(renderer, pose).centre_px
+    rolled = find_true_stripe(renderer, pose, travel=travel(row_mm=delay))
     # Every line is exposed where its stripe then is: the still frame at the travel of that row shows the same.
     for line in (4, 24, 43):
         at = rolled.centre_px[line] * delay
-        assert true_stripe(renderer, sensor_at(x=at)).centre_px[line] == pytest.approx(rolled.centre_px[line], abs=2e-3)
+        assert find_true_stripe(renderer, sensor_at(x=at)).centre_px[line] == pytest.approx(
+            rolled.centre_px[line], abs=2e-3
+        )
     assert np.abs(rolled.centre_px - centre).max() > 1
     image = renderer.irradiance("laser", pose, spp=256, travel=travel(row_mm=delay)).astype(float)
     np.testing.assert_allclose(moments(image)[0], rolled.centre_px, atol=0.05)
@@ -88,23 +90,23 @@ def test_an_exposure_under_any_twist_is_the_mean_of_still_frames_along_it(render
 def test_a_turn_moves_each_row_of_a_rolling_shutter(renderer):
     """The truth of a row is that of a still frame at the pose of that row's moment."""
     turn, row_s, begun = np.array([0.0, 30.0, 3.0]), 1e-4, sensor_at(x=15.0)
-    rolled = true_stripe(renderer, begun, travel=Travel(np.zeros(3), 0.0, turn, row_s=row_s))
+    rolled = find_true_stripe(renderer, begun, travel=Travel(np.zeros(3), 0.0, turn, row_s=row_s))
     for line in (4, 43):
         pose = begun.copy()
         pose[:3, :3] = Rotation.from_rotvec(turn * rolled.centre_px[line] * row_s).as_matrix()
-        assert true_stripe(renderer, pose).centre_px[line] == pytest.approx(rolled.centre_px[line], abs=2e-3)
-    assert np.abs(rolled.centre_px - true_stripe(renderer, begun).centre_px).max() > 1
+        assert find_true_stripe(renderer, pose).centre_px[line] == pytest.approx(rolled.centre_px[line], abs=2e-3)
+    assert np.abs(rolled.centre_px - find_true_stripe(renderer, begun).centre_px).max() > 1
 
 
 def test_too_fast_a_travel_is_refused_with_numbers(thesis):
     sensor = altered(thesis, {"exposure": {"laser_ms": 5.0}})
     fast = {"count": 5, "step_mm": 1.0, "speed_mm_per_s": 100.0}
     with pytest.raises(DesignError, match=r"at 100 mm/s .* after 10 ms, but the camera needs 16.7 ms"):
-        Studio(sensor, scene_of(TILTED, motion=fast), Options(effects=NONE))
-    studio = Studio(sensor, scene_of(TILTED, motion=fast | {"speed_mm_per_s": 50.0}), Options(effects=NONE))
+        SensorSimulator(sensor, scene_of(TILTED, motion=fast), Options(effects=NONE))
+    studio = SensorSimulator(sensor, scene_of(TILTED, motion=fast | {"speed_mm_per_s": 50.0}), Options(effects=NONE))
     assert studio.period_s == pytest.approx(0.02)
     shot = next(studio.scene.motion.shots())
     assert studio.travel(shot) is None, "the motion is left out"
-    moving = Studio(sensor, studio.scene, Options(effects=replace(NONE, motion=True)))
+    moving = SensorSimulator(sensor, studio.scene, Options(effects=replace(NONE, motion=True)))
     way = moving.travel(shot)
     assert way.velocity_mm_s * way.exposure_s == pytest.approx([0.25, 0.0, 0.0])

@@ -10,7 +10,7 @@ import pytest
 from tests.virtual_sensors import clear, oracle_paths, scene_of, sensor_at
 from twin.backend.arrays import to_jit, to_numpy
 from twin.light.renderer import Renderer
-from twin.recording.frame_truth import true_stripe
+from twin.recording.frame_truth import find_true_stripe
 from twin.scene.forms.head import head_depth
 from twin.scene.forms.weld import Weld, weld_height
 from twin.scene.objects import Objects, build_objects
@@ -95,7 +95,7 @@ def hidden_places(sensor: Sensor, medium: Medium, x: float) -> np.ndarray:
 @pytest.mark.parametrize("x", [-13.0, 13.0])
 def test_the_nose_hides_the_stripe_on_the_cameras_far_side_only(thesis, x):
     medium = clear()
-    truth = true_stripe(Renderer(thesis, medium, scene_of(HEAD)), sensor_at(x=x))
+    truth = find_true_stripe(Renderer(thesis, medium, scene_of(HEAD)), sensor_at(x=x))
     seen = np.sort(truth.point_mm[truth.status == TruthStatus.VISIBLE][:, 1].astype(float))
     gaps = [(a, b) for a, b in pairwise(seen) if b - a > 1.0 and -40 < a < 40]
     if x < 0:  # the camera stands on this side

@@ -14,7 +14,7 @@ from tests.virtual_sensors import altered, clear, laser_origin, oracle_fan, orac
 from twin.backend.arrays import to_jit, to_numpy
 from twin.light.sheet import PowerTable, Sheet
 from uwlts.errors import DescriptionError, DesignError
-from uwlts.model.library import validated
+from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Laser, Medium, Sensor
 
@@ -125,7 +125,7 @@ def fan_edges(sheet: Sheet, z: float) -> np.ndarray:
 )
 def test_a_laser_that_cannot_be_is_refused(thesis, changes, message):
     with pytest.raises(DescriptionError, match=message):
-        validated(Laser, thesis.laser.model_dump() | changes, "test")
+        validate_description(Laser, thesis.laser.model_dump() | changes, "test")
 
 
 def test_a_profile_may_reach_the_edges_of_the_fan_and_lasers_may_be_several(thesis):

@@ -23,7 +23,7 @@ from tests.virtual_sensors import (
     sensor_at,
 )
 from twin.backend.arrays import to_jit
-from twin.light.illumination import lights
+from twin.light.illumination import make_lights
 from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer
 from twin.light.walk import Walker
@@ -48,12 +48,12 @@ def coarse(thesis) -> Sensor:
 def walked(renderer: Renderer, pixels: np.ndarray, walks: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return the irradiance (N,) of indirect light at image points (N, 2), and its standard error."""
     pose = SensorPose(np.eye(4))
-    direct, _ = lights([renderer._sheets[0]], pose)
+    direct, _ = make_lights([renderer._sheets[0]], pose)
     walker = Walker(renderer.objects, renderer.scattering, renderer.effects, pose, direct, 2000.0)
     each = walks // BATCHES
     cell = np.repeat(np.arange(len(pixels) * BATCHES), each)
     x, y = pixels[cell // BATCHES].T
-    bundle = renderer.view.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
+    bundle = renderer.view.trace_bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
     sums = np.zeros(len(pixels) * BATCHES)
     for where, *parts in walker.trace(bundle, to_jit(mi.UInt32, cell), seed=seed):
         for light in parts:

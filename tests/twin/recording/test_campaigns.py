@@ -6,7 +6,7 @@ import pytest
 
 from twin.recording.campaigns import PLAN, keep_to_plan
 from uwlts.errors import DescriptionError
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 
 
 def test_a_command_may_replace_the_plan_that_it_has_read(tmp_path):
@@ -14,7 +14,7 @@ def test_a_command_may_replace_the_plan_that_it_has_read(tmp_path):
     (tmp_path / "a.h5").touch()
     (tmp_path / PLAN).write_text('{"seed": 1}', encoding="utf-8")
     # As within a command, whose inputs are never written.
-    with inputs_kept():
+    with protect_inputs():
         with pytest.raises(DescriptionError, match="another seed"):
             keep_to_plan(tmp_path, {"seed": 2}, {tmp_path / "a.h5"}, overwrite=False, **kinds)
         keep_to_plan(tmp_path, {"seed": 2}, {tmp_path / "a.h5"}, overwrite=True, **kinds)

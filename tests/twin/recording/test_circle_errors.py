@@ -12,7 +12,7 @@ from twin.light.renderer import Renderer
 from twin.options import NONE, Options
 from twin.recording.frame_truth import depth_map
 from twin.recording.record_scene import record_scene
-from twin.recording.studio import Studio, with_window
+from twin.recording.sensor_simulator import SensorSimulator, with_window
 from twin.scene.description import CirclePlate, Scene
 from twin.scene.finish import draw_print_errors
 from twin.scene.motion import Motion, Shot
@@ -129,8 +129,8 @@ def test_printed_shifts_have_their_size():
 # --- circles found off their places
 
 
-def studio_of(sensor: Sensor, scene: Scene) -> Studio:
-    return Studio(sensor, scene, Options(spp=64, effects=NONE))
+def studio_of(sensor: Sensor, scene: Scene) -> SensorSimulator:
+    return SensorSimulator(sensor, scene, Options(spp=64, effects=NONE))
 
 
 @pytest.mark.parametrize("medium", ["air", "water"])

@@ -9,7 +9,7 @@ from tests.virtual_sensors import altered, camera_axes, clear, cropped, oracle_p
 from twin.light.renderer import Renderer
 from twin.options import NONE, Flaws, Options
 from twin.recording.record_scene import record_scene
-from twin.recording.studio import Studio
+from twin.recording.sensor_simulator import SensorSimulator
 from twin.sensor.flaws import dirt
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Sensor
@@ -42,35 +42,35 @@ def sensor(thesis: Sensor) -> Sensor:
     return altered(thesis, {"camera": camera, "exposure": {"laser_ms": 2.0, "lamp_ms": 1.0}})
 
 
-def studio(sensor: Sensor, *effects: str) -> Studio:
+def studio(sensor: Sensor, *effects: str) -> SensorSimulator:
     """The sensor before a turned plate, without any of the other effects."""
     turned = plate(reflectance=0.6, side=150.0) | {"rotation_deg": (20.0, 10.0, 0.0)}
     scene = scene_of(turned, motion={"lights": ("lamp", "laser")})
-    return Studio(sensor, scene, Options(effects=NONE, flaws=Flaws.of(*effects)))
+    return SensorSimulator(sensor, scene, Options(effects=NONE, flaws=Flaws.parse(*effects)))
 
 
 @pytest.fixture(scope="module")
-def apart(sensor: Sensor) -> Studio:
+def apart(sensor: Sensor) -> SensorSimulator:
     """The sensor without flaws."""
     return studio(sensor)
 
 
-def images(taken: Studio) -> list[np.ndarray]:
+def images(taken: SensorSimulator) -> list[np.ndarray]:
     return [taken.image(shot, index).astype(float) for index, shot in enumerate(taken.scene.motion.shots())]
 
 
 @pytest.fixture(scope="module")
-def plain(apart: Studio) -> list[np.ndarray]:
+def plain(apart: SensorSimulator) -> list[np.ndarray]:
     """Its image under the lamp, and the laser's."""
     return images(apart)
 
 
 def test_a_name_alone_stands_for_its_typical_strength():
-    assert Flaws.of(*NAMES) == Flaws.of(*TYPICAL)
-    assert Flaws.of(*TYPICAL).names() == TYPICAL
+    assert Flaws.parse(*NAMES) == Flaws.parse(*TYPICAL)
+    assert Flaws.parse(*TYPICAL).names() == TYPICAL
     assert len(TYPICAL) == len(fields(Flaws))
-    assert Flaws.of() == Flaws() and Flaws().names() == []
-    assert Flaws.of("jpeg=75", "glare=0.1") == Flaws(jpeg=75, glare=0.1)
+    assert Flaws.parse() == Flaws() and Flaws().names() == []
+    assert Flaws.parse("jpeg=75", "glare=0.1") == Flaws(jpeg=75, glare=0.1)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_a_name_alone_stands_for_its_typical_strength():
 )
 def test_what_is_no_flaw_is_refused(text, message):
     with pytest.raises(DescriptionError, match=message):
-        Flaws.of("glare", text)
+        Flaws.parse("glare", text)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("rolling-shutter", "caustics", "camera-3d")])
@@ -137,7 +137,7 @@ def test_dirt_takes_its_share_in_patches_as_wide_as_the_pupil(sensor):
 def test_a_rolling_shutter_delays_the_rows_of_a_moving_sensor(sensor):
     scene = scene_of(plate(), motion={"speed_mm_per_s": 40.0})
     studios = [
-        Studio(sensor, scene, Options(effects=replace(NONE, motion=True), flaws=Flaws.of(*effects)))
+        SensorSimulator(sensor, scene, Options(effects=replace(NONE, motion=True), flaws=Flaws.parse(*effects)))
         for effects in (["rolling-shutter=25"], [])
     ]
     travels = [each.travel(next(scene.motion.shots())) for each in studios]
@@ -217,7 +217,7 @@ def test_a_plate_cut_off_by_the_image_is_seen_as_in_a_larger_one(thesis):
 def test_the_capture_states_the_drawings_and_lists_the_flaws(sensor, tmp_path):
     path, asked = tmp_path / "scan.h5", ["pixel-aspect=1.01", "tangential", "jpeg=80"]
     scene = scene_of(plate(), motion={"lights": ("lamp",)})
-    record_scene(scene, sensor, path, options=Options(flaws=Flaws.of(*asked)))
+    record_scene(scene, sensor, path, options=Options(flaws=Flaws.parse(*asked)))
     with Capture(path) as capture:
         assert capture.header.sensor == sensor
         assert capture.header.provenance["effects"][-3:] == ["pixel-aspect=1.01", "tangential=0.001", "jpeg=80"]

@@ -22,7 +22,14 @@ from tests.virtual_sensors import (
 )
 from twin.light.renderer import Renderer
 from twin.options import NONE
-from twin.recording.frame_truth import FrameTruth, crossings, depth_map, image_points, seen_surfaces, true_stripe
+from twin.recording.frame_truth import (
+    FrameTruth,
+    depth_map,
+    find_crossings,
+    find_true_stripe,
+    find_visible_surfaces,
+    project_points,
+)
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus
 
@@ -53,7 +60,7 @@ def test_true_centres_are_where_light_of_least_time_shows_the_sheet(thesis, name
     sensor, medium = altered(thesis, {"camera": SENSORS[name]}), clear(0.3)
     renderer = Renderer(sensor, medium, scene_of(plate()))
     for z in (-45.0, 60.0):
-        truth = true_stripe(renderer, sensor_at(-z))
+        truth = find_true_stripe(renderer, sensor_at(-z))
         lines = np.arange(100, sensor.camera.lines() - 100, 11).astype(float)
         y, across = stripe_on_plate(sensor, medium, lines, z)
         chosen = lines.astype(int)
@@ -73,7 +80,7 @@ def test_the_rendered_stripe_lies_about_its_true_centre(thesis):
     renderer = Renderer(sensor, clear(0.3), scene_of(plate()), effects=NONE)
     for z in (-40.0, 0.0, 40.0):
         image = renderer.irradiance("laser", sensor_at(-z), spp=256).astype(float)
-        truth = true_stripe(renderer, sensor_at(-z))
+        truth = find_true_stripe(renderer, sensor_at(-z))
         assert (truth.status == TruthStatus.VISIBLE).all()
         centroid = np.arange(512) @ image / image.sum(axis=0)
         # The sum covers the stripe to 4.5 sigma. Scale and brightness of the picture change by some 5e-3 per mm across
@@ -89,7 +96,7 @@ def distance_to_sphere(points: np.ndarray, centre: np.ndarray, diameter: float) 
 
 def true_points(renderer: Renderer, pose: np.ndarray, at_least: int) -> FrameTruth:
     """Return the points of a frame's visible lines; every point must be in the plane of the sheet."""
-    truth = true_stripe(renderer, pose)
+    truth = find_true_stripe(renderer, pose)
     visible = truth.status == TruthStatus.VISIBLE
     assert visible.sum() >= at_least
     assert np.isnan(truth.centre_px[~visible]).all()
@@ -190,7 +197,7 @@ def test_points_are_seen_where_light_of_least_time_shows_them(thesis):
     renderer = Renderer(sensor, medium, scene_of(plate(30.0, side=120.0), block((20.0, 20.0, 20.0), (0.0, 0.0, 10.0))))
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(-70, 70, 9), np.linspace(-70, 70, 9)))
     points = np.stack([x, y, np.full_like(x, 30.0)], axis=1)
-    found, expected = image_points(renderer, sensor_at(), points), seen_at(sensor, medium, points)
+    found, expected = project_points(renderer, sensor_at(), points), seen_at(sensor, medium, points)
     known = np.isfinite(found).all(axis=1)
     # 0.05 px are 0.01 mm: within the rounding of Newton's last step and of coordinates in 32 bits.
     np.testing.assert_allclose(found[known], expected[known], rtol=0, atol=2 * CENTRE_PX)
@@ -204,12 +211,12 @@ def test_pixels_know_the_object_that_they_see(thesis):
     renderer = Renderer(
         coarse(thesis), clear(), scene_of(plate(30.0, side=120.0), block((60.0, 60.0, 20.0), (0.0, 0.0, 0.0)))
     )
-    depth, number = seen_surfaces(renderer, sensor_at())
+    depth, number = find_visible_surfaces(renderer, sensor_at())
     assert set(np.unique(number)) == {-1, 0, 1}
     np.testing.assert_array_equal(number < 0, np.isnan(depth))
     # Of both things the block is nearer wherever it is seen, by its 20 mm less what tilts by 35 deg do to depths.
     assert depth[128, 160] < np.nanmin(depth[number == 0]) + 60.0 and number[128, 160] == 1
-    truth = crossings(renderer, sensor_at())
+    truth = find_crossings(renderer, sensor_at())
     np.testing.assert_array_equal(truth.thing, np.where(truth.point_mm[:, 2] > 20.0, 0, 1))
     assert set(truth.thing) == {0, 1}
 
@@ -237,7 +244,7 @@ def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
     size, position = BLOCKS[name]
     low, high = (np.array(position) + sign * np.array(size) / 2 for sign in (-1, 1))
     renderer = Renderer(sensor, medium, scene_of(plate(z), block(size, position)))
-    truth = true_stripe(renderer, sensor_at())
+    truth = find_true_stripe(renderer, sensor_at())
     lines = np.arange(30.0, 290.0, 2.0)
     y, _ = stripe_on_plate(sensor, medium, lines, z)
     on_plate = np.stack([0 * y, y, np.full_like(y, z)], axis=1)
@@ -261,7 +268,7 @@ def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
     assert bright[inner == 0].all()
     assert truth.crossings[lines.astype(int)].max() == 1
     # Points in the shadow are visible, hidden ones are not.
-    found = crossings(renderer, sensor_at())
+    found = find_crossings(renderer, sensor_at())
     on_the_plate = found.line[np.abs(found.point_mm[:, 2] - z) < 0.1]
     seen = np.isin(lines, on_the_plate)
     np.testing.assert_array_equal(seen[clear_cut], hidden[clear_cut] <= 0)

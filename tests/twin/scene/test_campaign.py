@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import scene_of
-from twin.scene.campaign import Campaign, Imperfections, Take, _SampledImperfections, load_campaign, takes
+from twin.scene.campaign import Campaign, Imperfections, Take, _SampledImperfections, list_takes, load_campaign
 from twin.scene.description import load_scene
 from uwlts.errors import DescriptionError
-from uwlts.model.library import load_sensor, names
+from uwlts.model.library import list_names, load_sensor
 
 SIZES = {
     "circle_centre_std_mm": 0.002,
@@ -53,13 +53,13 @@ def campaign(recordings: list[dict[str, Any]] = RECORDINGS, **sizes: float) -> C
 
 
 def drawn(seed: int = 0, *, every: int = 1, **sizes: float) -> dict[str, Take]:
-    return {take.name: take for take in takes(campaign(**sizes), seed=seed, every=every)}
+    return {take.name: take for take in list_takes(campaign(**sizes), seed=seed, every=every)}
 
 
 def over_seeds(name: str, wanted: list[int]) -> list[dict[str, Take]]:
     """Takes of the recordings of some numbers for many seeds, with one imperfection alone."""
     chosen = campaign([RECORDINGS[number] for number in wanted], **{name: SIZES[name]})
-    return [{take.name: take for take in takes(chosen, seed=seed)} for seed in range(SEEDS)]
+    return [{take.name: take for take in list_takes(chosen, seed=seed)} for seed in range(SEEDS)]
 
 
 def differing(one: Any, other: Any, *, at: str = "") -> set[str]:
@@ -112,7 +112,7 @@ def test_takes_are_named_by_scene_placement_and_medium():
 
 
 def test_one_seed_draws_the_same_again():
-    assert takes(campaign(**SIZES), seed=3) == takes(campaign(**SIZES), seed=3)
+    assert list_takes(campaign(**SIZES), seed=3) == list_takes(campaign(**SIZES), seed=3)
 
 
 def test_another_seed_draws_all_anew():
@@ -125,7 +125,7 @@ def test_another_seed_draws_all_anew():
 
 
 def test_recordings_do_not_depend_on_which_others_there_are():
-    alone = takes(campaign([RECORDINGS[3]], **SIZES), seed=5)
+    alone = list_takes(campaign([RECORDINGS[3]], **SIZES), seed=5)
     whole = drawn(5, **SIZES)
     assert len(alone) == len(PLANES)
     assert all(take == whole[take.name] for take in alone)
@@ -359,10 +359,10 @@ PLANE = '[[recordings]]\nscene = "plane"\n'
 
 
 def test_shipped_campaigns_can_be_drawn():
-    assert "thesis" in names("campaigns")
-    for name in names("campaigns"):
+    assert "thesis" in list_names("campaigns")
+    for name in list_names("campaigns"):
         shipped = load_campaign(name)
-        assert len(takes(shipped, seed=0)) >= len(shipped.recordings)
+        assert len(list_takes(shipped, seed=0)) >= len(shipped.recordings)
 
 
 def test_paths_start_at_the_campaigns_folder(tmp_path: Path, monkeypatch):
@@ -374,10 +374,10 @@ def test_paths_start_at_the_campaigns_folder(tmp_path: Path, monkeypatch):
     head = 'title = "test"\nsensor = "sensor.toml"\nas_built = "sensor.toml"\n'
     written(folder / "campaign.toml", f'{head}[[recordings]]\nscene = "board.toml"\n')
     monkeypatch.chdir(elsewhere)
-    (take,) = takes(load_campaign("../mine/campaign.toml"), seed=0)
+    (take,) = list_takes(load_campaign("../mine/campaign.toml"), seed=0)
     assert (take.name, take.scene.title) == ("board-standoff-water", "Board")
     assert take.sensor.name == take.built.name == "mine"
-    (take,) = takes(load_campaign(folder / "campaign.toml"), seed=0)
+    (take,) = list_takes(load_campaign(folder / "campaign.toml"), seed=0)
     assert take.name == "board-standoff-water"
 
 
@@ -418,7 +418,7 @@ def test_campaigns_that_are_wrong(tmp_path: Path, text: str, says: str):
 )
 def test_campaigns_that_cannot_be_taken(tmp_path: Path, text: str, says: str):
     with pytest.raises(DescriptionError) as raised:
-        takes(load_campaign(written(tmp_path / "campaign.toml", text)), seed=0)
+        list_takes(load_campaign(written(tmp_path / "campaign.toml", text)), seed=0)
     assert says in str(raised.value)
 
 
@@ -427,5 +427,5 @@ def test_a_step_standard_without_blocks(tmp_path: Path):
     scene = 'title = "Step"\n[artefact]\nkind = "step"\n[[objects]]\nkind = "sphere"\ndiameter_mm = 9.0\n'
     recordings = [{"scene": str(written(tmp_path / "smooth.toml", scene)), "name": "a"}]
     with pytest.raises(DescriptionError, match=r"Step: a step standard of 0 blocks.*step_height_half_width_mm to 0"):
-        takes(campaign(recordings, step_height_half_width_mm=0.02), seed=0)
-    assert [take.name for take in takes(campaign(recordings, window_tilt_std_deg=0.1), seed=0)] == ["a"]
+        list_takes(campaign(recordings, step_height_half_width_mm=0.02), seed=0)
+    assert [take.name for take in list_takes(campaign(recordings, window_tilt_std_deg=0.1), seed=0)] == ["a"]

@@ -7,17 +7,17 @@ from scipy.spatial.transform import Rotation
 from tests.virtual_sensors import altered, plate, scene_of
 from twin.light.renderer import Renderer
 from twin.options import Options
-from twin.recording.studio import check_scene, medium_of
+from twin.recording.sensor_simulator import check_scene, medium_of
 from twin.scene.description import Scene, load_scene
 from twin.scene.motion import Motion
 from twin.scene.objects import Objects, build_objects
 from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError, RangeError
-from uwlts.model.library import library_folder, load_sensor, names
+from uwlts.model.library import library_folder, list_names, load_sensor
 from uwlts.model.sensor import Sensor
 
-SENSORS = names("sensors")
-PLACES = [(scene, place) for scene in names() for place in load_scene(scene).placements]
+SENSORS = list_names("sensors")
+PLACES = [(scene, place) for scene in list_names() for place in load_scene(scene).placements]
 
 
 def built(scene: Scene) -> Objects:
@@ -26,7 +26,7 @@ def built(scene: Scene) -> Objects:
 
 def test_the_library_is_not_empty():
     assert {"thesis", "thesis-as-built"} <= set(SENSORS)
-    assert {"plane", "spheres", "step", "pipe", "head", "weld", "target"} <= set(names())
+    assert {"plane", "spheres", "step", "pipe", "head", "weld", "target"} <= set(list_names())
     assert len(PLACES) > 15
 
 

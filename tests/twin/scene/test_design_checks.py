@@ -9,7 +9,7 @@ from tests.oracles import fermat
 from tests.virtual_sensors import altered, camera_axes, image_of, oracle_window, plate, scene_of
 from twin.light.renderer import Renderer
 from twin.light.sheet import Sheet
-from twin.recording.studio import check_scene
+from twin.recording.sensor_simulator import check_scene
 from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object, check_design, laser_pose, view_of_sheet
 from uwlts.model.sensor import Sensor

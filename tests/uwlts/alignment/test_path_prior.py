@@ -23,7 +23,7 @@ def straight_path() -> Trajectory:
 def prior_of(*, correlation: float = np.inf, dead_reckoned: bool = False) -> PathPrior:
     """With 81 even nodes."""
     drift = DriftModel(STD, WALK, correlation, dead_reckoned, True)
-    return PathPrior.over(np.linspace(0, SECONDS, 41), drift, straight_path(), intervals=80)
+    return PathPrior.from_times(np.linspace(0, SECONDS, 41), drift, straight_path(), intervals=80)
 
 
 def covariance(prior: PathPrior, times_s: np.ndarray) -> np.ndarray:

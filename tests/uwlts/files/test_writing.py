@@ -9,7 +9,7 @@ import pytest
 
 from uwlts.errors import OutputError
 from uwlts.files import writing
-from uwlts.files.writing import one_writer, remove_unfinished, written_aside
+from uwlts.files.writing import lock_output, remove_unfinished, write_atomically
 
 
 def interrupted_at(step: int, target: Path) -> bool:
@@ -31,7 +31,7 @@ def interrupted_at(step: int, target: Path) -> bool:
     before = sys.gettrace()
     sys.settrace(trace)
     try:
-        with written_aside(target, overwrite=True) as aside:
+        with write_atomically(target, overwrite=True) as aside:
             aside.write_text("complete", encoding="utf-8")
     except KeyboardInterrupt:
         return True
@@ -64,7 +64,7 @@ def test_locks_of_others_stay(tmp_path):
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", program, str(target)], **pipes) as holder:
         assert holder.stdout is not None and holder.stdout.readline() == "held\n"
-        with pytest.raises(OutputError, match="is writing it"), one_writer(target):
+        with pytest.raises(OutputError, match="is writing it"), lock_output(target):
             pass
         remove_unfinished()
         assert (tmp_path / ".a-txt.lock").exists()

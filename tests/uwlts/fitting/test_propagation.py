@@ -27,7 +27,7 @@ def test_draws_and_patterns_give_the_covariance_of_sums():
 def test_a_selection_has_the_errors_of_its_points():
     errors = PointErrors(np.ones((5, 3)), np.ones((1, 5, 3)), np.array([0, 0, 1, 1, 2]), None)
     chosen = errors[np.array([0, 1, 4])]
-    (move,) = chosen.drawn(1)
+    (move,) = chosen.draw(1)
     assert move.shape == (3, 3) and chosen.by_patterns(lambda moves: moves.sum()) is None
     # Noise along (1, 1, 1), and images that move their points together by the same.
     np.testing.assert_allclose(move, np.repeat(move[:, :1], 3, axis=1))

@@ -145,7 +145,7 @@ def test_settings_that_cannot_work_are_refused():
 def test_a_movement_keeps_to_speed_and_acceleration_and_arrives(way_mm):
     ramp = Ramp(5.0, (5.0 + way_mm,), speed=10.0, acceleration=50.0, start_s=2.0)
     times = np.linspace(2.0, ramp.end_s, 20001)
-    positions, speeds = np.array([ramp.at(time_s) for time_s in times]).T
+    positions, speeds = np.array([ramp.state_at(time_s) for time_s in times]).T
     assert (positions[0], positions[-1]) == (5.0, 5.0 + way_mm)
     assert np.abs(speeds).max() <= 10 * (1 + 1e-12)
     assert np.abs(np.diff(speeds)).max() <= 50 * np.diff(times).max() * (1 + 1e-6)
@@ -159,12 +159,12 @@ def test_a_hold_brakes_and_a_resumption_arrives():
     axis.add(100.0, speed=10.0, time_s=0.0)
     axis.hold(3.0)
     # v^2 / 2a beyond the position at the command.
-    held_mm = Ramp(0.0, (100.0,), 10.0, 50.0, 0.0).at(3.0)[0] + 10**2 / (2 * 50)
+    held_mm = Ramp(0.0, (100.0,), 10.0, 50.0, 0.0).state_at(3.0)[0] + 10**2 / (2 * 50)
     assert axis.braking(3.1) and not axis.braking(3.3)
-    assert axis.at(9.0) == (pytest.approx(held_mm), 0.0)
+    assert axis.state_at(9.0) == (pytest.approx(held_mm), 0.0)
     axis.resume(10.0)
     axis.advance(100.0)
-    assert axis.at(100.0) == (100.0, 0.0) and not axis.pending
+    assert axis.state_at(100.0) == (100.0, 0.0) and not axis.pending
 
 
 def test_blocks_of_one_direction_are_one_movement():
@@ -176,17 +176,17 @@ def test_blocks_of_one_direction_are_one_movement():
         axis.add(10.0 * number, speed=10.0, time_s=number - 1.8)
         assert axis.pending == 2
     for time_s in np.linspace(8.3, whole.end_s, 50).tolist():
-        assert axis.at(time_s) == pytest.approx(whole.at(time_s))
+        assert axis.state_at(time_s) == pytest.approx(whole.state_at(time_s))
     # Rounding of the times.
     axis.advance(whole.end_s + 1e-9)
-    assert not axis.pending and axis.at(20.0) == (100.0, 0.0)
+    assert not axis.pending and axis.state_at(20.0) == (100.0, 0.0)
     # A block that arrives during braking accelerates the axis again, and the positions follow from its speed.
     axis.add(110.0, speed=10.0, time_s=20.0)
     late_s = 20.0 + 1.1
-    assert axis.at(late_s)[1] == pytest.approx(5.0)
+    assert axis.state_at(late_s)[1] == pytest.approx(5.0)
     axis.add(120.0, speed=10.0, time_s=late_s)
     times = np.linspace(late_s, 24.0, 20001)
-    places, speeds = np.array([axis.at(time_s) for time_s in times]).T
+    places, speeds = np.array([axis.state_at(time_s) for time_s in times]).T
     assert speeds[0] == pytest.approx(5.0) and speeds.max() == 10.0 and (places[-1], speeds[-1]) == (120.0, 0.0)
     assert np.abs(np.diff(speeds)).max() <= 50 * np.diff(times).max() * (1 + 1e-6)
     way = np.sum((speeds[1:] + speeds[:-1]) / 2 * np.diff(times))

@@ -21,7 +21,7 @@ from uwlts.errors import EvaluationError
 from uwlts.inspection.blemish_search import UnrolledSurface, search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
 from uwlts.inspection.flat import _fit_circle
-from uwlts.inspection.inspect import inspected
+from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty
@@ -194,7 +194,7 @@ def test_pits_are_found_and_measured():
     found = uwlts.inspect_pipe(cloud, wall_mm=9.0)
     assert any("deg of the circumference" in note for note in found.notes)
     assert not any("no uncertainty" in note for note in found.notes)
-    blemishes = found.of(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
+    blemishes = found.select(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
     assert len(blemishes) == len(places)
     for feature in blemishes:
         x, y, z = feature.place_mm
@@ -227,7 +227,7 @@ def test_a_pit_where_a_whole_pipe_is_cut_open_is_found_once():
         return RADIUS_MM + sum(bell(x, RADIUS_MM * each, (0.0, 0.0), 20.0, 1.0) for each in away)
 
     cloud = pipe_scan(np.random.default_rng(13), radius=radius, along=(-30, 30.5, 1.5), around_mm=1.5)
-    pits = uwlts.inspect_pipe(cloud).of(FeatureKind.PIT)
+    pits = uwlts.inspect_pipe(cloud).select(FeatureKind.PIT)
     angles = np.sort([np.arctan2(pit.place_mm[1], -pit.place_mm[2]) for pit in pits])
     assert len(pits) == 8
     assert np.diff(angles) == pytest.approx(np.full(7, np.pi / 4), abs=0.02)
@@ -244,7 +244,7 @@ def test_depths_are_within_their_intervals():
         return RADIUS_MM + sum(bell(x, RADIUS_MM * angle, at, 5.0, 1.0) for at in places)
 
     cloud = pipe_scan(np.random.default_rng(6), half_arc=0.2, along=(-25, 25, 0.5), around_mm=0.25, radius=radius)
-    pits = uwlts.inspect_pipe(cloud).of(FeatureKind.PIT)
+    pits = uwlts.inspect_pipe(cloud).select(FeatureKind.PIT)
     assert len(pits) == len(places)
     assert np.count_nonzero([pit["depth"].low <= 1.0 <= pit["depth"].high for pit in pits]) >= 27
     # Errors common to all points are equal in a pit and its surroundings.
@@ -268,7 +268,7 @@ def test_what_the_footprint_of_points_smooths_is_put_back():
     known = replace(cloud, metadata={FOOTPRINT: list(sizes), FOOTPRINT_STD: 0.2})
     means = []
     for each in (cloud, known):
-        pits = uwlts.inspect_pipe(each).of(FeatureKind.PIT)
+        pits = uwlts.inspect_pipe(each).select(FeatureKind.PIT)
         assert len(pits) == len(places)
         means.append(np.mean([pit["depth"].value for pit in pits]))
     inside = [pit["depth"].low <= 0.5 <= pit["depth"].high for pit in pits]
@@ -323,7 +323,7 @@ def test_a_flange_is_measured():
     found = uwlts.inspect_flange(cloud, datum=datum)
     flange = found.features[0]
     within(flange, {"bore": 36.0, "bolt circle": 76.0, "parallelism": np.degrees(np.arctan(0.005))})
-    holes = found.of(FeatureKind.HOLE)
+    holes = found.select(FeatureKind.HOLE)
     assert len(holes) == 6
     for hole in holes:
         within(hole, {"diameter": 12.0})
@@ -419,7 +419,7 @@ def test_holes_that_are_not_measured_are_named():
 
     cloud = flat_scan(np.random.default_rng(18), lambda x, y: 0 * x, face, along=(-60, 60, 0.5))
     flange = uwlts.inspect_flange(cloud)
-    assert len(flange.of(FeatureKind.HOLE)) == 5
+    assert len(flange.select(FeatureKind.HOLE)) == 5
     left_out = [note for note in flange.notes if "is omitted" in note]
     assert any("its diameter is" in note for note in left_out), flange.notes
     assert any("not round" in note for note in left_out), flange.notes
@@ -494,8 +494,8 @@ def test_wrong_input_is_refused():
         ("no gap found", {"kind": "gap"}),
     ):
         with pytest.raises(EvaluationError, match=words):
-            inspected(cloud, **({"kind": "pipe"} | options))
+            inspect_cloud(cloud, **({"kind": "pipe"} | options))
     few = PointCloud(cloud.points_mm[:50], cloud.intensity[:50], cloud.frame[:50], cloud.line[:50])
     for kind in ("pipe", "weld", "step", "flange", "gap"):
         with pytest.raises(EvaluationError, match="at least"):
-            inspected(few, kind)
+            inspect_cloud(few, kind)

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from uwlts.errors import EvaluationError
-from uwlts.inspection.picking import Inspected, Shape, length_between, point_near, shape_near
+from uwlts.inspection.picking import PickedMeasurement, Shape, find_nearest_point, fit_shape_near, measure_length
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 
 CENTRE = np.array([30.0, -12.0, 350.0])
@@ -93,30 +93,30 @@ def agree(ratio: float, freedom: int) -> bool:
 
 def test_the_nearest_point_is_found():
     cloud = cloud_of(np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 5]]))
-    assert [point_near(cloud, np.array(place)) for place in ([1.0, 0, 0], [6, 0, 0], [0, 9, 90])] == [0, 1, 2]
+    assert [find_nearest_point(cloud, np.array(place)) for place in ([1.0, 0, 0], [6, 0, 0], [0, 9, 90])] == [0, 1, 2]
     with pytest.raises(EvaluationError, match="no points to measure"):
-        point_near(cloud_of(np.empty((0, 3))), np.zeros(3))
+        find_nearest_point(cloud_of(np.empty((0, 3))), np.zeros(3))
 
 
 def test_a_length_is_that_of_its_two_points():
     points = np.array([[1.0, 2.0, 300.0], [4.0, -2.0, 312.0], [0, 0, 0]])
-    measured = length_between(cloud_of(points), 0, 1)
+    measured = measure_length(cloud_of(points), 0, 1)
     assert measured.figures_mm == {"distance": pytest.approx(13.0, abs=1e-12)}
     assert measured.uncertainty == {} and (measured.points_used, measured.points_rejected) == (2, 0)
     assert measured.text() == "length: distance 13.0000 mm (2 points)"
-    assert length_between(cloud_of(points), 1, 0).figures_mm == measured.figures_mm
+    assert measure_length(cloud_of(points), 1, 0).figures_mm == measured.figures_mm
 
 
 def test_a_length_between_one_point_is_refused():
     with pytest.raises(EvaluationError, match="same point"):
-        length_between(cloud_of(np.zeros((3, 3))), 1, 1)
+        measure_length(cloud_of(np.zeros((3, 3))), 1, 1)
 
 
 def test_points_in_one_place_are_no_distance_apart():
-    measured = length_between(disturbed(np.tile(CENTRE, (2, 1))), 0, 1)
+    measured = measure_length(disturbed(np.tile(CENTRE, (2, 1))), 0, 1)
     assert measured.figures_mm["distance"] < 0.1 and np.isfinite(measured.uncertainty["distance"].expanded_mm)
     still = cloud_of(np.ones((2, 3)))
-    assert length_between(still, 0, 1).figures_mm == {"distance": 0.0}
+    assert measure_length(still, 0, 1).figures_mm == {"distance": 0.0}
 
 
 @pytest.mark.parametrize("same_image", [True, False])
@@ -124,7 +124,7 @@ def test_a_lengths_uncertainty_is_that_of_drawn_errors(same_image):
     points = CENTRE + np.array([[-10.0, 3.0, 1.0], [-9.5 if same_image else 11.0, -6.0, 4.0]])
     cloud = disturbed(points)
     assert (cloud.frame[0] == cloud.frame[1]) is np.bool_(same_image)
-    stated = length_between(cloud, 0, 1).uncertainty["distance"]
+    stated = measure_length(cloud, 0, 1).uncertainty["distance"]
     rng, errors = np.random.default_rng(5), Errors(cloud)
     for drawn, value in ((errors.random, stated.random_mm), (errors.systematic, stated.systematic_mm)):
         first, second = np.moveaxis([cloud.points_mm + drawn(rng) for _ in range(DRAWS)], 1, 0)
@@ -132,9 +132,9 @@ def test_a_lengths_uncertainty_is_that_of_drawn_errors(same_image):
         assert agree(np.var(lengths, ddof=1) / value**2, DRAWS - 1)
     # Common errors cancel: a pattern that moves all points equally, the position of their common image.
     alike = PointUncertainty(np.zeros((2, 6)) + 1e-12, np.full((2, 3), 0.5), np.full((4, 2, 3), 0.7))
-    together = length_between(cloud_of(points, frame=np.array([3, 3]), known=alike), 0, 1).uncertainty["distance"]
+    together = measure_length(cloud_of(points, frame=np.array([3, 3]), known=alike), 0, 1).uncertainty["distance"]
     assert together.systematic_mm == pytest.approx(0, abs=1e-12) and together.random_mm < 1e-5
-    apart = length_between(cloud_of(points, frame=np.array([3, 4]), known=alike), 0, 1).uncertainty["distance"]
+    apart = measure_length(cloud_of(points, frame=np.array([3, 4]), known=alike), 0, 1).uncertainty["distance"]
     unit = (points[1] - points[0]) / np.linalg.norm(points[1] - points[0])
     assert apart.random_mm == pytest.approx(0.5 * abs(unit.sum()) * np.sqrt(2), rel=1e-4)
 
@@ -146,7 +146,7 @@ def test_a_lengths_uncertainty_is_that_of_drawn_errors(same_image):
 def test_a_shape_is_measured_exactly_on_exact_points(shape, diameter):
     points = on_shape(shape, 800)
     far = CENTRE + np.array([500.0, 0, 0]) + np.random.default_rng(3).normal(0, 5, (300, 3))
-    measured = shape_near(cloud_of(np.vstack([far, points])), CENTRE, 60.0, shape)
+    measured = fit_shape_near(cloud_of(np.vstack([far, points])), CENTRE, 60.0, shape)
     assert measured.name == shape and measured.uncertainty == {}
     assert (measured.points_used, measured.points_rejected) == (800, 0)
     assert measured.figures_mm["standard deviation"] == pytest.approx(0.0, abs=1e-8)
@@ -157,9 +157,9 @@ def test_a_shape_is_measured_exactly_on_exact_points(shape, diameter):
 def test_points_off_the_shape_are_left_out(shape):
     rng = np.random.default_rng(2)
     points = on_shape(shape, 800) + rng.normal(0, 0.01, (800, 3))
-    clean = shape_near(cloud_of(points), CENTRE, 60.0, shape)
+    clean = fit_shape_near(cloud_of(points), CENTRE, 60.0, shape)
     wrong = points[:12] + [0.0, 0.0, -3.0]
-    measured = shape_near(cloud_of(np.vstack([points, wrong])), CENTRE, 60.0, shape)
+    measured = fit_shape_near(cloud_of(np.vstack([points, wrong])), CENTRE, 60.0, shape)
     assert measured.points_rejected == 12 + clean.points_rejected and measured.points_used == clean.points_used
     assert measured.figures_mm == pytest.approx(clean.figures_mm, abs=1e-6)
     assert f"{measured.points_rejected} left out" in measured.text()
@@ -169,12 +169,12 @@ def test_only_points_within_the_radius_count():
     points = on_shape("plane", 4000)
     for radius in (5.0, 9.0):
         within = int((np.linalg.norm(points - CENTRE, axis=1) <= radius).sum())
-        assert shape_near(cloud_of(points), CENTRE, radius, "plane").points_used == within
+        assert fit_shape_near(cloud_of(points), CENTRE, radius, "plane").points_used == within
 
 
 def test_of_very_many_points_a_part_is_used():
     points = on_shape("plane", 45_000)
-    measured = shape_near(cloud_of(points), CENTRE, 100.0, "plane")
+    measured = fit_shape_near(cloud_of(points), CENTRE, 100.0, "plane")
     assert measured.points_used == 15_000 and measured.figures_mm["standard deviation"] < 1e-9
 
 
@@ -240,7 +240,7 @@ def remeasured(shape: Shape, cloud: PointCloud, kind: str, draws: int) -> np.nda
 def test_what_the_calibration_does_to_a_shape_is_that_of_drawn_patterns(shape, patterns_by, names):
     """The standard deviation is linear in the patterns only if they are small relative to it."""
     cloud, draws = disturbed(on_shape(shape, 120), patterns_by=patterns_by), 1000
-    measured = shape_near(cloud, CENTRE, 60.0, shape)
+    measured = fit_shape_near(cloud, CENTRE, 60.0, shape)
     assert measured.points_used == len(cloud)
     np.testing.assert_allclose(FIGURES[shape](cloud.points_mm), list(measured.figures_mm.values()), atol=1e-7)
     for name, variance in zip(measured.figures_mm, remeasured(shape, cloud, "systematic", draws), strict=True):
@@ -255,7 +255,7 @@ def test_what_noise_does_to_a_shape_is_that_of_drawn_noise(shape):
     ratios = []
     for number in range(10):
         cloud = disturbed(on_shape(shape, 100 + 7 * number, seed=number), seed=50 + number)
-        measured = shape_near(cloud, CENTRE, 60.0, shape)
+        measured = fit_shape_near(cloud, CENTRE, 60.0, shape)
         assert measured.points_used == len(cloud)
         stated = [measured.uncertainty[name].random_mm for name in measured.figures_mm]
         ratios.append(np.square(stated) / remeasured(shape, cloud, "random", 500))
@@ -268,17 +268,17 @@ def test_what_moves_a_shape_as_a_whole_leaves_its_figures():
     points = on_shape("sphere", 300)
     shifts = np.ones((2, 300, 1), np.float32) * np.float32([[[0.3, 0, 0.1]], [[0, -0.2, 0]]])
     known = PointUncertainty(np.full((300, 6), 1e-12, np.float32), np.zeros((300, 3), np.float32), shifts)
-    stated = shape_near(cloud_of(points, known=known), CENTRE, 60.0, "sphere").uncertainty["diameter"]
+    stated = fit_shape_near(cloud_of(points, known=known), CENTRE, 60.0, "sphere").uncertainty["diameter"]
     assert stated.systematic_mm < 1e-6 and stated.random_mm < 1e-5
     # A pattern that scales the cloud by 1.001 scales the diameter by the same factor.
     larger = PointUncertainty(known.random_mm2, known.position_mm, (1e-3 * (points - CENTRE))[None].astype(np.float32))
-    stated = shape_near(cloud_of(points, known=larger), CENTRE, 60.0, "sphere").uncertainty["diameter"]
+    stated = fit_shape_near(cloud_of(points, known=larger), CENTRE, 60.0, "sphere").uncertainty["diameter"]
     assert stated.systematic_mm == pytest.approx(0.04, rel=1e-4)
 
 
 def test_a_measurement_is_the_same_each_time():
     cloud = disturbed(on_shape("sphere", 200))
-    first, second = (shape_near(cloud, CENTRE, 60.0, "sphere") for _ in range(2))
+    first, second = (fit_shape_near(cloud, CENTRE, 60.0, "sphere") for _ in range(2))
     assert first.text() == second.text() and " ± " in first.text()
 
 
@@ -299,12 +299,12 @@ def test_a_measurement_is_the_same_each_time():
 )
 def test_points_that_determine_no_shape_are_refused(points, radius, shape, says):
     with pytest.raises(EvaluationError, match=says):
-        shape_near(cloud_of(points), CENTRE, radius, shape)
+        fit_shape_near(cloud_of(points), CENTRE, radius, shape)
 
 
 def test_the_text_has_expanded_uncertainties():
     cloud = disturbed(on_shape("sphere", 200))
-    measured: Inspected = shape_near(cloud, CENTRE, 60.0, "sphere")
+    measured: PickedMeasurement = fit_shape_near(cloud, CENTRE, 60.0, "sphere")
     stated = measured.uncertainty["diameter"]
     assert stated.expanded_mm == pytest.approx(2 * np.hypot(stated.random_mm, stated.systematic_mm))
     assert f"diameter {measured.figures_mm['diameter']:.4f} ± {stated.expanded_mm:.4f} mm" in measured.text()

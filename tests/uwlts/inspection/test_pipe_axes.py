@@ -34,7 +34,7 @@ def inspected(pipe: ScannedPipe) -> Inspection:
 
 def matched(pipe: ScannedPipe, found: Inspection, bumps: list[Bump]) -> list[Feature]:
     """Return the one feature of each bump, with its place and depth, and assert that there are no others."""
-    left, own = list(found.of(*BLEMISHES)), []
+    left, own = list(found.select(*BLEMISHES)), []
     for bump in bumps:
         near = [each for each in left if pipe.distance_mm(bump, each.place_mm) < 0.15 * bump.diameter_mm]
         assert len(near) == 1, (bump, [each.name for each in near], found.notes)
@@ -75,7 +75,7 @@ def test_clean_pipes_have_no_findings_along_any_axis(axis: tuple[float, float, f
     rng = np.random.default_rng([seed, 2])
     arc = 2 * np.pi if seed % 2 else 0.8 * np.pi
     found = inspected(scan_pipe(rng, axis=axis, arc=arc, spacing_mm=1.5, holes=[(5.0, 1.0, 15.0)]))
-    assert not found.of(*BLEMISHES) and not any("is omitted" in note for note in found.notes)
+    assert not found.select(*BLEMISHES) and not any("is omitted" in note for note in found.notes)
 
 
 def test_a_dent_at_the_cut_is_one_finding() -> None:

@@ -7,9 +7,9 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
-from uwlts.calibration.joint.next_shot import next_shots
+from uwlts.calibration.joint.next_shot import rank_next_shots
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.joint.stored_estimate import found_estimate
+from uwlts.calibration.joint.stored_estimate import read_original_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError
 from uwlts.model.parameter_keys import StageParameter
@@ -109,14 +109,14 @@ def test_a_damaged_origin_is_noticed_when_it_is_read(written, tmp_path, key, val
 
 def test_indices_without_their_media_are_noticed(written):
     calibration = read_calibration(written)
-    assert found_estimate(calibration, WATER).parameters.media == ("water",)
+    assert read_original_estimate(calibration, WATER).parameters.media == ("water",)
     with pytest.raises(CalibrationError, match="1 indices for 0 media"):
-        found_estimate(calibration.model_copy(update={"media": ()}), WATER)
+        read_original_estimate(calibration.model_copy(update={"media": ()}), WATER)
 
 
 def test_advice_is_given_where_the_stage_is_known_exactly(thesis):
     exact = thesis.uncertainty.model_copy(update={"stage_scale": 0.0})
     calibration = calibrated(thesis.model_copy(update={"uncertainty": exact}))
     assert StageParameter.SCALE not in calibration.joint.parameters
-    best = next_shots(calibration)[0]
+    best = rank_next_shots(calibration)[0]
     assert best.after_mm < best.before_mm

@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from uwlts.errors import DescriptionError, RangeError
-from uwlts.model.library import find, library_folder, load_sensor, merged, names, read_table, validated
+from uwlts.model.library import (
+    find_description,
+    library_folder,
+    list_names,
+    load_sensor,
+    merge_tables,
+    read_table,
+    validate_description,
+)
 from uwlts.model.sensor import Medium, Sensor
 
 SMALL = 'base = "thesis"\nname = "small"\n[camera]\nwidth_px = 64\n'
@@ -27,22 +35,22 @@ def refused(path: Path, *words: str) -> str:
 
 
 def test_every_shipped_sensor_is_valid():
-    shipped = names("sensors")
+    shipped = list_names("sensors")
     assert {"thesis", "thesis-as-built"} <= set(shipped)
     for name in shipped:
         assert load_sensor(name).name == name
-        assert find(name, "sensors") == library_folder() / "sensors" / f"{name}.toml"
+        assert find_description(name, "sensors") == library_folder() / "sensors" / f"{name}.toml"
 
 
 def test_names_are_of_their_own_folder():
-    assert "spheres" in names()
-    assert not set(names()) & set(names("sensors"))
+    assert "spheres" in list_names()
+    assert not set(list_names()) & set(list_names("sensors"))
     with pytest.raises(DescriptionError, match="known are thesis, thesis-as-built"):
         load_sensor("spheres")
 
 
 def test_path_and_name_of_the_same_sensor_agree():
-    path = find("thesis", "sensors")
+    path = find_description("thesis", "sensors")
     assert load_sensor(path) == load_sensor(str(path)) == load_sensor("thesis")
 
 
@@ -175,7 +183,7 @@ def test_model_name_is_given_in_words():
         pass
 
     with pytest.raises(DescriptionError, match="is not a valid reference values:"):
-        validated(ReferenceValues, {}, "here")
+        validate_description(ReferenceValues, {}, "here")
 
 
 def test_sensor_survives_its_own_dump():
@@ -206,7 +214,7 @@ def leaves(table: dict, way: tuple = ()) -> dict:
 @given(base=TABLE, changes=TABLE)
 def test_merging_keeps_every_change_and_touches_nothing_else(base: dict, changes: dict):
     before = repr((base, changes))
-    result = merged(base, changes)
+    result = merge_tables(base, changes)
     assert repr((base, changes)) == before
     after, wanted = leaves(result), leaves(changes)
     assert wanted.items() <= after.items()
@@ -214,6 +222,6 @@ def test_merging_keeps_every_change_and_touches_nothing_else(base: dict, changes
     for way, value in after.items():
         if way not in wanted:
             assert leaves(base)[way] == value
-    assert merged(base, {}) == base
-    assert merged({}, changes) == changes
-    assert merged(result, changes) == result
+    assert merge_tables(base, {}) == base
+    assert merge_tables({}, changes) == changes
+    assert merge_tables(result, changes) == result

@@ -7,7 +7,7 @@ from tests.uwlts.calibration_views import WATER
 from tests.uwlts.joint_views import MEDIUM, seen
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.placement import camera_from_object, laser_pose
-from uwlts.optics.brightness import LitSheet, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
+from uwlts.optics.brightness import SheetPoints, estimate_blur_shift_px, fit_brightness_slopes, sheet_sigma_mm
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
@@ -56,7 +56,7 @@ def test_the_footprint_is_that_of_sheet_and_blur(thesis):
     width = 2.3548 * np.hypot(blur_px, sigma * per_mm)
     calibration = nominal_calibration(thesis, medium=MEDIUM)
     line, centre = np.full(50, pixels[0, 0]), np.full(50, pixels[0, 1])
-    sheet = LitSheet.of(calibration, thesis, line, centre, medium_index=WATER)
+    sheet = SheetPoints.from_calibration(calibration, thesis, line, centre, medium_index=WATER)
     assert sheet.footprint_mm(np.full(50, width)) == pytest.approx((np.sqrt(3) * sigma, blur_px * per_line), rel=0.01)
 
 
@@ -122,7 +122,7 @@ def test_the_sheet_is_no_thicker_than_the_stripes_are_wide(thesis):
     laser = thesis.laser.model_copy(update={"waist_radius_mm": 3.0})
     calibration = nominal_calibration(thesis, thesis.media["water"])
     thick, thin = (
-        LitSheet.of(calibration, sensor, line, centre, medium_index=WATER).beside(
+        SheetPoints.from_calibration(calibration, sensor, line, centre, medium_index=WATER).brightness_shift(
             width, slopes, stage_direction=(1, 0, 0)
         )
         for sensor in (thesis.model_copy(update={"laser": laser}), thesis)
@@ -140,7 +140,8 @@ def test_many_centres_see_the_sheet_as_few_do(thesis):
     rng = np.random.default_rng(9)
     line, centre = rng.integers(100, 1180, 6000), rng.uniform(300.0, 700.0, 6000)
     many, few = (
-        LitSheet.of(calibration, thesis, line[:count], centre[:count], medium_index=WATER) for count in (6000, 400)
+        SheetPoints.from_calibration(calibration, thesis, line[:count], centre[:count], medium_index=WATER)
+        for count in (6000, 400)
     )
     np.testing.assert_allclose(many.found.points_mm[:400], few.found.points_mm, rtol=0, atol=1e-6)
     for name in ("of_slope", "sigma_mm", "per_sigma_px"):
@@ -148,7 +149,7 @@ def test_many_centres_see_the_sheet_as_few_do(thesis):
         assert np.abs(expected).max() > 1e-3
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
     width = np.full(6000, 4.0)
-    every = LitSheet.of(calibration, thesis, line + 0.0, centre, medium_index=WATER)
+    every = SheetPoints.from_calibration(calibration, thesis, line + 0.0, centre, medium_index=WATER)
     assert many.footprint_mm(width) == pytest.approx(every.footprint_mm(width), rel=1e-5)
 
 
@@ -176,7 +177,7 @@ def test_blur_moves_centres_of_leaning_and_bent_stripes(lean, bend, fading):
     image, rows = ridge(lean, bend, fading, blur)
     stripe = extract_stripe(np.round(image).astype(np.uint8), stripe_along="width", saturation=255)
     lines = stripe.lines
-    moved = moved_by_blur_px(
+    moved = estimate_blur_shift_px(
         np.zeros(len(lines), int), lines, stripe.centre_px[lines], stripe.amplitude[lines], stripe.width_px[lines]
     )
     middle = (lines >= 70) & (lines <= 90)
@@ -192,7 +193,7 @@ def test_slopes_are_those_of_the_brightness_up_to_the_borders():
     stage = np.array([5.0, 0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0])
     there = np.abs(line - 130) < 10 + 3 * frame
     amplitude = 40.0 * np.exp(0.3 * stage[frame] - 0.02 * line)
-    slopes = slopes_of_brightness(frame[there], line[there], amplitude[there], stage, np.ones(9))
+    slopes = fit_brightness_slopes(frame[there], line[there], amplitude[there], stage, np.ones(9))
     np.testing.assert_allclose(slopes, 0.3, atol=1e-9)
 
 
@@ -210,7 +211,7 @@ def test_slopes_are_found_however_the_stage_goes(stage):
     frame, line = (a.ravel() for a in np.meshgrid(np.arange(len(stage)), np.arange(40), indexing="ij"))
     # Bent, so that neighbours beyond the reach would show.
     amplitude = 40.0 * np.exp(0.3 * stage[frame] + 0.05 * stage[frame] ** 2)
-    slopes = slopes_of_brightness(frame, line, amplitude, stage, np.ones(len(stage)))
+    slopes = fit_brightness_slopes(frame, line, amplitude, stage, np.ones(len(stage)))
     inner = (stage[frame] > 1.9) & (stage[frame] < stage.max() - 1.9)
     np.testing.assert_allclose(slopes[inner], 0.3 + 0.1 * stage[frame][inner], atol=0.02)
     assert np.abs(slopes - 0.3 - 0.1 * stage[frame]).max() < 0.11
@@ -220,8 +221,8 @@ def test_exposures_do_not_show_in_the_slopes():
     stage, exposure = np.arange(9.0), np.array([1.0, 1.0, 1.0, 1.0, 3.0, 3.0, 2.0, 2.0, 2.0])
     frame, line = (a.ravel() for a in np.meshgrid(np.arange(9), np.arange(40), indexing="ij"))
     amplitude = exposure[frame] * np.exp(0.3 * stage[frame])
-    np.testing.assert_allclose(slopes_of_brightness(frame, line, amplitude, stage, exposure), 0.3, atol=1e-9)
-    alike = slopes_of_brightness(frame, line, np.exp(0.3 * stage[frame]), stage, np.zeros(9))
+    np.testing.assert_allclose(fit_brightness_slopes(frame, line, amplitude, stage, exposure), 0.3, atol=1e-9)
+    alike = fit_brightness_slopes(frame, line, np.exp(0.3 * stage[frame]), stage, np.zeros(9))
     np.testing.assert_allclose(alike, 0.3, atol=1e-9)
 
 
@@ -232,7 +233,7 @@ def test_exposures_do_not_show_in_the_slopes():
 )
 def test_images_at_one_place_or_far_apart_tell_no_slope(stage):
     frame, line = (a.ravel() for a in np.meshgrid(np.arange(len(stage)), np.arange(50), indexing="ij"))
-    assert not slopes_of_brightness(frame, line, 10.0 + frame, stage, np.ones(len(stage))).any()
+    assert not fit_brightness_slopes(frame, line, 10.0 + frame, stage, np.ones(len(stage))).any()
 
 
 def test_speckle_hardly_shows_in_the_slopes():
@@ -240,7 +241,7 @@ def test_speckle_hardly_shows_in_the_slopes():
     rng = np.random.default_rng(3)
     frame, line = (a.ravel() for a in np.meshgrid(np.arange(40), np.arange(400), indexing="ij"))
     amplitude = 60.0 * np.exp(0.2 * rng.standard_normal(len(frame)))
-    slopes = slopes_of_brightness(frame, line, amplitude, np.arange(40.0), np.ones(40))
+    slopes = fit_brightness_slopes(frame, line, amplitude, np.arange(40.0), np.ones(40))
     inner = (frame > 1) & (frame < 38) & (line > 12) & (line < 388)
     assert np.std(slopes[inner]) == pytest.approx(0.2 / np.sqrt(125 * 2.0), rel=0.15)
 

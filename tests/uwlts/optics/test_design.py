@@ -31,7 +31,7 @@ from uwlts.optics.design import (
     thesis_factor,
     window_thickness_mm,
 )
-from uwlts.optics.design_table import design, table_lines
+from uwlts.optics.design_table import design, format_table
 
 ANGLE = math.radians(35)
 AIR = Triangulation(baseline_mm=265, triangulation_angle_rad=ANGLE, focal_length_mm=12.5, pixel_size_mm=0.0053)
@@ -380,7 +380,7 @@ def test_the_command_prints_the_table(thesis, monkeypatch, capsys):
 
     code, out, _ = printed("thesis", "--medium", "water")
     assert code == 0
-    assert out.splitlines() == table_lines(design(thesis, medium="water"))
+    assert out.splitlines() == format_table(design(thesis, medium="water"))
     assert "0.2213 mm/px" in out
     code, _, error = printed("thesis", "--medium", "oil")
     assert code == 2

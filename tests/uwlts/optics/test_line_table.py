@@ -18,7 +18,7 @@ def waves(line, place):
     ("lines", "places"), [((0, 1279), (0.0, 1023.0)), ((100, 100), (50.0, 50.0)), ((3, 4), (7, 90))]
 )
 def test_values_are_those_of_the_function(lines, places):
-    table = LineTable.of(waves, lines, places, tolerance=1e-10)
+    table = LineTable.from_function(waves, lines, places, tolerance=1e-10)
     assert table is not None
     rng = np.random.default_rng(1)
     line, place = rng.integers(lines[0], lines[1] + 1, 500), rng.uniform(*places, 500)
@@ -27,20 +27,20 @@ def test_values_are_those_of_the_function(lines, places):
 
 @pytest.mark.parametrize("count", [50, 5000])
 def test_combined_values_are_sums_whether_lines_or_places_are_more(count):
-    table = LineTable.of(waves, (0, 1279), (0.0, 1023.0), tolerance=1e-10)
+    table = LineTable.from_function(waves, (0, 1279), (0.0, 1023.0), tolerance=1e-10)
     weights = np.array([[1.0, 0.0, 2.0], [0.0, 1.0, -3.0]])
     assert table is not None
     rng = np.random.default_rng(5)
     line, place = rng.integers(0, 1280, count), rng.uniform(0, 1023, count)
     sums = waves(line, place) @ weights
     # The largest of the weights times the table's error.
-    np.testing.assert_allclose(table.combined(weights).values(line, place), sums, rtol=0, atol=5e-9)
+    np.testing.assert_allclose(table.combine(weights).values(line, place), sums, rtol=0, atol=5e-9)
 
 
 def test_terms_are_left_out_up_to_an_error():
-    table = LineTable.of(waves, (0, 1279), (0.0, 1023.0), tolerance=1e-10)
+    table = LineTable.from_function(waves, (0, 1279), (0.0, 1023.0), tolerance=1e-10)
     assert table is not None
-    short = table.shortened(1e-4)
+    short = table.shorten(1e-4)
     assert short.terms.shape[0] < table.terms.shape[0] and short.terms.shape[1] < table.terms.shape[1]
     rng = np.random.default_rng(6)
     line, place = rng.integers(0, 1280, 500), rng.uniform(0, 1023, 500)
@@ -60,7 +60,7 @@ def test_a_table_is_kept_for_the_next_places_of_the_same_function():
     def table(seed, key, *, places=(70.0, 500.0)):
         rng = np.random.default_rng(seed)
         line, place = rng.integers(5, 1200, 6000), rng.uniform(*places, 6000)
-        found = LineTable.about(counted, line, place, tolerance=1e-10, key=key)
+        found = LineTable.over_range(counted, line, place, tolerance=1e-10, key=key)
         assert found is not None
         np.testing.assert_allclose(found.values(line, place), waves(line, place), rtol=0, atol=1e-9)
         return found
@@ -84,7 +84,7 @@ def test_where_the_wider_table_would_reach_too_far_it_is_for_the_places_alone():
     rng = np.random.default_rng(8)
     line, place = rng.integers(0, 1280, 6000), rng.uniform(70.0, 500.0, 6000)
     for _ in range(2):
-        table = LineTable.about(up_to_500, line, place, tolerance=1e-10, key="up to 500")
+        table = LineTable.over_range(up_to_500, line, place, tolerance=1e-10, key="up to 500")
         assert table is not None and table.high_px <= 500.0
         np.testing.assert_allclose(table.values(line, place), waves(line, place), rtol=0, atol=1e-9)
 
@@ -93,9 +93,9 @@ def test_the_error_is_a_share_of_each_value_where_that_is_more():
     def large(line, place):
         return waves(line, place) * [1e8, 1.0]
 
-    table = LineTable.of(large, (0, 1279), (0.0, 1023.0), tolerance=1e-9, share=1e-9)
+    table = LineTable.from_function(large, (0, 1279), (0.0, 1023.0), tolerance=1e-9, share=1e-9)
     assert table is not None
-    assert LineTable.of(large, (0, 1279), (0.0, 1023.0), tolerance=1e-14) is None
+    assert LineTable.from_function(large, (0, 1279), (0.0, 1023.0), tolerance=1e-14) is None
     rng = np.random.default_rng(7)
     line, place = rng.integers(0, 1280, 500), rng.uniform(0, 1023, 500)
     assert (np.abs(table.values(line, place) - large(line, place)).max(axis=0) <= [1.0, 1e-8]).all()
@@ -109,7 +109,7 @@ def test_there_is_none_of_what_is_not_smooth_or_not_everywhere():
         return np.where(line < 300, np.nan, place)[:, None]
 
     for function in (kinked, partly):
-        assert LineTable.of(function, (0, 1279), (0.0, 1023.0), tolerance=1e-7) is None
+        assert LineTable.from_function(function, (0, 1279), (0.0, 1023.0), tolerance=1e-7) is None
 
 
 @pytest.mark.parametrize("along", ["width", "height"])

@@ -8,7 +8,7 @@ import uwlts
 from tests.uwlts.mount_views import MOUNT, MOUNT_STD, known_mount
 from tests.uwlts.reconstruction.test_reconstruct import CALIBRATION, FRESH, HEIGHT, WIDTH, small_sensor, stripe_image
 from uwlts.evaluation.figure_uncertainty import shift_std_mm
-from uwlts.reconstruction.moving import Ride, with_platform
+from uwlts.reconstruction.moving import PlatformPoses, add_platform_uncertainty
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointUncertainty
@@ -136,8 +136,8 @@ def test_the_mount_s_uncertainty_moves_points_as_other_mounts_do():
         other[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ MOUNT[:3, :3]
         drawn.append(points(other))
     none = PointUncertainty(np.zeros((30, 6)), np.zeros((30, 3)), np.zeros((1, 30, 3)))
-    ride = Ride(poses, None, np.arange(30.0))
-    found = with_platform(none, points(MOUNT), np.arange(30), ride, known_mount(MOUNT)).covariance_mm2()
+    ride = PlatformPoses(poses, None, np.arange(30.0))
+    found = add_platform_uncertainty(none, points(MOUNT), np.arange(30), ride, known_mount(MOUNT)).covariance_mm2()
     # The standard deviation of 4000 is right to 1.1 %; 90 of them stay within five of those.
     np.testing.assert_allclose(np.sqrt(np.einsum("nii->ni", found)), np.std(drawn, axis=0), rtol=0.056)
 
@@ -157,8 +157,8 @@ def test_errors_of_each_pose_move_its_image_s_points_together():
     covariance = np.tile(root @ root.T, (images, 1, 1))
     points, frame = drawn_points(seen, poses, np.zeros((images, 6))).reshape(-1, 3), np.repeat(range(images), 5)
     none = PointUncertainty(np.zeros((30, 6)), np.zeros((30, 3)), np.zeros((1, 30, 3)))
-    ride = Ride(poses, covariance, np.arange(6.0))
-    found = with_platform(none, points, frame, ride, None)
+    ride = PlatformPoses(poses, covariance, np.arange(6.0))
+    found = add_platform_uncertainty(none, points, frame, ride, None)
     errors = rng.standard_normal((4000, images, 6)) @ root.T
     drawn = np.array([drawn_points(seen, poses, each).reshape(-1, 3) for each in errors])
     # The standard deviation of 4000 is right to 1.1 %; 90 of them stay within five of those.
@@ -193,8 +193,8 @@ def test_errors_along_a_path_are_as_alike_as_its_covariances_say(kind):
         errors = np.einsum("fg,mgk->mfk", alike, rng.standard_normal((4000, count, 6)) * std)
     points = drawn_points(seen, poses, np.zeros((count, 6)))[:, 0]
     none = PointUncertainty(np.zeros((count, 6)), np.zeros((count, 3)), np.zeros((1, count, 3)))
-    ride = Ride(poses, covariance, times, rates=np.zeros((count, 6)))
-    found = with_platform(none, points, np.arange(count), ride, None, correlation_s=correlation_s)
+    ride = PlatformPoses(poses, covariance, times, rates=np.zeros((count, 6)))
+    found = add_platform_uncertainty(none, points, np.arange(count), ride, None, correlation_s=correlation_s)
     drawn = np.array([drawn_points(seen, poses, each)[:, 0] for each in errors])
     # 1.1 % of 4000 draws five times, and 1 % of the variance.
     np.testing.assert_allclose(found.std_mm(), drawn.std(axis=0), rtol=0.065, atol=1e-3)
@@ -216,8 +216,8 @@ def test_many_images_have_the_uncertainty_of_few():
     found = []
     for images in (np.arange(count), np.arange(0, count, 10)):
         none = PointUncertainty(np.zeros((len(images), 6)), np.zeros((len(images), 3)), np.zeros((1, len(images), 3)))
-        ride = Ride(poses[images], covariance[images], images * 1.0, rates=np.zeros((len(images), 6)))
-        found.append(with_platform(none, points[images], np.arange(len(images)), ride, None))
+        ride = PlatformPoses(poses[images], covariance[images], images * 1.0, rates=np.zeros((len(images), 6)))
+        found.append(add_platform_uncertainty(none, points[images], np.arange(len(images)), ride, None))
     many, few = found[0][::10], found[1]
     np.testing.assert_allclose(many.std_mm(), few.std_mm(), rtol=1e-5)
     for first, last in ((0, 119), (60, 119), (60, 70)):
@@ -233,7 +233,9 @@ def test_the_time_offset_s_uncertainty_moves_points_along_the_path():
     mount = known_mount(
         MOUNT, time_offset_s=0.0, time_offset_std_s=2e-4, covariance=tuple(map(tuple, np.eye(6) * 1e-20))
     )
-    found = with_platform(none, points, np.arange(4), Ride(poses, None, np.arange(4.0), rates), mount)
+    found = add_platform_uncertainty(
+        none, points, np.arange(4), PlatformPoses(poses, None, np.arange(4.0), rates), mount
+    )
     # 100 mm/s along x, less 0.1 rad/s about z at 200 mm along y: 80 mm/s in 0.2 ms.
     np.testing.assert_allclose(found.std_mm(), np.tile([0.016, 0.0, 0.0], (4, 1)), atol=1e-6)
 

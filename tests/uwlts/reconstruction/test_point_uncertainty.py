@@ -10,7 +10,7 @@ from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
 from uwlts.calibration.joint.parameters import Prior
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
-from uwlts.calibration.joint.stored_estimate import stored_estimate
+from uwlts.calibration.joint.stored_estimate import read_stored_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
@@ -22,8 +22,8 @@ from uwlts.model.calibration import KnownMedium, KnownStage
 from uwlts.model.parameter_keys import MediumIndex, StageParameter
 from uwlts.model.sensor import Medium
 from uwlts.optics.triangulation import reconstruct_pixels
-from uwlts.reconstruction.point_uncertainty import point_uncertainty, stage_components, stripe_noise_px
-from uwlts.storage.capture import Capture, CaptureHeader, Frame, source_of
+from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px, point_uncertainty, stage_components
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, describe_source
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 from uwlts.storage.cloud_files import read_cloud, write_cloud
@@ -84,7 +84,7 @@ def test_the_stripes_noise_is_that_of_its_image(stripes):
     """The median of 1078 differences is right to 2 % (one standard deviation); a step between treads does not count."""
     frame, line, centre = stripes
     centre = centre + 40.0 * ((line > 500) & (line < 700))
-    noise = stripe_noise_px(frame, line, centre)
+    noise = estimate_stripe_noise_px(frame, line, centre)
     assert noise[frame == 0] == pytest.approx(0.1, rel=0.08)
     assert noise[frame == 1] == pytest.approx(0.3, rel=0.08)
 
@@ -94,7 +94,7 @@ def test_covariances_are_those_of_monte_carlo(calibration, stripes, thesis, tmp_
     frame, line, centre = stripes
     with capture_of(tmp_path, thesis, MEDIUM) as capture:
         known = point_uncertainty(capture, calibration, frame, line, centre)
-        stored = stored_estimate(calibration, thesis, MEDIUM)
+        stored = read_stored_estimate(calibration, thesis, MEDIUM)
         stage = capture.stage_mm[frame] - capture.stage_mm[:].mean()
     pick = np.arange(0, len(line), 120)
     rng = np.random.default_rng(3)
@@ -117,7 +117,7 @@ def test_covariances_are_those_of_monte_carlo(calibration, stripes, thesis, tmp_
             reconstruct_pixels(
                 changed,
                 pixels,
-                medium_index=changed.index_of(MEDIUM),
+                medium_index=changed.medium_index(MEDIUM),
                 stage_mm=scale * stage[pick],
                 stage_direction=along / np.linalg.norm(along),
             ).points_mm
@@ -163,13 +163,13 @@ def test_random_covariance_is_the_stripes_noise_on_the_object(calibration, strip
         return reconstruct_pixels(
             calibration,
             pixels,
-            medium_index=calibration.index_of(MEDIUM),
+            medium_index=calibration.medium_index(MEDIUM),
             stage_mm=0.0,
             stage_direction=np.array([1.0, 0, 0]),
         ).points_mm
 
     shared = np.sqrt(calibration.joint.shared_variance["stripe on the target"])
-    expected = (points(0.5) - points(-0.5)) * (stripe_noise_px(frame, line, centre) * shared)[:, None]
+    expected = (points(0.5) - points(-0.5)) * (estimate_stripe_noise_px(frame, line, centre) * shared)[:, None]
     np.testing.assert_allclose(
         full(known.random_mm2), np.einsum("ni,nj->nij", expected, expected), rtol=1e-3, atol=1e-3 * np.max(expected**2)
     )
@@ -180,7 +180,7 @@ def test_random_covariance_is_the_stripes_noise_on_the_object(calibration, strip
 def test_another_water_is_known_by_its_temperature_only(calibration, stripes, thesis, tmp_path):
     frame, line, centre = stripes
     other = Medium(kind="fresh", temperature_c=12.0)
-    stored = stored_estimate(calibration, thesis, other)
+    stored = read_stored_estimate(calibration, thesis, other)
     assert stored.parameters.keys[-1] == MediumIndex("the scan")
     std = other.index_uncertainty(calibration.wavelength_nm, thesis.uncertainty)
     assert np.sqrt(stored.covariance[-1, -1]) == pytest.approx(std)
@@ -307,7 +307,7 @@ def test_a_clouds_place_has_the_uncertainty_of_monte_carlo(spheres, part):
 @pytest.mark.parametrize(("calibrated", "way"), [(True, 1.0), (True, -1.0), (False, 1.0)])
 def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, thesis, calibrated, way):
     """Its direction by the estimate where that has found it, also for the way back, else by the description."""
-    stored = stored_estimate(calibration, thesis, MEDIUM)
+    stored = read_stored_estimate(calibration, thesis, MEDIUM)
     priors = stored.parameters.priors | dict.fromkeys(SLOPES, Prior(0.0, 1.0))
     parameters = replace(stored.parameters, priors=priors)
     covariance = np.zeros((len(parameters.keys), len(parameters.keys)))
@@ -333,7 +333,7 @@ def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, th
 def test_a_sequential_calibration_has_none(calibration, thesis):
     without = calibration.model_copy(update={"joint": None})
     with pytest.raises(CalibrationError, match="calibrate jointly"):
-        stored_estimate(without, thesis, MEDIUM)
+        read_stored_estimate(without, thesis, MEDIUM)
 
 
 def test_what_blur_and_light_beside_the_sheet_leave_moves_all_points_together(calibration, stripes, thesis, tmp_path):
@@ -345,9 +345,10 @@ def test_what_blur_and_light_beside_the_sheet_leave_moves_all_points_together(ca
         known = point_uncertainty(capture, calibration, frame, line, centre, blur_px=blur, beside_mm=beside)
     per_px = (
         noise_shifts(plain)
-        / (stripe_noise_px(frame, line, centre) * np.sqrt(calibration.joint.shared_variance["stripe on the target"]))[
-            :, None
-        ]
+        / (
+            estimate_stripe_noise_px(frame, line, centre)
+            * np.sqrt(calibration.joint.shared_variance["stripe on the target"])
+        )[:, None]
     )
     # Any part of what blur may do is as likely; the sheet's thickness, known to 10 %, counts by its square.
     added = [per_px * blur[:, None] / np.sqrt(3), 0.2 * beside]
@@ -363,7 +364,9 @@ def test_water_does_not_drift_before_its_own_scan(calibration, stripes, thesis, 
     known = calibration.model_copy(update={"media": (calibration.media[0].model_copy(update={"medium": water}),)})
     with capture_of(tmp_path, drifting, water) as capture:
         own = known.model_copy(
-            update={"provenance": known.provenance | {"scan_captures": [source_of(capture).model_dump(mode="json")]}}
+            update={
+                "provenance": known.provenance | {"scan_captures": [describe_source(capture).model_dump(mode="json")]}
+            }
         )
         free, tied = (
             point_uncertainty(capture, each, frame, line, centre).systematic_mm2()[:, 5] for each in (known, own)
@@ -393,13 +396,13 @@ def test_clouds_of_one_calibration_say_what_they_share(calibration, stripes, the
         ours @ theirs.T,
         second.patterns_mm[:, pick].astype(float),
     )
-    stored = stored_estimate(calibration, thesis, MEDIUM)
+    stored = read_stored_estimate(calibration, thesis, MEDIUM)
     drawn = np.random.default_rng(3).multivariate_normal(stored.values, stored.covariance, DRAWS, method="svd")
     image = frame[pick] == frame[0]
     off = []
     for values in drawn:
         now = replace(stored, values=values)
-        off.append([now.points_by(line[pick], each[pick])[0] for each in (centre, moved)])
+        off.append([now.triangulate(line[pick], each[pick])[0] for each in (centre, moved)])
     off = np.array(off) - np.mean(off, axis=0)
     # The stage, whose scale is among the parameters, moves points of both images along X alone.
     assert image.any() and not image.all()

@@ -276,10 +276,10 @@ def test_rows_of_a_rolling_shutter_are_where_the_stage_was_when_they_were_expose
         header = capture.header
     detector = header.sensor.detector.model_copy(update={"shutter": "rolling", "line_time_us": line_time_us})
     rolling = header.model_copy(update={"sensor": header.sensor.model_copy(update={"detector": detector})})
-    at_rest = reconstruct_stripes(FrameTable.of(header, frames), stripes, CALIBRATION)
+    at_rest = reconstruct_stripes(FrameTable.from_frames(header, frames), stripes, CALIBRATION)
     moving = [replace(frame, speed_mm_per_s=speed) for frame in frames]
-    together = reconstruct_stripes(FrameTable.of(header, moving), stripes, CALIBRATION)
-    rows = reconstruct_stripes(FrameTable.of(rolling, moving), stripes, CALIBRATION)
+    together = reconstruct_stripes(FrameTable.from_frames(header, moving), stripes, CALIBRATION)
+    rows = reconstruct_stripes(FrameTable.from_frames(rolling, moving), stripes, CALIBRATION)
     np.testing.assert_array_equal(together.points_mm, at_rest.points_mm)
     # The stripe's rows are 1e-6 line_time later than the middle row for each row below it; the stage moves along X.
     np.testing.assert_array_equal(rows.line, stripes.line)

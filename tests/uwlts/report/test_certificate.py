@@ -9,7 +9,7 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
-from uwlts.calibration.joint.observability import SheetRegion, estimate_in, pixels_at, regions
+from uwlts.calibration.joint.observability import SheetRegion, list_regions, project_sheet_points, read_region_estimate
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError, OutputError
@@ -19,9 +19,9 @@ from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.report.certificate import (
     NOT_JOINT,
     JointCertificate,
-    certificate_of,
     check_certificate,
     compute_seal,
+    make_certificate,
     read_certificate,
     to_canonical_json,
 )
@@ -59,16 +59,16 @@ def calibration(path):
 
 @pytest.fixture(scope="module")
 def use(calibration):
-    return prepare_use(calibration, regions(calibration)[0])
+    return prepare_use(calibration, list_regions(calibration)[0])
 
 
 @pytest.fixture(scope="module")
 def content(calibration, path):
-    return certificate_of(calibration, path, issued=ISSUED)
+    return make_certificate(calibration, path, issued=ISSUED)
 
 
 def test_the_same_calibration_gives_the_same_json(calibration, path, content):
-    again = certificate_of(read_calibration(path), path, issued=ISSUED)
+    again = make_certificate(read_calibration(path), path, issued=ISSUED)
     stored = content.in_file()
     assert json.dumps(again.in_file()) == json.dumps(stored)
     # The seal depends neither on the order of keys nor on the stored seal.
@@ -156,7 +156,7 @@ def test_uncertainties_of_lengths_agree_with_draws(calibration, use):
     for stated in length_uncertainties(use):
         if stated.axis == "X" or stated.length_mm not in (20.0, 100.0):
             continue
-        pixels = pixels_at(known, find_ends(use.region, stated.axis, stated.length_mm).reshape(-1, 2))
+        pixels = project_sheet_points(known, find_ends(use.region, stated.axis, stated.length_mm).reshape(-1, 2))
         found = np.array([points(calibration, known, values, pixels) for values in drawn])
         lengths = np.linalg.norm(found[:, 1::2] - found[:, ::2], axis=2)
         assert stated.calibration_mm == pytest.approx(2 * np.std(lengths, axis=0).max(), rel=0.2)
@@ -183,7 +183,7 @@ def test_drift_of_the_water_counts(calibration):
     for kelvin in (0.0, 5.0):
         provenance = calibration.provenance | {"known_before": known | {"drift_k": kelvin}}
         warmer = calibration.model_copy(update={"media": (medium,), "provenance": provenance})
-        found = length_uncertainties(prepare_use(warmer, regions(warmer)[0]))
+        found = length_uncertainties(prepare_use(warmer, list_regions(warmer)[0]))
         std.append(next(w.calibration_mm for w in found if w.axis == "Y" and w.length_mm == 100.0))
     assert std[1] > 2 * std[0]
 
@@ -224,7 +224,7 @@ def test_lengths_shown_where_they_are_measured_stay_in_the_volume(use):
 
 def test_against_another_calibration(calibration, thesis):
     """Half a per cent of the focal length changes all distances across the axis by as much, and none to itself."""
-    region = regions(calibration)[0]
+    region = list_regions(calibration)[0]
     same = compare_calibrations(calibration, calibration, region)
     assert same.largest_mm < 1e-9
     camera = calibration.camera.model_copy(
@@ -262,7 +262,7 @@ def test_without_a_joint_estimate_it_says_that_nothing_is_known(thesis, tmp_path
     path = tmp_path / "nominal.json"
     nominal_calibration(thesis).save(path)
     known = read_calibration(path)
-    content = certificate_of(known, path, issued=ISSUED)
+    content = make_certificate(known, path, issued=ISSUED)
     assert content.remark == NOT_JOINT
     assert not content.uncertainty_known
     assert not isinstance(content, JointCertificate) and "lengths" not in content.in_file()
@@ -276,6 +276,6 @@ def test_a_damaged_volume_is_reported(calibration):
         update={"covered": (calibration.joint.covered[0].model_copy(update={"medium": 7}),)}
     )
     with pytest.raises(CalibrationError, match="covered volume is damaged"):
-        regions(calibration.model_copy(update={"joint": damaged}))
-    region = regions(calibration)[0]
-    assert estimate_in(calibration, region).view == region.view
+        list_regions(calibration.model_copy(update={"joint": damaged}))
+    region = list_regions(calibration)[0]
+    assert read_region_estimate(calibration, region).view == region.view

@@ -10,7 +10,7 @@ import uwlts
 from tests.uwlts.comparison.test_surface_mesh import NOISE_MM
 from uwlts.cli import app
 from uwlts.errors import EvaluationError, OutputError, SetupError
-from uwlts.files.writing import sha256_of
+from uwlts.files.writing import hash_file
 from uwlts.model.artefacts import SphereStandard
 from uwlts.pages import pdf
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
@@ -62,8 +62,8 @@ def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
     wall = pits[0]["values"]["remaining wall"]
     # The noise of one point is 0.02 mm.
     assert wall["value"] == pytest.approx(8 - DEPTH_MM, abs=5 * NOISE_MM)
-    assert record["sources"][0]["sha256"] == sha256_of(folder / "pipe.ply")
-    assert record["sources"][-1]["sha256"] == sha256_of(folder / "ball.evaluation.json")
+    assert record["sources"][0]["sha256"] == hash_file(folder / "pipe.ply")
+    assert record["sources"][-1]["sha256"] == hash_file(folder / "ball.evaluation.json")
     (check,) = record["verification"]
     (diameter,) = (each for each in check["figures"] if each["calibrated_mm"] == 50.0)
     # Of 4000 points with 0.02 mm of noise; all figures are below a tenth of a mm.

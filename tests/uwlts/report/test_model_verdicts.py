@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from uwlts.calibration.joint.residuals import STRIPE
-from uwlts.calibration.model_comparison.comparison import Choice, Comparison, choice_of
+from uwlts.calibration.model_comparison.comparison import Choice, Comparison, build_choice
 from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE, Candidate, Misses, Prediction
-from uwlts.report.model_comparison import content_of, models_page, verdicts
+from uwlts.report.model_comparison import make_content, models_page, verdicts
 
 AIR, WATER = 0, 1
 SINGLE = Candidate(refractions=1)
@@ -37,7 +37,7 @@ def chosen(*, dry: int, wet: int, more_in_water_mm: float) -> Choice:
                 misses.append(Misses(image, STRIPE, np.abs(off) / 0.2, np.abs(off)))
             predicted[where] = Prediction(misses, SimpleNamespace(keys=()), np.empty(0), np.empty((0, 0)))
         found[candidate] = predicted
-    return choice_of(found, ways, frozenset({WATER}))
+    return build_choice(found, ways, frozenset({WATER}))
 
 
 def said_of_glass(choice: Choice) -> str:
@@ -80,7 +80,7 @@ def test_long_names_of_models_wrap_in_the_page():
     """A table of 15 columns is as wide as the page only if its names break; a narrower page scrolls it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("uwlts.report.model_comparison._describe_distortion", lambda *_: "k1 k2 is enough")
-        content = content_of(
+        content = make_content(
             Comparison("thesis", ["a.h5"], chosen(dry=8, wet=8, more_in_water_mm=0.0), None, "none", [])
         )
     page = models_page(content)

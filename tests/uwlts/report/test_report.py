@@ -21,8 +21,8 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.pages.numbers import as_fine_as, fixed, small_length
-from uwlts.pages.toolkit import png_of, svg_of, write_page
+from uwlts.pages.numbers import format_fixed, format_length, format_to_scale
+from uwlts.pages.toolkit import figure_png, figure_svg, write_page
 from uwlts.report import plot
 from uwlts.report.campaign_page import report_page
 from uwlts.report.campaign_tables import print_table, summary_table
@@ -549,7 +549,7 @@ def test_text_from_files_is_escaped(folder, tmp_path):
 
 def test_formulas_in_names_are_drawn_as_they_are():
     ax = plot.seconds({"a $x^2$": 1.0, "b $": 2.0})
-    assert "a $x^2$" in svg_of(ax.figure) and "b $" in svg_of(ax.figure)
+    assert "a $x^2$" in figure_svg(ax.figure) and "b $" in figure_svg(ax.figure)
 
 
 def test_the_page_is_written_once(campaign, tmp_path):
@@ -628,7 +628,7 @@ def test_the_cloud_picture_shows_both_signs_on_their_sides():
     x, y = map(np.ravel, np.meshgrid(np.linspace(-10, 10, 60), np.linspace(-40, 40, 200)))
     nothing = np.zeros(len(x), int)
     cloud = PointCloud(np.column_stack([x, y, 0 * x]), nothing, nothing, nothing, deviation_mm=0.01 * np.sign(y))
-    encoded = np.frombuffer(png_of(plot.cloud(cloud).figure), np.uint8)
+    encoded = np.frombuffer(figure_png(plot.cloud(cloud).figure), np.uint8)
     picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)[:, :950].astype(int)
     red = np.argwhere(picture[:, :, 2] - picture[:, :, 0] > 80)
     blue = np.argwhere(picture[:, :, 0] - picture[:, :, 2] > 80)
@@ -653,7 +653,7 @@ def test_clouds_can_be_coloured_by_what_is_known(colour):
 def test_clouds_of_hardly_any_points_can_be_drawn(count):
     nothing = np.zeros(count, int)
     cloud = PointCloud(np.ones((count, 3)), nothing, nothing, nothing)
-    assert png_of(plot.cloud(cloud).figure).startswith(b"\x89PNG")
+    assert figure_png(plot.cloud(cloud).figure).startswith(b"\x89PNG")
     assert plot.interactive_cloud(cloud)[0].to_json()
 
 
@@ -707,13 +707,15 @@ def test_colours_are_symmetric_and_end_at_the_limit():
 @settings(deadline=None)
 @given(st.floats(min_value=-1e6, max_value=1e6), st.integers(0, 6), st.booleans())
 def test_fixed_numbers_are_near_and_have_no_negative_zero(value, decimals, signed):
-    text = fixed(value, decimals, signed=signed)
+    text = format_fixed(value, decimals, signed=signed)
     # Half of the last decimal, and the rounding of a double near a million.
     assert abs(float(text) - value) <= 0.5 * 10**-decimals + 1e-9
     assert (text[0] in "+-") == (float(text) < 0 or (signed and float(text) > 0))
 
 
 def test_lengths_choose_their_unit():
-    assert small_length(0.0123456) == "12.3 µm" and small_length(-0.00002, signed=True) == "-0.02 µm"
-    assert small_length(1.5, signed=True) == "+1.500 mm" and small_length(None) == "-" and fixed(math.nan) == "-"
-    assert as_fine_as(0.123456, 1.58) == "0.12" and as_fine_as(7.0, 0.0) == "7.000"
+    assert format_length(0.0123456) == "12.3 µm" and format_length(-0.00002, signed=True) == "-0.02 µm"
+    assert (
+        format_length(1.5, signed=True) == "+1.500 mm" and format_length(None) == "-" and format_fixed(math.nan) == "-"
+    )
+    assert format_to_scale(0.123456, 1.58) == "0.12" and format_to_scale(7.0, 0.0) == "7.000"

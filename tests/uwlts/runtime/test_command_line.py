@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from uwlts.errors import DescriptionError
-from uwlts.runtime.command_line import PathText, settings_of, typed
+from uwlts.runtime.command_line import PathText, option_type, parse_settings
 
 Corner = tuple[float, float, float]
 
@@ -38,11 +38,15 @@ class Opened:
     ],
 )
 def test_options_have_the_types_that_text_can_give(parameter: Any, option: Any):
-    assert typed(parameter) == option
+    assert option_type(parameter) == option
 
 
 def test_settings_are_names_and_values():
-    assert settings_of("stripe", ["width=3", "model=a.onnx", "on=true"]) == {"width": 3, "model": "a.onnx", "on": True}
+    assert parse_settings("stripe", ["width=3", "model=a.onnx", "on=true"]) == {
+        "width": 3,
+        "model": "a.onnx",
+        "on": True,
+    }
     for wrong in ("width", "=3", "width="):
         with pytest.raises(DescriptionError, match=f"`stripe` {wrong}: expected NAME=VALUE"):
-            settings_of("stripe", [wrong])
+            parse_settings("stripe", [wrong])

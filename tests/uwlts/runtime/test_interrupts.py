@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from uwlts.runtime.interrupts import interrupts_kept
+from uwlts.runtime.interrupts import preserve_interrupts
 
 
 def test_an_interrupt_within_a_callback_is_not_lost(capsys: pytest.CaptureFixture):
@@ -16,7 +16,7 @@ def test_an_interrupt_within_a_callback_is_not_lost(capsys: pytest.CaptureFixtur
     def callback(_: object) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), interrupts_kept():
+    with pytest.raises(KeyboardInterrupt), preserve_interrupts():
         thing: set[int] = set()
         reference = weakref.ref(thing, callback)
         del thing
@@ -31,10 +31,10 @@ def test_an_interrupt_within_a_recorded_loop_is_not_lost():
     def body(i: mi.UInt32) -> tuple[mi.UInt32]:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), interrupts_kept():
+    with pytest.raises(KeyboardInterrupt), preserve_interrupts():
         dr.while_loop((mi.UInt32([0, 1]),), lambda i: i < 3, body)
 
 
 def test_an_error_within_a_recorded_loop_stays_what_it_is():
-    with pytest.raises(RuntimeError, match="encountered an exception"), interrupts_kept():
+    with pytest.raises(RuntimeError, match="encountered an exception"), preserve_interrupts():
         dr.while_loop((mi.UInt32([0, 1]),), lambda i: i < 3, lambda i: (i + [],))

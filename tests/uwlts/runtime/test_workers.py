@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from uwlts.errors import CaptureError, SetupError
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.runtime import workers
-from uwlts.runtime.workers import work_through
+from uwlts.runtime.workers import run_jobs
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -63,7 +63,7 @@ def no_process_is_left():
 
 def test_results_come_in_the_order_of_the_jobs():
     heard = []
-    assert work_through(square, range(20), workers=3, on_message=heard.append) == [n * n for n in range(20)]
+    assert run_jobs(square, range(20), workers=3, on_message=heard.append) == [n * n for n in range(20)]
     assert sorted(number for number, _ in heard) == list(range(20))
     processes = {process for _, process in heard}
     assert len(processes) == 3
@@ -71,9 +71,9 @@ def test_results_come_in_the_order_of_the_jobs():
 
 
 def test_fewer_jobs_than_processes():
-    assert work_through(square, [], workers=4) == []
+    assert run_jobs(square, [], workers=4) == []
     heard = []
-    assert work_through(square, [3], workers=4, on_message=heard.append) == [9]
+    assert run_jobs(square, [3], workers=4, on_message=heard.append) == [9]
     assert len(heard) == 1
 
 
@@ -81,7 +81,7 @@ def test_fewer_jobs_than_processes():
 def test_a_job_that_fails_stops_the_others(error):
     start = time.monotonic()
     with pytest.raises(type(error)) as raised:
-        work_through(partial(fail, error), range(5), workers=2)
+        run_jobs(partial(fail, error), range(5), workers=2)
     assert str(raised.value) == str(error)
     assert time.monotonic() - start < 30
 
@@ -89,12 +89,12 @@ def test_a_job_that_fails_stops_the_others(error):
 @pytest.mark.parametrize(("how", "says"), [(-signal.SIGKILL, "signal SIGKILL"), (7, "exit code 7")])
 def test_a_process_that_vanishes_is_no_mystery(how: int, says: str):
     with pytest.raises(SetupError, match=rf"ended unexpectedly \({says}\).*fewer workers"):
-        work_through(partial(end, how), range(3), workers=2)
+        run_jobs(partial(end, how), range(3), workers=2)
 
 
 def test_a_bug_shows_its_traceback(capfd):
     with pytest.raises(SetupError, match="exit code 1"):
-        work_through(partial(fail, ZeroDivisionError("a bug")), range(3), workers=2)
+        run_jobs(partial(fail, ZeroDivisionError("a bug")), range(3), workers=2)
     assert "ZeroDivisionError: a bug" in capfd.readouterr().err
 
 
@@ -108,7 +108,7 @@ def test_an_interrupt_stops_what_is_under_way_and_begins_nothing_more(tmp_path: 
 
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        work_through(partial(linger, tmp_path), range(9), workers=2, on_message=interrupted)
+        run_jobs(partial(linger, tmp_path), range(9), workers=2, on_message=interrupted)
     assert time.monotonic() - start < 30
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0.begun", "0.stopped", "1.begun", "1.stopped"]
     assert capfd.readouterr() == ("", "")
@@ -121,12 +121,12 @@ def test_what_does_not_end_is_killed(monkeypatch):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        work_through(hold_on, [0], on_message=interrupted)
+        run_jobs(hold_on, [0], on_message=interrupted)
 
 
 def write_and_hold_on(folder, job, send):
     """Begin a file, then wait regardless of requests to stop."""
-    with written_aside(folder / f"{job}.txt"):
+    with write_atomically(folder / f"{job}.txt"):
         hold_on(job, send)
 
 
@@ -138,7 +138,7 @@ def test_what_does_not_end_leaves_no_unfinished_files(tmp_path: Path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        work_through(partial(write_and_hold_on, tmp_path), range(2), workers=2, on_message=interrupted)
+        run_jobs(partial(write_and_hold_on, tmp_path), range(2), workers=2, on_message=interrupted)
     assert ".lock" in seen[0] and ".txt" in seen[0]
     assert list(tmp_path.iterdir()) == []
 
@@ -183,6 +183,6 @@ def threads(job, send):
 def test_workers_do_linear_algebra_in_one_thread_unless_set_otherwise(monkeypatch):
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert work_through(threads, [0, 1], workers=2) == [("1", "3")] * 2
+    assert run_jobs(threads, [0, 1], workers=2) == [("1", "3")] * 2
     assert "OPENBLAS_NUM_THREADS" not in os.environ
     assert os.environ["OMP_NUM_THREADS"] == "3"

@@ -83,7 +83,7 @@ def test_lamp_images_and_centre_lines_mix_and_come_back_from_an_export(tmp_path:
             assert np.array_equal(capture.image(2), lamp_image(2))
             assert [index for index, _ in capture.frames(laser_on=False)] == [0, 2]
             for number, frame in ((0, 1), (1, 3)):
-                assert np.array_equal(capture.seen(frame).centre_px, places[number], equal_nan=True)
+                assert np.array_equal(capture.read_observation(frame).centre_px, places[number], equal_nan=True)
 
 
 def test_a_table_gives_encoder_and_time_of_every_profile(tmp_path: Path):
@@ -143,7 +143,7 @@ def test_amplitude_width_and_status_are_kept_and_damage_is_found(tmp_path: Path)
         with pytest.raises(ImageError, match="image with the laser on, the capture holds centre lines"):
             writer.append(Frame(lamp_image(), 0.0, True, 1.0, 0.0))
     with Capture(tmp_path / "b.h5") as capture:
-        kept = capture.seen(0)
+        kept = capture.read_observation(0)
         assert np.array_equal(kept.status, stripe.status)
         assert np.array_equal(kept.amplitude, stripe.amplitude, equal_nan=True)
         assert find_stripes(capture).width_px.tolist() == [3.5] * (WIDTH - 1)
@@ -180,7 +180,7 @@ def test_centre_lines_of_another_length_are_refused(tmp_path: Path):
     write(folder / "map.npy", profiles(1))
     uwlts.import_images(folder, tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
-        header, stripe = capture.header, capture.seen(0)
+        header, stripe = capture.header, capture.read_observation(0)
     with CaptureWriter(tmp_path / "c.h5", header, dtype=np.dtype(np.uint8)) as writer:
         with pytest.raises(ImageError, match=f"centre line of {WIDTH} lines, the capture holds images"):
             writer.append(Frame(stripe, 0.0, True, 1.0, 0.0))
@@ -205,4 +205,6 @@ def test_an_interrupted_recording_keeps_its_centre_lines_and_goes_on(tmp_path: P
     with Capture(tmp_path / "a.h5") as one, Capture(tmp_path / "b.h5") as other:
         assert len(other) == 3
         for k in range(3):
-            assert np.array_equal(one.seen(k).centre_px, other.seen(k).centre_px, equal_nan=True)
+            assert np.array_equal(
+                one.read_observation(k).centre_px, other.read_observation(k).centre_px, equal_nan=True
+            )

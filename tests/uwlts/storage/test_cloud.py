@@ -17,7 +17,7 @@ from plyfile import PlyData, PlyElement
 from tests.system.in_process import uwlts
 from tests.uwlts import drawn_stripes
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 from uwlts.storage.cloud_files import is_cloud, read_cloud, read_thinned_cloud, write_cloud
@@ -389,7 +389,7 @@ def test_a_write_that_the_system_cuts_short_leaves_the_old_file(tmp_path, name):
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt, ValueError, SystemExit])
 def test_any_exception_removes_the_temporary_file(tmp_path, interruption):
     (tmp_path / "a.json").write_text("old")
-    with pytest.raises(interruption), written_aside(tmp_path / "a.json", overwrite=True) as aside:
+    with pytest.raises(interruption), write_atomically(tmp_path / "a.json", overwrite=True) as aside:
         aside.write_text("half")
         raise interruption
     assert os.listdir(tmp_path) == ["a.json"]
@@ -401,7 +401,7 @@ def test_any_exception_removes_the_temporary_file(tmp_path, interruption):
     [(errno.ENOSPC, "disk is full"), (errno.EACCES, "no permission"), (errno.EROFS, "read-only"), (errno.EIO, "error")],
 )
 def test_errors_of_the_system_say_what_to_do(tmp_path, number, message):
-    with pytest.raises(OutputError, match=message), written_aside(tmp_path / "a.json"):
+    with pytest.raises(OutputError, match=message), write_atomically(tmp_path / "a.json"):
         raise OSError(number, os.strerror(number))
     assert os.listdir(tmp_path) == []
 
@@ -409,7 +409,7 @@ def test_errors_of_the_system_say_what_to_do(tmp_path, number, message):
 def test_the_file_appears_at_the_end_with_its_suffix_and_ordinary_permissions(tmp_path):
     mask = os.umask(0o027)
     try:
-        with written_aside(tmp_path / "a.json") as aside:
+        with write_atomically(tmp_path / "a.json") as aside:
             aside.write_text("{}")
             assert aside.parent == tmp_path and aside.suffix == ".json"
             assert not (tmp_path / "a.json").exists()
@@ -420,7 +420,7 @@ def test_the_file_appears_at_the_end_with_its_suffix_and_ordinary_permissions(tm
 
 
 def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
-    with pytest.raises(OutputError, match="exists already"), written_aside(tmp_path / "a.json") as aside:
+    with pytest.raises(OutputError, match="exists already"), write_atomically(tmp_path / "a.json") as aside:
         aside.write_text("mine")
         (tmp_path / "a.json").write_text("theirs")
     assert (tmp_path / "a.json").read_text() == "theirs"
@@ -430,7 +430,7 @@ def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
 def test_a_link_stays_and_its_file_is_replaced(tmp_path):
     (tmp_path / "file.json").write_text("old")
     (tmp_path / "link.json").symlink_to("file.json")
-    with written_aside(tmp_path / "link.json", overwrite=True) as aside:
+    with write_atomically(tmp_path / "link.json", overwrite=True) as aside:
         aside.write_text("new")
     assert (tmp_path / "link.json").is_symlink()
     assert (tmp_path / "file.json").read_text() == "new"
@@ -443,7 +443,7 @@ def test_unsuitable_places_are_refused_before_the_body_runs(tmp_path):
         (tmp_path / "folder.json", "not a regular file"),
         (Path("/dev/null"), "not a regular file"),
     ):
-        with pytest.raises(OutputError, match=message), written_aside(path, overwrite=True):
+        with pytest.raises(OutputError, match=message), write_atomically(path, overwrite=True):
             pytest.fail("the body ran")
-    with pytest.raises(OutputError, match="cannot write"), written_aside(Path("/proc/a.json")):
+    with pytest.raises(OutputError, match="cannot write"), write_atomically(Path("/proc/a.json")):
         pytest.fail("the body ran")

@@ -13,7 +13,7 @@ from uwlts.cli import app
 from uwlts.errors import CaptureError, OutputError
 from uwlts.storage import copc_file
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import cloud_parts, read_region, read_thinned_cloud
+from uwlts.storage.cloud_files import read_parts, read_region, read_thinned_cloud
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def test_the_command_cuts_out_a_region(cloud, tmp_path, monkeypatch):
 def test_parts_are_the_whole(cloud, tmp_path):
     for name in ("pipe.ply", "pipe.h5"):
         cloud.save(tmp_path / name)
-        parts = list(cloud_parts(tmp_path / name, 50_000))
+        parts = list(read_parts(tmp_path / name, 50_000))
         assert [len(part) for part in parts] == [50_000, 50_000, 20_000]
         np.testing.assert_array_equal(np.concatenate([part.points_mm for part in parts]), cloud.points_mm)
 
@@ -99,7 +99,7 @@ def test_damaged_and_empty_clouds_are_refused(cloud, tmp_path):
     (tmp_path / "text.copc.laz").write_text("no cloud")
     with pytest.raises(CaptureError, match=r"text.copc.laz is not a complete COPC file"):
         uwlts.read(tmp_path / "text.copc.laz")
-    cloud.selected(slice(0, 0)).save(tmp_path / "empty.ply")
+    cloud.select(slice(0, 0)).save(tmp_path / "empty.ply")
     with pytest.raises(OutputError, match="no points"):
         uwlts.export(tmp_path / "empty.ply", tmp_path / "empty.copc.laz")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.ply", "text.copc.laz"]

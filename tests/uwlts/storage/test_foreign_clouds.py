@@ -9,7 +9,7 @@ import pytest
 
 from tests.uwlts.storage.test_cloud import some_cloud
 from uwlts.errors import CaptureError
-from uwlts.storage.cloud_files import cloud_parts, is_cloud, read_cloud, read_thinned_cloud, write_cloud
+from uwlts.storage.cloud_files import is_cloud, read_cloud, read_parts, read_thinned_cloud, write_cloud
 
 
 # All digits; half a unit in the last of 24 binary digits of coordinates below 2 m.
@@ -22,7 +22,7 @@ def test_exported_clouds_come_back(tmp_path: Path, suffix: str, apart_mm: float)
     assert np.array_equal(back.intensity, cloud.intensity)
     thinned, total = read_thinned_cloud(path, 100)
     assert total == 300 and np.array_equal(thinned.points_mm, back.points_mm[::3])
-    parts = list(cloud_parts(path, 128))
+    parts = list(read_parts(path, 128))
     assert [len(part) for part in parts] == [128, 128, 44] and np.array_equal(
         parts[1].points_mm, back.points_mm[128:256]
     )

@@ -15,7 +15,7 @@ from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_ import import_images
-from uwlts.storage.import_.grey_values import grey_values, one_channel
+from uwlts.storage.import_.grey_values import extract_channel, grey_values
 from uwlts.storage.import_.matching import natural_key, read_rows
 from uwlts.stripe import extract_stripe
 
@@ -158,7 +158,7 @@ def test_the_laser_s_light_is_separated_by_a_difference_of_colours(tmp_path: Pat
 def test_formulas_of_channels(formula, value):
     image = np.empty((2, 3, 3), np.uint8)
     image[:] = 20, 100, 200
-    np.testing.assert_array_equal(one_channel(image, formula, name="a"), np.full((2, 3), value))
+    np.testing.assert_array_equal(extract_channel(image, formula, name="a"), np.full((2, 3), value))
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_a_grey_image_has_no_difference_of_colours(tmp_path: Path):
 
 def test_colour_without_colours_needs_no_channel():
     image = stripe_image()
-    assert np.array_equal(one_channel(np.dstack([image] * 3), None, name="a"), image)
+    assert np.array_equal(extract_channel(np.dstack([image] * 3), None, name="a"), image)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
@@ -311,7 +311,7 @@ def test_intrinsics_fill_the_sensor(tmp_path: Path):
         camera = capture.header.sensor.camera
     assert camera.focal_length_px() == pytest.approx(2002.0, rel=1e-12)
     assert camera.principal_point() == (50.0, 31.0)
-    assert tuple(camera.distortion.used().values()) == tuple(coefficients)
+    assert tuple(camera.distortion.used_coefficients().values()) == tuple(coefficients)
 
 
 # --- refusals

@@ -10,7 +10,7 @@ import pytest
 from uwlts.errors import DescriptionError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Distortion
-from uwlts.storage.import_ import KnownCamera, read_intrinsics, with_intrinsics
+from uwlts.storage.import_ import KnownCamera, read_intrinsics, set_intrinsics
 
 MATRIX = np.array([[2451.25, 0.0, 640.5], [0.0, 2450.75, 511.25], [0.0, 0.0, 1.0]])
 COEFFICIENTS = np.array([-0.125, 0.0625, 1e-3, -2e-3, 0.03125])
@@ -153,11 +153,11 @@ def test_a_missing_or_binary_file(tmp_path: Path):
 
 def test_the_sensor_takes_them_over():
     sensor = load_sensor("thesis")
-    filled = with_intrinsics(sensor, KNOWN, source="camera.yaml")
+    filled = set_intrinsics(sensor, KNOWN, source="camera.yaml")
     assert filled.camera.focal_lengths_px() == pytest.approx((2451.0, 2451.0), rel=1e-12)
     assert filled.camera.principal_point() == (640.5, 511.25) and filled.camera.distortion == KNOWN.distortion
     assert filled.laser == sensor.laser and filled.media == sensor.media
-    oblong = with_intrinsics(sensor, replace(KNOWN, fy_px=2500.0), source="camera.yaml")
+    oblong = set_intrinsics(sensor, replace(KNOWN, fy_px=2500.0), source="camera.yaml")
     assert oblong.camera.focal_lengths_px() == pytest.approx((KNOWN.fx_px, 2500.0), rel=1e-12)
 
 
@@ -165,7 +165,7 @@ def test_intrinsics_of_another_camera_are_refused():
     sensor = load_sensor("thesis")
     other = KnownCamera(2451.0, 2451.0, 512.0, 640.0, Distortion(), (1024, 1280))
     with pytest.raises(DescriptionError, match="1024 x 1280 pixels, the sensor's are 1280 x 1024"):
-        with_intrinsics(sensor, other, source="camera.yaml")
+        set_intrinsics(sensor, other, source="camera.yaml")
     oblong = KnownCamera(2000.0, 2500.0, 640.0, 512.0, Distortion(), None)
     with pytest.raises(DescriptionError, match=r"pixel_aspect.*1\.25"):
-        with_intrinsics(sensor, oblong, source="camera.yaml")
+        set_intrinsics(sensor, oblong, source="camera.yaml")

@@ -11,7 +11,7 @@ from uwlts.optics.nominal import nominal
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import StripeStatus, extract_stripe, find_stripes
-from uwlts.stripe.exposures import fused, group_brackets
+from uwlts.stripe.exposures import fuse_exposures, group_brackets
 
 LINES, LENGTH = 300, 120
 OFFSET, FULL = 16.0, 255
@@ -79,7 +79,7 @@ def drawn():
 
 def test_the_fused_image_shows_what_no_exposure_shows_alone(drawn):
     centre, height, images = drawn
-    image, saturation = fused(images, STATED_MS, full_dn=FULL)
+    image, saturation = fuse_exposures(images, STATED_MS, full_dn=FULL)
     # The shortest exposure's range, in grey levels of the longest.
     assert saturation == pytest.approx(OFFSET + (FULL - OFFSET) * TRUE_MS[-1] / TRUE_MS[0], rel=0.02)
     stripe = extract_stripe(image, stripe_along="height", saturation=saturation)
@@ -100,7 +100,7 @@ def test_the_fused_image_shows_what_no_exposure_shows_alone(drawn):
 def test_ratio_and_offset_where_little_is_well_exposed(drawn):
     _, _, images = drawn
     dark = [np.minimum(image, 40) for image in images]
-    image, saturation = fused(dark, STATED_MS, full_dn=FULL)
+    image, saturation = fuse_exposures(dark, STATED_MS, full_dn=FULL)
     # No pixel determines the ratio: the stated exposures are used. The offset follows from the background.
     assert saturation == pytest.approx(OFFSET + (FULL - OFFSET) * 25.0, rel=0.01)
     assert np.median(image) == pytest.approx(OFFSET + 5.0, abs=0.3)

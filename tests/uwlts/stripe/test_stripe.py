@@ -521,9 +521,9 @@ def test_a_stripe_shorter_than_its_two_ends_gives_no_points():
 
 def test_settings_of_the_sensor_and_of_the_call():
     sensor = load_sensor("thesis").model_copy(update={"stripe": {"half_window_px": 32, "peak": "first"}})
-    assert StripeOptions.of(sensor) == StripeOptions(half_window_px=32, peak=PeakRule.FIRST)
-    assert StripeOptions.of(sensor, {"peak": "last"}) == StripeOptions(half_window_px=32, peak=PeakRule.LAST)
-    assert StripeOptions.of(sensor, StripeOptions()) == StripeOptions()
+    assert StripeOptions.resolve(sensor) == StripeOptions(half_window_px=32, peak=PeakRule.FIRST)
+    assert StripeOptions.resolve(sensor, {"peak": "last"}) == StripeOptions(half_window_px=32, peak=PeakRule.LAST)
+    assert StripeOptions.resolve(sensor, StripeOptions()) == StripeOptions()
     for wrong, said in (
         ({"window": 3}, "unknown setting of the stripe: window; known are method"),
         ({"method": "x"}, "method is 'x'"),
@@ -531,7 +531,7 @@ def test_settings_of_the_sensor_and_of_the_call():
         ({"threshold_sigmas": "many"}, "settings of the stripe"),
     ):
         with pytest.raises(DescriptionError, match=said):
-            StripeOptions.of(sensor, wrong)
+            StripeOptions.resolve(sensor, wrong)
 
 
 @pytest.mark.parametrize("seed", range(4))

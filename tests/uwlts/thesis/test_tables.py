@@ -14,7 +14,7 @@ import pytest
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium
-from uwlts.pages.toolkit import svg_of
+from uwlts.pages.toolkit import figure_svg
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud
@@ -24,8 +24,8 @@ from uwlts.thesis.published_tables import TableRow, all_rows, headline_rows, loa
 from uwlts.thesis.report import (
     comparison_figure,
     differences,
+    format_markdown,
     line_figure,
-    markdown,
     polynomials_figures,
     select_outlying_rows,
     window_distance_figure,
@@ -372,13 +372,13 @@ def test_the_files_hold_the_rows(folder):
     for line, row in zip(lines, kept, strict=True):
         assert line == {name: "" if value is None else str(value) for name, value in row.items()}
     text = (folder / "summary.md").read_text()
-    assert text == markdown(rows, results)
+    assert text == format_markdown(rows, results)
     table = text.splitlines()
     assert len(table) == 2 + 20
     assert {line.count("|") for line in table} == {7}
     assert "range of 2 campaigns" in table[0]
     assert "| Table 6: spheres, water | PE | 0.55 | 0.579 | 0.496 to 0.662 | 1.05 |" in table
-    assert "range of 1 campaign |" in markdown(rows, results[:1])
+    assert "range of 1 campaign |" in format_markdown(rows, results[:1])
 
 
 def test_existing_files_are_refused_and_kept(folder):
@@ -450,7 +450,7 @@ def test_figures_are_well_formed_whatever_was_measured():
         line_figure(campaign()),
     ]
     for figure in drawn:
-        root = ElementTree.fromstring(svg_of(figure))
+        root = ElementTree.fromstring(figure_svg(figure))
         numbers = [
             float(value)
             for element in root.iter()
@@ -463,7 +463,7 @@ def test_figures_are_well_formed_whatever_was_measured():
     # One bar for each row with values; one diamond for each of them that was published.
     assert [bar.get_width() for bar in axes.patches] == pytest.approx([0.125, 0.1])
     assert axes.lines[0].get_xydata().tolist() == [[0.1, 0.0]]
-    words = [element.text for element in ElementTree.fromstring(svg_of(drawn[0])).iter("text")]
+    words = [element.text for element in ElementTree.fromstring(figure_svg(drawn[0])).iter("text")]
     assert 'STD: a & b <c> "d", water' in words
 
 
@@ -472,13 +472,13 @@ def test_foreign_results_are_refused(tmp_path, content):
     path = tmp_path / "results.json"
     path.write_text(content)
     with pytest.raises(CaptureError, match="remove it"):
-        CampaignResults.read(path)
+        CampaignResults.read_file(path)
 
 
 def test_results_are_read_again(tmp_path):
     path = tmp_path / "results.json"
     campaign().keep(path)
-    assert CampaignResults.read(path) == campaign()
+    assert CampaignResults.read_file(path) == campaign()
     assert list(json.loads(path.read_text()))[:3] == ["format", "version", "measurements"]
 
 

@@ -279,12 +279,14 @@ def test_the_travel_is_turned_by_the_angles_drawn(along):
     direction = np.array({"x": [1.0, 0.0, 0.0], "oblique": [0.6, 0.48, 0.64]}[along])
     lead, angles = draw({"stage_lead_std": 1e-4, "stage_misalignment_std_deg": 0.1}).scan(Fixed())
     assert lead == 1e-4
-    turned = monte_carlo._turned(direction, angles)
+    turned = monte_carlo._rotate_direction(direction, angles)
     assert np.linalg.norm(turned) == pytest.approx(1.0, abs=1e-12)
     # Two angles at right angles make their root sum of squares, up to their cube.
     assert math.acos(turned @ direction) == pytest.approx(math.radians(0.1) * math.sqrt(2), rel=1e-5)
-    first = monte_carlo._turned(direction, angles * (1, 0)) - direction
-    assert first @ (monte_carlo._turned(direction, angles * (0, 1)) - direction) == pytest.approx(0, abs=1e-10)
+    first = monte_carlo._rotate_direction(direction, angles * (1, 0)) - direction
+    assert first @ (monte_carlo._rotate_direction(direction, angles * (0, 1)) - direction) == pytest.approx(
+        0, abs=1e-10
+    )
 
 
 def test_noise_is_drawn_as_large_as_it_is():

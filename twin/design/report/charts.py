@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import Triangulation
 
-from twin.design.choice import Judged, pareto
-from twin.design.designs import Marked
+from twin.design.choice import StudyResults, find_pareto_front
+from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import CLASS_NAMES
 from twin.design.report import study_tables as tables
 from twin.design.study import Variable
@@ -93,9 +93,9 @@ _escaped = partial(escape, quote=False)
 """Escape text for plotly."""
 
 
-def shown_figures(judged: Judged) -> list[str]:
+def shown_figures(judged: StudyResults) -> list[str]:
     """Return the known figures to show: objectives, constraints, then the most informative others."""
-    names = dict.fromkeys([*judged.study.wanted(), *_SHOWN])
+    names = dict.fromkeys([*judged.study.figures(), *_SHOWN])
     return [name for name in names if np.isfinite(judged.figure(name)[judged.works]).any()]
 
 
@@ -115,7 +115,7 @@ def _panels(names: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[
     return figure, list(zip(axes, names, strict=False))
 
 
-def _mark(axes: Axes, marked: Sequence[Marked], x: str, y: str) -> None:
+def _mark(axes: Axes, marked: Sequence[HighlightedDesign], x: str, y: str) -> None:
     """Draw highlighted designs as symbols, the chosen one in red."""
     for number, one in enumerate(marked):
         at, (colour, size) = (
@@ -127,7 +127,7 @@ def _mark(axes: Axes, marked: Sequence[Marked], x: str, y: str) -> None:
             axes.plot(*at, _SYMBOLS[number % len(_SYMBOLS)][1], label=one.label, **style)
 
 
-def _draw_bounds(draw: Callable[..., object], judged: Judged, name: str) -> None:
+def _draw_bounds(draw: Callable[..., object], judged: StudyResults, name: str) -> None:
     for bounded, _, bound in judged.study.bounds():
         if bounded == name:
             draw(bound, color=RED, linewidth=1.2, linestyle="--")
@@ -137,7 +137,7 @@ def _draw_bounds(draw: Callable[..., object], judged: Judged, name: str) -> None
 
 
 @_plain_text
-def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
+def curves(judged: StudyResults, marked: Sequence[HighlightedDesign], x: str) -> Static:
     """Draw figures over one variable: a curve for each combination of the other variables, or the best of all."""
     others = [name for name in judged.study.free() if name != x]
     groups: dict[str, list[int]] = {}
@@ -146,14 +146,14 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
     caption = ""
     if len(groups) > len(COLOURS):
         groups = {"best": judged.best_first.tolist()}
-        varying = tables.listed([tables.words_of(name) for name in others]).capitalize()
+        varying = tables.join_words([tables.words_of(name) for name in others]).capitalize()
         caption = f"{varying} also vary: each point is the best design of its interval. "
     at, found = np.asarray(judged.columns[x], dtype=float), {}
     for name, members in groups.items():
         places = np.array(members)
         if caption:
             # Designs are sorted by merit: the first of each interval is the best.
-            share = share_of(judged.study.variables[x], at[places])
+            share = normalise(judged.study.variables[x], at[places])
             places = places[np.unique((share * (_INTERVALS - 1)).round(), return_index=True)[1]]
         places = places[np.argsort(at[places], kind="stable")]
         thinned = np.linspace(0, len(places) - 1, min(len(places), _MOST_OF_CURVE)).round().astype(int)
@@ -172,12 +172,12 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
     return figure, f"{caption}{missed}{_DASHED if judged.study.bounds() else ''}".strip()
 
 
-def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
-    return ", ".join(tables.text_at(judged, name, place) for name in names)
+def _combination(judged: StudyResults, names: Sequence[str], place: int) -> str:
+    return ", ".join(tables.format_design_value(judged, name, place) for name in names)
 
 
 @_plain_text
-def bars(judged: Judged) -> Static:
+def bars(judged: StudyResults) -> Static:
     """Draw the figures of all combinations of choices as bars, the best first."""
     places = judged.best_first[:_MOST_BARS]
     labels = [_combination(judged, list(judged.study.free()), place) for place in places]
@@ -193,7 +193,7 @@ def bars(judged: Judged) -> Static:
     return figure, f"{count}{grey} {_DASHED if judged.study.bounds() else ''}".strip()
 
 
-def share_of(variable: Variable, values: np.ndarray) -> np.ndarray:
+def normalise(variable: Variable, values: np.ndarray) -> np.ndarray:
     """Normalise values to a variable's range (0 to 1), on its scale."""
     values, (least, most) = np.asarray(values, dtype=float), variable.ends()
     if variable.scale == "log":
@@ -204,21 +204,21 @@ def share_of(variable: Variable, values: np.ndarray) -> np.ndarray:
 # --- maps over two variables ------------------------------------------------------------------------------------------
 
 
-def map_places(judged: Judged, x: str, y: str) -> np.ndarray:
+def map_places(judged: StudyResults, x: str, y: str) -> np.ndarray:
     """Return the indices of designs to show over two variables: all, or the best of each cell if more are free."""
     if len(judged.study.free()) == 2:
         return np.arange(len(judged))
-    cells = [np.rint(_CELLS * share_of(judged.study.variables[name], judged.columns[name])) for name in (x, y)]
+    cells = [np.rint(_CELLS * normalise(judged.study.variables[name], judged.columns[name])) for name in (x, y)]
     order = np.concatenate([judged.best_first, np.flatnonzero(~judged.works)])
     return order[np.unique(np.stack(cells)[:, order], axis=1, return_index=True)[1]]
 
 
-def mesh_between(judged: Judged, places: np.ndarray, x: str, y: str) -> Triangulation | None:
+def mesh_between(judged: StudyResults, places: np.ndarray, x: str, y: str) -> Triangulation | None:
     """Triangulate designs over two variables; triangles with a failed design are masked.
 
     Return None if the designs are on a line.
     """
-    shares = np.column_stack([share_of(judged.study.variables[name], judged.columns[name][places]) for name in (x, y)])
+    shares = np.column_stack([normalise(judged.study.variables[name], judged.columns[name][places]) for name in (x, y)])
     if np.linalg.matrix_rank(shares - shares.mean(axis=0), tol=_FLAT) < 2:
         return None
     triangles = Triangulation(shares[:, 0], shares[:, 1]).triangles
@@ -227,7 +227,7 @@ def mesh_between(judged: Judged, places: np.ndarray, x: str, y: str) -> Triangul
 
 
 @_plain_text
-def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static | None:
+def contours(judged: StudyResults, marked: Sequence[HighlightedDesign], x: str, y: str) -> Static | None:
     """Draw maps of the figures over two variables; None if the designs are on a line."""
     study, places = judged.study, map_places(judged, x, y)
     mesh = mesh_between(judged, places, x, y)
@@ -264,21 +264,21 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
         axes.set(xlabel=tables.label_of(x), ylabel="" if number % _PANEL_COLUMNS else tables.label_of(y))
         axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
         # Margin for symbols at the border of the range.
-        xlim, ylim = ((float(v.at(-_MARGIN)), float(v.at(1 + _MARGIN))) for v in variables)
+        xlim, ylim = ((float(v.value_at(-_MARGIN)), float(v.value_at(1 + _MARGIN))) for v in variables)
         axes.set(xlim=xlim, ylim=ylim)
     legend_below(figure)
     others = [tables.words_of(name) for name in study.free() if name not in (x, y)]
     ends = {name: variable.ends() for name, variable in zip((x, y), variables, strict=True)}
     outside = [m.label for m in marked if not all(a <= m.design.number_of(n) <= b for n, (a, b) in ends.items())]
     parts = (
-        f"{tables.listed(others).capitalize()} also vary: each point is the design of its cell with the smallest "
+        f"{tables.join_words(others).capitalize()} also vary: each point is the design of its cell with the smallest "
         f"constraint violation, then with the best {tables.words_of(study.objectives[0].figure)}."
         if others
         else "",
         "Interpolated linearly between designs (dots).",
         "Grey: a constraint is missed." if misses else "",
         "Crosses: designs that cannot work; see the table of reasons." if not works.all() else "",
-        f"Outside the ranges: {tables.listed(outside)}." if outside else "",
+        f"Outside the ranges: {tables.join_words(outside)}." if outside else "",
     )
     return figure, " ".join(filter(None, parts))
 
@@ -328,7 +328,7 @@ def verification_chart(found: Agreement) -> Static | None:
 # --- the Pareto front -------------------------------------------------------------------------------------------------
 
 
-def trade_off(judged: Judged) -> tuple[tuple[str, int], tuple[str, int]]:
+def choose_pareto_axes(judged: StudyResults) -> tuple[tuple[str, int], tuple[str, int]]:
     """Return the two figures of the Pareto chart, each with 1 to minimise or -1 to maximise.
 
     They are the study's first two objectives. With one objective, the second figure is the first constrained one, or
@@ -345,20 +345,20 @@ def trade_off(judged: Judged) -> tuple[tuple[str, int], tuple[str, int]]:
     return wanted[0], second
 
 
-def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None:
+def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> Interactive | None:
     """Draw all working designs over two figures, and the Pareto front of those that meet the constraints."""
-    (x, x_sign), (y, y_sign) = trade_off(judged)
+    (x, x_sign), (y, y_sign) = choose_pareto_axes(judged)
     values = np.column_stack([judged.figure(x) * x_sign, judged.figure(y) * y_sign])
     known = judged.works & np.isfinite(values).all(axis=1)
     if not known.any():
         return None
-    front = pareto(np.where((judged.of_interest & known)[:, None], values, np.nan))
+    front = find_pareto_front(np.where((judged.of_interest & known)[:, None], values, np.nan))
     shown = sample(known, front, MOST_POINTS)
     figure = go.Figure()
     labels = [_escaped(tables.label_of(name)) for name in (x, y)]
 
-    def at(places: np.ndarray) -> dict[str, object]:
-        return {axis: tables.rounded(judged.figure(name)[places]) for axis, name in (("x", x), ("y", y))}
+    def select_points(places: np.ndarray) -> dict[str, object]:
+        return {axis: tables.round_for_json(judged.figure(name)[places]) for axis, name in (("x", x), ("y", y))}
 
     for name, chosen, colour in (
         ("misses a constraint", shown & ~judged.feasible, "#b3bcc6"),
@@ -366,7 +366,7 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
     ):
         if len(places := np.flatnonzero(chosen)):
             trace = (go.Scattergl if len(places) > _IN_SVG else go.Scatter)(
-                **at(places),
+                **select_points(places),
                 name=name,
                 mode="markers",
                 marker={"color": colour, "size": 4 if shown.sum() > _FEW else 7, "opacity": 0.55},
@@ -378,7 +378,7 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
     order = np.flatnonzero(front)[np.argsort(values[front, 0])]
     names = list(dict.fromkeys([*judged.study.free(), x, y]))
     figure.add_scatter(
-        **at(order),
+        **select_points(order),
         name=f"Pareto front ({len(order):,} of the designs)",
         mode="lines+markers",
         line={"color": _FRONT, "width": 2},
@@ -386,7 +386,10 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
         text=[
             "<br>".join(
                 [f"design {judged.columns['design'][place]}"]
-                + [_escaped(f"{tables.words_of(name)}: {tables.text_at(judged, name, place)}") for name in names]
+                + [
+                    _escaped(f"{tables.words_of(name)}: {tables.format_design_value(judged, name, place)}")
+                    for name in names
+                ]
             )
             for place in order
         ],
@@ -417,8 +420,8 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
         place, colour = [one.design.number_of(name) for name in (x, y)], RED if one is marked[-1] else INK
         if all(map(math.isfinite, place)):
             figure.add_scatter(
-                x=tables.rounded(place[:1]),
-                y=tables.rounded(place[1:]),
+                x=tables.round_for_json(place[:1]),
+                y=tables.round_for_json(place[1:]),
                 mode="markers+text",
                 showlegend=False,
                 cliponaxis=False,
@@ -450,12 +453,12 @@ def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
     return chosen
 
 
-def parallel_chart(judged: Judged) -> Interactive | None:
+def parallel_chart(judged: StudyResults) -> Interactive | None:
     """Draw each design that meets the constraints as a line over free variables, objectives and constraints."""
     if not judged.feasible.any():
         return None
     places = np.flatnonzero(sample(judged.feasible, judged.front(judged.of_interest), MOST_LINES))
-    names = list(dict.fromkeys([*judged.study.free(), *judged.study.wanted()]))[:_MOST_DIMENSIONS]
+    names = list(dict.fromkeys([*judged.study.free(), *judged.study.figures()]))[:_MOST_DIMENSIONS]
     objective = judged.study.objectives[0]
     colours = judged.figure(objective.figure)[places]
     low, high = float(colours.min()), float(np.quantile(colours, 0.95))
@@ -468,7 +471,7 @@ def parallel_chart(judged: Judged) -> Interactive | None:
             tickfont={"size": 11},
             rangefont={"size": 1, "color": "rgba(0,0,0,0)"},
             line={
-                "color": tables.rounded(colours),
+                "color": tables.round_for_json(colours),
                 "colorscale": "Viridis",
                 "showscale": True,
                 "cmin": low,
@@ -487,7 +490,7 @@ def parallel_chart(judged: Judged) -> Interactive | None:
     return figure, f"{count} that meet all constraints. Drag along an axis to select designs by their values."
 
 
-def _dimension(judged: Judged, name: str, places: np.ndarray) -> dict[str, object]:
+def _dimension(judged: StudyResults, name: str, places: np.ndarray) -> dict[str, object]:
     """Return a parallel axis: choices and laser classes by name, else numbers."""
     values, variable = judged.columns[name][places], judged.study.free().get(name)
     label = _escaped(tables.label_of(name))
@@ -499,10 +502,10 @@ def _dimension(judged: Judged, name: str, places: np.ndarray) -> dict[str, objec
         ]
         ticks, codes = list(range(len(options))), [options.index(value) for value in values.tolist()]
     elif name == "laser_class":
-        ticks, texts, codes = list(CLASS_NAMES), list(CLASS_NAMES.values()), tables.rounded(values)
+        ticks, texts, codes = list(CLASS_NAMES), list(CLASS_NAMES.values()), tables.round_for_json(values)
     else:
         low, high = float(values.min()), float(values.max())
         margin = 0.0 if high > low else max(abs(low) * 0.05, 1e-6)
-        return {"label": label, "values": tables.rounded(values), "range": [low - margin, high + margin]}
+        return {"label": label, "values": tables.round_for_json(values), "range": [low - margin, high + margin]}
     ends = [ticks[0] - 0.3, ticks[-1] + 0.3]
     return {"label": label, "values": codes, "tickvals": ticks, "ticktext": texts, "range": ends}

@@ -14,9 +14,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.design.figures_of_merit import depths_in_view, field_of
-from twin.design.geometry import Lens, WindowGeometry, directions_of, traced
-from twin.design.parameters import SensorArrays, parameters_of
+from twin.design.figures_of_merit import evaluate_field, find_depths_in_view
+from twin.design.geometry import Lens, WindowGeometry, trace_rays, undistort_pixels
+from twin.design.parameters import SensorArrays, extract_parameters
 from twin.design.report.study_tables import number_text
 from uwlts.errors import DesignError
 from uwlts.model.placement import LaserPose, laser_pose
@@ -123,7 +123,7 @@ class FrontView:
         return [*self.fan, *self.lines, self.laser.housing]
 
 
-def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
+def make_views(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     """Return the side view and front view of a sensor in a medium.
 
     Raises
@@ -131,9 +131,9 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     DesignError
         The sheet does not cross the camera's axis in front of the window, or the laser points back to the camera.
     Error
-        As for `twin.design.parameters.numbers_of`.
+        As for `twin.design.parameters.extract_numbers`.
     """
-    pose, p, camera = laser_pose(sensor), parameters_of([sensor], [medium]), sensor.camera
+    pose, p, camera = laser_pose(sensor), extract_parameters([sensor], [medium]), sensor.camera
     outer = float(p.outer_mm(np).item())
     crossing = _crossing_mm(pose, outer)
     start = np.array([0.0, 0.0, crossing])
@@ -143,10 +143,10 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
         return start + ((depths - crossing) / pose.axis[2])[:, None] * pose.axis
 
     # Camera and laser are both modules: a frame with z along the axis, and optionally a window.
-    seeing = _Mounted.of(sensor, camera.window, medium, np.zeros(3), np.eye(3))
+    seeing = _ModuleGeometry.from_description(sensor, camera.window, medium, np.zeros(3), np.eye(3))
     frame = np.stack([pose.normal, np.cross(pose.axis, pose.normal), pose.axis], axis=1)
-    lighting = _Mounted.of(sensor, sensor.laser.window, medium, pose.origin_mm, frame)
-    lens = Lens.of(camera)
+    lighting = _ModuleGeometry.from_description(sensor, sensor.laser.window, medium, pose.origin_mm, frame)
+    lens = Lens.from_description(camera)
     depths, low, high, shown, line = _reach(sensor, p, float((start - pose.origin_mm) @ pose.fan))
     near, far = outer + depths[[0, -1]]
     reached = np.isfinite(low)
@@ -160,10 +160,10 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     across = pose.normal[:2] / sideways * (-1 if pose.normal[:2] @ pose.origin_mm[:2] < 0 else 1)
     side_axes = np.array([[*across, 0.0], [0.0, 0.0, 1.0]])
     ahead = np.array([0.0, 0.0, 1.0])
-    border = directions_of(lens, _border_towards(camera, across))
+    border = undistort_pixels(lens, _border_towards(camera, across))
     side_view = SideView(
-        camera=seeing.seen_along(side_axes, 0.0),
-        laser=lighting.seen_along(side_axes, 0.0),
+        camera=seeing.project(side_axes, 0.0),
+        laser=lighting.project(side_axes, 0.0),
         pupil_mm=camera.focal_length_mm / camera.f_number,
         baseline_mm=math.hypot(*pose.origin_mm[:2]),
         edges=tuple(seeing.rays(border, far * _BEYOND * ahead, ahead) @ side_axes.T),
@@ -180,10 +180,10 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     low, high = (np.stack([y, heights], axis=1)[reached] for y in (low, high))
     width, height = camera.width_px - 0.5, camera.height_px - 0.5
     corners = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height), (-0.5, -0.5)])
-    sides = [directions_of(lens, np.linspace(a, b, _BORDER)) for a, b in pairwise(corners)]
+    sides = [undistort_pixels(lens, np.linspace(a, b, _BORDER)) for a, b in pairwise(corners)]
     borders = [seeing.rays(side, pose.origin_mm, pose.normal)[:, -1] for side in sides]
     front = FrontView(
-        laser=lighting.seen_along(front_axes, pose.origin_mm),
+        laser=lighting.project(front_axes, pose.origin_mm),
         fan=tuple((edge - pose.origin_mm) @ front_axes.T for edge in fan),
         borders=tuple((border - pose.origin_mm) @ front_axes.T for border in borders),
         lines=np.stack([line, np.repeat(shown[:, None], 2, axis=1)], axis=2),
@@ -226,10 +226,10 @@ def _reach(sensor: Sensor, p: SensorArrays, aside: float) -> tuple[np.ndarray, .
     places = np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
     depths = np.linspace(sensor.volume.near_mm, sensor.volume.far_mm, _DEPTHS)
     with np.errstate(all="ignore"):
-        f = field_of(np, p, depths.reshape(1, -1, 1), places.reshape(1, 1, -1), reflectance=0.5)
-        near, far = depths_in_view(np, p)
+        f = evaluate_field(np, p, depths.reshape(1, -1, 1), places.reshape(1, 1, -1), reflectance=0.5)
+        near, far = find_depths_in_view(np, p)
         shown = near + (far - near) * np.array([0.0, 0.5, 1.0]).reshape(1, -1, 1)
-        line = field_of(np, p, shown, places[[0, -1]].reshape(1, 1, -1), reflectance=0.5).y_mm[0] + aside
+        line = evaluate_field(np, p, shown, places[[0, -1]].reshape(1, 1, -1), reflectance=0.5).y_mm[0] + aside
     y, inside = (np.broadcast_to(values, (1, _DEPTHS, _PLACES))[0] for values in (f.y_mm + aside, f.in_view))
     reached = inside.any(axis=1)
     low = np.where(reached, np.where(inside, y, np.inf).min(axis=1), np.nan)
@@ -242,7 +242,7 @@ def _reach(sensor: Sensor, p: SensorArrays, aside: float) -> tuple[np.ndarray, .
 
 
 @dataclass(frozen=True, eq=False)
-class _Mounted:
+class _ModuleGeometry:
     """Module (camera or laser): origin and axis in the camera frame, and window, described and mounted."""
 
     origin: np.ndarray
@@ -251,23 +251,29 @@ class _Mounted:
     window: WindowGeometry | None
 
     @classmethod
-    def of(cls, sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray) -> _Mounted:
+    def from_description(
+        cls, sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray
+    ) -> _ModuleGeometry:
         """Make a module; ``rotation`` (3, 3) rotates from its frame, with z along its axis, to the camera frame."""
-        flat = WindowGeometry.of(window, medium, sensor.laser.wavelength_nm, rotation) if window.mounted else None
+        flat = (
+            WindowGeometry.from_description(window, medium, sensor.laser.wavelength_nm, rotation)
+            if window.mounted
+            else None
+        )
         return cls(origin, rotation[:, 2], window, flat)
 
     def rays(self, directions: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Trace rays (N, K, 3) from the origin through the window to a plane; NaN for rays that miss the plane."""
         points = np.broadcast_to(self.origin, directions.shape)[:, None]
         if self.window is not None:
-            points, directions = traced(self.window, self.origin, directions)
+            points, directions = trace_rays(self.window, self.origin, directions)
         last = points[:, -1]
         with np.errstate(invalid="ignore", divide="ignore"):
             length = (place - last) @ normal / (directions @ normal)
             end = last + np.where(length > 0, length, np.nan)[:, None] * directions
         return np.concatenate([points, end[:, None]], axis=1)
 
-    def seen_along(self, axes: np.ndarray, about: np.ndarray | float) -> Module:
+    def project(self, axes: np.ndarray, about: np.ndarray | float) -> Module:
         """Project the module onto ``axes`` (2, 3), with the drawing's origin at ``about``."""
         forward = axes @ self.axis / np.linalg.norm(axes @ self.axis)
         sideways = np.array([forward[1], -forward[0]])

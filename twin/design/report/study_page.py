@@ -7,14 +7,14 @@ from contextlib import suppress
 
 from markupsafe import Markup
 
-from twin.design.choice import Judged
-from twin.design.designs import Columns, Marked
+from twin.design.choice import StudyResults
+from twin.design.designs import Columns, HighlightedDesign
 from twin.design.report import charts, drawing, study_tables as tables
 from twin.design.study import Study
 from twin.design.verification import Agreement
 from uwlts._version import __version__
 from uwlts.errors import Error
-from uwlts.pages.toolkit import FigureCollector, render_page, svg_of
+from uwlts.pages.toolkit import FigureCollector, figure_svg, render_page
 
 _BEST = 20
 """Designs in the table of the best."""
@@ -30,7 +30,7 @@ def page_text(
     study: Study,
     columns: Columns,
     *,
-    marked: Sequence[Marked],
+    marked: Sequence[HighlightedDesign],
     agreements: Sequence[Agreement],
     notes: Sequence[str] = (),
 ) -> str:
@@ -54,7 +54,7 @@ def page_text(
     EvaluationError
         The columns belong to another study.
     """
-    judged, collected = Judged(study, columns), FigureCollector()
+    judged, collected = StudyResults(study, columns), FigureCollector()
     over_free_title, over_free = _over_what_is_free(judged, marked)
     nothing = "" if judged.works.any() else "None of the designs works: see the reasons below."
     pareto, parallel = charts.pareto_chart(judged, marked), charts.parallel_chart(judged)
@@ -76,7 +76,7 @@ def page_text(
         number=tables.number_text,
         value=tables.value_text,
         verdicts=[
-            (found, tables.agreement_text(study, found), _shown(charts.verification_chart(found)))
+            (found, tables.agreement_text(study, found), _show_static(charts.verification_chart(found)))
             for found in agreements
         ],
         best=_best(judged),
@@ -87,28 +87,30 @@ def page_text(
     )
 
 
-def _shown(drawn: charts.Static | None) -> tuple[Markup, str] | None:
-    return drawn and (svg_of(drawn[0]), drawn[1])
+def _show_static(drawn: charts.Static | None) -> tuple[Markup, str] | None:
+    return drawn and (figure_svg(drawn[0]), drawn[1])
 
 
-def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str]:
+def _drawing(study: Study, marked: Sequence[HighlightedDesign]) -> tuple[Markup | None, str]:
     """Return the drawing of the chosen design and its caption, or None and the reason."""
     if not marked:
         return None, "There is no design to draw."
     chosen, base = marked[-1], marked[0]
     try:
-        views = drawing.views_of(chosen.sensor, study.medium_of(chosen.sensor))
+        views = drawing.make_views(chosen.sensor, study.medium_of(chosen.sensor))
     except Error as error:
         return None, f"The design cannot be drawn: {error}."
     other = None
     if base is not chosen:
         with suppress(Error):
-            other = drawing.views_of(base.sensor, study.medium_of(base.sensor))
+            other = drawing.make_views(base.sensor, study.medium_of(base.sensor))
     behind = f" Dashed grey behind, as far as it fits in: {base.label}." if other else ""
-    return svg_of(drawing.draw(*views, other)), _DRAWN + behind
+    return figure_svg(drawing.draw(*views, other)), _DRAWN + behind
 
 
-def _over_what_is_free(judged: Judged, marked: Sequence[Marked]) -> tuple[str, tuple[Markup, str] | None]:
+def _over_what_is_free(
+    judged: StudyResults, marked: Sequence[HighlightedDesign]
+) -> tuple[str, tuple[Markup, str] | None]:
     """Return the title and the chart of figures over the free variables; no chart if no design works."""
     ranges = [name for name, variable in judged.study.variables.items() if variable.values is None][:2]
     title = f"Figures over {' and '.join(map(tables.words_of, ranges))}" if ranges else "Figures of the choices"
@@ -116,23 +118,23 @@ def _over_what_is_free(judged: Judged, marked: Sequence[Marked]) -> tuple[str, t
         return title, None
     match ranges:
         case [x, y]:
-            return title, _shown(charts.contours(judged, marked, x, y))
+            return title, _show_static(charts.contours(judged, marked, x, y))
         case [x]:
-            return title, _shown(charts.curves(judged, marked, x))
+            return title, _show_static(charts.curves(judged, marked, x))
         case _:
-            return title, _shown(charts.bars(judged))
+            return title, _show_static(charts.bars(judged))
 
 
-def _best(judged: Judged) -> tuple[list[str], list[list[str]]]:
+def _best(judged: StudyResults) -> tuple[list[str], list[list[str]]]:
     """Return the head and rows of the table of the best designs."""
     study = judged.study
     more = ("sigma_z_rms_mm", "line_mm", "depth_mm", "standoff_mm", "required_ms", "laser_class")
-    figures = dict.fromkeys([*study.wanted(), *more])
+    figures = dict.fromkeys([*study.figures(), *more])
     names = list(dict.fromkeys([*study.free(), *(name for name in figures if name in judged.columns)]))
     missed = not judged.feasible.any()
     rows = [
         [str(judged.columns["design"][place])]
-        + [tables.text_at(judged, name, place, unit=False) for name in names]
+        + [tables.format_design_value(judged, name, place, unit=False) for name in names]
         + ([f"{judged.figure('violation')[place]:.3g}"] if missed else [])
         for place in (judged.best_first[:_BEST] if len(judged) else [])
     ]

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from twin.design.choice import Judged
-from twin.design.designs import Marked
+from twin.design.choice import StudyResults
+from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import CLASS_NAMES, FIGURES
 from twin.design.study import Study, Variable
 from twin.design.verification import Agreement
@@ -102,12 +102,12 @@ def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
     return text + (of if of == "°" else "\N{NO-BREAK SPACE}" + of)
 
 
-def listed(words: Sequence[str]) -> str:
+def join_words(words: Sequence[str]) -> str:
     """Join words as "a, b and c"."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-def rounded(values: Iterable[float]) -> list[float | None]:
+def round_for_json(values: Iterable[float]) -> list[float | None]:
     """Round numbers to five significant digits for JSON: None if not finite."""
     numbers = np.asarray(values, dtype=float).tolist()
     return [float(f"{value:.5g}") if math.isfinite(value) else None for value in numbers]
@@ -118,18 +118,18 @@ def without_numbers(text: str) -> str:
     return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", text)
 
 
-def text_at(judged: Judged, name: str, place: int, *, unit: bool = True) -> str:
+def format_design_value(judged: StudyResults, name: str, place: int, *, unit: bool = True) -> str:
     """Format a design's value with its unit."""
     return value_text(name, judged.columns[name][place : place + 1].tolist()[0], unit=unit)
 
 
-def failure_counts(judged: Judged) -> list[tuple[str, str]]:
+def failure_counts(judged: StudyResults) -> list[tuple[str, str]]:
     """Return reasons of failure without numbers, and their counts, the most frequent first."""
     counts = Counter(without_numbers(text) for text in judged.failures if text)
     return [(text, f"{count:,}") for text, count in counts.most_common()]
 
 
-def miss_counts(judged: Judged) -> list[tuple[str, str]]:
+def miss_counts(judged: StudyResults) -> list[tuple[str, str]]:
     """Return the constraints as texts, and the number of working designs that violate each."""
     return [
         (bound_text(name, sign, bound), f"{(sign * (judged.figure(name)[judged.works] - bound) > 0).sum():,}")
@@ -171,7 +171,7 @@ _FOLLOW = {
 }
 
 
-def introduction(judged: Judged) -> list[tuple[str, str]]:
+def introduction(judged: StudyResults) -> list[tuple[str, str]]:
     """Return the study's question and the number of evaluated designs, as pairs of keyword and text."""
     study, bounds = judged.study, judged.study.bounds()
     facts = [
@@ -182,7 +182,7 @@ def introduction(judged: Judged) -> list[tuple[str, str]]:
     if bounds:
         facts.append(("constraints", "; ".join(bound_text(*bound) for bound in bounds)))
     if study.follow:
-        facts.append(("at each stand-off", listed([_FOLLOW[name] for name in study.follow])))
+        facts.append(("at each stand-off", join_words([_FOLLOW[name] for name in study.follow])))
     counted = f"{len(judged):,} evaluated, {_CHOSEN[study.sampling.kind]}; {judged.works.sum():,} work"
     facts.append(("designs", counted + (f", {judged.feasible.sum():,} meet all constraints" if bounds else "")))
     return facts
@@ -198,7 +198,7 @@ def _range_text(name: str, variable: Variable) -> str:
 _ALWAYS_SHOWN = ("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm", "line_mm", "depth_mm", "standoff_mm")
 
 
-def tiles(study: Study, chosen: Marked, compared: Marked | None) -> list[Tile]:
+def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign | None) -> list[Tile]:
     """Return tiles with the chosen design's values: free variables, objectives, constraints and other key figures.
 
     The values of the ``compared`` design are shown as notes.

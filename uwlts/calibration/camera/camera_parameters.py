@@ -31,7 +31,7 @@ class CameraOptions:
         if self.soft_limit_px is not None and not self.soft_limit_px > 0:
             raise DescriptionError(f"soft_limit_px must be positive, not {self.soft_limit_px}")
 
-    def described(self, camera: Camera) -> "CameraOptions":
+    def with_described_pixels(self, camera: Camera) -> "CameraOptions":
         """Return these options with the described pixel shape, unless it is estimated."""
         return self if self.pixel_aspect is None else replace(self, pixel_aspect=camera.pixel_aspect)
 

@@ -38,7 +38,7 @@ class QualityLimits:
     largest_blur_px: float = 2.5  # Gaussian blur (standard deviation) of the edges, median over the points
     smallest_contrast: float = 0.08  # bright minus dark, median over the points, relative to full scale
     largest_saturated: float = 0.02  # fraction of the target's pixels, or of the stripe's lines, at full scale
-    largest_motion_px: float = 0.5  # shift of the points between two images of one pose, see `way_px`
+    largest_motion_px: float = 0.5  # shift of the points between two images of one pose, see `measure_shift_px`
     smallest_change_px: float = 5.0  # shift of the points from the nearest recorded pose
     fewest_lines: int = 20  # profile lines with the stripe on the target
 
@@ -120,7 +120,7 @@ def edge_blur_px(image: np.ndarray, pixels: np.ndarray, *, half_px: float) -> fl
     return float(np.median(blurs))
 
 
-def why_not_found(image: np.ndarray, error: str, *, full_dn: int) -> str:
+def explain_missing_target(image: np.ndarray, error: str, *, full_dn: int) -> str:
     """Return the reason why no target was found: too dark, too bright, or the detector's error."""
     brightest = float(np.quantile(image, 0.995)) / full_dn
     clipped = float(np.mean(image >= full_dn))
@@ -133,7 +133,7 @@ def why_not_found(image: np.ndarray, error: str, *, full_dn: int) -> str:
     return error
 
 
-def way_px(one: TargetView, other: TargetView) -> float:
+def measure_shift_px(one: TargetView, other: TargetView) -> float:
     """Return the 90 % quantile of the shifts in px of common points of two views; infinite for few points.
 
     A target that rotates about its middle moves its outer points only, so the median would not show it.
@@ -148,7 +148,7 @@ def way_px(one: TargetView, other: TargetView) -> float:
 
 def judge_motion(before: TargetView, after: TargetView, limits: QualityLimits = QualityLimits()) -> tuple[str, ...]:
     """Return a reason if the target moved between two images of one pose; else empty."""
-    way, most = way_px(before, after), limits.largest_motion_px
+    way, most = measure_shift_px(before, after), limits.largest_motion_px
     reason = MotionFault(f"moved: the target moved {way:.1f} px between its images, at most {most:g} are allowed")
     return () if way <= most else (reason,)
 
@@ -157,7 +157,7 @@ def judge_novelty(
     view: TargetView, recorded: Sequence[TargetView], limits: QualityLimits = QualityLimits()
 ) -> tuple[str, ...]:
     """Return a reason if a pose is too similar to a recorded one; else empty."""
-    ways = [way_px(view, old) for old in recorded]
+    ways = [measure_shift_px(view, old) for old in recorded]
     if not ways or min(ways) >= limits.smallest_change_px:
         return ()
     return (f"too similar to image {int(np.argmin(ways)) + 1}: differs by {min(ways):.1f} px; move or tilt the target",)

@@ -21,7 +21,7 @@ from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.model.calibration import CameraModel
 from uwlts.model.sensor import Uncertainty
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 
 BESIDES = (("p1", "p2"), ("k3",), ("p1", "p2", "k3"))
 """Coefficients that are tried in addition to k1 and k2."""
@@ -174,7 +174,7 @@ def calibrate_lens(
     approaching: bool = True,
     choice: LensChoice = LensChoice(),
     circle_diameter_mm: float | None = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> LensCalibration:
     """Calibrate a lens from images of a flat target.
 
@@ -195,7 +195,7 @@ def calibrate_lens(
         The images determine no model, or contradict each other.
     """
 
-    def solved(
+    def solve(
         chosen: Sequence[TargetImage], start: CameraSolution | None = None, *, options: CameraOptions, circles: bool
     ) -> CameraSolution:
         return solve_camera(
@@ -214,19 +214,19 @@ def calibrate_lens(
 
     def inliers(options: CameraOptions) -> list[np.ndarray]:
         """Return masks (N,) of the points near their predicted positions, from a robust fit."""
-        plain = solved(images, options=options, circles=True)
-        robust = solved(images, plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)), circles=True)
+        plain = solve(images, options=options, circles=True)
+        robust = solve(images, plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)), circles=True)
         return _inliers(robust)
 
     candidates: list[LensCandidate] = []
     options, keep = usual, inliers(usual)
     good = [_remove_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _has_enough_inliers(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
-        centred = _correct_circles(good, solved(good, options=usual, circles=True))
+        centred = _correct_circles(good, solve(good, options=usual, circles=True))
         squares: dict[CameraOptions, np.ndarray] = {}
         for further in (tried, _candidates(_RATIONAL, choice, poses)):
             for number, each in enumerate(further):
-                squares[each] = _cross_validate(centred, partial(solved, options=each, circles=False))
+                squares[each] = _cross_validate(centred, partial(solve, options=each, circles=False))
                 progress(number + 1, len(further))
             candidates = _compare_models(squares)
             options = _select_model(candidates, usual)
@@ -248,14 +248,14 @@ def calibrate_lens(
         and choice.tangential > 0
         and "p1" not in full.distortion
     ):
-        scatter = _scatter(solved([*cleaned.values()], options=options, circles=True))
+        scatter = _scatter(solve([*cleaned.values()], options=options, circles=True))
         names = (*options.distortion, "p1", "p2")
         full = replace(options, distortion=names, tangential=(choice.tangential, max(scatter, _LEAST_SCATTER_PX)))
     intrinsics = Intrinsics(full, width_px=width_px, height_px=height_px)
-    solved_again = partial(solved, options=full, circles=False)
+    solved_again = partial(solve, options=full, circles=False)
     while True:
         chosen = [cleaned[number] for number in used]
-        solution = solved(chosen, options=full, circles=True)
+        solution = solve(chosen, options=full, circles=True)
         centred = _correct_circles(chosen, solution)
         numbers = np.arange(len(used))
         all_but_one = [np.delete(numbers, number) for number in numbers]

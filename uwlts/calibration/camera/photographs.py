@@ -19,12 +19,12 @@ from uwlts.calibration.camera.lens import (
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
 from uwlts.files.reading import is_regular_file
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.library import read_table
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.image_file import read_image
-from uwlts.storage.import_ import DESCRIPTION_NAME, checked_channel, image_files, one_channel
+from uwlts.storage.import_ import DESCRIPTION_NAME, check_channel, extract_channel, image_files
 from uwlts.targets import Target, parse_target
 
 _FEWEST_IMAGES = 4
@@ -88,7 +88,7 @@ class CameraCalibration(Brief):
             "camera_name": self.folder.resolve().name,
             "camera_matrix": matrix(model.matrix().tolist()),
             "distortion_model": "rational_polynomial" if known.is_rational() else "plumb_bob",
-            "distortion_coefficients": matrix([list(known.used().values())]),
+            "distortion_coefficients": matrix([list(known.used_coefficients().values())]),
             "rectification_matrix": matrix(np.eye(3).tolist()),
             "projection_matrix": matrix(projection),
             "estimated": {
@@ -100,7 +100,7 @@ class CameraCalibration(Brief):
                 "left_out": {each.name: each.reason for each in self.photographs if each.reason is not None},
             },
         }
-        with written_aside(path, overwrite=overwrite) as aside:
+        with write_atomically(path, overwrite=overwrite) as aside:
             aside.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
@@ -111,7 +111,7 @@ def calibrate_camera(
     channel: str | None = None,
     distortion: Distortion = "auto",
     pixels: Pixels = "auto",
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> CameraCalibration:
     """Calibrate a camera from photographs of a target in different poses.
 
@@ -151,7 +151,7 @@ def calibrate_camera(
     described = _read_target(folder, target)
     names = image_files(folder)
     try:
-        wanted = checked_channel(channel or "grey")
+        wanted = check_channel(channel or "grey")
     except ValueError as error:
         raise DescriptionError(f"channel is {channel!r}: {error}") from error
     seen: dict[int, tuple[tuple[int, int], TargetImage]] = {}
@@ -159,7 +159,7 @@ def calibrate_camera(
     for number, name in enumerate(names):
         try:
             raw = read_image(folder / name)
-            grey = one_channel(raw, wanted, name=name)
+            grey = extract_channel(raw, wanted, name=name)
             view = described.detect(np.clip(grey, 0, None).astype(raw.dtype))
             seen[number] = (raw.shape[1], raw.shape[0]), TargetImage(view.points_mm, view.pixels)
         except (ImageError, TargetError, CalibrationError) as error:

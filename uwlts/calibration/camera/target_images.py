@@ -63,7 +63,7 @@ class Placement:
         raw = np.array([*(tilt if len(tilt) else (0.0, 0.0)), self.along_z])
         return raw / np.linalg.norm(raw)
 
-    def displaced(self, direction: np.ndarray | None = None) -> np.ndarray:
+    def displace(self, direction: np.ndarray | None = None) -> np.ndarray:
         """Return points (N, 3) in the target's frame at s0, shifted back by the stage's motion."""
         along = self.direction(np.empty(0)) if direction is None else direction
         return self.points_mm - self.shifts_mm[:, None] * along
@@ -118,7 +118,7 @@ def observe(
         Rotation vector and translation in mm (6,), followed by the tilt (a, b) of a free stage direction (8,).
     """
     direction = placement.direction(local[6:])
-    points = placement.displaced(direction)
+    points = placement.displace(direction)
     rotation = cv2.Rodrigues(local[:3])[0]
     if np.min(points @ rotation[2] + local[5]) <= 0:
         return None

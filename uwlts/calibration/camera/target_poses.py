@@ -88,7 +88,7 @@ def _linear_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.nd
     The placement with the largest motion gives both by the linear method; the poses of the others follow.
     """
     farthest = int(np.argmax([np.ptp(view.shifts_mm) for view in views]))
-    matrix, rotation, translation = direct_linear(views[farthest].displaced(), views[farthest].pixels)
+    matrix, rotation, translation = direct_linear(views[farthest].displace(), views[farthest].pixels)
     global_values = intrinsics.from_matrix(matrix)
     poses = [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
     poses[farthest] = np.r_[cv2.Rodrigues(rotation)[0].ravel(), translation]
@@ -115,7 +115,7 @@ def _planar_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.nd
 
 def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
     """Estimate rotation vector and shift (6,) of a placement for a camera without distortion."""
-    found, rotation, translation = cv2.solvePnP(placement.displaced(), placement.pixels, matrix, None)
+    found, rotation, translation = cv2.solvePnP(placement.displace(), placement.pixels, matrix, None)
     if not found:
         raise CalibrationError("no pose of the target fits one of its images: is it the right target?")
     return np.r_[rotation.ravel(), translation.ravel()]
@@ -254,7 +254,7 @@ def solve_camera(
     options = CameraOptions() if options is None else options
     intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
 
-    def solved(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
+    def solve(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
         views = _group_views(images, poses, approaching, options)
         if start is not None:
             global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
@@ -275,11 +275,11 @@ def solve_camera(
         return _solution(images, views, fit, intrinsics, poses)
 
     if circle_diameter_mm is None:
-        return solved(images, start)
+        return solve(images, start)
     bias = [np.zeros_like(image.pixels) for image in images]
     for _ in range(_BIAS_ROUNDS):
         centred = [replace(i, pixels=i.pixels - offset) for i, offset in zip(images, bias, strict=True)]
-        start, before = solved(centred, start), bias
+        start, before = solve(centred, start), bias
         seen_by = partial(project, start.model)
         bias = [
             centre_offsets(seen_by, pose, image.points_mm, diameter_mm=circle_diameter_mm)
@@ -314,10 +314,10 @@ def centre_offsets(
         A circle's image is not an ellipse.
     """
 
-    def seen(points: np.ndarray) -> np.ndarray:
+    def project_target(points: np.ndarray) -> np.ndarray:
         return project(points @ pose[:3, :3].T + pose[:3, 3])
 
-    return circle_centre_bias(seen, points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y)
+    return circle_centre_bias(project_target, points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y)
 
 
 def _group_views(
@@ -377,7 +377,7 @@ def _solution(
             target_poses[index, :3, 3] = local[3:6] - view.shifts_mm[here][0] * directions[-1]
             residuals[index] = misses[here]
         if poses == "stage":
-            tilts.append(_tilt(local[6:], covariance[6:, 6:]))
+            tilts.append(_measure_tilt(local[6:], covariance[6:, 6:]))
     if poses == "free":
         stage = stage_direction(target_poses, np.array([image.stage_mm for image in images]))
     else:
@@ -398,7 +398,7 @@ def _solution(
     )
 
 
-def _tilt(tilt: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+def _measure_tilt(tilt: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
     """Return the angle in rad between the stage's direction and the normal, and its standard deviation."""
     size = float(np.hypot(*tilt))
     outward = tilt / size if size > 0 else np.array([1.0, 0.0])

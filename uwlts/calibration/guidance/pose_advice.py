@@ -46,17 +46,19 @@ class Setting:
     def intrinsics(self) -> Intrinsics:
         """Return the camera parameters that are estimated."""
         camera = self.sensor.camera
-        return Intrinsics(self.camera.described(camera), width_px=camera.width_px, height_px=camera.height_px)
+        return Intrinsics(
+            self.camera.with_described_pixels(camera), width_px=camera.width_px, height_px=camera.height_px
+        )
 
 
 def nominal_camera(setting: Setting) -> CameraModel:
     """Return the described camera; behind a window, the medium's index multiplies its focal length."""
     camera = setting.sensor.camera
     index = setting.medium.refractive_index(setting.sensor.laser.wavelength_nm) if camera.window.mounted else 1.0
-    return CameraModel.described(camera, magnified=index)
+    return CameraModel.from_description(camera, magnified=index)
 
 
-def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
+def estimate_pose(view: TargetView, camera: CameraModel) -> np.ndarray:
     """Estimate ``T_camera_target`` (4, 4) of a view with a known camera.
 
     Raises
@@ -85,7 +87,7 @@ def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tupl
     return () if worst <= limit else (reason,)
 
 
-def without_window(sensor: Sensor) -> Sensor:
+def remove_window(sensor: Sensor) -> Sensor:
     """Return the sensor without its camera's window."""
     window = sensor.camera.window.model_copy(update={"mounted": False})
     return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
@@ -222,7 +224,7 @@ def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) 
         pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
         ahead = points @ pose[2, :3] + pose[2, 3] > 0
         inside = ahead & np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
-        if target.findable(inside):
+        if target.is_findable(inside):
             sample = np.flatnonzero(inside)[::step]
             added = information_of(points[sample], pixels[sample], pose, camera, setting)
             found.append(CandidatePose(pose, pixels[inside], added * inside.sum() / len(sample)))
@@ -252,7 +254,7 @@ _SAME_DISTANCE = 0.1  # the same for the distance, relative to it
 
 
 @dataclass(frozen=True)
-class Wanted:
+class CompletionLimits:
     """Limits of a complete calibration.
 
     Attributes
@@ -279,7 +281,7 @@ class State:
     """State of a calibration after the recorded poses."""
 
     setting: Setting
-    wanted: Wanted
+    wanted: CompletionLimits
     recorded: tuple[RecordedPose, ...]
     camera: CameraModel  # known so far
     solution: CameraSolution | None  # None if the poses do not determine it
@@ -319,8 +321,8 @@ class State:
 class PoseAdvice:
     """Most helpful pose, its benefit, and the place of the target's middle.
 
-    ``gain`` is in the units of `lack`, ``place`` in fractions of the image's width and height, ``distance_mm`` along
-    the camera's axis.
+    ``gain`` is in the units of `compute_shortfall`, ``place`` in fractions of the image's width and height,
+    ``distance_mm`` along the camera's axis.
     """
 
     candidate: CandidatePose
@@ -329,7 +331,9 @@ class PoseAdvice:
     distance_mm: float
 
 
-def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted = Wanted()) -> State:
+def solve_state(
+    recorded: Sequence[RecordedPose], setting: Setting, wanted: CompletionLimits = CompletionLimits()
+) -> State:
     """Solve the calibration with the recorded poses and return its state.
 
     Raises
@@ -366,22 +370,22 @@ def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted 
         coverage=coverage_of([], width_px=image.width_px, height_px=image.height_px),
         information=np.diag(np.array(stds) ** -2.0),
     )
-    poses = [pose_of(one.view, camera) for one in recorded] if solution is None else solution.target_poses
+    poses = [estimate_pose(one.view, camera) for one in recorded] if solution is None else solution.target_poses
     for one, pose in zip(recorded, poses, strict=True):
         state = state.with_view(one.view, pose)
     return state
 
 
-def lack(state: State) -> float:
+def compute_shortfall(state: State) -> float:
     """Return a measure of missing evidence: 0 when all limits are reached, else log ratios and weighted fractions."""
     std, share = state.expected_std(), state.coverage.share
     ratios = np.log([std[key] / limit for key, limit in state.wanted.std_px().items() if key in std])
     beyond = _BEYOND * (ratios.sum() + _COVERAGE_WEIGHT * (1 - share))
     short = _COVERAGE_WEIGHT * max(state.wanted.coverage - share, 0.0)
-    return float(np.maximum(ratios, 0).sum() + short + _SPREAD_WEIGHT * _untilted(state).sum() + beyond)
+    return float(np.maximum(ratios, 0).sum() + short + _SPREAD_WEIGHT * _find_missing_tilt(state).sum() + beyond)
 
 
-def _untilted(state: State) -> np.ndarray:
+def _find_missing_tilt(state: State) -> np.ndarray:
     """Return for each side of the target the missing fraction (4,) of the wanted tilt."""
     if state.setting.poses != "free":
         return np.zeros(4)
@@ -395,15 +399,15 @@ def best_pose(state: State, *, spin_rad: float = 0.0, skipped: int = 0) -> PoseA
     options = candidates(state.setting, state.camera, spin_rad=spin_rad)
     if not options:
         return None
-    after = [lack(state.with_image(each.pose, each.pixels, each.information)) for each in options]
+    after = [compute_shortfall(state.with_image(each.pose, each.pixels, each.information)) for each in options]
     best = int(np.argsort(after, kind="stable")[skipped % len(after)])
     place, distance = middle_of(options[best].pose, state)
-    return PoseAdvice(options[best], lack(state) - after[best], place, distance)
+    return PoseAdvice(options[best], compute_shortfall(state) - after[best], place, distance)
 
 
-def gain_of(state: State, view: TargetView, pose: np.ndarray) -> float:
+def compute_gain(state: State, view: TargetView, pose: np.ndarray) -> float:
     """Return the reduction of missing evidence by an image at a pose ``T_camera_target`` (4, 4)."""
-    return lack(state) - lack(state.with_view(view, pose))
+    return compute_shortfall(state) - compute_shortfall(state.with_view(view, pose))
 
 
 def middle_of(pose: np.ndarray, state: State) -> tuple[tuple[float, float], float]:
@@ -445,7 +449,7 @@ def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
     return f"tilt the target so that its {what} is farther, {size:.0f} deg{now}"
 
 
-def missing(state: State) -> list[str]:
+def describe_missing(state: State) -> list[str]:
     """Describe limits that are not reached yet; empty if all are reached."""
     said, wanted = [], state.wanted
     if len(state.recorded) < wanted.fewest_images:
@@ -463,13 +467,13 @@ def missing(state: State) -> list[str]:
             f"{100 * state.coverage.share:.0f} % of the image is covered, {100 * wanted.coverage:.0f} % are wanted: "
             f"most is missing at the {state.coverage.emptiest()}"
         )
-    level = [side for side, short in zip(_SIDES, _untilted(state), strict=True) if short > 0]
+    level = [side for side, short in zip(_SIDES, _find_missing_tilt(state), strict=True) if short > 0]
     if level:
         said.append(f"the target's {', '.join(level)} was never farther by {np.degrees(wanted.tilt_rad):.0f} deg")
     return said
 
 
-def missing_sheet(state: State) -> list[str]:
+def describe_missing_sheet(state: State) -> list[str]:
     """Describe why the laser sheet is not determined yet; empty if the camera is not known."""
     if state.solution is None:
         return []

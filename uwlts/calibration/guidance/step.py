@@ -37,7 +37,7 @@ def next_depth_mm(seen_mm: Sequence[float], sensor: Sensor, *, skipped: int = 0)
     Candidates are the centres of three equal parts of the measuring volume; the one farthest from previous depths is
     returned. After ``skipped`` skipped depths, the next candidates follow in turn.
     """
-    if len(apart_mm(seen_mm, sensor)) >= PLACES:
+    if len(select_separate_depths(seen_mm, sensor)) >= PLACES:
         return None
     near, far = sensor.volume.near_mm, sensor.volume.far_mm
     middles = [near + (far - near) * (2 * k + 1) / (2 * PLACES) for k in range(PLACES)]
@@ -45,20 +45,20 @@ def next_depth_mm(seen_mm: Sequence[float], sensor: Sensor, *, skipped: int = 0)
     return middles[skipped % PLACES]
 
 
-def apart_mm(seen_mm: Sequence[float], sensor: Sensor) -> list[float]:
+def select_separate_depths(seen_mm: Sequence[float], sensor: Sensor) -> list[float]:
     """Return those depths that are far from each other."""
     chosen: list[float] = []
     for depth in seen_mm:
-        chosen += [depth] if is_new(depth, chosen, sensor) else []
+        chosen += [depth] if is_separate_depth(depth, chosen, sensor) else []
     return chosen
 
 
-def is_new(depth_mm: float, seen_mm: Sequence[float], sensor: Sensor) -> bool:
+def is_separate_depth(depth_mm: float, seen_mm: Sequence[float], sensor: Sensor) -> bool:
     """Return whether a depth differs from all others by more than a seventh of the measuring volume's depth."""
-    return all(abs(depth_mm - other) >= least_apart_mm(sensor) for other in seen_mm)
+    return all(abs(depth_mm - other) >= least_separation_mm(sensor) for other in seen_mm)
 
 
-def least_apart_mm(sensor: Sensor) -> float:
+def least_separation_mm(sensor: Sensor) -> float:
     """Return the smallest difference between two depths of the standard, mm."""
     return _APART * (sensor.volume.far_mm - sensor.volume.near_mm)
 

@@ -149,7 +149,7 @@ class _Image:
     noise_px: float
 
     @classmethod
-    def of(cls, residuals: Residuals, evidence: Evidence) -> "_Image":
+    def from_residuals(cls, residuals: Residuals, evidence: Evidence) -> "_Image":
         values = residuals.values
         scatter = robust_std(values)
         # A wrong model has the same effect on neighbouring points or lines.
@@ -166,7 +166,7 @@ class _Image:
 def check_consistency(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) -> Findings:
     """Check an estimate against its evidence and the sensor's description."""
     images = [
-        _Image.of(residuals, piece)
+        _Image.from_residuals(residuals, piece)
         for piece, parts in zip(evidence, result.residuals, strict=True)
         for residuals in parts
         if len(residuals.values) >= _FEWEST_VALUES

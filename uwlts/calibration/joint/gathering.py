@@ -11,8 +11,8 @@ from uwlts.calibration.camera.target_images import Placement, placements
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
     StepEvidence,
-    air_evidence,
     explain_missing_stripe,
+    find_air_evidence,
     step_evidence,
 )
 from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, window_values
@@ -31,8 +31,8 @@ from uwlts.model.parameter_keys import (
     StepHeight,
 )
 from uwlts.model.sensor import Medium, Sensor, Uncertainty
-from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.optics.brightness import fit_brightness_slopes, select_sharp_lines
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeSettings, find_stripes
 
@@ -89,7 +89,7 @@ class ScanStripes:
         """Return capture and stage position of each of the F images."""
         return [f"{self.source}, at {position:g} mm" for position in self.stage_mm]
 
-    def without(self, sources: Collection[str]) -> "ScanStripes | None":
+    def remove_images(self, sources: Collection[str]) -> "ScanStripes | None":
         """Remove images by name; return None if too few would remain."""
         left_out = np.array([name in sources for name in self.image_names()])
         seen = np.unique(self.frame)
@@ -119,7 +119,7 @@ class Gathered:
         """Return window state and medium of each series of target images, each scan and each step image."""
         return [s.view for s in [*self.series, *self.scans]] + [view for _, view in self.steps]
 
-    def without(self, sources: Collection[str]) -> "Gathered | None":
+    def remove_images(self, sources: Collection[str]) -> "Gathered | None":
         """Remove images by name; return None if too few of a series, the steps or a scan would remain."""
         series = []
         for each in self.series:
@@ -128,7 +128,7 @@ class Gathered:
                 return None
             series.append(replace(each, found=each.found.only(np.array(kept), [each.found.images[n] for n in kept])))
         steps = [(step, view) for step, view in self.steps if step.source not in sources]
-        scans = [kept for scan in self.scans if (kept := scan.without(sources)) is not None]
+        scans = [kept for scan in self.scans if (kept := scan.remove_images(sources)) is not None]
         if not _remain_enough(len(steps), len(self.steps)) or len(scans) < len(self.scans):
             return None
         return replace(self, series=series, steps=steps, scans=scans)
@@ -145,7 +145,7 @@ def gather_jointly(
     scans: Sequence[Capture] = (),
     *,
     options: CalibrationOptions,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> Gathered:
     """Find the target, the stripes on it, and the stripes on steps and scanned surfaces in all images.
 
@@ -166,7 +166,7 @@ def gather_jointly(
         views.setdefault(_identify_view(capture, media), []).append(capture)
     series, on_steps, on_scans, warnings = [], [], [], []
     for view, captures in views.items():
-        found = air_evidence(captures, stripe=options.stripe, progress=progress)
+        found = find_air_evidence(captures, stripe=options.stripe, progress=progress)
         warnings += found.warnings
         directions = [capture.header.stage_direction for capture in captures]
         series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures], directions))
@@ -216,7 +216,7 @@ def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) 
             "without poses"
         )
     found = find_stripes(capture, options=stripe)
-    sharp, blur = sharp_lines(found)
+    sharp, blur = select_sharp_lines(found)
     found = found[sharp]
     stage = capture.stage_mm[:]
     return ScanStripes(
@@ -226,7 +226,7 @@ def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) 
         centre_px=found.centre_px,
         width_px=found.width_px,
         blur_px=blur,
-        slopes=slopes_of_brightness(found.frame, found.line, found.amplitude, stage, capture.exposure_ms[:]),
+        slopes=fit_brightness_slopes(found.frame, found.line, found.amplitude, stage, capture.exposure_ms[:]),
         stage_mm=stage,
         stage_direction=np.array(capture.header.stage_direction),
         artefact=artefact,

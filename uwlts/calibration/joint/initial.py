@@ -20,7 +20,7 @@ from uwlts.calibration.joint.scanned_surfaces import (
     Spheres,
     Surface,
     SurfaceScanEvidence,
-    across_of,
+    perpendicular_directions,
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, object_frame
@@ -34,8 +34,8 @@ from uwlts.model.calibration import Calibration, CameraModel, SheetModel, Window
 from uwlts.model.parameter_keys import StepHeight
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
-from uwlts.model.stripe import pixels_of
-from uwlts.optics.brightness import BLUR_STD, LitSheet, beside_std
+from uwlts.model.stripe import stack_pixels
+from uwlts.optics.brightness import BLUR_STD, SheetPoints, brightness_shift_std
 from uwlts.optics.camera import directions
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.optics.window import trace_window
@@ -135,7 +135,7 @@ def estimate_series_start(
         the stage.
     """
     width_px, height_px, free = sensor.camera.width_px, sensor.camera.height_px, options.poses == "free"
-    camera = options.camera.described(sensor.camera)
+    camera = options.camera.with_described_pixels(sensor.camera)
     tangential = tuple(key.text for key in list_added_tangential(camera, sensor.uncertainty))
     extended = replace(camera, distortion=(*camera.distortion, *tangential))
     intrinsics = Intrinsics(extended, width_px=width_px, height_px=height_px)
@@ -234,7 +234,7 @@ def _build_target_evidence(
     stage_mm = np.array([entry.stage_mm for entry in found.images])
     shifts = stage_mm[image] - stage_mm[placement.image[0]] if staged else np.zeros(len(image))
     at = seen_by.on_target(pixels, pose, shifts[:, None] * placement.direction(np.empty(0)))
-    on_target = found.target.on_plate(at[:, :2])
+    on_target = found.target.is_on_plate(at[:, :2])
     evidence = TargetEvidence(
         view=series.view,
         placement=placement,
@@ -306,7 +306,7 @@ def build_scan_evidence(
     """
     line, centre, direction = stripes.line, stripes.centre_px, stripes.stage_direction
     across = 1 if start.stripe_along == "width" else 0
-    pixels = pixels_of(line, centre, stripe_along=start.stripe_along)
+    pixels = stack_pixels(line, centre, stripe_along=start.stripe_along)
     stage_mm = stripes.stage_mm[stripes.frame]
 
     def reconstructed(pixels: np.ndarray, stage_mm: np.ndarray) -> np.ndarray:
@@ -315,8 +315,8 @@ def build_scan_evidence(
         ).points_mm
 
     on_sheet = reconstructed(pixels, stage_mm)
-    sheet = LitSheet.of(start, sensor, line, centre, medium_index=medium_index)
-    beside = sheet.beside(stripes.width_px, stripes.slopes, stage_direction=tuple(direction.tolist()))
+    sheet = SheetPoints.from_calibration(start, sensor, line, centre, medium_index=medium_index)
+    beside = sheet.brightness_shift(stripes.width_px, stripes.slopes, stage_direction=tuple(direction.tolist()))
     points = on_sheet + beside
     # Exclude rims, where few points are left and are unreliable, and fast changes of brightness.
     often = np.bincount(stripes.frame)[stripes.frame] >= _FEWEST_POINTS
@@ -341,12 +341,14 @@ def build_scan_evidence(
         across=across,
         sources={image + n: stripes.image_names()[place] for n, place in enumerate(frames)},
         beside_mm=rotation @ beside[kept].T,
-        common_px=np.hypot(BLUR_STD * stripes.blur_px[kept], beside_std(sensor.uncertainty) * np.nan_to_num(beside_px)),
+        common_px=np.hypot(
+            BLUR_STD * stripes.blur_px[kept], brightness_shift_std(sensor.uncertainty) * np.nan_to_num(beside_px)
+        ),
         surface=surface,
         frame=frame,
         stage_mm=position_mm,
         direction=rotation @ direction,
-        across_stage=across_of(direction) @ rotation.T,
+        across_stage=perpendicular_directions(direction) @ rotation.T,
         image=image,
     )
     return evidence, np.append(local, np.zeros(len(frames)))
@@ -418,7 +420,7 @@ def _fit_surface(
         case PlaneStandard():
             plane = evaluate_plane(points, artefact)
             normal = np.array(plane.normal)
-            surface = Plane(in_camera(plane.point_mm), rotation @ normal, across_of(normal) @ rotation.T)
+            surface = Plane(in_camera(plane.point_mm), rotation @ normal, perpendicular_directions(normal) @ rotation.T)
             return np.isfinite(plane.deviation_mm), surface, np.zeros(3)
         case PipeStandard():
             pipe = evaluate_pipe(points, artefact)
@@ -426,7 +428,7 @@ def _fit_surface(
             surface = Cylinder(
                 point_mm=in_camera(pipe.point_mm),
                 axis=rotation @ axis,
-                across=across_of(axis) @ rotation.T,
+                across=perpendicular_directions(axis) @ rotation.T,
                 diameter_mm=artefact.diameter_mm,
                 diameter_std_mm=std(artefact.diameter_uncertainty_mm),
             )

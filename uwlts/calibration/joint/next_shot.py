@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 from uwlts.calibration.camera.target_images import Placement, pose_values
 from uwlts.calibration.joint.estimate import Evidence, Noise, add_common_error
 from uwlts.calibration.joint.observability import (
-    estimate_in,
+    compute_mesh_lengths,
+    find_weaknesses,
     format_weaknesses,
-    lengths_over,
-    pixels_at,
-    regions,
-    weaknesses,
+    list_regions,
+    project_sheet_points,
+    read_region_estimate,
 )
 from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
@@ -58,7 +58,7 @@ _HELPFUL = 0.95  # ratio to the previous uncertainty; less than a twentieth is n
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
+class ShotForecast:
     """Possible image with its description and effect.
 
     ``before_mm`` and ``after_mm`` are the standard uncertainty of lengths over the volume (root mean square) without
@@ -87,7 +87,7 @@ _Shot = tuple[StoredEstimate, Evidence, np.ndarray]
 """The estimate (with parameters that the image adds), the image's evidence, and its local parameters."""
 
 
-def next_shots(calibration: Calibration) -> list[Outlook]:
+def rank_next_shots(calibration: Calibration) -> list[ShotForecast]:
     """Return possible further images, the most helpful one first; empty if the evidence covers no area.
 
     Raises
@@ -95,11 +95,11 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
     CalibrationError
         The calibration contains no joint estimate, or a damaged one.
     """
-    region = next(iter(regions(calibration)), None)
+    region = next(iter(list_regions(calibration)), None)
     if region is None or not region.has_area():
         return []
-    known, uncertainty = estimate_in(calibration, region), calibration.origin().known_before
-    lengths = lengths_over(known, region)
+    known, uncertainty = read_region_estimate(calibration, region), calibration.origin().known_before
+    lengths = compute_mesh_lengths(known, region)
     count, before_mm, found = len(known.values), _rms(lengths.std_mm(known.covariance)), []
     low, high = region.outline_mm[:, 1].min(), region.outline_mm[:, 1].max()
     depths = {words: float(low + share * (high - low)) for words, share in _PLACES.items()}
@@ -111,7 +111,7 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
             covariance = root @ np.linalg.solve(np.eye(root.shape[1]) + root.T @ added @ root, root.T)
             covariance = covariance[:count, :count]
             after_mm = _rms(lengths.std_mm(covariance))
-            found.append(Outlook(words, before_mm, after_mm, covariance, shot[0].view, pose))
+            found.append(ShotForecast(words, before_mm, after_mm, covariance, shot[0].view, pose))
     return sorted(found, key=lambda outlook: outlook.after_mm)
 
 
@@ -123,12 +123,14 @@ def advice_lines(calibration: Calibration) -> list[str]:
     CalibrationError
         The calibration contains no joint estimate, or a damaged one.
     """
-    region = next(iter(regions(calibration)), None)
+    region = next(iter(list_regions(calibration)), None)
     if region is None or not region.has_area():
         return ["the stripes of the evidence cover no area: the uncertainty of measured lengths is not known"]
-    known = estimate_in(calibration, region)
-    lines = format_weaknesses(weaknesses(lengths_over(known, region), known.parameters.keys, known.covariance))
-    return [*lines, *(f"next: {outlook.advice()}" for outlook in next_shots(calibration)[:1])]
+    known = read_region_estimate(calibration, region)
+    lines = format_weaknesses(
+        find_weaknesses(compute_mesh_lengths(known, region), known.parameters.keys, known.covariance)
+    )
+    return [*lines, *(f"next: {outlook.advice()}" for outlook in rank_next_shots(calibration)[:1])]
 
 
 def _generate_candidates(
@@ -139,7 +141,7 @@ def _generate_candidates(
     if described is not None:
         views = {medium: known.view}
         # An image in air helps only beside others in air, whose series determines the camera.
-        in_air = [other.view for other in regions(known.calibration) if other.view.medium is None]
+        in_air = [other.view for other in list_regions(known.calibration) if other.view.medium is None]
         if known.view.medium is not None and in_air:
             views["air"] = in_air[0]
         for name, view in views.items():
@@ -279,12 +281,12 @@ def _simulate_stripe(known: StoredEstimate, target: Target, pose: np.ndarray) ->
     reach = float(np.ptp(target.plate_mm, axis=0).sum())
     points = start + np.linspace(-reach, reach, _SAMPLES)[:, None] * along
     at = (points - pose[:3, 3]) @ pose[:3, :3]
-    return _interpolate_lines(known, known.project(points[target.on_plate(at[:, :2])]))
+    return _interpolate_lines(known, known.project(points[target.is_on_plate(at[:, :2])]))
 
 
 def _sample_curve(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
     """Return pixels (N, 2) of a curve Y and Z (K, 2) on the sheet, one for each profile line in the image."""
-    return _interpolate_lines(known, pixels_at(known, at_mm))
+    return _interpolate_lines(known, project_sheet_points(known, at_mm))
 
 
 def _interpolate_lines(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:

@@ -6,7 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwlts.calibration.joint.parameters import ViewMedium
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, found_estimate, require_joint
+from uwlts.calibration.joint.stored_estimate import (
+    StoredEstimate,
+    covariance_root,
+    read_original_estimate,
+    require_joint,
+)
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
@@ -86,7 +91,7 @@ class Lengths:
         return np.sqrt(np.maximum(variance, 0.0) + (noise_px * self.by_px) ** 2)
 
 
-def regions(calibration: Calibration) -> list[SheetRegion]:
+def list_regions(calibration: Calibration) -> list[SheetRegion]:
     """Return the regions that a joint calibration's evidence covers, that of its medium of use first.
 
     Raises
@@ -107,12 +112,12 @@ def regions(calibration: Calibration) -> list[SheetRegion]:
     return sorted(found, key=lambda region: (region.view.medium is None, -region.points))
 
 
-def estimate_in(calibration: Calibration, region: SheetRegion) -> StoredEstimate:
-    """Return the joint estimate for the view of a region; errors as `found_estimate`."""
-    return replace(found_estimate(calibration, region.medium), view=region.view)
+def read_region_estimate(calibration: Calibration, region: SheetRegion) -> StoredEstimate:
+    """Return the joint estimate for the view of a region; errors as `read_original_estimate`."""
+    return replace(read_original_estimate(calibration, region.medium), view=region.view)
 
 
-def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
+def sample_sheet(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
     """Return points of the sheet at Y and Z (N, 2) of the OCS.
 
     Raises
@@ -120,7 +125,7 @@ def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
     CalibrationError
         A point is outside the camera's view.
     """
-    pixels = pixels_at(known, at_mm)
+    pixels = project_sheet_points(known, at_mm)
     found = None
     if np.isfinite(pixels).all():
         found = known.parameters.stripe_points(known.values, known.view, pixels, across=known.across())
@@ -130,13 +135,13 @@ def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
     return SheetSamples(at_mm, by[:, :, 1:], by[:, :, 0])
 
 
-def pixels_at(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
+def project_sheet_points(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
     """Return pixels (N, 2) of points at Y and Z (N, 2) of the OCS; NaN if the camera does not see them."""
     transform = known.calibration.object_transform()
     return known.project(at_mm @ transform[:3, 1:3].T + transform[:3, 3])
 
 
-def lengths_between(points: SheetSamples, start: np.ndarray, end: np.ndarray) -> Lengths:
+def compute_lengths(points: SheetSamples, start: np.ndarray, end: np.ndarray) -> Lengths:
     """Return lengths between points, given by their numbers (M,)."""
     apart = points.at_mm[end] - points.at_mm[start]
     length = np.linalg.norm(apart, axis=1)
@@ -147,10 +152,10 @@ def lengths_between(points: SheetSamples, start: np.ndarray, end: np.ndarray) ->
     return Lengths(ends, length, np.einsum("mi,mip->mp", unit, moved), np.hypot(*by_px))
 
 
-def lengths_over(known: StoredEstimate, region: SheetRegion) -> Lengths:
+def compute_mesh_lengths(known: StoredEstimate, region: SheetRegion) -> Lengths:
     """Return lengths between all pairs of points of a region's mesh."""
     at = region.mesh().reshape(-1, 2)
-    return lengths_between(points_at(known, at), *np.triu_indices(len(at), k=1))
+    return compute_lengths(sample_sheet(known, at), *np.triu_indices(len(at), k=1))
 
 
 _MOST = 3  # largest number of parameters or directions to list
@@ -189,7 +194,7 @@ class Weakness:
         return f"{', '.join(names[:-1])} and {names[-1]} {why}; together they add {what}"
 
 
-def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.ndarray) -> list[Weakness]:
+def find_weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.ndarray) -> list[Weakness]:
     """Return at most three weakest directions; empty if every length is certain to a micrometre.
 
     ``lengths`` are those over the volume; ``covariance`` is (P, P).

@@ -11,7 +11,7 @@ from uwlts.model.joint_estimate import NominalSheet
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey, SheetParameter, WindowParameter
 from uwlts.optics.camera import directions, image_derivatives, project_through_window
 from uwlts.optics.sheet import behind_window_mm, fan_distances, sheet_surface
-from uwlts.optics.window import RayDerivatives, leaning, trace_derivatives
+from uwlts.optics.window import RayDerivatives, tilt_direction, trace_derivatives
 
 LENS = tuple(key for key in LensParameter if key is not LensParameter.F)
 WINDOW = tuple(WindowParameter)
@@ -101,7 +101,7 @@ class DescribedSheet:
     pivot_mm: np.ndarray
 
     @classmethod
-    def of(cls, nominal: NominalSheet) -> "DescribedSheet":
+    def from_description(cls, nominal: NominalSheet) -> "DescribedSheet":
         """Read the sheet from a file's description."""
         return cls(*(np.array(getattr(nominal, name)) for name in NominalSheet.model_fields))
 
@@ -124,7 +124,7 @@ class DescribedSheet:
 
     def _normal(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the normal (3,) and its derivatives (2, 3) by the two rotations."""
-        return leaning(self.normal, np.stack([self.axis, np.cross(self.axis, self.normal)]), values[:2])
+        return tilt_direction(self.normal, np.stack([self.axis, np.cross(self.axis, self.normal)]), values[:2])
 
     def miss_by(self, values: np.ndarray, points: np.ndarray, index: float) -> np.ndarray:
         """Return derivatives (6, N) of `SheetSurface.miss_mm` at points (3, N) by the parameters and the index."""
@@ -146,8 +146,8 @@ class DescribedSheet:
         at, behind = fan_distances(points, fan, medium_index=index), behind_window_mm(fan)
         of_bow, of_turn = at.bulges()
         # The fan's apparent apex moves away as the index grows.
-        air_by = (index * (at.along**2 - at.all**2) + at.along * behind) / at.in_air
-        of_bow_by = behind * at.along / at.all - air_by
+        air_by = (index * (at.along**2 - at.distance**2) + at.along * behind) / at.in_air
+        of_bow_by = behind * at.along / at.distance - air_by
         of_turn_by = at.wet * (behind - air_by) - behind / at.along * at.wet * (at.along - at.in_air)
         by_angle = (cosine * across(normal, normal) - sine * normal) @ from_pivot
         by[2] = -1.0
@@ -168,7 +168,7 @@ class SheetPoints:
     points: np.ndarray
     by: np.ndarray
 
-    def along(self, directions: np.ndarray) -> np.ndarray:
+    def derivatives_along(self, directions: np.ndarray) -> np.ndarray:
         """Return derivatives (N, 1 + P) of the points' coordinates along directions (3, N)."""
         return np.einsum("in,nic->nc", directions, self.by)
 

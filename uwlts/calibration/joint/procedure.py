@@ -34,7 +34,7 @@ from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
 from uwlts.model.parameter_keys import LensParameter, TargetParameter
 from uwlts.model.sensor import Sensor
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
 
 _ROUNDS_LEFT_OUT = 3
@@ -72,7 +72,7 @@ class JointProblem:
             misfits=self.misfits,
         )
 
-    def judged(self) -> tuple[Estimate, Findings]:
+    def solve_and_check(self) -> tuple[Estimate, Findings]:
         """Return the estimate and the findings against it; errors as `estimate`.
 
         The sizes of scanned objects are first estimated and compared with their descriptions. Wrong sizes would change
@@ -151,7 +151,7 @@ def calibrate_jointly(
     scans: Sequence[Capture] = (),
     *,
     options: CalibrationOptions | None = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> JointResult:
     """Calibrate a sensor from all captures at once.
 
@@ -193,7 +193,7 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
         )
     window = None
     if any(view.window for view in views):
-        window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm)
+        window = WindowModel.from_description(sensor.camera.window, sensor.laser.wavelength_nm)
     indices = gathered.indices(options)
     start = estimate_series_start(gathered.series, sensor, window, indices, options=options)
     found = start.sheet()
@@ -233,10 +233,10 @@ class _Attempt:
     said: tuple[str, ...]
 
     @classmethod
-    def at(cls, gathered: Gathered, options: CalibrationOptions, said: tuple[str, ...] = ()) -> Self:
+    def solve(cls, gathered: Gathered, options: CalibrationOptions, said: tuple[str, ...] = ()) -> Self:
         """Solve the problem for this evidence and these options."""
         problem = joint_problem(gathered, options=options)
-        return cls(gathered, options, problem, *problem.judged(), said)
+        return cls(gathered, options, problem, *problem.solve_and_check(), said)
 
     def improve(self) -> "_Attempt":
         """Try a richer lens, then remove images that do not fit; contradictions of the description remain.
@@ -254,11 +254,11 @@ class _Attempt:
 
     def _without_unfit(self) -> "_Attempt | None":
         """Remove the images that contradict all others; None if too few remain, or more contradictions appear."""
-        kept = self.gathered.without(self.against.unfit)
+        kept = self.gathered.remove_images(self.against.unfit)
         if kept is None:
             return None
         said = [f"{words}; left out" for words in self.against.unfit.values()]
-        fewer = _Attempt.at(kept, self.options, (*self.said, *said))
+        fewer = _Attempt.solve(kept, self.options, (*self.said, *said))
         return None if fewer.against.contradictions else fewer
 
     def _with_richer_lens(self) -> "_Attempt":
@@ -315,7 +315,7 @@ class _Attempt:
     def _with_lens(self, camera: CameraOptions) -> "_Attempt | None":
         """Solve with another lens; None if it is not determined, or the evidence contradicts the description."""
         try:
-            richer = _Attempt.at(self.gathered, replace(self.options, camera=camera), self.said)
+            richer = _Attempt.solve(self.gathered, replace(self.options, camera=camera), self.said)
         except CalibrationError:
             return None
         return None if richer.against.contradictions else richer
@@ -348,7 +348,7 @@ class _Attempt:
         An incomplete model also biases lens and poses, so that kinds that fit well are affected too.
         """
         problem = replace(self.problem, misfits=frozenset(self.result.noise))
-        result, against = problem.judged()
+        result, against = problem.solve_and_check()
         before, after = self.result.std(), result.std()
         factor = float(np.median([after[key] / before[key] for key in before if key in after]))
         said = [f"{words}; kept, as too many images are like this" for words in self.against.unfit.values()]
@@ -374,7 +374,7 @@ def _select_best(tried: Sequence[_Attempt]) -> _Attempt:
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
     """Calibrate from gathered evidence; errors as `calibrate_jointly`."""
-    attempt = _Attempt.at(gathered, options)
+    attempt = _Attempt.solve(gathered, options)
     if not options.strict:
         attempt = attempt.improve()
     sensor, problem, result, against = gathered.sensor, attempt.problem, attempt.result, attempt.against

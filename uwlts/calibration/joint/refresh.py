@@ -11,7 +11,7 @@ from pydantic import JsonValue
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered, build_priors, gather_jointly
 from uwlts.calibration.joint.initial import build_step_evidence, estimate_line_start
-from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.observability import compute_mesh_lengths, list_regions, read_region_estimate
 from uwlts.calibration.joint.parameters import SHEET, EarlierEstimate, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.stored_estimate import (
@@ -19,7 +19,7 @@ from uwlts.calibration.joint.stored_estimate import (
     append_independent,
     build_calibration,
     convex_outline,
-    found_estimate,
+    read_original_estimate,
     require_joint,
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, sources_of
@@ -32,9 +32,9 @@ from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Medium
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.window import require_index
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import read_calibration
-from uwlts.storage.capture import Capture, opened_captures
+from uwlts.storage.capture import Capture, open_captures
 from uwlts.stripe import StripeSettings
 
 
@@ -84,7 +84,7 @@ def compute_water_changes(calibration: Calibration, result: Estimate, earlier: E
     before = np.append(earlier.values, parameters.prior_mean()[count:])
     covariance = append_independent(earlier.covariance, parameters.prior_std()[count:].tolist())
     std_before, std = np.sqrt(np.diag(covariance)), result.std()
-    seen = {region.view.medium: region for region in regions(calibration)}
+    seen = {region.view.medium: region for region in list_regions(calibration)}
     found = []
     for number, name in enumerate(parameters.media):
         key = MediumIndex(name)
@@ -93,7 +93,7 @@ def compute_water_changes(calibration: Calibration, result: Estimate, earlier: E
             continue
         length = None
         if seen[number].has_area():
-            lengths = lengths_over(estimate_in(calibration, seen[number]), seen[number])
+            lengths = compute_mesh_lengths(read_region_estimate(calibration, seen[number]), seen[number])
             known, now = lengths.std_mm(covariance), lengths.std_mm(result.covariance)
             worst = int(np.argmax(known))
             longer = lengths.by_parameters[worst] @ (result.values - before)
@@ -208,7 +208,7 @@ def refresh(
     index: float | None = None,
     index_std: float | None = None,
     stripe: StripeSettings = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> Refreshed:
     """Adapt a joint calibration to new water, or to another water temperature, with images of a step.
 
@@ -252,7 +252,7 @@ def refresh(
     if index_std is not None and not index_std > 0:
         raise RangeError(f"the standard uncertainty of the index is {index_std:g}; it must be positive")
     options = CalibrationOptions(medium_index=index, stripe=stripe)
-    with opened_captures(step) as captures:
+    with open_captures(step) as captures:
         for capture in captures:
             _refuse_unsuitable(capture, calibration)
         gathered = gather_jointly([], captures, options=options, progress=progress)
@@ -284,7 +284,7 @@ def solve_refreshed(
     start = parameters.start(earlier.values[: len(parameters.intrinsics.names)])
     lines = [estimate_line_start(profile, parameters, start) for profile in profiles]
     problem = JointProblem(parameters, profiles, start, lines, gathered.sensor, None, warnings)
-    result, against = problem.judged()
+    result, against = problem.solve_and_check()
     if against.all_against():
         raise CalibrationError(_explain_contradiction(problem, earlier) or against.refusal())
     warnings += against.doubts
@@ -298,7 +298,7 @@ def _explain_contradiction(problem: JointProblem, earlier: EarlierEstimate) -> s
     new = [key for key in parameters.keys[len(earlier.values) :] if isinstance(key, MediumIndex)]
     free = {key: replace(parameters.priors[key], std=_ANY_INDEX) for key in new}
     freed = replace(problem, parameters=replace(parameters, priors=parameters.priors | free))
-    result, against = freed.judged()
+    result, against = freed.solve_and_check()
     if against.all_against():
         return ""
     found = dict(zip(parameters.keys, result.values, strict=True))
@@ -319,7 +319,7 @@ def _explain_contradiction(problem: JointProblem, earlier: EarlierEstimate) -> s
 
 
 def _require_earlier(calibration: Calibration) -> StoredEstimate:
-    known = found_estimate(calibration, _AIR)
+    known = read_original_estimate(calibration, _AIR)
     if calibration.window is None:
         raise CalibrationError(
             "the calibration has no window, so it cannot be refreshed for new water: calibrate with images taken in "

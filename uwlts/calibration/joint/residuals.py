@@ -16,7 +16,7 @@ from uwlts.model.calibration import rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.line_table import LineTable, sum_series
-from uwlts.optics.window import leaning
+from uwlts.optics.window import tilt_direction
 
 TARGET, STRIPE, STEP = "target", "stripe on the target", "stripe on the step"
 BENDS = (TargetParameter.BOW, TargetParameter.SADDLE)
@@ -87,7 +87,7 @@ class StripeEvidence(ABC):
         known = np.isfinite(std)
         return local[known] / std[known], np.diag(1.0 / std)[known]
 
-    def lit(self, image: int) -> np.ndarray:
+    def stripe_mask(self, image: int) -> np.ndarray:
         """Return a mask of the stripe pixels (N,) of an image."""
         return np.ones(len(self.pixels), dtype=bool)
 
@@ -96,14 +96,14 @@ class StripeEvidence(ABC):
         predicted = self.pixels.copy()
         for part, kept in zip(residuals, used, strict=True):
             if part.kind != TARGET:
-                predicted[self.lit(part.image), self.across] -= np.where(kept, part.values, 0.0)
+                predicted[self.stripe_mask(part.image), self.across] -= np.where(kept, part.values, 0.0)
         return replace(self, predicted=predicted)
 
     def on_sheet(self, parameters: Parameters, global_values: np.ndarray, *, shifted_px: float = 0.0) -> "SeenSheet":
         """Compute the sheet points of the pixels, with the stripe shifted across itself."""
         at_px = self.pixels if self.predicted is None else self.predicted
         at_px = at_px - shifted_px * np.eye(2)[self.across]
-        return SeenSheet.of(parameters, global_values, self.view, at_px, across=self.across)
+        return SeenSheet.from_parameters(parameters, global_values, self.view, at_px, across=self.across)
 
     def stripe_residuals(
         self,
@@ -121,7 +121,7 @@ class StripeEvidence(ABC):
 
         ``least_share`` is the minimum ratio of the distance change to the point's shift per pixel.
         """
-        by = points.along(off.outward)
+        by = points.derivatives_along(off.outward)
         by_px, by_global = by[:, 0], by[:, 1:]
         for key, column in off.by_global.items():
             parameters.add(by_global, key, column)
@@ -152,7 +152,7 @@ class SeenSheet:
     table: tuple[np.ndarray, np.ndarray, np.ndarray] | None
 
     @classmethod
-    def of(
+    def from_parameters(
         cls, parameters: Parameters, global_values: np.ndarray, view: ViewMedium, pixels: np.ndarray, *, across: int
     ) -> "SeenSheet":
         """Build the sheet for a vector of the global parameters."""
@@ -167,7 +167,7 @@ class SeenSheet:
                 return np.full((len(line), 1), np.nan)
             return np.hstack([found.points.T, found.by.reshape(len(line), -1)])
 
-        table = LineTable.about(values, line, place, tolerance=_TABLE_MM, share=_TABLE_SHARE)
+        table = LineTable.over_range(values, line, place, tolerance=_TABLE_MM, share=_TABLE_SHARE)
         return cls(exact, pixels, None if table is None else table.series(line, place))
 
     def places_mm(self) -> np.ndarray | None:
@@ -225,7 +225,7 @@ class TargetEvidence(StripeEvidence):
         """Return the numbers of the images with a position error."""
         return np.unique(self.placement.image)[1:] if self.staged else np.empty(0, dtype=int)
 
-    def lit(self, image: int) -> np.ndarray:
+    def stripe_mask(self, image: int) -> np.ndarray:
         return self.image == image
 
     def with_stripes(self, chosen: np.ndarray | slice) -> Self:
@@ -380,7 +380,9 @@ class _Poses:
         self._rotation_by = rotation_by.reshape(3, 3, 3)
         self.shift, self.image, self._staged = local[3:6], image, evidence.staged
         tilt = local[6:8] if evidence.staged else np.zeros(2)
-        self.direction, self._direction_by = leaning(np.array([0.0, 0.0, placement.along_z]), np.eye(3)[:2], tilt)
+        self.direction, self._direction_by = tilt_direction(
+            np.array([0.0, 0.0, placement.along_z]), np.eye(3)[:2], tilt
+        )
         self._nominal = self.travel = np.zeros(len(image))
         if evidence.staged:
             images, first = np.unique(placement.image, return_index=True)
@@ -451,7 +453,7 @@ class StepProfileEvidence(StripeEvidence):
         points = self.on_sheet(parameters, global_values).points()
         if points is None:
             return None
-        normal, by_slope = leaning(self.upward, self.along[None], local[:1])
+        normal, by_slope = tilt_direction(self.upward, self.along[None], local[:1])
         off = Distances(
             normal @ points.points - local[1] - self.upper_mm(parameters, global_values),
             np.broadcast_to(normal[:, None], points.points.shape),

@@ -10,7 +10,7 @@ from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import Distances, Residuals, StripeEvidence
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Uncertainty
-from uwlts.optics.window import leaning
+from uwlts.optics.window import tilt_direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ class Plane(Surface):
         return 3
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
-        normal, by_slopes = leaning(self.normal, self.across, local[:2])
+        normal, by_slopes = tilt_direction(self.normal, self.across, local[:2])
         away = points - self.point_mm[:, None]
         by_local = np.column_stack([(by_slopes @ away).T, np.full(points.shape[1], -1.0)])
         return Distances(normal @ away - local[2], np.broadcast_to(normal[:, None], points.shape), by_local)
@@ -172,7 +172,7 @@ class Cylinder(Surface):
         return replace(self, diameter_std_mm=np.inf)
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
-        axis, by_slopes = leaning(self.axis, self.across, local[2:4])
+        axis, by_slopes = tilt_direction(self.axis, self.across, local[2:4])
         away = points - (self.point_mm + local[:2] @ self.across)[:, None]
         along = axis @ away
         radial = away - axis[:, None] * along
@@ -231,7 +231,7 @@ class SurfaceScanEvidence(StripeEvidence):
         by_sizes = np.pad(by_surface, ((0, 0), (0, len(self.stage_mm))))
         return np.append(off, sizes), np.vstack([by_local, by_sizes])
 
-    def lit(self, image: int) -> np.ndarray:
+    def stripe_mask(self, image: int) -> np.ndarray:
         return self.frame == image - self.image
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
@@ -263,10 +263,10 @@ class SurfaceScanEvidence(StripeEvidence):
     def stage_direction(self, parameters: Parameters, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the stage's direction (3,), camera frame, and its derivatives (2, 3) by the slopes."""
         slopes = np.array([parameters.value(global_values, key) for key in SLOPES])
-        return leaning(self.direction, self.across_stage, slopes)
+        return tilt_direction(self.direction, self.across_stage, slopes)
 
 
-def across_of(direction: np.ndarray) -> np.ndarray:
+def perpendicular_directions(direction: np.ndarray) -> np.ndarray:
     """Return two unit vectors (2, 3) perpendicular to a direction and each other; Y and Z for a motion along X."""
     second = np.cross((0.0, 0.0, 1.0) if abs(direction[2]) < 0.9 else (1.0, 0.0, 0.0), direction)
     second /= np.linalg.norm(second)

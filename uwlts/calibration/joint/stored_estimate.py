@@ -16,9 +16,9 @@ from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownMedium
 from uwlts.model.joint_estimate import CoveredRegion, ImageFit, JointEstimate
-from uwlts.model.parameter_keys import LensParameter, MediumIndex, SheetParameter, WindowParameter, parameter_of
+from uwlts.model.parameter_keys import LensParameter, MediumIndex, SheetParameter, WindowParameter, parse_parameter
 from uwlts.model.sensor import Medium, Sensor, Table, Uncertainty
-from uwlts.model.stripe import pixels_of
+from uwlts.model.stripe import stack_pixels
 
 _FRAME_STEP = 1e-5
 """Step of the sheet's parameters, rad and mm, for central differences; their error is negligible."""
@@ -70,7 +70,7 @@ def _build_joint_estimate(result: Estimate, evidence: Sequence[Evidence], object
                 )
             )
             if part.kind != TARGET:
-                lit.setdefault(piece.view, []).append(piece.pixels[piece.lit(part.image)][~left_out])
+                lit.setdefault(piece.view, []).append(piece.pixels[piece.stripe_mask(part.image)][~left_out])
     return JointEstimate(
         parameters=result.parameters.keys,
         values=tuple(result.values.tolist()),
@@ -107,7 +107,7 @@ def _lens_and_window(result: Estimate) -> dict[str, Table]:
 def _build_covered_region(
     result: Estimate, view: ViewMedium, pixels: np.ndarray, object_frame: np.ndarray, *, across: int
 ) -> CoveredRegion:
-    seen = SeenSheet.of(result.parameters, result.values, view, pixels, across=across).places_mm()
+    seen = SeenSheet.from_parameters(result.parameters, result.values, view, pixels, across=across).places_mm()
     if seen is None:
         raise CalibrationError("with the joint estimate, the ray of a used stripe pixel does not meet the sheet")
     at = (object_frame[:3, 1:3].T @ (seen - object_frame[:3, 3:4])).T
@@ -145,13 +145,13 @@ class StoredEstimate:
         """Project points (N, 3) of the camera frame; return pixels (N, 2), else NaN."""
         return self.parameters.project(self.values, self.view, points)
 
-    def points_by(self, line: np.ndarray, centre_px: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def triangulate(self, line: np.ndarray, centre_px: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Return points (N, 3) of stripe centres, and derivatives (N, 3, 1 + P) by the pixel and all parameters.
 
         The pixel is that across the stripe. The coordinates are in the OCS, fixed relative to the camera. None if a
         centre cannot be triangulated.
         """
-        pixels = pixels_of(line, centre_px, stripe_along=self.calibration.stripe_along)
+        pixels = stack_pixels(line, centre_px, stripe_along=self.calibration.stripe_along)
         found = self.parameters.stripe_points(self.values, self.view, pixels, across=self.across())
         if found is None:
             return None
@@ -212,7 +212,7 @@ def require_joint(calibration: Calibration) -> JointEstimate:
     return calibration.joint
 
 
-def stored_estimate(calibration: Calibration, sensor: Sensor, medium: Medium) -> StoredEstimate:
+def read_stored_estimate(calibration: Calibration, sensor: Sensor, medium: Medium) -> StoredEstimate:
     """Return the estimate of a calibration for scans of a sensor in a medium.
 
     In a calibrated medium, the uncertainty of the index includes its drift. In another medium, the index follows from
@@ -223,20 +223,22 @@ def stored_estimate(calibration: Calibration, sensor: Sensor, medium: Medium) ->
     CalibrationError
         The calibration contains no joint estimate, or a damaged one.
     """
-    return _read(calibration, medium, mounted=sensor.camera.window.mounted, uncertainty=sensor.uncertainty)
+    return _read_estimate(calibration, medium, mounted=sensor.camera.window.mounted, uncertainty=sensor.uncertainty)
 
 
-def found_estimate(calibration: Calibration, medium: Medium) -> StoredEstimate:
-    """Return the estimate as originally calculated, in one of its media or in air; errors as `stored_estimate`."""
-    return _read(calibration, medium, mounted=True, uncertainty=Uncertainty(drift_k=0.0))
+def read_original_estimate(calibration: Calibration, medium: Medium) -> StoredEstimate:
+    """Return the estimate as originally calculated, in one of its media or in air; errors as `read_stored_estimate`."""
+    return _read_estimate(calibration, medium, mounted=True, uncertainty=Uncertainty(drift_k=0.0))
 
 
-def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertainty: Uncertainty) -> StoredEstimate:
+def _read_estimate(
+    calibration: Calibration, medium: Medium, *, mounted: bool, uncertainty: Uncertainty
+) -> StoredEstimate:
     joint, camera = require_joint(calibration), calibration.camera
     keys, values = list(joint.parameters), np.array(joint.values)
     covariance = joint.covariance_matrix()
     options = CameraOptions(
-        distortion=tuple(name for name in DISTORTION if parameter_of(name) in keys),
+        distortion=tuple(name for name in DISTORTION if parse_parameter(name) in keys),
         pixel_aspect=camera.fy_px / camera.fx_px if LensParameter.F in keys else None,
         principal_point_px=None if LensParameter.CX in keys else (camera.cx_px, camera.cy_px),
     )
@@ -244,7 +246,7 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
     media = [key.medium for key in keys if isinstance(key, MediumIndex)]
     if len(media) != len(calibration.media):
         raise _damage_error(f"it has {len(media)} indices for {len(calibration.media)} media")
-    # As in `Calibration.index_of`: the last of equal media.
+    # As in `Calibration.medium_index`: the last of equal media.
     known = next((n for n, found in reversed([*enumerate(calibration.media)]) if found.medium == medium), None)
     seen_in = None if medium.kind == "air" else known
     if known is not None:
@@ -255,7 +257,7 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
         seen_in = len(media)
         media.append("the scan")
         keys.append(MediumIndex(media[-1]))
-        values = np.append(values, calibration.index_of(medium))
+        values = np.append(values, calibration.medium_index(medium))
         covariance = append_independent(covariance, [medium.index_uncertainty(calibration.wavelength_nm, uncertainty)])
     lens = len(intrinsics.names)
     if tuple(keys[:lens]) != intrinsics.keys:
@@ -266,7 +268,7 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
         held |= {SheetParameter.BOW: fan.bow_rad, SheetParameter.WINDOW_TURN: fan.window_turn_rad}
     priors = {key: Prior(value, np.inf) for key, value in zip(keys[lens:], values[lens:], strict=True)}
     priors |= {key: Prior(value, 0.0) for key, value in held.items() if key not in priors}
-    sheet = DescribedSheet.of(joint.nominal_sheet)
+    sheet = DescribedSheet.from_description(joint.nominal_sheet)
     parameters = Parameters(intrinsics, sheet, calibration.window, tuple(media), priors)
     view = ViewMedium(mounted and calibration.window is not None, seen_in)
     return StoredEstimate(calibration, parameters, values, covariance, view)

@@ -30,9 +30,9 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.brief import Brief
 from uwlts.optics.window import require_index
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.runtime.workers import Send, work_through
-from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.workers import Send, run_jobs
+from uwlts.storage.capture import Capture, CaptureHeader, open_captures
 from uwlts.stripe import StripeSettings
 
 Level = TypeVar("Level")
@@ -83,7 +83,7 @@ class Tally:
             std_mm=std_mm,
         )
 
-    def beyond(self, model: int, other: int) -> tuple[float, float]:
+    def compute_excess(self, model: int, other: int) -> tuple[float, float]:
         """Return a model's mean squared error minus another's, and the standard error of this difference, mm2."""
         difference, draws = self._all(model) - self._all(other), _draws(len(self._number()))
         drawn = draws @ difference / (draws @ self._number())
@@ -91,7 +91,7 @@ class Tally:
 
     def as_good(self, model: int, other: int) -> bool:
         """Return whether a model is no worse than another, within the standard error of their difference."""
-        difference, std = self.beyond(model, other)
+        difference, std = self.compute_excess(model, other)
         return difference <= std
 
     def _all(self, model: int) -> np.ndarray:
@@ -200,7 +200,7 @@ def _robust_rms(misses: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedModel:
+class ScoredModel:
     """Model with its score for each split, or the reason for a missing score."""
 
     candidate: Candidate
@@ -218,8 +218,8 @@ class Choice:
     these images, and is empty if they are too few.
     """
 
-    judged: list[JudgedModel]
-    ways: dict[str, frozenset[Image]]
+    judged: list[ScoredModel]
+    splits: dict[str, frozenset[Image]]
     predictions: dict[Candidate, dict[str, Prediction]]
     tallies: dict[str, Tally]
     wet: dict[str, int]
@@ -229,7 +229,7 @@ class Choice:
         """Return the model with the smallest mean squared error, summed over the splits."""
         return self._good_among()[0].candidate
 
-    def as_good(self) -> list[Candidate]:
+    def list_equivalent(self) -> list[Candidate]:
         """Return the models that are no worse than the best in any split, within chance."""
         return [each.candidate for each in self._good_among()[1]]
 
@@ -245,7 +245,7 @@ class Choice:
         """Return the number of a model among those with scores."""
         return list(self.predictions).index(candidate)
 
-    def no_worse(self, candidate: Candidate, other: Candidate, where: str, *, wet: bool = False) -> bool:
+    def predicts_as_well(self, candidate: Candidate, other: Candidate, where: str, *, wet: bool = False) -> bool:
         """Return whether a model predicts as well as another in a split; ``wet`` restricts it to images in a medium.
 
         Held-out images can share errors of the stage and of poses, which favour one model by more than chance. A model
@@ -256,11 +256,13 @@ class Choice:
         tallies = self.wet_tallies if wet else self.tallies
         return not separate or tallies[where].as_good(self.number(candidate), self.number(other))
 
-    def _good_among(self, among: Sequence[Candidate] | None = None) -> tuple[JudgedModel, list[JudgedModel]]:
+    def _good_among(self, among: Sequence[Candidate] | None = None) -> tuple[ScoredModel, list[ScoredModel]]:
         """Return the best model and all models as good as it in every split; ``among`` restricts the models."""
         able = [each for each in self.judged if each.scores and (among is None or each.candidate in among)]
         best = min(able, key=lambda each: sum(score.all_mm**2 for score in each.scores.values()))
-        good = [e for e in able if all(self.no_worse(e.candidate, best.candidate, where) for where in self.ways)]
+        good = [
+            e for e in able if all(self.predicts_as_well(e.candidate, best.candidate, where) for where in self.splits)
+        ]
         return best, good
 
 
@@ -268,7 +270,9 @@ Found = dict[Candidate, dict[str, Prediction] | str]
 """For each model its predictions for each split, or the reason for their absence."""
 
 
-def choose(problem: JointProblem, *, workers: int | None = None, progress: ProgressListener = unheard) -> Choice:
+def choose(
+    problem: JointProblem, *, workers: int | None = None, progress: ProgressListener = ignore_progress
+) -> Choice:
     """Compare the usual model, models that differ from it by one property, and the simplest sufficient one.
 
     Raises
@@ -283,7 +287,7 @@ def choose(problem: JointProblem, *, workers: int | None = None, progress: Progr
 
     def predicted(candidates: Sequence[Candidate]) -> Found:
         jobs = [(problem, candidate, held) for candidate in candidates for held in ways.values()]
-        results = work_through(_work, jobs, workers=workers, on_message=lambda _: progress(next(done), total))
+        results = run_jobs(_work, jobs, workers=workers, on_message=lambda _: progress(next(done), total))
         found: Found = {}
         for place, candidate in enumerate(candidates):
             own = results[place * len(ways) : (place + 1) * len(ways)]
@@ -295,13 +299,13 @@ def choose(problem: JointProblem, *, workers: int | None = None, progress: Progr
     found = predicted(singles)
     if isinstance(found[usual], str):
         raise CalibrationError(f"the usual model cannot be calibrated without the held-out images: {found[usual]}")
-    first = choice_of(found, ways, in_medium)
+    first = build_choice(found, ways, in_medium)
     needed = {name: first.level(name, [getattr(usual, name), *others]) for name, others in dimensions.items()}
     simple = replace(usual, **needed)
     if simple not in found:
         found |= predicted([simple])
     progress(total, total)
-    return choice_of(found, ways, in_medium)
+    return build_choice(found, ways, in_medium)
 
 
 def _work(job: tuple[JointProblem, Candidate, frozenset[Image]], send: Send) -> Prediction | str:
@@ -313,7 +317,7 @@ def _work(job: tuple[JointProblem, Candidate, frozenset[Image]], send: Send) -> 
         send(None)
 
 
-def choice_of(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozenset[int]) -> Choice:
+def build_choice(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozenset[int]) -> Choice:
     """Score and compare models from their predictions, or the reasons for missing ones.
 
     ``in_medium`` contains the numbers of the pieces of evidence in a medium.
@@ -323,11 +327,11 @@ def choice_of(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozen
     judged, number = [], count()
     for candidate, result in found.items():
         if isinstance(result, str):
-            judged.append(JudgedModel(candidate, None, {}, result))
+            judged.append(ScoredModel(candidate, None, {}, result))
         else:
             place = next(number)
             scores = {where: each.score(place) for where, each in tallies.items()}
-            judged.append(JudgedModel(candidate, len(result[INSIDE].parameters.keys), scores))
+            judged.append(ScoredModel(candidate, len(result[INSIDE].parameters.keys), scores))
     wet = {where: frozenset(image for image in held if image[0] in in_medium) for where, held in ways.items()}
     wet_tallies: dict[str, Tally] = {}
     if min(map(len, wet.values())) >= FEWEST_HELD:
@@ -359,7 +363,7 @@ def compare_models(
     index: float | None = None,
     stripe: StripeSettings = None,
     workers: int | None = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> Comparison:
     """Compare sensor models by how well each predicts images that were not used for its calibration.
 
@@ -405,7 +409,7 @@ def compare_models(
     if not (air or water):
         raise DescriptionError("no captures of a target to compare models with: give `air` or `water`")
     options = CalibrationOptions(poses=poses, medium_index=index, stripe=stripe)
-    with opened_captures([*air, *water]) as targets, opened_captures(step) as steps:
+    with open_captures([*air, *water]) as targets, open_captures(step) as steps:
         gathered = gather_jointly(targets, steps, options=options, progress=progress)
         problem = joint_problem(gathered, options=options)
         choice = choose(problem, workers=workers, progress=partial(progress, stage="models"))
@@ -423,7 +427,7 @@ def _score_polynomials(
         return None, "polynomials need a target in the medium of use that is moved by the stage"
     part = wet[0]
     alike = [n for n, e in enumerate(problem.evidence) if isinstance(e, TargetEvidence) and e.view == part.view]
-    images = [image for image in choice.ways[INSIDE] if image[0] in alike]
+    images = [image for image in choice.splits[INSIDE] if image[0] in alike]
     try:
         header = common_header([c for c in targets if c.path.name in part.names and c.header.medium.kind != "air"])
         return score_polynomials(part, header, images, choice.predictions[choice.simplest()][INSIDE]), ""

@@ -49,16 +49,16 @@ class Candidate:
     window_turn: bool = True
     distortion: tuple[str, ...] = ("k1", "k2")
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Describe the difference from the usual model."""
         usual = Candidate()
         parts = [words for name, words in _WORDS.items() if getattr(self, name) != getattr(usual, name)]
         if self.distortion != usual.distortion:
-            parts.append(distortion_words(self.distortion))
+            parts.append(describe_distortion(self.distortion))
         return ", ".join(parts) or "usual (glass plate, tilts, bow, k1 k2)"
 
 
-def distortion_words(distortion: tuple[str, ...]) -> str:
+def describe_distortion(distortion: tuple[str, ...]) -> str:
     """Describe the free distortion coefficients."""
     return "distortion " + " ".join(distortion) if distortion else "no distortion"
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
 from uwlts.calibration.mount.estimate import (
     LARGEST_ROUGH,
     GroupedEvidence,
@@ -25,7 +25,7 @@ from uwlts.calibration.mount.estimate import (
 from uwlts.calibration.mount.next_pose import OPEN_RAD, describe_missing_turns, require_determined, weaknesses
 from uwlts.calibration.mount.sensor import mount_covariance
 from uwlts.errors import CalibrationError, DescriptionError, TargetError
-from uwlts.files.writing import sha256_of
+from uwlts.files.writing import hash_file
 from uwlts.model.calibration import Calibration, WindowModel, rigid_transform
 from uwlts.model.mount import BoardFound, Mount, MountPose
 from uwlts.optics.camera import directions, project_through_window
@@ -84,7 +84,7 @@ def mount_by_board(
         Too few images show the target, or the poses do not determine the mount or contradict the images.
     """
     header = capture.header
-    known = None if calibration.joint is None else stored_estimate(calibration, header.sensor, header.medium)
+    known = None if calibration.joint is None else read_stored_estimate(calibration, header.sensor, header.medium)
     target, images, reasons = detect_boards(capture, calibration, known, poses)
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
@@ -144,7 +144,7 @@ def mount_by_board(
         sensor=share,
         poses=tuple(rows),
         weaknesses=tuple(weak),
-        inputs={capture.path.name: sha256_of(capture.path)},
+        inputs={capture.path.name: hash_file(capture.path)},
     )
 
 
@@ -179,7 +179,7 @@ def detect_boards(
     check_fits(header, calibration, source=capture.path.name)
     if header.target is None:
         raise DescriptionError(f"{capture.path.name} does not describe its target")
-    target, index = parse_target(header.target), calibration.index_of(header.medium)
+    target, index = parse_target(header.target), calibration.medium_index(header.medium)
     window = calibration.window if header.sensor.camera.window.mounted else None
     numbers = np.flatnonzero(~capture.laser_on)
     taken, at = len(numbers), capture.pose[numbers] if poses is None else poses
@@ -391,14 +391,14 @@ class BoardEvidence(GroupedEvidence[_State]):
         at = np.zeros(12) if step is None else self.free @ step
 
         def residuals(every: np.ndarray) -> np.ndarray:
-            return self.residuals(self._moved(state, every))
+            return self.residuals(self._apply_step(state, every))
 
         return differences(residuals, at, np.tile(POSE_STEPS, 2)).reshape(-1, 6, 12) @ self.free
 
     def apply_step(self, state: _State, step: np.ndarray) -> _State:
-        return self._moved(state, self.free @ step)
+        return self._apply_step(state, self.free @ step)
 
-    def _moved(self, state: _State, step: np.ndarray) -> _State:
+    def _apply_step(self, state: _State, step: np.ndarray) -> _State:
         """Shift and rotate the mount along the platform's axes, then the target about its middle."""
         mount, common = state
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ mount[:3, :3]

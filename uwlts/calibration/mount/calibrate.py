@@ -14,13 +14,13 @@ from uwlts.calibration.mount.estimate import LARGEST_ROUGH, NotSettled, Restrict
 from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, from_sheet, to_sheet
 from uwlts.calibration.mount.profiles import LEAST_POINTS
-from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, profiles_of
+from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, reconstruct_profiles
 from uwlts.calibration.mount.start import NoFit, require_surfaces, start
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose
 from uwlts.model.trajectory import Trajectory
-from uwlts.storage.calibration_file import loaded_calibration
+from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, Artefact, MountEvidence, SensorAxis, read_mount_evidence
 from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
@@ -119,7 +119,7 @@ def calibrate_mount(
     if calibration is not None:
         if not isinstance(profiles, str | Path):
             raise DescriptionError("a calibration needs a capture: give the capture's path as `profiles`")
-        known = loaded_calibration(calibration)
+        known = resolve_calibration(calibration)
         if not isinstance(known, Calibration):
             raise DescriptionError("a polynomial calibration cannot locate a target: give one with a camera model")
         table, times = poses, pose_times_s
@@ -131,7 +131,7 @@ def calibrate_mount(
                 if radius_mm is not None or height_mm is not None or scale or time:
                     raise DescriptionError("the capture shows a target: give no radius, height, scale or time")
                 return mount_by_board(capture, known, table, axis=axis)
-            profiles = profiles_of(capture, known, table, times)
+            profiles = reconstruct_profiles(capture, known, table, times)
     captured = None
     if isinstance(profiles, CapturedProfiles):
         captured, poses = profiles, profiles.poses
@@ -152,7 +152,7 @@ def calibrate_mount(
         pose_times_s=pose_times_s,
     )
     try:
-        return _Calibration(evidence, captured).result()
+        return _Calibration(evidence, captured).make_result()
     except (NoFit, NotSettled) as error:
         raise CalibrationError(f"{error}. {_advice(evidence)}") from error
 
@@ -161,7 +161,7 @@ def _advice(evidence: MountEvidence) -> str:
     """Return advice on the usual mistakes; a wrong artefact size is tested by estimating it."""
     if evidence.size_mm is not None:
         with suppress(CalibrationError):
-            found = _Calibration(replace(evidence, size_mm=None)).result()
+            found = _Calibration(replace(evidence, size_mm=None)).make_result()
             if 2 * sum(pose.reason is None for pose in found.poses) > len(found.poses):
                 return (
                     f"The profiles fit with {found.rms_mm:.3g} mm rms if the {evidence.artefact} has another "
@@ -175,7 +175,7 @@ def _advice(evidence: MountEvidence) -> str:
 
 
 class _Calibration:
-    """Steps of one calibration, in the order in which `result` needs them."""
+    """Steps of one calibration, in the order in which `make_result` needs them."""
 
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
@@ -190,7 +190,7 @@ class _Calibration:
         self.flat = to_sheet(self.profiles, self.sheet)
         self.reasons: dict[int, str] = {}
 
-    def result(self) -> Mount:
+    def make_result(self) -> Mount:
         """Return the mount with its uncertainty, rejected poses and advice."""
         shapes = [self.shape.find(points, self.rng) for points in self.flat]
         for number, shape in enumerate(shapes):
@@ -289,7 +289,7 @@ class _Calibration:
         state, scatter = estimate.state, Scatter(*estimate.scatter)
         known = None if self.captured is None else self.captured.known
         covariance, share, factor = mount_covariance(
-            estimate, used.free, state.rotation, known, lambda: self._moved(used, state, members)
+            estimate, used.free, state.rotation, known, lambda: self._calibration_derivatives(used, state, members)
         )
         turns = Rotation.from_matrix(used.motion(state.offset_s)[0])
         weak = weaknesses(covariance[:6, :6], turns, table=used.table)
@@ -345,7 +345,7 @@ class _Calibration:
             inputs=self.evidence.digests,
         )
 
-    def _moved(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
+    def _calibration_derivatives(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
         """Return derivatives (P, K, Q) of the residuals by the parameters of the sensor's calibration."""
         assert self.captured is not None
         numbers = [n for n in range(len(members)) if n not in self.reasons]

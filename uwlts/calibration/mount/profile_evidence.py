@@ -348,13 +348,13 @@ class Problem(GroupedEvidence[MountState]):
 
     def solve_unweighted(self, state: MountState) -> MountState:
         """Minimise the squares of all distances with equal weights."""
-        return self._solved(state, Scatter(1.0, *np.full(4, _POINT_MM[0])), "linear")
+        return self._solve_robustly(state, Scatter(1.0, *np.full(4, _POINT_MM[0])), "linear")
 
     def solve_robustly(self, state: MountState, scatter: Scatter) -> MountState:
         """Minimise the weighted squares with a robust loss (Cauchy)."""
-        return self._solved(state, scatter, "cauchy")
+        return self._solve_robustly(state, scatter, "cauchy")
 
-    def _solved(self, state: MountState, scatter: Scatter, loss: str) -> MountState:
+    def _solve_robustly(self, state: MountState, scatter: Scatter, loss: str) -> MountState:
         covariances, _ = self.covariance(state)(np.log(scatter))
         return self.apply_step(state, solve_step(self, state, covariances, loss=loss))
 

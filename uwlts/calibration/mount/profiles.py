@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from uwlts.fitting.least_squares import MAD_TO_STD, robust_std
-from uwlts.fitting.shapes import algebraic_centres
+from uwlts.fitting.shapes import fit_algebraic_centres
 
 LEAST_POINTS = 12
 """Points on the artefact that a profile needs: four for each of a circle's three parameters."""
@@ -172,7 +172,7 @@ def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Pr
 def _fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Fit a circle by least squares of the distances, with Gauss-Newton steps from the algebraic solution."""
     middle = points.mean(axis=0)
-    centre, radius = algebraic_centres(points - middle)
+    centre, radius = fit_algebraic_centres(points - middle)
     centre = middle + centre
     radius = float(radius)
     for _ in range(5):
@@ -208,11 +208,11 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
         middle = points[some].mean(axis=0)
         return middle, np.linalg.svd(points[some] - middle, full_matrices=False)[2][0]
 
-    def beside(some: np.ndarray) -> np.ndarray:
+    def measure_distances(some: np.ndarray) -> np.ndarray:
         middle, direction = line(some)
         return (points - middle) @ np.array([-direction[1], direction[0]])
 
-    if (found := _refit_inliers(members, tolerance, beside)) is None:
+    if (found := _refit_inliers(members, tolerance, measure_distances)) is None:
         return None
     members, std = found
     middle, direction = line(members)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
 from uwlts.calibration.mount.estimate import RestrictedEstimate
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.any_calibration import calibration_digest
@@ -43,13 +43,13 @@ class CapturedProfiles:
     def point_derivatives(self, number: int, rows: np.ndarray) -> np.ndarray:
         """Return derivatives (n, 3, Q) of points of a profile by the parameters of the joint estimate, sensor frame."""
         assert self.known is not None
-        found = self.known.points_by(*self.stripes[number][rows].T)
+        found = self.known.triangulate(*self.stripes[number][rows].T)
         if found is None:
             raise CalibrationError("a stripe centre cannot be triangulated with the calibration's joint estimate")
         return found[1][:, :, 1:]
 
 
-def profiles_of(
+def reconstruct_profiles(
     capture: Capture, calibration: Calibration, poses: np.ndarray | None, pose_times_s: np.ndarray | None
 ) -> CapturedProfiles:
     """Reconstruct the profiles of all laser images of a capture; ``poses`` replace the capture's own poses.
@@ -66,7 +66,7 @@ def profiles_of(
         calibration if mounted else calibration.model_copy(update={"window": None}),
         stripes.line,
         stripes.centre_px,
-        medium_index=calibration.index_of(capture.header.medium),
+        medium_index=calibration.medium_index(capture.header.medium),
         stage_mm=0.0,
         stage_direction=np.array([1.0, 0.0, 0.0]),
     ).points_mm
@@ -81,7 +81,7 @@ def profiles_of(
             )
     known = None
     if calibration.joint is not None:
-        known = stored_estimate(calibration, capture.header.sensor, capture.header.medium)
+        known = read_stored_estimate(calibration, capture.header.sensor, capture.header.medium)
     found = np.column_stack([stripes.line, stripes.centre_px])
     profiles, where = ([each[stripes.frame == frame] for frame in laser] for each in (points, found))
     return CapturedProfiles(profiles, where, times, at, pose_times_s, known)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from pydantic import JsonValue
 
-from uwlts.calibration.capture_evidence import AirEvidence, air_evidence
+from uwlts.calibration.capture_evidence import AirEvidence, find_air_evidence
 from uwlts.calibration.polynomial.polynomial_evidence import (
     PlateStripes,
     common_header,
@@ -19,8 +19,8 @@ from uwlts.errors import CalibrationError, RangeError
 from uwlts.fitting.least_squares import robust_std
 from uwlts.model.brief import Brief
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.storage.capture import Capture, CaptureHeader, open_captures
 from uwlts.stripe import StripeSettings
 
 MOST_SMOOTH = 8
@@ -152,7 +152,7 @@ def calibrate_polynomials(
     *,
     degree: int = 6,
     stripe: StripeSettings = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> PolynomialResult:
     """Calibrate by polynomials, position to Z and Z to Y for each profile line, completely in the medium of use.
 
@@ -186,9 +186,9 @@ def calibrate_polynomials(
     """
     if degree < 1:
         raise RangeError(f"the polynomials' degree is {degree}; expected at least 1, usually 6")
-    with opened_captures(target) as captures:
+    with open_captures(target) as captures:
         header = common_header(captures)
-        evidence = air_evidence(captures, stripe=stripe, progress=progress)
+        evidence = find_air_evidence(captures, stripe=stripe, progress=progress)
         sources = [{"file": capture.path.name, "name": capture.header.name} for capture in captures]
     return fit_polynomials(evidence, header, degree=degree, sources=sources)
 

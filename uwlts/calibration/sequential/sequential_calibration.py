@@ -18,8 +18,8 @@ from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
     StepEvidence,
-    air_evidence,
     explain_missing_stripe,
+    find_air_evidence,
     step_evidence,
 )
 from uwlts.calibration.sequential.sheet_fit import (
@@ -35,8 +35,8 @@ from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Window
-from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.storage.capture import Capture, source_of
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.storage.capture import Capture, describe_source
 from uwlts.stripe import StripeSettings
 
 _FEWEST_LEFT_OUT = 4  # images; with fewer, the jackknife is unreliable
@@ -127,7 +127,7 @@ def calibrate_sequentially(
     steps: Sequence[Capture] = (),
     *,
     options: CalibrationOptions | None = None,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> CalibrationResult:
     """Calibrate a sensor from its captures; without step captures, for the medium of the target's images only.
 
@@ -161,7 +161,7 @@ def gather(
     steps: Sequence[Capture],
     *,
     options: CalibrationOptions,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> Evidence:
     """Find the target, and the stripes on it and on the step standard, in all images.
 
@@ -175,7 +175,7 @@ def gather(
             "determines the window, else all in the medium of use"
         )
     sources = sources_of(air, steps)
-    found = air_evidence(air, stripe=options.stripe, progress=progress)
+    found = find_air_evidence(air, stripe=options.stripe, progress=progress)
     warnings = [*found.warnings, *_window_warnings(air, steps, options)]
     on_steps: list[StepEvidence] = []
     if steps:
@@ -233,7 +233,9 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     )
     used, on_steps, window = [], [], None
     if evidence.window is not None:
-        described = WindowModel.described(evidence.window, sensor.laser.wavelength_nm, refractions=options.refractions)
+        described = WindowModel.from_description(
+            evidence.window, sensor.laser.wavelength_nm, refractions=options.refractions
+        )
         labelled, on_steps = label_steps(calibration, described, evidence.steps, uncertainty=sensor.uncertainty)
         used = [image for image in labelled if image is not None]
         if not used:
@@ -273,7 +275,7 @@ def _calibrate_camera(evidence: Evidence, options: CalibrationOptions, start: Ca
         solve_camera, width_px=width_px, height_px=height_px, approaching=approaching, circle_diameter_mm=diameter_mm
     )
     if options.lens is None:
-        estimated = options.camera.described(evidence.sensor.camera)
+        estimated = options.camera.with_described_pixels(evidence.sensor.camera)
         return _CameraResult(solved(air.images, poses=options.poses, options=estimated, start=start), None, air, [])
     lens = calibrate_lens(
         air.images,
@@ -477,7 +479,7 @@ def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence
         A capture is given twice, so its noise would count twice.
     """
     kinds = {"air_captures": air, "step_captures": steps, "scan_captures": scans}
-    sources = {kind: [source_of(capture) for capture in captures] for kind, captures in kinds.items()}
+    sources = {kind: [describe_source(capture) for capture in captures] for kind, captures in kinds.items()}
     names: dict[str, str] = {}
     for source in chain.from_iterable(sources.values()):
         if source.sha256 in names:

@@ -84,7 +84,7 @@ class StandardTurn:
     about_stripe: float | None
     std: float
 
-    def lengthened(self) -> tuple[float, float]:
+    def compute_lengthening(self) -> tuple[float, float]:
         """Return the height within the sheet relative to that along the normal, and its standard uncertainty."""
         turn = self.about_stripe or 0.0
         return float(1 / np.cos(turn)), float(np.hypot(np.tan(turn) * self.std, _OF_SQUARE * self.std**2))
@@ -134,7 +134,7 @@ def label_steps(
             std_mm = stated / 2 if stated else uncertainty.step_height_mm
             if doubt := turn.doubt(height_mm=standard.height_mm, std_mm=std_mm):
                 warnings.append(f"{capture}: {doubt}")
-            factor, std = turn.lengthened()
+            factor, std = turn.compute_lengthening()
             labelled = [
                 None if image is None else replace(image, lengthened=factor, lengthened_std=std) for image in labelled
             ]

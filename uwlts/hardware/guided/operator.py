@@ -31,13 +31,13 @@ class Screen(Protocol):
     ) -> None:
         """Show an image (H, W) with the target's points (N, 2) and the stripe's pixels (N, 2) found in it."""
 
-    def recorded(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
+    def show_coverage(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
         """Show the coverage, with the points (N, 2) of each image."""
 
     def add(self, line: str) -> None:
         """Add a line to the list of images."""
 
-    def connected(self, stage: LaserStage | None) -> None:
+    def set_stage(self, stage: LaserStage | None) -> None:
         """Set the stage that now switches the laser, or None once it is closed."""
 
 

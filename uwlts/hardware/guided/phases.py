@@ -17,29 +17,35 @@ from uwlts.calibration.camera.image_quality import (
     QualityLimits,
     StripeQuality,
     TargetQuality,
+    explain_missing_target,
     judge_motion,
     judge_novelty,
     judge_stripe,
     judge_target,
-    way_px,
-    why_not_found,
+    measure_shift_px,
 )
 from uwlts.calibration.guidance.pose_advice import (
+    CompletionLimits,
     PoseAdvice,
     RecordedPose,
     Setting,
     State,
-    Wanted,
     best_pose,
+    compute_gain,
+    describe_missing,
+    describe_missing_sheet,
+    estimate_pose,
     format_pose_advice,
-    gain_of,
     judge_residual,
-    missing,
-    missing_sheet,
-    pose_of,
-    state_of,
+    solve_state,
 )
-from uwlts.calibration.guidance.step import StepQuality, is_new, judge_step, least_apart_mm, next_depth_mm
+from uwlts.calibration.guidance.step import (
+    StepQuality,
+    is_separate_depth,
+    judge_step,
+    least_separation_mm,
+    next_depth_mm,
+)
 from uwlts.errors import CalibrationError, TargetError
 from uwlts.hardware.guided.operator import Operator, Screen
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
@@ -171,7 +177,7 @@ class Accepted(Found):
 class PoseJudge:
     """Judgement of target images, new or recorded; ``full_dn`` is the saturation grey value."""
 
-    def __init__(self, setting: Setting, wanted: Wanted, *, full_dn: int):
+    def __init__(self, setting: Setting, wanted: CompletionLimits, *, full_dn: int):
         self._setting, self._wanted, self._full = setting, wanted, full_dn
         limits = QualityLimits()
         self.limits = limits if setting.poses == "free" else replace(limits, smallest_change_px=_STAGE_CHANGE_PX)
@@ -181,7 +187,7 @@ class PoseJudge:
         try:
             view = self._setting.target.detect(image)
         except TargetError as error:
-            return Found(image, None, None, (why_not_found(image, str(error), full_dn=self._full),))
+            return Found(image, None, None, (explain_missing_target(image, str(error), full_dn=self._full),))
         quality = judge_target(image, view, self._setting.target, full_dn=self._full, limits=self.limits)
         return Found(image, view, quality, quality.reasons)
 
@@ -197,10 +203,10 @@ class PoseJudge:
         )
 
     def state(self, recorded: Sequence[RecordedPose]) -> State:
-        """Return the state that recorded poses lead to; raises the errors of `state_of`."""
-        return state_of(recorded, self._setting, self._wanted)
+        """Return the state that recorded poses lead to; raises the errors of `solve_state`."""
+        return solve_state(recorded, self._setting, self._wanted)
 
-    def recorded(self, path: Path) -> list[RecordedPose]:
+    def read_recorded(self, path: Path) -> list[RecordedPose]:
         """Read the poses in a capture of the target, judged like new ones."""
         with Capture(path) as capture:
             stripes = {float(capture.stage_mm[k]): image for k, image in capture.frames(laser_on=True)}
@@ -248,7 +254,7 @@ class PoseJudge:
 
 def list_missing(state: State) -> list[str]:
     """List the evidence that is still missing for camera and laser sheet."""
-    return [*missing(state), *missing_sheet(state)]
+    return [*describe_missing(state), *describe_missing_sheet(state)]
 
 
 class TargetPhase:
@@ -279,7 +285,7 @@ class TargetPhase:
             position = self._session.rig.move_to(place)
             for _ in range(_TRIES):
                 found = self._judge.attempt(self._session, state, position)
-                state = self._done(found, state, f"{position:.2f} mm")
+                state = self._record_accepted(found, state, f"{position:.2f} mm")
                 # Another attempt may succeed once the target is at rest, or with another exposure.
                 moved = any(isinstance(reason, MotionFault) for reason in found.reasons)
                 if not (moved or self._improve_light(found.reasons)):
@@ -300,7 +306,7 @@ class TargetPhase:
             if answer == "skip":
                 advice, skipped = None, skipped + 1
                 continue
-            if found.view is None or still is None or way_px(still, found.view) > _STILL_PX:
+            if found.view is None or still is None or measure_shift_px(still, found.view) > _STILL_PX:
                 still, since_s = found.view, time.monotonic()
             self._improve_light(found.reasons)
             reasons = self._why_wait(found, state, advice, [*(p.view for p in state.recorded), *refused])
@@ -310,7 +316,7 @@ class TargetPhase:
                 continue
             last = max((round(pose.stage_mm / _NUMBER_MM) for pose in state.recorded), default=0)
             found = self._judge.attempt(self._session, state, _NUMBER_MM * (last + 1))
-            state = self._done(found, state, f"image {len(state.recorded) + 1}")
+            state = self._record_accepted(found, state, f"image {len(state.recorded) + 1}")
             still, since_s = None, time.monotonic()
             if isinstance(found, Accepted):
                 advice, skipped = None, 0
@@ -326,17 +332,17 @@ class TargetPhase:
         if view is None:
             return found.reasons
         reasons = judge_novelty(view, known, self._judge.limits)
-        if reasons or advice is None or missing_sheet(state):
+        if reasons or advice is None or describe_missing_sheet(state):
             return reasons
-        gain = gain_of(state, view, pose_of(view, state.camera))
+        gain = compute_gain(state, view, estimate_pose(view, state.camera))
         return () if gain >= _USEFUL * advice.gain else ("adds little to what there is",)
 
     def _lead(self, found: Found, state: State, advice: PoseAdvice | None, reasons: tuple[str, ...]) -> None:
         """Show the image and the next request to the operator."""
-        pose = None if found.usable is None else pose_of(found.usable, state.camera)
-        sheet = missing_sheet(state)
+        pose = None if found.usable is None else estimate_pose(found.usable, state.camera)
+        sheet = describe_missing_sheet(state)
         request = "move the target" if advice is None else format_pose_advice(advice, state, pose)
-        if sheet and not missing(state):
+        if sheet and not describe_missing(state):
             request = f"move the target so that the laser line lies on it, nearer and farther: {sheet[0]}"
         self._screen.request(request if reasons else "hold it still")
         self._operator.hint(f"next: {request if advice is None or sheet else format_pose_advice(advice, state, None)}")
@@ -352,7 +358,7 @@ class TargetPhase:
         self._settled_s = time.monotonic()
         return changed
 
-    def _done(self, found: Found, state: State, name: str) -> State:
+    def _record_accepted(self, found: Found, state: State, name: str) -> State:
         """Record an accepted pose, report the result, and return the state after it."""
         stripe = None
         if isinstance(found, Accepted):
@@ -368,12 +374,12 @@ class TargetPhase:
         return state
 
     def _show_state(self, state: State) -> None:
-        self._screen.recorded(state.coverage, [pose.view.pixels for pose in state.recorded])
+        self._screen.show_coverage(state.coverage, [pose.view.pixels for pose in state.recorded])
 
 
 def _estimate_spin(view: TargetView | None, state: State) -> float:
     """Return the latest orientation of the target in the image, in rad."""
-    poses = [pose_of(view, state.camera)] if view is not None else state.poses[-1:]
+    poses = [estimate_pose(view, state.camera)] if view is not None else state.poses[-1:]
     return float(np.arctan2(poses[0][1, 0], poses[0][0, 0])) if len(poses) else 0.0
 
 
@@ -443,11 +449,11 @@ class StepPhase:
         # The laser must be off while the standard is moved.
         session.take_unlit()
         depth_mm, reasons, sensor = quality.depth_mm, quality.reasons, self._judge.sensor
-        if depth_mm is not None and not reasons and not is_new(depth_mm, before_mm, sensor):
+        if depth_mm is not None and not reasons and not is_separate_depth(depth_mm, before_mm, sensor):
             nearest = min(before_mm, key=lambda other: abs(other - depth_mm))
             reasons = (
                 f"too similar: it stands {depth_mm:.0f} mm outside the window and was seen at {nearest:.0f} mm; move "
-                f"it by {least_apart_mm(sensor):.0f} mm or more",
+                f"it by {least_separation_mm(sensor):.0f} mm or more",
             )
         if reasons:
             line = f"refused: {'; '.join(reasons)}"

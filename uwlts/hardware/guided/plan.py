@@ -9,11 +9,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from uwlts.calibration.camera.target_poses import Poses
-from uwlts.calibration.guidance.pose_advice import RecordedPose, Setting, Wanted, without_window
+from uwlts.calibration.guidance.pose_advice import CompletionLimits, RecordedPose, Setting, remove_window
 from uwlts.errors import DescriptionError
 from uwlts.hardware.scan_plan import Direction, RigPlan, StageSettings, Table, read_plan_table
 from uwlts.model.artefacts import StepStandard
-from uwlts.model.library import validated
+from uwlts.model.library import validate_description
 from uwlts.model.sensor import Description, NotNegative, Positive
 from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
@@ -78,9 +78,9 @@ class WantedPlan(Description):
     tilt_deg: NotNegative = 12.0
     fewest_images: Annotated[int, Field(ge=3)] = 8
 
-    def wanted(self) -> Wanted:
+    def make_goals(self) -> CompletionLimits:
         """Return the goals with angles in rad."""
-        return Wanted(**self.model_dump(exclude={"tilt_deg"}), tilt_rad=float(np.radians(self.tilt_deg)))
+        return CompletionLimits(**self.model_dump(exclude={"tilt_deg"}), tilt_rad=float(np.radians(self.tilt_deg)))
 
 
 class GuidedPlan(RigPlan):
@@ -109,9 +109,9 @@ class GuidedPlan(RigPlan):
             )
         return self
 
-    def goal(self) -> Wanted:
+    def goal(self) -> CompletionLimits:
         """Return the goals, with at most as many images as the stage has positions."""
-        wanted = self.wanted.wanted()
+        wanted = self.wanted.make_goals()
         if self.poses == "free" or self.stage is None:
             return wanted
         return replace(wanted, fewest_images=min(wanted.fewest_images, len(self.stage.places_mm())))
@@ -123,7 +123,7 @@ class GuidedPlan(RigPlan):
         done = np.array([pose.stage_mm for pose in recorded])
         return [place for place in self.stage.places_mm() if not (np.abs(done - place) <= _SAME_POSITION_MM).any()]
 
-    def connected(self, *, camera: str | None, port: str | None) -> "GuidedPlan":
+    def with_connection(self, *, camera: str | None, port: str | None) -> "GuidedPlan":
         """Return the plan with another camera address or stage port, if given."""
         stage = self.stage if port is None else (self.stage or GuidedStage()).model_copy(update={"port": port})
         return self.model_copy(update={"camera": camera or self.camera, "stage": stage})
@@ -146,7 +146,7 @@ class GuidedPlan(RigPlan):
         medium = sensor.medium(self.medium)
         mounted = medium.kind != "air" if self.window_mounted is None else self.window_mounted
         return Setting(
-            sensor=sensor if mounted else without_window(sensor),
+            sensor=sensor if mounted else remove_window(sensor),
             target=parse_target(self.target),
             medium=medium,
             poses=self.poses,
@@ -172,7 +172,7 @@ def load_guided_plan(path: Path) -> GuidedPlan:
     Raises DescriptionError if the file is missing, is not TOML, or has an unknown or wrong key, or if sensor, medium or
     target are not valid.
     """
-    plan = validated(
+    plan = validate_description(
         GuidedPlan, read_plan_table(path, wanted="sensor and target (docs/how-to/calibrate-live.md)"), path
     )
     plan.setting()

@@ -16,7 +16,7 @@ import numpy as np
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.target_poses import Poses
 from uwlts.calibration.guidance.pose_advice import Setting, State
-from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
+from uwlts.calibration.guidance.step import PLACES, next_depth_mm, select_separate_depths
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
@@ -69,7 +69,7 @@ def guide(
         with Capture(target) as capture:
             known = calibrate_sequentially([capture], (), options=options).calibration
         sensor = plan.described_sensor()
-        window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
+        window = WindowModel.from_description(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
         missing += phases.step(step, plan.step, StepJudge(plan.step, sensor, known, window))
     return GuidedRecording(
         air=(target,) if plan.target_in_air() else (),
@@ -101,7 +101,7 @@ class _Phases:
         plan = self.plan
         judge = PoseJudge(self.setting, plan.goal(), full_dn=self.setting.sensor.detector.full_scale_dn())
         left = self._find_unfinished(path)
-        state = judge.state([] if left is None else judge.recorded(left))
+        state = judge.state([] if left is None else judge.read_recorded(left))
         if left == path:
             if plan.poses == "free":
                 more = bool(list_missing(state)) and len(state.recorded) < plan.most_images
@@ -129,7 +129,7 @@ class _Phases:
         self.operator.wait(request)
         with self._session(path, list(step.positions_mm), self.plan.step_header(path.stem, step)) as session:
             seen = StepPhase(judge, session).run(seen)
-        count = len(apart_mm(seen, judge.sensor))
+        count = len(select_separate_depths(seen, judge.sensor))
         return [] if count >= PLACES else [f"the step standard was seen at {count} depths, expected {PLACES}"]
 
     @contextmanager
@@ -157,7 +157,7 @@ class _Phases:
             return
         with GrblStage(planned.port) as stage:
             try:
-                self.screen.connected(stage)
+                self.screen.set_stage(stage)
                 planned.check(positions_mm, stage)
                 if planned.home:
                     stage.home()
@@ -165,4 +165,4 @@ class _Phases:
                     stage.unlock()
                 yield stage
             finally:
-                self.screen.connected(None)
+                self.screen.set_stage(None)

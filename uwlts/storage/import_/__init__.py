@@ -1,9 +1,9 @@
 """Import of images of any camera and program as a capture."""
 
-from uwlts.storage.import_.camera_files import KnownCamera, read_intrinsics, with_intrinsics
+from uwlts.storage.import_.camera_files import KnownCamera, read_intrinsics, set_intrinsics
 from uwlts.storage.import_.folder import Imported, import_images
 from uwlts.storage.import_.folder_description import NAME as DESCRIPTION_NAME
-from uwlts.storage.import_.grey_values import Channel, checked_channel, one_channel
+from uwlts.storage.import_.grey_values import Channel, check_channel, extract_channel
 from uwlts.storage.import_.matching import image_files
 
 __all__ = [
@@ -11,10 +11,10 @@ __all__ = [
     "Channel",
     "Imported",
     "KnownCamera",
-    "checked_channel",
+    "check_channel",
+    "extract_channel",
     "image_files",
     "import_images",
-    "one_channel",
     "read_intrinsics",
-    "with_intrinsics",
+    "set_intrinsics",
 ]

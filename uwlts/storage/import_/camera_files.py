@@ -10,8 +10,8 @@ import numpy as np
 import yaml
 
 from uwlts.errors import DescriptionError
-from uwlts.files.reading import MOST_DEPTH, read_text, require_plain, shortened
-from uwlts.model.library import merged, validated
+from uwlts.files.reading import MOST_DEPTH, read_text, require_plain, shorten
+from uwlts.model.library import merge_tables, validate_description
 from uwlts.model.sensor import Distortion, Sensor
 
 # Alternative names, compared without case and underscores.
@@ -65,7 +65,7 @@ def read_intrinsics(path: Path) -> KnownCamera:
     model = str(known.get("distortionmodel") or "").lower()
     if model not in _BROWN_CONRADY:
         raise DescriptionError(
-            f"{path}: the distortion model is {shortened(repr(model))}; this program's camera is a pinhole with k1, "
+            f"{path}: the distortion model is {shorten(repr(model))}; this program's camera is a pinhole with k1, "
             "k2, p1, p2, k3 (plumb_bob) or with k4, k5, k6 as well (rational_polynomial): calibrate with one of these"
         )
     matrix, coefficients = _numbers(known, _MATRIX, path), _numbers(known, _COEFFICIENTS, path)
@@ -79,7 +79,7 @@ def read_intrinsics(path: Path) -> KnownCamera:
     return KnownCamera(fx, fy, cx, cy, _distortion(coefficients, path), _size(known, path))
 
 
-def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor:
+def set_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor:
     """Return the sensor with focal lengths, principal point and distortion of a known camera.
 
     Raises DescriptionError if the image size differs.
@@ -99,7 +99,7 @@ def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Senso
         "principal_point_px": [known.cx_px, known.cy_px],
         "distortion": known.distortion.model_dump(),
     }
-    return validated(Sensor, merged(sensor.model_dump(), {"camera": changes}), source)
+    return validate_description(Sensor, merge_tables(sensor.model_dump(), {"camera": changes}), source)
 
 
 def _xml(text: str, path: Path) -> dict[str, object]:
@@ -170,14 +170,14 @@ def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np
     if value is None:
         raise DescriptionError(
             f"{path} has none of {', '.join(names)} (in any case, with or without underscores); it has "
-            f"{shortened(', '.join(known)) or 'nothing'}"
+            f"{shorten(', '.join(known)) or 'nothing'}"
         )
     try:
         numbers = np.asarray(value, dtype=np.float64).ravel()
     except (TypeError, ValueError, OverflowError) as error:
-        raise DescriptionError(f"{path}: {names[0]} is {shortened(repr(value))}; expected numbers") from error
+        raise DescriptionError(f"{path}: {names[0]} is {shorten(repr(value))}; expected numbers") from error
     if not (np.abs(numbers) < _LARGEST).all():
-        found = shortened(str(numbers.tolist()))
+        found = shorten(str(numbers.tolist()))
         raise DescriptionError(f"{path}: {names[0]} holds {found}; expected finite numbers below {_LARGEST:g}")
     return numbers
 
@@ -193,7 +193,7 @@ def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
             "program's camera has k1, k2, p1, p2, k3, k4, k5, k6: calibrate with one of the models plumb_bob and "
             "rational_polynomial"
         )
-    return validated(Distortion, known, path)
+    return validate_description(Distortion, known, path)
 
 
 def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
@@ -203,6 +203,6 @@ def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
     try:
         width_px, height_px = (int(float(str(each))) for each in size)
     except (TypeError, ValueError, OverflowError) as error:
-        found = shortened(" x ".join(map(repr, size)))
+        found = shorten(" x ".join(map(repr, size)))
         raise DescriptionError(f"{path}: the image size is {found}; expected whole numbers") from error
     return width_px, height_px

@@ -9,10 +9,10 @@ import numpy as np
 
 from uwlts._version import __version__
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.inputs import inputs_kept
+from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.sensor import Sensor, Table
-from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import CAPTURES, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.image_file import read_image
@@ -25,10 +25,17 @@ from uwlts.storage.import_.folder_description import (
     described_sensor,
     read_description,
 )
-from uwlts.storage.import_.grey_values import bits_of, grey_values, is_formula, one_channel, subtract_background
+from uwlts.storage.import_.grey_values import bits_of, extract_channel, grey_values, is_formula, subtract_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe import Stripe
-from uwlts.stripe.capture_stripes import BLACK, FEWEST_LINES, WHITE, is_black, shown_stripe, white_share
+from uwlts.stripe.capture_stripes import (
+    BLACK,
+    FEWEST_LINES,
+    WHITE,
+    find_stripe_direction,
+    is_black,
+    measure_clipped_share,
+)
 
 _SIZE_ADVICE = {
     (True, True): "the images are rotated by 90 deg: rotate them back, or exchange width_px and height_px of the "
@@ -60,7 +67,7 @@ class _Content:
     def add_image(self, image: np.ndarray, *, laser_on: bool, name: str) -> None:
         """Count an image (H, W) from the camera; raises ImageError if most of it is saturated."""
         self.seen[laser_on] += 1
-        white = white_share(image, self.saturation_dn)
+        white = measure_clipped_share(image, self.saturation_dn)
         if white > WHITE:
             raise ImageError(
                 f"{name} is white: {100 * white:.0f} % of its pixels are saturated ({self.saturation_dn} DN): shorten "
@@ -71,7 +78,7 @@ class _Content:
 
     def find_stripe(self, image: np.ndarray) -> None:
         """Look for a stripe in a laser image (H, W) after background subtraction, if any."""
-        direction = shown_stripe(image, stripe_along=self.stripe_along)
+        direction = find_stripe_direction(image, stripe_along=self.stripe_along)
         self.with_stripe += direction == "along"
         self.sideways += direction == "across"
 
@@ -118,14 +125,14 @@ class Imported:
     warnings: tuple[str, ...]
 
 
-@inputs_kept()
+@protect_inputs()
 def import_images(
     folder: str | Path,
     out: str | Path,
     *,
     description: str | Path | None = None,
     overwrite: bool = False,
-    progress: ProgressListener = unheard,
+    progress: ProgressListener = ignore_progress,
 ) -> Imported:
     """Convert a folder of images of any camera to a capture, written completely or not at all.
 
@@ -268,7 +275,7 @@ class _Reader:
         bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
         self.dtype = raw.dtype
         values = grey_values(raw, bits=bits, aligned=given.aligned, name=name)
-        return one_channel(values, channel, name=name), bits
+        return extract_channel(values, channel, name=name), bits
 
     def _require_size(self, name: str, declared: ImageHeader) -> None:
         camera, size = self._sensor.camera, (declared.width_px, declared.height_px)

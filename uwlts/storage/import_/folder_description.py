@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from uwlts.errors import DescriptionError
-from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parsed_json, read_text
+from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json, read_text
 from uwlts.model.artefacts import parse_artefact
-from uwlts.model.library import find, load_sensor, merged, read_table, validated
+from uwlts.model.library import find_description, load_sensor, merge_tables, read_table, validate_description
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
 from uwlts.storage.capture import CaptureHeader
-from uwlts.storage.import_.camera_files import read_intrinsics, with_intrinsics
+from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.grey_values import Channel
 from uwlts.targets import parse_target
 
@@ -116,7 +116,7 @@ def read_description(path: Path) -> ImportDescription:
             f"no description at {path}: write one with sensor, medium, and the role of each image "
             "(docs/how-to/import-images.md)"
         )
-    return validated(ImportDescription, read_table(path), path)
+    return validate_description(ImportDescription, read_table(path), path)
 
 
 def capture_header(
@@ -142,17 +142,17 @@ def capture_header(
     table |= {"stage_direction": given.stage.direction or (1.0, 0.0, 0.0), "medium_name": given.medium}
     table |= {"medium": sensor.medium(given.medium or ""), "target": given.target, "artefact": given.artefact}
     table |= {"provenance": remarks if given.provenance is None else given.provenance}
-    return validated(CaptureHeader, table, "the header from the description")
+    return validate_description(CaptureHeader, table, "the header from the description")
 
 
 def read_header(path: Path) -> CaptureHeader:
     """Read a capture's header from JSON; raises DescriptionError if it is missing, not JSON or not valid."""
     text = read_text(path, most_bytes=MOST_JSON_BYTES, error=DescriptionError, called="header in JSON")
     try:
-        content = parsed_json(text)
+        content = parse_json(text)
     except ValueError as error:
         raise DescriptionError(f"{path} is no header in JSON, or is truncated: {error}") from error
-    return validated(CaptureHeader, content, path)
+    return validate_description(CaptureHeader, content, path)
 
 
 def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:
@@ -162,16 +162,18 @@ def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:
     if isinstance(given.sensor, dict):
         table = {key: value for key, value in given.sensor.items() if key != "base"}
         if (base := given.sensor.get("base")) is not None:
-            table = merged(read_table(find(_beside(beside, base), "sensors"), "sensors"), table)
-        sensor = validated(Sensor, table, "sensor")
+            table = merge_tables(
+                read_table(find_description(_resolve_beside(beside, base), "sensors"), "sensors"), table
+            )
+        sensor = validate_description(Sensor, table, "sensor")
     else:
-        sensor = load_sensor(_beside(beside, given.sensor))
+        sensor = load_sensor(_resolve_beside(beside, given.sensor))
     if given.intrinsics is None:
         return sensor
-    return with_intrinsics(sensor, read_intrinsics(beside / given.intrinsics), source=given.intrinsics)
+    return set_intrinsics(sensor, read_intrinsics(beside / given.intrinsics), source=given.intrinsics)
 
 
-def _beside(folder: Path, name: object) -> str:
+def _resolve_beside(folder: Path, name: object) -> str:
     """Return a sensor's name unchanged, or the path of a description relative to the one that names it."""
     if not isinstance(name, str):
         raise DescriptionError(f"sensor is based on {name!r}; expected the name or path of a description")

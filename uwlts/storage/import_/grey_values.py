@@ -23,14 +23,14 @@ _EXPECTED = (
 )
 
 
-def checked_channel(text: str) -> str:
+def check_channel(text: str) -> str:
     """Return the name or formula of a channel unchanged; raises ValueError if it is not valid."""
     if text != "max":
         _evaluate(text, dict.fromkeys(_NAMES, np.ones(1, np.float32)))
     return text
 
 
-Channel = Annotated[str, AfterValidator(checked_channel)]
+Channel = Annotated[str, AfterValidator(check_channel)]
 """Name or formula of a channel."""
 
 
@@ -39,7 +39,7 @@ def is_formula(channel: str | None) -> bool:
     return channel is not None and channel not in (*_NAMES, "max")
 
 
-def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
+def extract_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
     """Return a grey image (H, W): a colour channel, the luminance (grey), the maximum (max), or a formula's result.
 
     It has the image's type, or int32 for a formula. Raises ImageError for a colour image without a selected channel,

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.inputs import note_input
+from uwlts.files.inputs import record_input
 from uwlts.files.reading import is_regular_file, read_text
 from uwlts.model.calibration import is_rigid
 from uwlts.storage.capture import POSE_ROUNDED
@@ -147,7 +147,7 @@ def image_files(folder: Path, *, more: tuple[str, ...] = ()) -> list[str]:
     if not files:
         raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(wanted)}")
     for name in files:
-        note_input(folder / name)
+        record_input(folder / name)
     return sorted(files, key=natural_key)
 
 

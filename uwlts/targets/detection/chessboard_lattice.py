@@ -101,7 +101,7 @@ class _Corners:
     grey: np.ndarray
 
     @classmethod
-    def of(cls, image: np.ndarray) -> "_Corners":
+    def from_image(cls, image: np.ndarray) -> "_Corners":
         """Find the candidates in an image (H, W)."""
         grey = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _RULE.sigma_px)
         along_x, along_y = (cv2.Scharr(grey, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))
@@ -218,7 +218,7 @@ def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
         small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
         if min(small.shape) < 8 * _RULE.ring_px:
             break
-        corners = _Corners.of(small)
+        corners = _Corners.from_image(small)
         if len(corners.pixels) < 4:
             continue
         tree, tried, found = KDTree(corners.pixels), set(), {}

@@ -10,37 +10,37 @@ from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lens_of, step_
 from tests.uwlts.drawn_target import drawn_lamp, drawn_laser, target_pose
 from uwlts.calibration.camera.image_quality import (
     QualityLimits,
+    explain_missing_target,
     judge_motion,
     judge_novelty,
     judge_stripe,
     judge_target,
-    way_px,
-    why_not_found,
+    measure_shift_px,
 )
 from uwlts.calibration.guidance.pose_advice import (
+    CompletionLimits,
     RecordedPose,
     Setting,
     State,
-    Wanted,
     best_pose,
     candidates,
+    compute_gain,
     coverage_of,
+    describe_missing,
+    describe_missing_sheet,
+    estimate_pose,
     format_pose_advice,
-    gain_of,
     judge_residual,
-    missing,
-    missing_sheet,
     nominal_camera,
     place_words,
-    pose_of,
-    state_of,
+    solve_state,
     tilts_rad,
 )
-from uwlts.calibration.guidance.step import apart_mm, is_new, judge_step, next_depth_mm
+from uwlts.calibration.guidance.step import is_separate_depth, judge_step, next_depth_mm, select_separate_depths
 from uwlts.errors import TargetError
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import WindowModel
-from uwlts.model.library import merged
+from uwlts.model.library import merge_tables
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
@@ -69,7 +69,7 @@ NO_STRIPE = np.empty((0, 2))
 
 @pytest.fixture(scope="module")
 def small(thesis_as_built: Sensor) -> Sensor:
-    return Sensor.model_validate(merged(thesis_as_built.model_dump(), SMALL))
+    return Sensor.model_validate(merge_tables(thesis_as_built.model_dump(), SMALL))
 
 
 @pytest.fixture(scope="module")
@@ -126,12 +126,12 @@ def test_light_explains_why_no_target_is_found(small, gain, says):
     image = drawn_lamp(small, PLATE, target_pose(), gain=gain)
     with pytest.raises(TargetError) as error:
         PLATE.detect(image)
-    assert why_not_found(image, str(error.value), full_dn=FULL).startswith(says)
+    assert explain_missing_target(image, str(error.value), full_dn=FULL).startswith(says)
 
 
 def test_a_target_that_is_not_there_is_reported_by_its_search(small):
     image = np.full((512, 640), 90, np.uint8)
-    assert why_not_found(image, "found no circles", full_dn=FULL) == "found no circles"
+    assert explain_missing_target(image, "found no circles", full_dn=FULL) == "found no circles"
 
 
 def test_a_partial_target_is_refused(small):
@@ -147,14 +147,14 @@ def test_motion_and_sameness_are_reported_in_pixels(small):
     again = PLATE.detect(drawn_lamp(small, PLATE, target_pose(), seed=1))
     # f of about 1220 px at 378 mm: 1 mm is 3.2 px.
     shifted = PLATE.detect(drawn_lamp(small, PLATE, target_pose(middle_mm=(1.0, 0.0, 378.0))))
-    assert way_px(first, again) < 0.1 and judge_motion(first, again) == ()
-    assert way_px(first, shifted) == pytest.approx(lens_of(small).fx / 378, rel=0.03)
+    assert measure_shift_px(first, again) < 0.1 and judge_motion(first, again) == ()
+    assert measure_shift_px(first, shifted) == pytest.approx(lens_of(small).fx / 378, rel=0.03)
     assert judge_motion(first, shifted)[0].startswith("moved: the target moved 3.")
     assert judge_novelty(again, [shifted, first])[0].startswith("too similar to image 2: differs by 0.")
     moved = PLATE.detect(drawn_lamp(small, PLATE, target_pose(tilt_deg=(20, 0))))
     assert judge_novelty(moved, [first, shifted]) == ()
     none_in_common = replace(first, indices=first.indices + 100)
-    assert way_px(first, none_in_common) == np.inf and judge_motion(first, none_in_common)
+    assert measure_shift_px(first, none_in_common) == np.inf and judge_motion(first, none_in_common)
 
 
 def test_the_stripe_counts_where_it_lies_on_the_target(small):
@@ -209,11 +209,11 @@ def test_tilts_are_those_of_the_poses():
 # Guidance
 
 
-def led(setting: Setting, wanted: Wanted, rng: np.random.Generator, *, most: int) -> State:
+def led(setting: Setting, wanted: CompletionLimits, rng: np.random.Generator, *, most: int) -> State:
     """Follow the wishes as a hand does: to some 3 deg and 5 mm."""
     poses: list[np.ndarray] = []
-    state = state_of([], setting, wanted)
-    while missing(state) and len(poses) < most:
+    state = solve_state([], setting, wanted)
+    while describe_missing(state) and len(poses) < most:
         wish = best_pose(state)
         # The advised pose itself needs no further instruction.
         assert format_pose_advice(wish, state, wish.candidate.pose) == "hold it still, just like this"
@@ -221,14 +221,14 @@ def led(setting: Setting, wanted: Wanted, rng: np.random.Generator, *, most: int
         pose[:3, :3] = cv2.Rodrigues(rng.normal(0, 0.05, 3))[0] @ pose[:3, :3]
         pose[:3, 3] += rng.normal(0, 5.0, 3)
         poses.append(pose)
-        state = state_of(recorded(setting, poses, np.random.default_rng(7)), setting, wanted)
+        state = solve_state(recorded(setting, poses, np.random.default_rng(7)), setting, wanted)
     return state
 
 
 def test_following_the_advice_leads_to_a_good_camera_soon(setting, thesis_as_built):
-    wanted = Wanted(focal_std_px=0.5, centre_std_px=0.4, coverage=0.85, fewest_images=5)
+    wanted = CompletionLimits(focal_std_px=0.5, centre_std_px=0.4, coverage=0.85, fewest_images=5)
     state = led(setting, wanted, np.random.default_rng(3), most=14)
-    assert missing(state) == []
+    assert describe_missing(state) == []
     assert 5 <= len(state.recorded) <= 9
     true, std = lens_of(thesis_as_built), state.solution.std()
     assert std["f"] <= 0.5 and std["cx"] <= 0.4 and state.coverage.share >= 0.85
@@ -241,7 +241,7 @@ def test_following_the_advice_leads_to_a_good_camera_soon(setting, thesis_as_bui
 
 
 def test_advised_poses_beat_as_many_random_ones(setting):
-    wanted = Wanted(focal_std_px=1e-6, centre_std_px=1e-6)
+    wanted = CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6)
     count = 6
     wished = led(setting, wanted, np.random.default_rng(3), most=count)
     options = candidates(setting, nominal_camera(setting))
@@ -250,7 +250,7 @@ def test_advised_poses_beat_as_many_random_ones(setting):
     for draw in range(12):
         rng = np.random.default_rng(draw)
         chosen = [options[k].pose for k in rng.choice(len(options), count, replace=False)]
-        stds.append(state_of(recorded(setting, chosen, rng), setting, wanted).std()[LensParameter.F])
+        stds.append(solve_state(recorded(setting, chosen, rng), setting, wanted).std()[LensParameter.F])
     # Better than the typical draw, and than nearly every one.
     assert wished.std()[LensParameter.F] < 0.8 * np.median(stds)
     assert np.mean(np.array(stds) > wished.std()[LensParameter.F]) >= 10 / 12
@@ -258,7 +258,7 @@ def test_advised_poses_beat_as_many_random_ones(setting):
 
 def test_what_is_expected_of_an_image_comes_true(setting):
     """The standard deviations expected from the information are those of the solution; the description adds little."""
-    state = led(setting, Wanted(focal_std_px=1e-6, centre_std_px=1e-6), np.random.default_rng(5), most=6)
+    state = led(setting, CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6), np.random.default_rng(5), most=6)
     expected = state.expected_std()
     for key, std in state.std().items():
         # The solution's scatter has some 1000 degrees of freedom, the start of the lens matters at the percent level.
@@ -266,17 +266,17 @@ def test_what_is_expected_of_an_image_comes_true(setting):
 
 
 def test_an_image_seen_again_gains_little(setting):
-    state = led(setting, Wanted(), np.random.default_rng(3), most=1)
+    state = led(setting, CompletionLimits(), np.random.default_rng(3), most=1)
     wish = best_pose(state)
     again = seen(setting, state.poses[-1], np.random.default_rng(1))
     other = seen(setting, wish.candidate.pose, np.random.default_rng(1))
-    assert gain_of(state, other, wish.candidate.pose) == pytest.approx(wish.gain, rel=0.2)
+    assert compute_gain(state, other, wish.candidate.pose) == pytest.approx(wish.gain, rel=0.2)
     # The same points seen twice reduce the scatter by the square root of two; new points add other information.
-    assert gain_of(state, again, state.poses[-1]) < 0.4 * wish.gain
+    assert compute_gain(state, again, state.poses[-1]) < 0.4 * wish.gain
 
 
 def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
-    state = led(setting, Wanted(), np.random.default_rng(3), most=1)
+    state = led(setting, CompletionLimits(), np.random.default_rng(3), most=1)
     count = len(candidates(setting, state.camera))
     first, second, last, again = (best_pose(state, skipped=skipped) for skipped in (0, 1, count - 1, count))
     assert first.gain >= second.gain >= last.gain and first.gain > last.gain
@@ -286,7 +286,9 @@ def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
 
 
 def test_pose_advice_is_in_plain_words(setting):
-    state = state_of(recorded(setting, [target_pose(middle_mm=(-60, -40, 330.0))], np.random.default_rng(0)), setting)
+    state = solve_state(
+        recorded(setting, [target_pose(middle_mm=(-60, -40, 330.0))], np.random.default_rng(0)), setting
+    )
     wish = best_pose(state)
     far = replace(wish, distance_mm=450.0, place=(0.8, 0.8))
     far.candidate.pose[:3, :3] = target_pose(tilt_deg=(25, 0))[:3, :3]
@@ -300,31 +302,31 @@ def test_pose_advice_is_in_plain_words(setting):
 
 
 def test_what_is_missing_is_said(setting):
-    assert any("0 images, at least 8" in line for line in missing(state_of([], setting)))
+    assert any("0 images, at least 8" in line for line in describe_missing(solve_state([], setting)))
     square = [target_pose(middle_mm=(x, 0.0, z)) for x, z in ((-20, 300), (0, 330), (20, 360))]
-    said = " ".join(missing(state_of(recorded(setting, square, np.random.default_rng(0)), setting)))
+    said = " ".join(describe_missing(solve_state(recorded(setting, square, np.random.default_rng(0)), setting)))
     assert "3 images, at least 8" in said and "% of the image is covered" in said
     assert "right side, left side, lower side, upper side was never farther by 12 deg" in said
 
 
 def test_a_sheet_without_stripes_is_missing(setting):
-    state = led(setting, Wanted(), np.random.default_rng(3), most=5)
+    state = led(setting, CompletionLimits(), np.random.default_rng(3), most=5)
     assert state.solution is not None
-    assert "the laser line is on the target in 0 of 5 images" in missing_sheet(state)[0]
+    assert "the laser line is on the target in 0 of 5 images" in describe_missing_sheet(state)[0]
 
 
 def test_an_image_that_contradicts_the_others_is_refused_with_its_residual(setting):
-    state = led(setting, Wanted(), np.random.default_rng(3), most=6)
+    state = led(setting, CompletionLimits(), np.random.default_rng(3), most=6)
     rng = np.random.default_rng(2)
     wish = best_pose(state)
     right = RecordedPose(seen(setting, wish.candidate.pose, rng), NO_STRIPE, 9.0)
-    assert judge_residual(state.solution, state_of([*state.recorded, right], setting).solution) == ()
+    assert judge_residual(state.solution, solve_state([*state.recorded, right], setting).solution) == ()
     # A plate that is bent by 1 mm over its width.
     points = BOARD.points_mm
     bent = points - np.column_stack([np.zeros((len(points), 2)), ((points[:, 0] - 60) / 60) ** 2])
     pixels = lens_of(setting.sensor).pixels(bent @ wish.candidate.pose[:3, :3].T + wish.candidate.pose[:3, 3])
     wrong = RecordedPose(replace(right.view, pixels=pixels), NO_STRIPE, 9.0)
-    reasons = judge_residual(state.solution, state_of([*state.recorded, wrong], setting).solution)
+    reasons = judge_residual(state.solution, solve_state([*state.recorded, wrong], setting).solution)
     assert reasons and reasons[0].startswith("contradicts the others: with it the residual is ")
 
 
@@ -336,7 +338,7 @@ def test_in_a_medium_the_camera_seems_longer(thesis):
     points = BOARD.points_mm
     pixels = cv2.projectPoints(points, cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3], air.matrix(), None)[0][:, 0]
     view = TargetView(pixels, points, np.zeros((len(points), 2), int), {})
-    np.testing.assert_allclose(pose_of(view, air), pose, atol=1e-4)
+    np.testing.assert_allclose(estimate_pose(view, air), pose, atol=1e-4)
 
 
 def test_limits_can_be_chosen(small):
@@ -360,7 +362,7 @@ def step_image(sensor: Sensor, profile_mm: np.ndarray, *, gain: float = 1.0) -> 
 
 def test_the_step_standard_is_judged(thesis):
     calibration = nominal_calibration(thesis).model_copy(update={"window": None})
-    window = WindowModel.described(thesis.camera.window, thesis.laser.wavelength_nm)
+    window = WindowModel.from_description(thesis.camera.window, thesis.laser.wavelength_nm)
 
     def judge(image):
         standard = StepStandard(height_mm=STEP_MM)
@@ -381,8 +383,8 @@ def test_the_step_standard_is_wanted_at_three_depths(thesis):
     # The measuring volume reaches from 200 to 420 mm; a seventh of it is 31 mm.
     assert next_depth_mm([330.0], thesis) == pytest.approx(200 + 220 / 6)
     assert next_depth_mm([282.0], thesis) == pytest.approx(200 + 220 * 5 / 6)
-    assert not is_new(300.0, [282.0], thesis) and is_new(314.0, [282.0], thesis)
-    assert apart_mm([282.0, 282.5, 319.0, 381.0], thesis) == [282.0, 319.0, 381.0]
+    assert not is_separate_depth(300.0, [282.0], thesis) and is_separate_depth(314.0, [282.0], thesis)
+    assert select_separate_depths([282.0, 282.5, 319.0, 381.0], thesis) == [282.0, 319.0, 381.0]
     assert next_depth_mm([282.0, 282.5, 319.0, 381.0], thesis) is None
 
 

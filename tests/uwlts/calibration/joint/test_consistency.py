@@ -15,7 +15,7 @@ from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import CameraModel
-from uwlts.model.parameter_keys import LensParameter, WindowParameter, parameter_of
+from uwlts.model.parameter_keys import LensParameter, WindowParameter, parse_parameter
 from uwlts.model.sensor import Medium, Uncertainty
 
 pytestmark = pytest.mark.slow
@@ -59,14 +59,14 @@ def refusal(evidence, *, strict=False):
 
 def lens_pulls(result, sensor):
     """Errors of the lens's parameters over their stated uncertainties."""
-    known = CameraModel.described(sensor.camera).parameters()
+    known = CameraModel.from_description(sensor.camera).parameters()
     found = zip(result.estimate.parameters.keys, result.estimate.values, result.estimate.std().values(), strict=True)
     return np.array([abs(value - known[k.text]) / std for k, value, std in found if isinstance(k, LensParameter)])
 
 
 def pulls(result):
     """Errors of lens and window distance over their stated uncertainties."""
-    lens = CameraModel.described(BUILT.camera).parameters()
+    lens = CameraModel.from_description(BUILT.camera).parameters()
     names = (LensParameter.F, LensParameter.CX, LensParameter.CY, LensParameter.K1, LensParameter.K2)
     true = {name: lens[name.text] for name in names} | {WindowParameter.DISTANCE: BUILT.camera.window.distance_mm}
     found = dict(zip(result.estimate.parameters.keys, result.estimate.values.tolist(), strict=True))
@@ -112,10 +112,10 @@ def test_the_image_that_does_not_fit_is_left_out(views, thesis):
 
 def test_images_are_left_out_as_long_as_enough_agree(views, thesis):
     evidence = gathered(thesis, views)
-    assert evidence.without({"air.h5, frame 0", "air.h5, frame 7"}).series[0].found.frames == [
+    assert evidence.remove_images({"air.h5, frame 0", "air.h5, frame 7"}).series[0].found.frames == [
         (0, n) for n in range(1, 7)
     ]
-    assert evidence.without({f"air.h5, frame {n}" for n in range(3)}) is None
+    assert evidence.remove_images({f"air.h5, frame {n}" for n in range(3)}) is None
 
 
 def curled(strength_px):
@@ -260,4 +260,4 @@ def test_a_lens_that_looks_straight_into_water_is_calibrated_for_it(thesis):
 )
 def test_angles_are_reported_in_degrees(name, value, words):
     std = np.tan(np.radians(0.5)) if "slope" in name else np.radians(0.5)
-    assert format_deviation(parameter_of(name), value, 0.0, std, sigmas=6.0).startswith(words)
+    assert format_deviation(parse_parameter(name), value, 0.0, std, sigmas=6.0).startswith(words)

@@ -31,7 +31,9 @@ def pixels(problem):
 
 def seen(problem, pixels) -> SeenSheet:
     evidence = problem.evidence[0]
-    return SeenSheet.of(problem.parameters, problem.global_values, evidence.view, pixels, across=evidence.across)
+    return SeenSheet.from_parameters(
+        problem.parameters, problem.global_values, evidence.view, pixels, across=evidence.across
+    )
 
 
 def test_points_by_a_table_are_those_of_each_pixel(problem, pixels):

@@ -9,14 +9,14 @@ from tests.uwlts.calibration_views import WATER, built_sensor
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_points, step_views, target_series
 from tests.uwlts.simulated_campaign import ModelErrors, drawn_reality, evidence
 from uwlts.calibration.joint.initial import estimate_series_start
-from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.observability import compute_mesh_lengths, list_regions, read_region_estimate
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import FanModel, SheetModel
-from uwlts.model.parameter_keys import StageParameter, StepHeight, TargetParameter, WindowParameter, parameter_of
+from uwlts.model.parameter_keys import StageParameter, StepHeight, TargetParameter, WindowParameter, parse_parameter
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.sheet import sheet_surface
@@ -128,7 +128,7 @@ def at_truth(view):
         "target_stripe": 0.04,
         "height of the 23 mm step": 23.0,
     }
-    priors = {parameter_of(text): Prior(value, 1.0) for text, value in known.items()}
+    priors = {parse_parameter(text): Prior(value, 1.0) for text, value in known.items()}
     parameters = Parameters(start.intrinsics, sheet, window, ("water",), priors)
     return parameters, parameters.start(start.intrinsics.from_model(nominal.camera)), start
 
@@ -207,7 +207,7 @@ def test_target_images_in_water_alone_give_everything(in_water, thesis):
     assert result.estimate.noise["stripe on the target"].sigma_px == pytest.approx(0.1, rel=0.15)
     calibration = result.calibration
     assert calibration.media[0].index == pytest.approx(WATER, abs=5e-4)
-    assert calibration.index_of(calibration.media[0].medium) == calibration.media[0].index
+    assert calibration.medium_index(calibration.media[0].medium) == calibration.media[0].index
 
 
 def test_air_and_water_together_are_better_than_either(in_air, in_water, thesis):
@@ -326,7 +326,7 @@ def test_a_target_of_another_form_is_noticed_and_taken_for_uncertain(thesis, err
     place = list(calibration.joint.parameters).index(key)
     true = {TargetParameter.SADDLE: real.target_saddle_mm, TargetParameter.STRETCH_X: real.stretch[0]}[key]
     assert abs(calibration.joint.values[place] - true) < 4 * calibration.joint.std[place]
-    region = regions(calibration)[0]
-    lengths = lengths_over(estimate_in(calibration, region), region)
+    region = list_regions(calibration)[0]
+    lengths = compute_mesh_lengths(read_region_estimate(calibration, region), region)
     relative = float(np.median(lengths.std_mm(calibration.joint.covariance_matrix()) / lengths.length_mm))
     assert relative > 1e-4 if key is TargetParameter.STRETCH_X else relative < 1e-4

@@ -10,18 +10,18 @@ from tests.uwlts.joint_views import TARGET, Noise, gathered, lit_points, seen, s
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
 from uwlts.calibration.joint.gathering import Series
-from uwlts.calibration.joint.next_shot import advice_lines, next_shots
+from uwlts.calibration.joint.next_shot import advice_lines, rank_next_shots
 from uwlts.calibration.joint.observability import (
     Lengths,
-    estimate_in,
+    compute_mesh_lengths,
+    find_weaknesses,
     format_weaknesses,
-    lengths_over,
-    regions,
-    weaknesses,
+    list_regions,
+    read_region_estimate,
 )
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
-from uwlts.model.parameter_keys import SheetParameter, StepHeight, WindowParameter, parameter_of
+from uwlts.model.parameter_keys import SheetParameter, StepHeight, WindowParameter, parse_parameter
 from uwlts.targets import parse_target
 
 BUILT = built_sensor()
@@ -29,7 +29,7 @@ OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
 
 
 def keys(*texts):
-    return [parameter_of(text) for text in texts]
+    return [parse_parameter(text) for text in texts]
 
 
 def noise(seed):
@@ -66,17 +66,17 @@ def lengths(by_parameters):
 
 
 def of_calibration(calibration):
-    region = regions(calibration)[0]
-    known = estimate_in(calibration, region)
-    over = lengths_over(known, region)
-    return known, over, weaknesses(over, known.parameters.keys, known.covariance)
+    region = list_regions(calibration)[0]
+    known = read_region_estimate(calibration, region)
+    over = compute_mesh_lengths(known, region)
+    return known, over, find_weaknesses(over, known.parameters.keys, known.covariance)
 
 
 def test_two_that_cannot_be_distinguished_are_named_together():
     """Each alone costs 10 µm, they trade places with a correlation of 0.99, and the third is known well."""
     names = keys("window_distance", "index of water", "cx")
     covariance = np.array([[1.0, 0.99, 0.0], [0.99, 1.0, 0.0], [0.0, 0.0, 0.01]])
-    found = weaknesses(lengths([[0.01, 0.01, 0.001], [0.005, 0.005, 0.0]]), names, covariance)
+    found = find_weaknesses(lengths([[0.01, 0.01, 0.001], [0.005, 0.005, 0.0]]), names, covariance)
     assert len(found) == 1
     assert set(found[0].parameters) == set(names[:2])
     # The standard uncertainty of their sum: 0.01 sqrt(2 + 2 * 0.99).
@@ -91,19 +91,19 @@ def test_two_that_cannot_be_distinguished_are_named_together():
 def test_what_cancels_in_every_length_is_not_named():
     """Two parameters known to 1 each trade places without any length changing."""
     covariance = np.array([[1.0, -0.9999999, 0.0], [-0.9999999, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    found = weaknesses(lengths([[0.01, 0.01, 0.002]]), keys("window_distance", "f", "glass_index"), covariance)
+    found = find_weaknesses(lengths([[0.01, 0.01, 0.002]]), keys("window_distance", "f", "glass_index"), covariance)
     assert [each.parameters for each in found] == [(WindowParameter.GLASS_INDEX,)]
     assert "index of the window's glass is not known well enough; this adds 0.002 mm" in found[0].words()
 
 
 def test_independent_ones_are_not_called_confused():
-    found = weaknesses(lengths([[0.01, 0.01]]), keys("window_distance", "glass_index"), np.eye(2))
+    found = find_weaknesses(lengths([[0.01, 0.01]]), keys("window_distance", "glass_index"), np.eye(2))
     assert not found[0].confused
     assert "are not known well enough; together they add 0.014 mm" in found[0].words()
 
 
 def test_less_than_a_micrometre_is_said_to_be_nothing():
-    assert weaknesses(lengths([[0.0009, 0.0]]), keys("window_distance", "f"), np.eye(2)) == []
+    assert find_weaknesses(lengths([[0.0009, 0.0]]), keys("window_distance", "f"), np.eye(2)) == []
     assert format_weaknesses([])[0].startswith("no weakly determined parameter")
 
 
@@ -111,7 +111,7 @@ def test_a_height_that_is_the_cause_is_named_though_it_moves_no_point():
     """Knowing the height would leave 0.2 of the window distance's standard uncertainty."""
     covariance = np.array([[1.0, 0.98], [0.98, 1.0]])
     names = keys("window_distance", "height of the 23 mm step")
-    found = weaknesses(lengths([[0.01, 0.0]]), names, covariance)
+    found = find_weaknesses(lengths([[0.01, 0.0]]), names, covariance)
     assert found[0].parameters == tuple(names)
     assert found[0].confused
 
@@ -121,14 +121,14 @@ def test_what_changes_lengths_most_is_named_where_knowing_one_would_not_help():
     covariance = np.eye(6)
     covariance[:5, 5] = covariance[5, :5] = 0.5 / np.sqrt(5)
     names = keys("window_distance", "glass_index", "f", "cx", "cy", "height of the 23 mm step")
-    (found,) = weaknesses(lengths([[0.0100, 0.0098, 0.0096, 0.0094, 0.0092, 0.0]]), names, covariance)
+    (found,) = find_weaknesses(lengths([[0.0100, 0.0098, 0.0096, 0.0094, 0.0092, 0.0]]), names, covariance)
     assert found.parameters == tuple(names[:3])
 
 
 @pytest.mark.parametrize(("smaller_mm", "count"), [(0.006, 1), (0.007, 2)])
 def test_a_direction_of_less_than_a_tenth_of_the_variance_is_not_named(smaller_mm, count):
     """Beside 0.02 mm, 0.006 mm are 8 % of the sum of squares, and 0.007 mm are 11 %."""
-    found = weaknesses(lengths([[0.02, 0.0], [0.0, smaller_mm]]), keys("window_distance", "f"), np.eye(2))
+    found = find_weaknesses(lengths([[0.02, 0.0], [0.0, smaller_mm]]), keys("window_distance", "f"), np.eye(2))
     assert [each.cost_mm for each in found] == pytest.approx([0.02, smaller_mm][:count])
 
 
@@ -156,7 +156,7 @@ def test_steps_alone_leave_the_window_open(thesis, height_mm, pair):
     before = np.mean(over.std_mm(known.covariance) ** 2)
     for key in pair:
         assert np.mean(over.std_mm(without(known, key)) ** 2) < 0.65 * before
-    assert any("target in air without the window" in outlook.words for outlook in next_shots(calibration))
+    assert any("target in air without the window" in outlook.words for outlook in rank_next_shots(calibration))
 
 
 def test_the_cost_is_part_of_the_lengths_uncertainty(from_water):
@@ -173,7 +173,7 @@ def test_shots_are_where_their_words_say(from_water):
     """Depths along the laser's axis, in the order of their words; the edge said to be nearer is so, by 20 deg."""
     frame, corner = from_water.object_transform(), np.abs(TARGET.extent_mm).max()
     square, tilted, depths = {}, [], {}
-    for shot in next_shots(from_water):
+    for shot in rank_next_shots(from_water):
         if shot.pose is not None:
             words = shot.words.split(", ")
             where, depth = words[1].split(" (Z ")
@@ -205,8 +205,8 @@ def test_lengths_do_not_change_by_how_the_frame_turns(from_water):
     outline = np.array(from_water.joint.covered[0].outline_mm) @ turn[1:, 1:]
     frame[:3, :3] = frame[:3, :3] @ turn
     moved = from_water.model_copy(update={"camera_from_object": tuple(map(tuple, frame.tolist()))})
-    region = replace(regions(from_water)[0], outline_mm=outline)
-    there = lengths_over(replace(known, calibration=moved), region).std_mm(known.covariance)
+    region = replace(list_regions(from_water)[0], outline_mm=outline)
+    there = compute_mesh_lengths(replace(known, calibration=moved), region).std_mm(known.covariance)
     # Meshes of a turned outline differ; the largest length runs between the same corners but for the inset of 2 %.
     assert there.max() == pytest.approx(over.std_mm(known.covariance).max(), rel=0.06)
 
@@ -236,7 +236,7 @@ def shot(sensor, pose, view, spoilt):
 @pytest.mark.slow
 def test_the_advised_shot_does_what_was_predicted(from_water, in_water, thesis):
     """Predicted uncertainty within 20 %, as noise, and so the weights, is estimated again from all residuals."""
-    outlooks = next_shots(from_water)
+    outlooks = rank_next_shots(from_water)
     best = outlooks[0]
     assert best.pose is not None
     assert best.after_mm < 0.9 * best.before_mm
@@ -257,5 +257,5 @@ def test_a_single_line_covers_no_area(from_water):
     joint = from_water.joint
     line = joint.covered[0].model_copy(update={"outline_mm": ((-50.0, 10.0), (50.0, 10.0))})
     calibration = from_water.model_copy(update={"joint": joint.model_copy(update={"covered": (line,)})})
-    assert next_shots(calibration) == []
+    assert rank_next_shots(calibration) == []
     assert "cover no area" in advice_lines(calibration)[0]

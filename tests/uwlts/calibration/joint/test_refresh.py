@@ -14,21 +14,21 @@ from tests.uwlts.calibration_views import STEP_MM, built_sensor
 from tests.uwlts.joint_views import Noise, gathered, lit_points, seen, target_series
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.joint.estimate import estimate
-from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.observability import compute_mesh_lengths, list_regions, read_region_estimate
 from uwlts.calibration.joint.parameters import EarlierEstimate, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.refresh import refresh, solve_refreshed
 from uwlts.calibration.joint.residuals import StepProfileEvidence
-from uwlts.calibration.joint.stored_estimate import found_estimate, stored_estimate
+from uwlts.calibration.joint.stored_estimate import read_original_estimate, read_stored_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, DescriptionError, RangeError
 from uwlts.model.artefacts import StepStandard
-from uwlts.model.parameter_keys import MediumIndex, SheetParameter, StepHeight, parameter_of
+from uwlts.model.parameter_keys import MediumIndex, SheetParameter, StepHeight, parse_parameter
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
-from uwlts.report.certificate import certificate_of
+from uwlts.report.certificate import make_certificate
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture
 
@@ -94,7 +94,7 @@ def length_error(calibration):
     lit = lit_points(BUILT, normal=frame[:3, 2], point=frame[:3, 3] + 80.0 * frame[:3, 2], index=INDEX)[[20, -21]]
     pixels = seen(BUILT, lit, index=INDEX, window=True)
     found = reconstruct_pixels(
-        calibration, pixels, medium_index=calibration.index_of(WARM), stage_mm=0.0, stage_direction=np.eye(3)[0]
+        calibration, pixels, medium_index=calibration.medium_index(WARM), stage_mm=0.0, stage_direction=np.eye(3)[0]
     ).points_mm
     return abs(np.linalg.norm(found[1] - found[0]) - np.linalg.norm(lit[1] - lit[0]))
 
@@ -113,7 +113,7 @@ def test_one_step_gives_the_index_of_colder_water(earlier, thesis):
     assert result.warnings == []
     calibration = result.calibration
     assert [known.medium for known in calibration.media] == [WARM, WARM]
-    assert calibration.index_of(WARM) == change.index
+    assert calibration.medium_index(WARM) == change.index
     assert calibration.media[0].index == pytest.approx(earlier.media[0].index, abs=1e-4)
     assert change.name == "water 2"
 
@@ -181,7 +181,7 @@ def test_a_covariance_that_is_none_is_refused(covariance):
 
 def test_evidence_without_information_leaves_everything_as_it_was(earlier, thesis):
     """Two pixels are a line, and a third a height that nobody knows."""
-    known = found_estimate(earlier, WARM)
+    known = read_original_estimate(earlier, WARM)
     frame = camera_from_object(BUILT)
     priors = known.parameters.priors | {StepHeight(20.0): Prior(20.0, 1e4)}
     parameters = replace(known.parameters, priors=priors, earlier=EarlierEstimate(known.values, known.covariance))
@@ -221,9 +221,12 @@ def test_what_was_held_is_as_the_calibration_says(earlier):
             "sheet": sheet.model_copy(update={"fan": turned}),
         }
     )
-    known, pixels = found_estimate(calibration, WARM), np.array([[150.0, 480.0], [640.0, 520.0], [1100.0, 450.0]])
+    known, pixels = (
+        read_original_estimate(calibration, WARM),
+        np.array([[150.0, 480.0], [640.0, 520.0], [1100.0, 450.0]]),
+    )
     found = known.parameters.stripe_points(known.values, known.view, pixels, across=0).points
-    index, along = calibration.index_of(WARM), np.eye(3)[0]
+    index, along = calibration.medium_index(WARM), np.eye(3)[0]
     frame = calibration.object_transform()
 
     def expected(by):
@@ -260,15 +263,15 @@ def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
     assert len(joint.images) == len(before.images) + 1
     assert calibration.provenance["refreshed"][0]["date"] == earlier.provenance.get("date")
     # The new water is that of use, over the same volume, and its index is the new one.
-    region = regions(calibration)[0]
+    region = list_regions(calibration)[0]
     assert region.name == "water 2"
     assert region.has_area()
-    known = estimate_in(calibration, region)
+    known = read_region_estimate(calibration, region)
     assert known.parameters.medium_index(known.values, known.view) == calibration.media[1].index
-    assert stored_estimate(calibration, thesis, WARM).view == ViewMedium(True, 1)
-    std = lengths_over(known, region).std_mm(known.covariance)
+    assert read_stored_estimate(calibration, thesis, WARM).view == ViewMedium(True, 1)
+    std = compute_mesh_lengths(known, region).std_mm(known.covariance)
     assert std.max() == pytest.approx(result.changes[0].length.after_mm, rel=0.1)
-    assert certificate_of(calibration, path, issued="2026-01-01").validity[0].name == "water 2"
+    assert make_certificate(calibration, path, issued="2026-01-01").validity[0].name == "water 2"
     again = refreshed(calibration, steps(thesis, seed=2), index_std=POORLY_KNOWN)
     assert again.changes[0].name == "water 3"
     assert len(again.calibration.provenance["refreshed"]) == 2
@@ -287,7 +290,7 @@ def moved_since(calibration, name, by):
     """Return a calibration of the sensor before a parameter changed."""
     joint = calibration.joint
     values = list(joint.values)
-    values[joint.parameters.index(parameter_of(name))] += by
+    values[joint.parameters.index(parse_parameter(name))] += by
     return calibration.model_copy(update={"joint": joint.model_copy(update={"values": tuple(values)})})
 
 

@@ -20,7 +20,7 @@ from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Sp
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
-from uwlts.model.parameter_keys import parameter_of
+from uwlts.model.parameter_keys import parse_parameter
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
@@ -68,7 +68,9 @@ def parameters(**std):
         "scan_slope_1": 0.0,
         "scan_slope_2": 0.0,
     }
-    priors = {parameter_of(text): Prior(value, std.get(text.replace(" ", "_"), 1e-9)) for text, value in known.items()}
+    priors = {
+        parse_parameter(text): Prior(value, std.get(text.replace(" ", "_"), 1e-9)) for text, value in known.items()
+    }
     camera = SENSOR.camera
     intrinsics = Intrinsics(CameraOptions(), width_px=camera.width_px, height_px=camera.height_px)
     found = Parameters(intrinsics, sheet, window, ("water",), priors)
@@ -179,7 +181,7 @@ def asked(found, **std):
     )
     true = dict(zip(model.keys, global_values, strict=True)) | dict(zip(SLOPES, SLOPE, strict=True))
     values = dict(zip(model.keys, result.values, strict=True))
-    keys = {text: parameter_of(text) for text in (name.replace("_of_", " of ") for name in std)}
+    keys = {text: parse_parameter(text) for text in (name.replace("_of_", " of ") for name in std)}
     errors = {text: values[key] - true[key] for text, key in keys.items()}
     return errors, {text: result.std()[key] for text, key in keys.items()}, result
 
@@ -273,7 +275,7 @@ def test_all_kinds_together_with_a_target_in_water(thesis):
     values = dict(zip(found.parameters.keys, found.values, strict=True))
     camera = SENSOR.camera
     true = {"f": camera.focal_length_px(), "window_distance": camera.window.distance_mm, "index of water": WATER}
-    assert max(abs(values[key] - true[key.text]) / std[key] for key in map(parameter_of, true)) < 4.5
+    assert max(abs(values[key] - true[key.text]) / std[key] for key in map(parse_parameter, true)) < 4.5
     for kind in (Spheres.kind, Plane.kind, Cylinder.kind):
         assert found.noise[kind].sigma_px == pytest.approx(0.1, rel=0.1)
     frame = result.calibration.object_transform()
@@ -381,11 +383,11 @@ def test_what_only_a_known_size_contradicts_it_is_the_cause_of(thesis, target_in
 
 def test_images_of_a_scan_are_left_out_as_long_as_enough_agree(thesis, target_in_water):
     seen = replace(gathered(thesis, [target_in_water]), scans=[scanned("spheres")])
-    assert seen.without({"spheres.h5, at 0 mm"}).scans[0].image_names() == seen.scans[0].image_names()
-    (kept,) = seen.without({"spheres.h5, at 0 mm", "spheres.h5, at -18 mm"}).scans
+    assert seen.remove_images({"spheres.h5, at 0 mm"}).scans[0].image_names() == seen.scans[0].image_names()
+    (kept,) = seen.remove_images({"spheres.h5, at 0 mm", "spheres.h5, at -18 mm"}).scans
     assert np.unique(kept.frame).tolist() == sorted({*seen.scans[0].frame.tolist()} - {0, 6})
     assert len(kept.line) == len(kept.slopes) == np.isin(seen.scans[0].frame, kept.frame).sum()
-    assert seen.without({f"spheres.h5, at {position:g} mm" for position in STAGE[:4]}) is None
+    assert seen.remove_images({f"spheres.h5, at {position:g} mm" for position in STAGE[:4]}) is None
 
 
 def test_scans_that_do_not_show_what_they_say_are_left_out():

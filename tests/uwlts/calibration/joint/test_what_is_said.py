@@ -19,7 +19,7 @@ from uwlts.calibration.joint.consistency import (
 )
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Noise
 from uwlts.calibration.joint.initial import estimate_series_start
-from uwlts.calibration.joint.next_shot import Outlook
+from uwlts.calibration.joint.next_shot import ShotForecast
 from uwlts.calibration.joint.parameters import DescribedSheet, EarlierEstimate, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.refresh import LengthChange, WaterChange
 from uwlts.calibration.joint.residuals import STRIPE, TARGET, Residuals
@@ -257,7 +257,7 @@ def test_a_refresh_tells_expanded_uncertainties_before_and_after(longer_mm, word
 
 
 def test_a_shot_is_advised_where_it_lowers_the_uncertainty_by_a_twentieth():
-    shot = Outlook("a shot", 0.1, 0.0949, np.eye(1), VIEW)
+    shot = ShotForecast("a shot", 0.1, 0.0949, np.eye(1), VIEW)
     assert shot.advice() == (
         "a shot would reduce the standard uncertainty of lengths over the volume from 0.1000 to 0.0949 mm"
     )

@@ -10,8 +10,8 @@ from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.procedure import joint_problem, solve_jointly
 from uwlts.calibration.joint.residuals import STRIPE, TARGET
-from uwlts.calibration.joint.stored_estimate import found_estimate
-from uwlts.calibration.model_comparison.comparison import Comparison, choice_of, choose, sum_errors
+from uwlts.calibration.joint.stored_estimate import read_original_estimate
+from uwlts.calibration.model_comparison.comparison import Comparison, build_choice, choose, sum_errors
 from uwlts.calibration.model_comparison.held_out import (
     INSIDE,
     OUTSIDE,
@@ -25,7 +25,14 @@ from uwlts.calibration.model_comparison.held_out import (
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.files.json_files import json_text
-from uwlts.report.model_comparison import ModelComparisonContent, adds, content_of, lines_of, models_page, verdicts
+from uwlts.report.model_comparison import (
+    ModelComparisonContent,
+    compute_additional_error,
+    format_lines,
+    make_content,
+    models_page,
+    verdicts,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -67,7 +74,7 @@ def tilted_choice(thesis):
     problem = problem_of(thesis, sensor_with(window_tilt_deg=0.2, laser_tilt_deg=0.0), bow=0.0, seed=0)
     ways = split_images(problem)
     models = (Candidate(), Candidate(window_tilt=False), Candidate(bow=False))
-    return choice_of(
+    return build_choice(
         {model: {where: predict(problem, model, held) for where, held in ways.items()} for model in models},
         ways,
         frozenset({1}),
@@ -93,8 +100,8 @@ def test_a_tilted_window_is_found_to_be_needed(tilted_choice):
     determine them to a quarter or a third.
     """
     assert tilted_choice.simplest().window_tilt
-    assert Candidate(window_tilt=False) not in tilted_choice.as_good()
-    cost, std = adds(tilted_choice, Candidate(window_tilt=False), Candidate(), OUTSIDE)
+    assert Candidate(window_tilt=False) not in tilted_choice.list_equivalent()
+    cost, std = compute_additional_error(tilted_choice, Candidate(window_tilt=False), Candidate(), OUTSIDE)
     assert 0.001 < cost < 0.01
     assert std < cost / 3
     assert any(line.startswith("the tilt of the window is needed: without it") for line in verdicts(tilted_choice))
@@ -177,7 +184,7 @@ def test_what_a_model_adds_is_distinguished_from_noise_and_outliers_do_not_count
     found = sum_errors([made(np.zeros(12)), made(more), made(np.full(12, 1e-4))])
     assert found.score(0).px["stripes"] == pytest.approx(0.1, rel=0.03)
     assert found.score(0).all_mm == pytest.approx(0.02, rel=0.03)
-    difference, std = found.beyond(1, 0)
+    difference, std = found.compute_excess(1, 0)
     # Of 12,000 values the cross term 2 * 0.1 * 0.05 scatters by 1 / sqrt(12000) of itself.
     assert difference == pytest.approx((0.2 * 0.05) ** 2, abs=4 * 0.2**2 * 0.01 / np.sqrt(12000))
     assert 0 < std < 0.2 * difference
@@ -196,7 +203,7 @@ def test_a_parameter_without_uncertainty_is_held_and_read_back(thesis):
     parameters = result.estimate.parameters
     assert not {"window_slope_x", "window_slope_y", "sheet_bow"} & {key.text for key in parameters.keys}
     assert result.calibration.window.normal == pytest.approx(tuple(window.normal()), abs=1e-12)
-    stored = found_estimate(result.calibration, result.calibration.media[0].medium)
+    stored = read_original_estimate(result.calibration, result.calibration.media[0].medium)
     assert stored.parameters.keys == parameters.keys
     assert stored.parameters.window_model(stored.values) == result.calibration.window
     assert stored.parameters.sheet_model(stored.values) == parameters.sheet_model(result.estimate.values)
@@ -224,14 +231,14 @@ def test_the_page_and_the_lines_tell_every_model(plain_choice):
     comparison = Comparison(
         "thesis <as built>", ["target.h5"], plain_choice, None, "no polynomials here", ["a warning"]
     )
-    content = content_of(comparison)
+    content = make_content(comparison)
     text = json_text(content, indent=2, ascii=False)
     assert ModelComparisonContent.model_validate_json(text) == content
     usual = json.loads(text)["models"][0]
     assert list(usual) == ["model", "parameters", "inside", "outside", "as_good"]
-    page, lines = models_page(content), "\n".join(lines_of(content))
+    page, lines = models_page(content), "\n".join(format_lines(content))
     assert "<svg" in page and "thesis &lt;as built&gt;" in page
     for judged in plain_choice.judged:
-        assert judged.candidate.words() in page and judged.candidate.words() in lines
+        assert judged.candidate.describe() in page and judged.candidate.describe() in lines
     for verdict in content.verdicts:
         assert verdict in lines and verdict[1:].replace("'", "&#39;") in page

@@ -198,7 +198,7 @@ def test_a_target_s_pose_follows_the_sensor(thesis, capture_path):
             }
         )
         return estimate_board_pose(
-            "", image, target, changed, known, changed.window, changed.index_of(MEDIUM), np.eye(4)
+            "", image, target, changed, known, changed.window, changed.medium_index(MEDIUM), np.eye(4)
         )
 
     own = posed(known.values)

@@ -17,7 +17,7 @@ from uwlts.calibration.joint.stored_estimate import covariance_root
 from uwlts.calibration.mount.board import BoardEvidence
 from uwlts.calibration.mount.estimate import RestrictedEstimate, solve_step
 from uwlts.model.any_calibration import calibration_digest
-from uwlts.reconstruction.moving import Ride, with_platform
+from uwlts.reconstruction.moving import PlatformPoses, add_platform_uncertainty
 from uwlts.reconstruction.point_uncertainty import point_uncertainty
 from uwlts.storage.capture import CaptureHeader, FrameTable
 
@@ -44,7 +44,7 @@ def test_a_mount_follows_the_sensor_as_its_derivatives_say(known, captured, moun
         found = []
         for sign in (1, -1):
             other = replace(known, values=known.values + sign * part)
-            profiles = [other.points_by(*stripes.T)[0] for stripes in captured.stripes]
+            profiles = [other.triangulate(*stripes.T)[0] for stripes in captured.stripes]
             found.append(uwlts.calibrate_mount(replace(captured, profiles=profiles), radius_mm=RADIUS_MM).transform())
         moved, std = half_way(*found), mount.std()
         assert np.linalg.norm(moved / std) > 0.3, "a part that matters"
@@ -87,11 +87,11 @@ def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
     poses = np.array([pose, pose])
     table = FrameTable(header, Path("scan"), np.zeros(2), np.ones(2), poses, np.zeros(2))
     noisy = centre + 0.1 * np.random.default_rng(2).standard_normal(len(line))
-    apart, common = mount.apart_from(calibration_digest(known.calibration))
-    assert common is not None and mount.apart_from("another")[1] is None
+    apart, common = mount.independent_covariance(calibration_digest(known.calibration))
+    assert common is not None and mount.independent_covariance("another")[1] is None
 
     def points(values, step):
-        seen, _ = replace(known, values=values).points_by(line, noisy)
+        seen, _ = replace(known, values=values).triangulate(line, noisy)
         turn = Rotation.from_rotvec(step[3:]).as_matrix() @ mount.transform()[:3, :3]
         on_platform = seen @ turn.T + mount.transform()[:3, 3] + step[:3]
         return on_platform @ pose[:3, :3].T + pose[:3, 3]
@@ -105,10 +105,10 @@ def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
     by_patterns = np.sqrt(np.sum(shared.patterns_mm.astype(float) ** 2, axis=0))
     # Second order of the errors, and patterns of 0.05 um that are left out.
     np.testing.assert_allclose(by_patterns, expected, rtol=0.02, atol=2e-4)
-    ride, base = Ride(poses, None, np.zeros(2)), points(known.values, np.zeros(6))
-    together = with_platform(shared, base, frame, ride, mount, mount_covariance=apart).std_mm()
+    ride, base = PlatformPoses(poses, None, np.zeros(2)), points(known.values, np.zeros(6))
+    together = add_platform_uncertainty(shared, base, frame, ride, mount, mount_covariance=apart).std_mm()
     alone = point_uncertainty(table, known.calibration, frame, line, noisy)
-    twice = with_platform(alone, base, frame, ride, mount).std_mm()
+    twice = add_platform_uncertainty(alone, base, frame, ride, mount).std_mm()
     # At the place of the mount's calibration, the mount compensates the change of the calibration: the sphere stays.
     assert np.median(together) < 0.5 * np.median(twice)
 

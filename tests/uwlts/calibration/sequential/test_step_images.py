@@ -20,7 +20,7 @@ from uwlts.optics.nominal import nominal_calibration
 
 SENSOR = built_sensor()
 AIR = nominal_calibration(SENSOR).model_copy(update={"window": None})
-TRUE = WindowModel.described(SENSOR.camera.window, SENSOR.laser.wavelength_nm)
+TRUE = WindowModel.from_description(SENSOR.camera.window, SENSOR.laser.wavelength_nm)
 DESCRIBED = TRUE.model_copy(update={"distance_mm": TRUE.distance_mm + 5.0})
 STANDARD = StepStandard(height_mm=STEP_MM, height_uncertainty_mm=0.002)
 TURN = np.radians(6.0)

@@ -9,8 +9,8 @@ import numpy as np
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.options import Options
-from twin.recording.frame_truth import FrameTruth, no_stripe, true_stripe
-from twin.scene.description import Printed, Scene, altered
+from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth
+from twin.scene.description import PrintedPlate, Scene, replace_values
 from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
 from twin.scene.platforms import Platform
@@ -19,7 +19,7 @@ from twin.sensor.flaws import add_glare, as_built, deliver_image, dirt, laser_sh
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
-from uwlts.model.library import validated
+from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.model.stripe import Coordinates
@@ -44,12 +44,12 @@ def medium_of(sensor: Sensor, scene: Scene) -> Medium:
         return medium
     kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}
     kept = medium.model_dump(include={"kind", "temperature_c", "salinity_g_kg", "index"})
-    return validated(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
+    return validate_description(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
 
 
 def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
     """Return the sensor with its camera window mounted or removed."""
-    return altered(sensor, camera={"window": {"mounted": mounted}})
+    return replace_values(sensor, camera={"window": {"mounted": mounted}})
 
 
 def true_pose(scene: Scene, shot: Shot) -> np.ndarray:
@@ -88,7 +88,7 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
 
 
 @dataclass(frozen=True)
-class Exposed:
+class SimulatedImage:
     """A simulated image, and the mean photo-electrons of its exposure by light path.
 
     ``image`` (H, W) holds grey values. The other arrays (H, W), float32, contain neither speckle nor noise:
@@ -104,16 +104,16 @@ class Exposed:
     exposure_ms: float
     direct: np.ndarray
     scattered_once: np.ndarray
-    longer_ways: np.ndarray
+    indirect: np.ndarray
     particles: np.ndarray
     even: np.ndarray
 
     def total(self) -> np.ndarray:
         """Return the sum of all light paths (H, W)."""
-        return self.direct + self.scattered_once + self.longer_ways + self.particles + self.even
+        return self.direct + self.scattered_once + self.indirect + self.particles + self.even
 
 
-class Studio:
+class SensorSimulator:
     """Simulator of a sensor in a scene; it determines the exposures when it is created.
 
     An automatic exposure follows from the first, middle and last shot of the ``scan``. With "middle", it follows from
@@ -316,7 +316,7 @@ class Studio:
         electrons_per_ms = self._electrons_per_ms(*light, shot)
         return self._expose(electrons_per_ms, index, exposure_ms=self.exposure_ms[shot.light] * shot.exposure)
 
-    def exposed(self, shot: Shot, index: int, *, exposure: float = 1.0) -> Exposed:
+    def expose(self, shot: Shot, index: int, *, exposure: float = 1.0) -> SimulatedImage:
         """Return the image of a shot as `image` does, with its light; ``exposure`` multiplies the exposure time."""
         even, laser = self.light(shot, index)
         exposure_ms = exposure * self.exposure_ms[shot.light] * shot.exposure
@@ -328,13 +328,13 @@ class Studio:
         parts = [shares * self._apply_lens(part) if part.any() else nothing for part in parts]
         parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._apply_lens(even))]
         image = self._expose(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
-        return Exposed(image, exposure_ms, *(np.maximum(part, 0, dtype=np.float32) for part in parts))
+        return SimulatedImage(image, exposure_ms, *(np.maximum(part, 0, dtype=np.float32) for part in parts))
 
     def _expose(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
         noise_seed = [self.options.seed, index]
-        return self.detected(exposure_ms * electrons_per_ms, exposure_ms=exposure_ms, noise_seed=noise_seed)
+        return self.detect(exposure_ms * electrons_per_ms, exposure_ms=exposure_ms, noise_seed=noise_seed)
 
-    def detected(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
+    def detect(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
         """Return grey values (H, W) for mean photo-electrons (H, W), with seeded noise if noise is enabled."""
         rng = np.random.default_rng(noise_seed) if self.options.effects.noise else None
         image = grey_values(electrons, self.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern)
@@ -343,13 +343,13 @@ class Studio:
     def truth(self, shot: Shot) -> FrameTruth:
         """Return the ground truth of every profile line of a shot."""
         if not self.shows(shot, "laser"):
-            return no_stripe(self.sensor.camera.lines())
-        return true_stripe(self.renderer, self.pose(shot), travel=self.travel(shot))
+            return make_empty_truth(self.sensor.camera.lines())
+        return find_true_stripe(self.renderer, self.pose(shot), travel=self.travel(shot))
 
     def _shift_points(self, shot: Shot, index: int) -> None:
         """Displace the points of a target by its detection errors in this image."""
         for plate, pose in zip(self.scene.objects, self.scene.object_poses(), strict=True):
-            if isinstance(plate, Printed) and plate.detection_std_px > 0:
+            if isinstance(plate, PrintedPlate) and plate.detection_std_px > 0:
                 seen = camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose
                 mm_per_px = self._apparent_depth_mm(seen[2, 3]) / self.sensor.camera.focal_length_px()
                 shift_points(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
