@@ -11,7 +11,7 @@ from uwlts.calibration.camera.target_images import Placement, placements
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
     StepEvidence,
-    explain_missing_stripe,
+    explain_captures_without_stripe,
     find_air_evidence,
     step_evidence,
 )
@@ -176,7 +176,7 @@ def gather_jointly(
         on_steps += [(step, view) for step in found_steps]
         warnings += left_out
     if steps and not on_steps:
-        raise CalibrationError(explain_missing_stripe(steps))
+        raise CalibrationError(explain_captures_without_stripe(steps))
     for capture in scans:
         name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the scans"
         on_scans.append(scan_stripes(capture, _identify_view(capture, media, name), stripe=options.stripe))

@@ -18,7 +18,7 @@ from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
     StepEvidence,
-    explain_missing_stripe,
+    explain_captures_without_stripe,
     find_air_evidence,
     step_evidence,
 )
@@ -184,7 +184,7 @@ def gather(
         )
         warnings += left_out
         if not on_steps:
-            raise CalibrationError(explain_missing_stripe(steps))
+            raise CalibrationError(explain_captures_without_stripe(steps))
     return Evidence(
         sensor=sensor,
         medium_kind=air[0].header.medium.kind,
