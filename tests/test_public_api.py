@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
+from numpydoc.validate import validate
 
 import twin
 import twin.cli
@@ -39,6 +40,31 @@ def test_every_public_name_is_there_and_documented(package):
     assert set(package.__all__) == set(dir(package))
     for name in package.__all__:
         assert inspect.getdoc(getattr(package, name)), name
+
+
+LEFT_OUT = {
+    "ES01": "a summary can be enough",
+    "EX01": "examples are in the documentation",
+    "SA01": "related functions are in the documentation",
+    "PR03": "options that many functions share are described after their own",
+    "PR04": "types are in the signature",
+    "PR08": "a description can begin with a name",
+    "YD01": "the docstring of a context manager says what it yields",
+}
+"""Checks of numpydoc that are not asked for, with the reason."""
+
+
+@pytest.mark.parametrize("package", [uwlts, twin, uwlts.report], ids=["uwlts", "twin", "report"])
+def test_public_docstrings_are_complete(package):
+    """Functions describe all parameters and results. The fields of a class are described beside them."""
+    wrong = []
+    for name in package.__all__:
+        thing = getattr(package, name)
+        if not inspect.ismodule(thing):
+            left_out = LEFT_OUT.keys() | ({"PR01", "PR02"} if inspect.isclass(thing) else set())
+            errors = validate(f"{package.__name__}.{name}")["errors"]
+            wrong += [f"{name}: {text}" for code, text in errors if code not in left_out]
+    assert wrong == []
 
 
 def test_there_are_few_public_names():

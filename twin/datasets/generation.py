@@ -84,6 +84,11 @@ def dataset(
     progress
         Called with the number of frames done, the number in all, and the name of the stage.
 
+    Returns
+    -------
+    pathlib.Path
+        The folder, which `load_dataset` reads.
+
     Raises
     ------
     DescriptionError

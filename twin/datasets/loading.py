@@ -105,6 +105,11 @@ def load_dataset(folder: str | Path, *, split: Split | None = None, names: Seque
     names
         Names of the arrays to read, such as ["image", "centre_px"]; default: all.
 
+    Returns
+    -------
+    DataSet
+        Sequence of samples: images with their labels, read when they are asked for.
+
     Raises
     ------
     CaptureError

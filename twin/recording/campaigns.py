@@ -58,6 +58,11 @@ def record(
     progress
         Called with the number of images done, the total number, and the name of the stage.
 
+    Returns
+    -------
+    pathlib.Path
+        The folder of the campaign.
+
     Raises
     ------
     DescriptionError, DesignError, OutputError, SetupError

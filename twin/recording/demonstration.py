@@ -59,6 +59,11 @@ def demo(out: str | Path = "runs/demo") -> Path:
     out
         Folder for all results.
 
+    Returns
+    -------
+    pathlib.Path
+        The report, ``OUT/report.html``.
+
     Raises
     ------
     CommandFailed

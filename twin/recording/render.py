@@ -87,6 +87,11 @@ def render(
     scene, sensor, as_built, placement, medium, spp, seed, water, without, ideal, variant
         As for `simulate`; scene and sensors may also be descriptions, and there is one placement.
 
+    Returns
+    -------
+    Recording
+        Images (N, height, width) in grey levels, positions in mm, and the truth.
+
     Raises
     ------
     DescriptionError, DesignError, SetupError

@@ -60,6 +60,11 @@ def reproduce(
     progress
         Called with the number of images rendered, the total number, and the name of the stage.
 
+    Returns
+    -------
+    pathlib.Path
+        The report, ``OUT/report.html``.
+
     Raises
     ------
     DescriptionError, DesignError, OutputError, SetupError

@@ -158,6 +158,11 @@ def align_trajectory(
     progress
         Called with the number of steps done and the total number.
 
+    Returns
+    -------
+    AlignedTrajectory
+        Corrected trajectory with the covariance that remains, the moved cloud, and the crossings that were used.
+
     Raises
     ------
     CaptureError

@@ -237,6 +237,11 @@ def compare_clouds(
     unit
         Unit of the reference, mm or m.
 
+    Returns
+    -------
+    SurfaceChange
+        Signed distance in mm, its standard uncertainty and its detection limit at each place of the reference.
+
     Raises
     ------
     CaptureError

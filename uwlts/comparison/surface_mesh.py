@@ -55,7 +55,7 @@ def mesh(
 
     Parameters
     ----------
-    clouds
+    *clouds
         Clouds or their files. A cloud merged by `uwlts.register` is split into its scans.
     cube_mm
         Edge of the cubes, smaller than the walls; by default the smaller of a third of the patch radius and two thirds

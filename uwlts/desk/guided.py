@@ -160,6 +160,11 @@ def record_guided(
     report : callable, optional
         Called with lines of text for the operator, who answers on standard input or on the page.
 
+    Returns
+    -------
+    GuidedRecording
+        Paths of the capture and the calibration, and the images that were taken.
+
     Raises
     ------
     DescriptionError, RangeError

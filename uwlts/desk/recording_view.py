@@ -137,6 +137,7 @@ def watch(
     """Show a recording in progress in a browser: the latest image with its stripe, and the cloud so far.
 
     Ctrl-C ends it.
+
     Parameters
     ----------
     capture : str or Path

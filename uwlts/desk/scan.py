@@ -53,6 +53,7 @@ def scan(
     back. The plan is checked against travel and volume before anything moves. The laser goes off however the scan ends.
     An interrupted scan leaves its complete images in ``out.part``; ``resume`` continues with the exposures of the
     recorded images.
+
     Parameters
     ----------
     plan : ScanPlan or path of a TOML file
@@ -81,6 +82,11 @@ def scan(
         Called with the number of finished images and the total.
     report, warn : callable, optional
         Called with lines of text about the scan, and with warnings.
+
+    Returns
+    -------
+    ScanProgress
+        State at the end: images taken, path of the capture, and warnings.
 
     Raises
     ------

@@ -38,6 +38,11 @@ def examine(
         an Arduino Uno restarts: home before the next scan.
     progress
         Called with the number of finished parts and the total.
+
+    Returns
+    -------
+    list of Finding
+        Subject, state and advice of each check.
     """
     parts: list[Callable[[], Sequence[Finding]]] = [
         _examine_libraries,

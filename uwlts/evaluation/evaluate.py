@@ -236,6 +236,11 @@ def evaluate(
     source : str, optional
         Name of the cloud in the evaluation file; by default the name of the cloud's file or capture.
 
+    Returns
+    -------
+    Evaluation
+        Figures of the artefact with their uncertainties in mm, and statistics of the distances from the truth.
+
     Raises
     ------
     EvaluationError

@@ -150,6 +150,11 @@ def gauge_study(
     reference
         True value of the only part, for a type-1 study with Cg and Cgk.
 
+    Returns
+    -------
+    GaugeStudy or RepeatedReference
+        Variance components and their fractions of the tolerance; with `reference`, bias and capability.
+
     Raises
     ------
     DescriptionError

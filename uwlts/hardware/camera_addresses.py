@@ -17,6 +17,7 @@ def open_camera(address: str) -> CameraDevice:
     """Open the camera at an address such as "gige:127.0.0.1", see `ADDRESSES`.
 
     The camera is open but not configured. Use it as a context manager, which closes it.
+
     Raises
     ------
     HardwareError

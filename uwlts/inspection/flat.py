@@ -117,6 +117,11 @@ def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     cloud
         See `inspect_pipe`.
 
+    Returns
+    -------
+    Inspection
+        Height and parallelism of the step with their uncertainties, mm and deg.
+
     Raises
     ------
     CaptureError
@@ -165,6 +170,11 @@ def inspect_flange(
         See `inspect_pipe`.
     datum
         Cloud of another face in the same frame, or its file. The parallelism refers to this face.
+
+    Returns
+    -------
+    Inspection
+        Flatness, holes, bolt circle and parallelism with their uncertainties, mm and deg.
 
     Raises
     ------
@@ -224,6 +234,11 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     ----------
     cloud
         See `inspect_pipe`.
+
+    Returns
+    -------
+    Inspection
+        Width, parallelism and flush with their uncertainties, mm and deg.
 
     Raises
     ------

@@ -59,6 +59,11 @@ def inspect_pipe(
         Largest ovality divided by the diameter, used if the cloud shows less than half of the circumference: the
         tolerance of the pipe's specification, if it still applies.
 
+    Returns
+    -------
+    Inspection
+        Form of the pipe and its blemishes with their uncertainties, mm.
+
     Raises
     ------
     CaptureError

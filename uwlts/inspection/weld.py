@@ -129,6 +129,11 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
     section_mm
         Length of a section along the weld. By default sections are as short as the number of points allows.
 
+    Returns
+    -------
+    Inspection
+        Sizes and angles of the bead with their uncertainties, mm and deg.
+
     Raises
     ------
     CaptureError

@@ -128,7 +128,15 @@ def _explain(problem: ErrorDetails) -> str:
 def load_sensor(name_or_path: str | Path) -> Sensor:
     """Read a sensor description: a shipped one by name, such as "thesis", or a TOML file, which can have a ``base``.
 
-    The description contains the nominal data of camera, laser, windows, detector, stage, measuring volume and media.
+    Parameters
+    ----------
+    name_or_path : str or Path
+        Name of a shipped description, or path of a TOML file.
+
+    Returns
+    -------
+    Sensor
+        Nominal data of camera, laser, windows, detector, stage, measuring volume and media.
 
     Raises
     ------

@@ -44,6 +44,11 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
     medium : str
         One of the sensor's media.
 
+    Returns
+    -------
+    list of DesignRow
+        Named quantities with value, unit and the equation that they follow.
+
     Raises
     ------
     DescriptionError

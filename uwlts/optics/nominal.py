@@ -27,6 +27,11 @@ def nominal(sensor: str | Path | Sensor, *, medium: str) -> Calibration:
     medium : str
         One of the sensor's media. A tilted window of the laser refracts the sheet in it.
 
+    Returns
+    -------
+    Calibration
+        Parameters without uncertainty or evidence.
+
     Raises
     ------
     DescriptionError

@@ -100,6 +100,11 @@ def verify(
     limit_mm : float, optional
         Maximum permissible error.
 
+    Returns
+    -------
+    Verification
+        Measured and certified sizes in mm, their uncertainties, E_n and conformity.
+
     Raises
     ------
     EvaluationError

@@ -253,6 +253,11 @@ def register(
     progress : callable, optional
         Called with the number of steps done and the total number.
 
+    Returns
+    -------
+    RegisteredScans
+        Poses of the scans with their joint covariance, and the merged cloud.
+
     Raises
     ------
     CaptureError

@@ -44,6 +44,11 @@ def read(
     pose_unit : {"mm", "m"}
         Unit of a trajectory's positions.
 
+    Returns
+    -------
+    Capture, PointCloud, SurfaceMesh, Truth, Calibration, PolynomialCalibration, Mount, EvaluationRecord or Trajectory
+        An opened capture must be closed, or used in a ``with`` statement.
+
     Raises
     ------
     CaptureError

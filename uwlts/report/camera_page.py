@@ -29,7 +29,22 @@ _ARROWS_PX = 0.02  # length of the rms arrow, relative to the image width
 
 
 def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool = False) -> None:
-    """Write the page of a camera calibration; OutputError if that fails."""
+    """Write the page of a camera calibration.
+
+    Parameters
+    ----------
+    path : str or Path
+        Page to write.
+    camera : CameraCalibration
+        Result of `uwlts.calibrate_camera`.
+    overwrite : bool
+        Replace existing files.
+
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not given, or cannot be written.
+    """
     lens = camera.lens
     left_out = [each for each in camera.photographs if each.reason is not None]
     used = sorted(_select_used(camera), key=Photograph.rms_px, reverse=True)

@@ -91,6 +91,11 @@ def write_campaign(
     overwrite : bool
         Replace an existing report, summary and pictures.
 
+    Returns
+    -------
+    Report
+        Paths of the page and the summary, the campaign, and the published values.
+
     Raises
     ------
     OutputError

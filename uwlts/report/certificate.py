@@ -77,6 +77,11 @@ def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
     calibration : str or Path
         The certified calibration file.
 
+    Returns
+    -------
+    list of str
+        Sentences about each problem; empty if the certificate is genuine and belongs to the file.
+
     Raises
     ------
     CaptureError

@@ -44,11 +44,28 @@ def write_change(
     coloured: str | Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write the page of a change, its figures as JSON beside it, and its points as a cloud (``coloured``).
+    """Write the page of a change, its figures as JSON beside it, and its points as a cloud.
 
-    The cloud is PLY, LAZ or LAS, depending on its ending. Its fields are x, y, z (mm in PLY, else m), the colours of
-    the map, nx, ny, nz, distance, level (mm; NaN if not compared) and significant (0, 1). OutputError if a file exists
-    and ``overwrite`` is not given, or cannot be written.
+    Fields of the cloud are x, y, z (mm in PLY, else m), the colours of the map, nx, ny, nz, distance, level (mm; NaN if
+    not compared) and significant (0, 1).
+
+    Parameters
+    ----------
+    path : str or Path
+        Page to write; the figures go into a JSON file of the same name.
+    change : SurfaceChange
+        Result of `uwlts.compare_clouds`.
+    title : str
+        Title of the page.
+    coloured : str or Path, optional
+        Cloud to write, in PLY, LAZ or LAS depending on its ending.
+    overwrite : bool
+        Replace existing files.
+
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not given, or cannot be written.
     """
     text = render_page(
         "uwlts.report",

@@ -123,8 +123,13 @@ def write_findings(
         reported.
     overwrite
         Replace existing files.
-    options
+    **options
         Options of the inspection: `uwlts.inspect_pipe`, `uwlts.inspect_weld`, `uwlts.inspect_flange`.
+
+    Returns
+    -------
+    Inspection
+        What the report is about, as from ``uwlts.inspect_pipe`` and its siblings.
 
     Raises
     ------

@@ -39,6 +39,11 @@ def describe(path: str | Path) -> str:
     path : str or Path
         File, or name of a shipped sensor such as thesis.
 
+    Returns
+    -------
+    str
+        Several lines of text.
+
     Raises
     ------
     CaptureError, DescriptionError

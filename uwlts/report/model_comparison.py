@@ -152,7 +152,22 @@ def _in_um(value_mm: float, std_mm: float) -> str:
 
 
 def write_models(path: str | Path, comparison: Comparison, *, overwrite: bool = False) -> None:
-    """Write a comparison as a page, with its figures as JSON beside it; OutputError if that fails."""
+    """Write a comparison as a page, with its figures as JSON beside it.
+
+    Parameters
+    ----------
+    path : str or Path
+        Page to write; the figures go into a JSON file of the same name.
+    comparison : Comparison
+        Result of `uwlts.compare_models`.
+    overwrite : bool
+        Replace existing files.
+
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not given, or cannot be written.
+    """
     content = make_content(comparison)
     write_page(path, models_page(content), beside=json_text(content, indent=2, ascii=False), overwrite=overwrite)
 

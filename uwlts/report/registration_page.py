@@ -27,7 +27,21 @@ def write_registration(
 ) -> None:
     """Write the page of a registration, and its figures, poses and their covariance as JSON beside it.
 
-    OutputError if a file exists and ``overwrite`` is not given, or cannot be written.
+    Parameters
+    ----------
+    path : str or Path
+        Page to write; the figures go into a JSON file of the same name.
+    registered : RegisteredScans
+        Result of `uwlts.register`.
+    title : str
+        Title of the page.
+    overwrite : bool
+        Replace existing files.
+
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not given, or cannot be written.
     """
     text = render_page(
         "uwlts.report",

@@ -290,7 +290,7 @@ def descriptions(package: ModuleType, function: str) -> dict[str, str]:
     found = {}
     sections = _sections(docstring(package, function))
     parameters = dict(zip(sections[1::2], sections[2::2], strict=True)).get("Parameters", "")
-    for listed, block in re.findall(r"^(\w.*)\n((?:    .*\n?|\n(?=    ))+)", parameters, flags=re.MULTILINE):
+    for listed, block in re.findall(r"^(\*?\w.*)\n((?:    .*\n?|\n(?=    ))+)", parameters, flags=re.MULTILINE):
         other = re.match(r"\s*As for `(?:\w+\.)?(\w+)`", block)
         elsewhere = descriptions(package, other[1]) if other else {}
         names = listed.split(" : ")[0].split(", ")

@@ -93,6 +93,7 @@ def write_cloud(
 
     ``colours`` (N, 3) uint8, red, green and blue, are stored for other programs in PLY, LAS, LAZ and E57
     (`COLOURED_FORMATS`); HDF5 has the deviation instead.
+
     Raises
     ------
     OutputError

@@ -96,6 +96,11 @@ def evaluate_thesis(
     progress : callable, optional
         Called with the number of parts done and the total, starting again for every campaign.
 
+    Returns
+    -------
+    ThesisReport
+        Tables of all methods beside the published ones, and the paths of the written pages.
+
     Raises
     ------
     DescriptionError

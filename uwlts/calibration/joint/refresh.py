@@ -232,6 +232,11 @@ def refresh(
     progress : callable, optional
         Called with the number of images done, the total, and the name of the stage.
 
+    Returns
+    -------
+    Refreshed
+        Adapted calibration with its covariance, and the differences from the earlier one.
+
     Raises
     ------
     CalibrationError

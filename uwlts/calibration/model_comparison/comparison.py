@@ -390,6 +390,11 @@ def compare_models(
     progress : callable, optional
         Called with the number of images or models done, the total, and the name of the stage.
 
+    Returns
+    -------
+    Comparison
+        Prediction error of each model in mm, on held-out images and over nearest and farthest images.
+
     Raises
     ------
     CalibrationError

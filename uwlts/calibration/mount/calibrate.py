@@ -103,6 +103,11 @@ def calibrate_mount(
         Times (P,) of the profiles and (M,) of the poses. The poses are then a trajectory with any number M of poses
         (`uwlts.Trajectory`).
 
+    Returns
+    -------
+    Mount
+        ``T_platform_sensor`` (4, 4), mm, with its covariance (6, 6), the left-out poses and a proposed next pose.
+
     Raises
     ------
     DescriptionError

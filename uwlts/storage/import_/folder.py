@@ -152,6 +152,11 @@ def import_images(
     progress : callable
         Called with the number of finished images and the total.
 
+    Returns
+    -------
+    Imported
+        Path of the capture, numbers of images by kind, and warnings.
+
     Raises
     ------
     DescriptionError
