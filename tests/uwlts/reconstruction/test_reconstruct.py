@@ -99,7 +99,8 @@ def test_options_reach_the_extraction(path):
 
 
 @pytest.mark.parametrize(
-    ("how", "message"), [({"lasers": (False, False)}, "no image with the laser on"), ({"blank": True}, "all are black")]
+    ("how", "message"),
+    [({"lasers": (False, False)}, "none of them with the laser on"), ({"blank": True}, "all are black")],
 )
 def test_captures_without_stripes_are_refused(tmp_path, how, message):
     with Capture(write(tmp_path / "none.h5", **how)) as capture, pytest.raises(CaptureError, match=message):
