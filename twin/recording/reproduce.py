@@ -78,7 +78,9 @@ def reproduce(
     if first < 0:
         raise DescriptionError(f"first is {first}; a seed must not be negative")
     if trials != 0 and trials < _LEAST_TRIALS:
-        raise DescriptionError(f"trials is {trials}: take {_LEAST_TRIALS} or more, or 0 for no Monte-Carlo propagation")
+        raise DescriptionError(
+            f"trials is {trials}; expected at least {_LEAST_TRIALS}, or 0 for no Monte-Carlo propagation"
+        )
     campaign = campaign or ("joint" if joint else "thesis")
     folder = Path(out or Path("runs") / Path(campaign).stem)
     described = load_campaign(campaign)

@@ -783,7 +783,8 @@ def lit_program(controller: GrblController, then: str = MOVES) -> tuple[subproce
     )
     assert program.stdout is not None
     guard = int(program.stdout.readline())
-    assert controller.state().laser_on
+    # A program that moves switches the laser off first, and on again with the movement.
+    assert wait_for(lambda: controller.state().laser_on)
     return program, guard
 
 
