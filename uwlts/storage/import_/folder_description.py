@@ -13,6 +13,7 @@ from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
 from uwlts.storage.capture import CaptureHeader
 from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.grey_values import Channel
+from uwlts.storage.import_.mosaic import BayerPattern
 from uwlts.targets import parse_target
 
 NAME = "import.toml"
@@ -67,7 +68,8 @@ class ImportDescription(Description):
     ``header`` names a capture's header as JSON, which replaces all fields that it contains. Other files are relative to
     the description, images to their folder. ``sensor`` is a name, the path of a description, or a table with an
     optional ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; images that are
-    both ``laser`` and ``lamp`` show the laser on the lit target. ``table`` is a CSV file with the values of each image.
+    both ``laser`` and ``lamp`` show the laser on the lit target. ``bayer`` is the pattern of a colour camera's raw
+    images. ``table`` is a CSV file with the values of each image.
     With ``centre_lines`` the laser files contain centre lines of one or more profiles.
     """
 
@@ -83,6 +85,7 @@ class ImportDescription(Description):
     table: str | None = None
     channel: Channel | None = None
     lamp_channel: Channel | None = None
+    bayer: BayerPattern | None = None
     bits: Annotated[int, Field(ge=8, le=16)] | None = None
     aligned: Literal["low", "high"] = "low"
     saturation_dn: Annotated[int, Field(gt=0)] | None = None
