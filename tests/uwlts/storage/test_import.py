@@ -12,7 +12,7 @@ import tomli_w
 from uwlts import cli
 from uwlts.errors import DescriptionError, ImageError, OutputError
 from uwlts.runtime.console import run
-from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.capture import NO_STAGE, Capture, part_path
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_ import import_images
@@ -271,7 +271,11 @@ def test_free_poses_count_the_images(tmp_path: Path):
     import_images(folder, tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert capture.stage_mm.tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
-        assert "counts the poses" in capture.header.provenance["stage"]
+        assert capture.header.provenance["stage"] == NO_STAGE
+    folder_of(tmp_path, {}, given | {"provenance": {"operator": "me"}})
+    import_images(folder, tmp_path / "a.h5", overwrite=True)
+    with Capture(tmp_path / "a.h5") as capture:
+        assert capture.header.provenance == {"operator": "me", "stage": NO_STAGE}
 
 
 @pytest.mark.parametrize("separator", [",", ";"])

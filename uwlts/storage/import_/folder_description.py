@@ -10,7 +10,7 @@ from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json, re
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.library import find_description, load_sensor, merge_tables, read_table, validate_description
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
-from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.capture import NO_STAGE, CaptureHeader
 from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.grey_values import Channel
 from uwlts.storage.import_.mosaic import BayerPattern
@@ -130,8 +130,11 @@ def capture_header(
     Files named in the description are relative to the folder ``beside``. Raises DescriptionError if medium, target,
     direction or header are missing, unknown or not valid, and EvaluationError if the artefact is not valid.
     """
+    # A description with its own provenance must not hide that there is no stage.
+    mark: Table = {"stage": NO_STAGE} if given.stage.free else {}
     if given.header is not None:
-        return read_header(beside / given.header)
+        header = read_header(beside / given.header)
+        return header.model_copy(update={"provenance": header.provenance | mark})
     if given.stage.direction is None and not given.stage.free:
         raise DescriptionError(
             "stage.direction is missing: give the unit vector in which the stage moves the sensor, in the OCS, "
@@ -144,7 +147,7 @@ def capture_header(
     table = {"name": given.name or name, "sensor": sensor, "saturation_dn": saturation_dn}
     table |= {"stage_direction": given.stage.direction or (1.0, 0.0, 0.0), "medium_name": given.medium}
     table |= {"medium": sensor.medium(given.medium or ""), "target": given.target, "artefact": given.artefact}
-    table |= {"provenance": remarks if given.provenance is None else given.provenance}
+    table |= {"provenance": (remarks if given.provenance is None else given.provenance) | mark}
     return validate_description(CaptureHeader, table, "the header from the description")
 
 
