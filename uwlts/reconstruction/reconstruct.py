@@ -226,6 +226,8 @@ def reconstruct_stripes(
             "medium_index": index,
             "artefact": capture.header.artefact,
             "calibration": digest,
+            "images": len(capture.stage_mm),
+            **{key: value for key, value in capture.header.provenance.items() if key == "scene"},
             **({} if sheet is None else _footprint_metadata(capture, sheet, stripes)),
         },
         lines_by_status=lines,
