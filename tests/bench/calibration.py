@@ -32,7 +32,7 @@ class _InMemory:
         self.speed_mm_per_s, self.time_s = np.tile(capture.speed_mm_per_s, times), np.arange(times * len(capture)) * 1.0
         self._images = [capture.image(number) for number in range(len(capture))] * times
 
-    def seen(self, index: int) -> np.ndarray:
+    def read_observation(self, index: int) -> np.ndarray:
         return self._images[index]
 
     def image(self, index: int) -> np.ndarray:

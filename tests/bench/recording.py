@@ -143,7 +143,7 @@ def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multipr
         header, number, frame = seen
         view = view or RecordingView(board, header, calibration)
         before = board.cloud.total
-        view.see(frame, number)
+        view.show(frame, number)
         if board.cloud.total > before:
             moments.append(time.perf_counter())
     result.send((len(moments), (len(moments) - 1) / (moments[-1] - moments[0])))
@@ -154,8 +154,8 @@ def following_rate() -> float:
     sensor = load_sensor("thesis")
     view = RecordingView(Board("bench"), _header(sensor), nominal_calibration(sensor, sensor.medium("air")))
     frames = [Frame(image, float(k), True, 1.0, float(k)) for k, image in enumerate(_images(sensor))]
-    view.see(frames[0], 0)
+    view.show(frames[0], 0)
     start = time.perf_counter()
     for number, frame in enumerate(frames):
-        view.see(frame, number)
+        view.show(frame, number)
     return len(frames) / (time.perf_counter() - start)

@@ -436,8 +436,8 @@ def test_cloud_without_points(command, tmp_path: Path):
         ("scan.h5", "dry.json", "the calibration is for air only"),
         ("black.h5", "calibration.json", "no stripe in any of the 3 laser images of black.h5"),
         ("white.h5", "calibration.json", "no stripe in any of the 3 laser images of white.h5"),
-        ("dark.h5", "calibration.json", "no image with the laser on"),
-        ("no-frames.h5", "calibration.json", "no image with the laser on"),
+        ("dark.h5", "calibration.json", "none of them with the laser on"),
+        ("no-frames.h5", "calibration.json", "none of them with the laser on"),
     ],
 )
 def test_capture_that_cannot_be_reconstructed(
@@ -554,8 +554,8 @@ def test_truth_of_another_scan(fails, folder: Path, tmp_path: Path):
         ("plane --medium milk --out x.h5", "'milk'"),
         ("plane --placement near far --out x.h5", "{placement}"),
         ("plane --placement near --placement far --out x.h5", "{placement}"),
-        ("plane --sensor sensor.toml --as-built turned.toml --out x.h5", "another image size or stripe orientation"),
-        ("plane --sensor sensor.toml --as-built thesis --out x.h5", "another image size or stripe orientation"),
+        ("plane --sensor sensor.toml --as-built turned.toml --out x.h5", "differ in image size or stripe orientation"),
+        ("plane --sensor sensor.toml --as-built thesis --out x.h5", "differ in image size or stripe orientation"),
         ("plane --sensor sensor.toml --spp 0 --out x.h5", "spp is 0"),
         ("plane --sensor sensor.toml --seed -1 --out x.h5", "seed is -1"),
         ("plane --sensor sensor.toml --out missing/x.h5", "missing does not exist"),
@@ -596,7 +596,7 @@ def test_reports_that_cannot_be(fails, folder: Path, tmp_path: Path):
         ("--every 0", "every is 0"),
         ("--workers 0", "workers is 0"),
         ("--spp 0", "spp is 0"),
-        ("--trials 5", "trials is 5: take 20 or more, or 0"),
+        ("--trials 5", "trials is 5; expected at least 20, or 0"),
         ("--trials -20", "trials is -20"),
         ("--out scan.h5", "cannot use the folder scan.h5"),
         ("--out scan.h5/runs", "cannot use the folder scan.h5/runs"),
@@ -625,7 +625,7 @@ def test_theses_that_cannot_be(fails, tmp_path: Path):
         (place / "results.json").write_text(text, encoding="utf-8")
         fails("uwlts", "thesis", tmp_path / "runs", says=words)
     fails("uwlts", "thesis", tmp_path / "runs", "--again", says="campaign-0 has no ")
-    fails("uwlts", "thesis", tmp_path / "runs", "--trials", "5", says="trials is 5: take 20 or more, or 0")
+    fails("uwlts", "thesis", tmp_path / "runs", "--trials", "5", says="trials is 5; expected at least 20, or 0")
     fails("uwlts", "thesis", tmp_path / "runs", "--trials", "-1", says="trials is -1")
     fails("uwlts", "thesis", tmp_path / "runs", "--workers", "0", says="workers is 0; it must be at least 1")
     fails("uwlts", "thesis", tmp_path / "runs", "--published", "thesis", says="contains no published tables")

@@ -139,7 +139,7 @@ def test_what_is_described_as_written_counts_as_an_output():
         for program, command, app in _commands()
         for argument in app[command].assemble_argument_collection()
         if program == "uwlts"
-        and re.search(r"\bto write\b|^(Also w|W)rite |not written unless", argument.parameter.help)
+        and re.search(r"\bto write\b|^(Also w|W)rite |default: not written", argument.parameter.help)
     }
     assert described >= {"out", "coloured", "aligned", "page", "poses_out", "pictures"}
     assert described <= OUTPUTS
@@ -201,7 +201,7 @@ def test_commands_of_one_block_write_different_files(lines):
 
 def test_inspection_and_report_of_one_pipe_write_different_files():
     page = (ROOT / "docs" / "how-to" / "inspect-a-pipe.md").read_text(encoding="utf-8")
-    lines = [line.strip() for line in page.splitlines() if line.startswith("    uwlts ")]
+    lines = [line.strip() for line in page.splitlines() if line.startswith("   uwlts ")]
     written = [name for line in lines for name in _written(line)]
     assert {"pipe.json", "pipe.html", "pipe.findings.json", "pipe.pdf"} <= set(written)
     assert len(set(written)) == len(written)

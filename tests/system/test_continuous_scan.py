@@ -175,7 +175,7 @@ def test_the_latency_of_drawn_passes_and_what_does_not_show_it():
     found = measure_latency(centres, places, signed)
     # 0.05 px of noise on some 40 x 96 points of the hill with slopes of up to 8 px/mm.
     assert found.std_s < 1e-5 and abs(found.latency_s - latency) < max(5 * found.std_s, 2e-6)
-    with pytest.raises(EvaluationError, match="one way and 0 the other"):
+    with pytest.raises(EvaluationError, match="forward and 0 of the backward pass"):
         measure_latency(centres, places, np.abs(signed))
     with pytest.raises(EvaluationError, match="relief"):
         measure_latency(np.full_like(centres, 200.0), places, signed)

@@ -320,7 +320,9 @@ def test_scans_of_another_size(says, scan_images, calibration, tmp_path: Path):
     frames = [Frame(image, 0.0, True, 1.0, 0.0) for image in scan_images[:2]]
     wrong = captured(tmp_path / "scan.h5", images(turned)(frames))
     line = f"--calibration {calibration} --out {tmp_path / 'x.ply'}"
-    says(f"reconstruct {wrong} {line}", "512 x 640 pixels, the calibration is for 640 x 512: .* quarter turn")
+    says(
+        f"reconstruct {wrong} {line}", "512 x 640 pixels, the calibration is for 640 x 512: rotate the images by 90 deg"
+    )
     small = captured(tmp_path / "small.h5", images(lambda image: image[:256])(frames))
     says(f"reconstruct {small} {line}", "640 x 256 pixels, .* 640 x 512: calibrate with images of this size")
 
@@ -343,7 +345,11 @@ def test_truncated_captures(says, scan_images, calibration, tmp_path: Path, shar
     scan = write(tmp_path / "scan.h5", scan_images, stage_mm=STAGE_MM)
     whole = scan.read_bytes()
     scan.write_bytes(whole[: int(share * len(whole))])
-    words = "not an HDF5 file" if share == 0 else f"truncated: {int(share * len(whole)):,} of its {len(whole):,} bytes"
+    words = (
+        "not an HDF5 file"
+        if share == 0
+        else f"truncated: it has {int(share * len(whole)):,} of its {len(whole):,} bytes"
+    )
     says(f"reconstruct {scan} --calibration {calibration} --out {tmp_path / 'x.ply'}", words)
 
 

@@ -223,8 +223,8 @@ def test_a_file_in_a_reported_folder_is_not_replaced_by_the_report(tmp_path, nom
 _HOLDER = """
 import sys, time
 from pathlib import Path
-from uwlts.files.writing import one_writer
-with one_writer(Path(sys.argv[1])):
+from uwlts.files.writing import lock_output
+with lock_output(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -320,8 +320,8 @@ def writer_elsewhere(path: Path) -> str:
     """Result of another process's attempt to write a path."""
     program = (
         "import sys\nfrom pathlib import Path\nfrom uwlts.errors import OutputError\n"
-        "from uwlts.files.writing import one_writer\n"
-        "try:\n    with one_writer(Path(sys.argv[1])):\n        print('none')\n"
+        "from uwlts.files.writing import lock_output\n"
+        "try:\n    with lock_output(Path(sys.argv[1])):\n        print('none')\n"
         "except OutputError:\n    print('another')\n"
     )
     done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True)

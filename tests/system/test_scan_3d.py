@@ -139,7 +139,7 @@ def test_profiles_without_time_stamps_follow_the_line_rate_and_single_ones_their
         frame = camera.grab(5.0)
         assert frame.encoder == 0 and (frame.seen.centre_px == 10.5).all()
         camera.stop()
-        with pytest.raises(HardwareError, match="profiles is 8: a free-running 3D camera"):
+        with pytest.raises(HardwareError, match="profiles is 8: expected 1, or more for a free-running 3D camera"):
             camera.configure(trigger="software", profiles=ROWS)
 
 

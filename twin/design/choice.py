@@ -158,7 +158,7 @@ class StudyResults:
 
 
 @dataclass(frozen=True)
-class Choice:
+class DesignChoice:
     """Chosen designs and notes.
 
     ``marked`` contains the base sensor if it works, the best design, and the refined design if it is better; the last
@@ -170,7 +170,7 @@ class Choice:
     notes: tuple[str, ...]
 
 
-def choose(study: Study, columns: Columns) -> Choice:
+def choose(study: Study, columns: Columns) -> DesignChoice:
     """Choose the best design by the first objective among those that meet the constraints, and further designs.
 
     If no design meets the constraints, the one with the smallest violation is chosen, with a note. The further designs
@@ -212,7 +212,7 @@ def choose(study: Study, columns: Columns) -> Choice:
     spread = front[np.unique(np.linspace(0, len(front) - 1, study.verify + 1).round().astype(int))]
     others = [int(place) for place in spread if place != best][: max(study.verify - 1, 0)]
     further = [found.highlight(place, "on the Pareto front") for place in others]
-    return Choice(tuple(marked), tuple(further), tuple(notes))
+    return DesignChoice(tuple(marked), tuple(further), tuple(notes))
 
 
 # --- refinement -------------------------------------------------------------------------------------------------------

@@ -63,7 +63,7 @@ _MOVED_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class SheetPoints:
+class IlluminatedPoints:
     """Points on a laser sheet of finite thickness, for N stripe centres.
 
     Attributes
@@ -103,7 +103,7 @@ class SheetPoints:
         *,
         medium_index: float,
         digest: str | None = None,
-    ) -> SheetPoints:
+    ) -> IlluminatedPoints:
         """Locate stripe centres on the sheet.
 
         Parameters
@@ -267,7 +267,7 @@ def footprint_std(uncertainty: Uncertainty) -> float:
 
 
 def brightness_shift_std(uncertainty: Uncertainty) -> float:
-    """Return the relative uncertainty of `SheetPoints.brightness_shift`, proportional to the squared thickness."""
+    """Return the relative std of `IlluminatedPoints.brightness_shift`, proportional to the squared thickness."""
     return 2.0 * uncertainty.sheet_thickness
 
 

@@ -13,7 +13,7 @@ from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Table
 from uwlts.model.stripe import CaptureStripes
 from uwlts.model.trajectory import Trajectory
-from uwlts.optics.brightness import SheetPoints, fit_brightness_slopes, footprint_std, select_sharp_lines
+from uwlts.optics.brightness import IlluminatedPoints, fit_brightness_slopes, footprint_std, select_sharp_lines
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile, stage_travel
 from uwlts.optics.window import RayStatus, require_index
@@ -257,12 +257,12 @@ def _warn_of_repeats(stripes: CaptureStripes) -> list[str]:
 
 def _lit_sheet(
     capture: Capture | FrameTable, calibration: AnyCalibration, stripes: CaptureStripes, index: float, digest: str
-) -> SheetPoints | None:
+) -> IlluminatedPoints | None:
     """Return the part of the sheet at the stripe centres; None with poses or a polynomial calibration."""
     if isinstance(calibration, PolynomialCalibration) or np.isfinite(capture.pose).any():
         return None
     sensor = capture.header.sensor
-    return SheetPoints.from_calibration(
+    return IlluminatedPoints.from_calibration(
         calibration, sensor, stripes.line, stripes.centre_px, medium_index=index, digest=digest
     )
 
@@ -272,7 +272,7 @@ def _triangulate(
     calibration: AnyCalibration,
     stripes: CaptureStripes,
     index: float,
-    sheet: SheetPoints | None,
+    sheet: IlluminatedPoints | None,
 ) -> MeasuredPoints:
     """Triangulate stripe centres with any kind of calibration to points in the OCS, moved by the stage."""
     direction = np.array(capture.header.stage_direction)
@@ -298,7 +298,7 @@ def _row_delay_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.n
     return 1e-6 * detector.line_time_us * (row - (camera.height_px - 1) / 2)
 
 
-def _brightness_shifts(capture: Capture | FrameTable, sheet: SheetPoints, stripes: CaptureStripes) -> np.ndarray:
+def _brightness_shifts(capture: Capture | FrameTable, sheet: IlluminatedPoints, stripes: CaptureStripes) -> np.ndarray:
     """Return the shifts (N, 3), OCS, from points on the central plane of the sheet to the origin of their light."""
     slopes = fit_brightness_slopes(
         stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm, capture.exposure_ms
@@ -306,7 +306,7 @@ def _brightness_shifts(capture: Capture | FrameTable, sheet: SheetPoints, stripe
     return sheet.brightness_shift(stripes.width_px, slopes, stage_direction=capture.header.stage_direction)
 
 
-def _footprint_metadata(capture: Capture | FrameTable, sheet: SheetPoints, stripes: CaptureStripes) -> Table:
+def _footprint_metadata(capture: Capture | FrameTable, sheet: IlluminatedPoints, stripes: CaptureStripes) -> Table:
     """Return metadata on the footprint of a point on the surface; empty if unknown."""
     if not np.isfinite(stripes.width_px[sheet.found.status == RayStatus.OK]).any():
         return {}

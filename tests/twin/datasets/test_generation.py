@@ -284,8 +284,8 @@ def test_shards_that_another_run_holds_are_left_to_it_and_then_waited_for(folder
     held = sorted(made)[-1]
     # Another machine's run that takes a shard, and dies before it is written.
     program = (
-        "import sys, time, pathlib\nfrom uwlts.files.writing import one_writer\n"
-        "with one_writer(pathlib.Path(sys.argv[1])):\n"
+        "import sys, time, pathlib\nfrom uwlts.files.writing import lock_output\n"
+        "with lock_output(pathlib.Path(sys.argv[1])):\n"
         "    print('held', flush=True)\n"
         "    while len(list(pathlib.Path(sys.argv[1]).parent.glob('*.tar'))) < int(sys.argv[2]):\n"
         "        time.sleep(0.02)\n"

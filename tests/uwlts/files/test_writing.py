@@ -58,8 +58,8 @@ def test_locks_of_others_stay(tmp_path):
 
     target = tmp_path / "a.txt"
     program = (
-        "import sys, pathlib\nfrom uwlts.files.writing import one_writer\n"
-        "with one_writer(pathlib.Path(sys.argv[1])):\n    print('held', flush=True)\n    sys.stdin.read()\n"
+        "import sys, pathlib\nfrom uwlts.files.writing import lock_output\n"
+        "with lock_output(pathlib.Path(sys.argv[1])):\n    print('held', flush=True)\n    sys.stdin.read()\n"
     )
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", program, str(target)], **pipes) as holder:

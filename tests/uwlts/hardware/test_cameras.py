@@ -179,7 +179,7 @@ def test_a_capture_is_shown_with_its_exposures(tmp_path, thesis: Sensor):
 def test_what_cannot_be_replayed_is_said(tmp_path):
     with pytest.raises(HardwareError, match="neither a folder of images nor a capture"):
         open_camera(f"replay:{tmp_path / 'missing'}")
-    with pytest.raises(HardwareError, match="holds no image"):
+    with pytest.raises(HardwareError, match="contains no image"):
         open_camera(f"replay:{tmp_path}")
     folder = pictures(tmp_path / "f", 2)
     (folder / "image-1.png").write_bytes((folder / "image-1.png").read_bytes()[:40])

@@ -26,7 +26,7 @@ def test_the_slip_is_found_to_its_standard_error(slip_mm):
     slope = np.linspace(-3, 3, LINES)
     relief = watched(slope, rng).relief
     assert relief.place.position_mm == 2.0
-    found = [relief.slip(centres(2.0 + slip_mm, slope, rng)) for _ in range(30)]
+    found = [relief.measure_slip(centres(2.0 + slip_mm, slope, rng)) for _ in range(30)]
     slips, errors = np.array(found).T
     # Noise of two centres divided by a root mean square motion of 1.7 px/mm on 400 lines is 0.004 mm; twice that is
     # reported, for lines that share speckle. All draws share the place's own noise.
@@ -53,8 +53,8 @@ def test_the_earliest_place_with_relief_counts():
 def test_an_object_that_is_gone_is_no_slip():
     rng = np.random.default_rng(4)
     relief = watched(np.full(LINES, 2.0), rng).relief
-    assert not relief.is_significant(*relief.slip(np.full(LINES, np.nan)))
+    assert not relief.is_significant(*relief.measure_slip(np.full(LINES, np.nan)))
     # A third of the lines now shows another surface.
     again = centres(2.0, np.full(LINES, 2.0), rng)
     again[: LINES // 3] += 40
-    assert not relief.is_significant(*relief.slip(again))
+    assert not relief.is_significant(*relief.measure_slip(again))

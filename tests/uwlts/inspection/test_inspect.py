@@ -475,7 +475,9 @@ def test_every_value_has_a_definition_with_a_source():
 
 
 def test_the_guide_has_all_definitions():
-    page = (Path(__file__).resolve().parents[3] / "docs" / "how-to" / "inspect-a-pipe.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[3] / "docs" / "reference" / "inspection-values.md").read_text(
+        encoding="utf-8"
+    )
     for kind, values in DEFINITIONS.items():
         for name, definition in values.items():
             assert f"| {kind} | {name} | {definition.unit} | {definition.text} | {definition.source} |" in page

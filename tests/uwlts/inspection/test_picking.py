@@ -290,7 +290,7 @@ def test_a_measurement_is_the_same_each_time():
         (on_shape("plane", 100), 0.0, "plane", "no points within"),
         (on_shape("plane", 100), float("nan"), "plane", "no points within"),
         (on_shape("plane", 3), 60.0, "plane", "needs at least 4 points"),
-        (np.tile(CENTRE, (50, 1)), 15.0, "plane", "in one place"),
+        (np.tile(CENTRE, (50, 1)), 15.0, "plane", "coincide"),
         (CENTRE + np.outer(np.arange(30.0), [1, 0, 0]), 60.0, "plane", "on one line"),
         (on_shape("plane", 100), 60.0, "sphere", "sphere"),
         (on_shape("sphere", 4), 60.0, "sphere", "needs at least 5 points"),

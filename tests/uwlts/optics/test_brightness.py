@@ -7,7 +7,7 @@ from tests.uwlts.calibration_views import WATER
 from tests.uwlts.joint_views import MEDIUM, seen
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.placement import camera_from_object, laser_pose
-from uwlts.optics.brightness import SheetPoints, estimate_blur_shift_px, fit_brightness_slopes, sheet_sigma_mm
+from uwlts.optics.brightness import IlluminatedPoints, estimate_blur_shift_px, fit_brightness_slopes, sheet_sigma_mm
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
@@ -56,7 +56,7 @@ def test_the_footprint_is_that_of_sheet_and_blur(thesis):
     width = 2.3548 * np.hypot(blur_px, sigma * per_mm)
     calibration = nominal_calibration(thesis, medium=MEDIUM)
     line, centre = np.full(50, pixels[0, 0]), np.full(50, pixels[0, 1])
-    sheet = SheetPoints.from_calibration(calibration, thesis, line, centre, medium_index=WATER)
+    sheet = IlluminatedPoints.from_calibration(calibration, thesis, line, centre, medium_index=WATER)
     assert sheet.footprint_mm(np.full(50, width)) == pytest.approx((np.sqrt(3) * sigma, blur_px * per_line), rel=0.01)
 
 
@@ -122,7 +122,7 @@ def test_the_sheet_is_no_thicker_than_the_stripes_are_wide(thesis):
     laser = thesis.laser.model_copy(update={"waist_radius_mm": 3.0})
     calibration = nominal_calibration(thesis, thesis.media["water"])
     thick, thin = (
-        SheetPoints.from_calibration(calibration, sensor, line, centre, medium_index=WATER).brightness_shift(
+        IlluminatedPoints.from_calibration(calibration, sensor, line, centre, medium_index=WATER).brightness_shift(
             width, slopes, stage_direction=(1, 0, 0)
         )
         for sensor in (thesis.model_copy(update={"laser": laser}), thesis)
@@ -140,7 +140,7 @@ def test_many_centres_see_the_sheet_as_few_do(thesis):
     rng = np.random.default_rng(9)
     line, centre = rng.integers(100, 1180, 6000), rng.uniform(300.0, 700.0, 6000)
     many, few = (
-        SheetPoints.from_calibration(calibration, thesis, line[:count], centre[:count], medium_index=WATER)
+        IlluminatedPoints.from_calibration(calibration, thesis, line[:count], centre[:count], medium_index=WATER)
         for count in (6000, 400)
     )
     np.testing.assert_allclose(many.found.points_mm[:400], few.found.points_mm, rtol=0, atol=1e-6)
@@ -149,7 +149,7 @@ def test_many_centres_see_the_sheet_as_few_do(thesis):
         assert np.abs(expected).max() > 1e-3
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
     width = np.full(6000, 4.0)
-    every = SheetPoints.from_calibration(calibration, thesis, line + 0.0, centre, medium_index=WATER)
+    every = IlluminatedPoints.from_calibration(calibration, thesis, line + 0.0, centre, medium_index=WATER)
     assert many.footprint_mm(width) == pytest.approx(every.footprint_mm(width), rel=1e-5)
 
 

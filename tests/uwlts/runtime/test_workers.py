@@ -148,10 +148,10 @@ def test_processes_end_with_their_command(tmp_path: Path, how: str):
     # A shell that runs the tests in the background makes all its children ignore Ctrl-C; the program must not.
     program = (
         "import signal, sys, pathlib, functools\n"
-        "from tests.uwlts.runtime.test_workers import linger, work_through\n"
+        "from tests.uwlts.runtime.test_workers import linger, run_jobs\n"
         "signal.signal(signal.SIGINT, lambda *_: sys.exit(130))\n"
         "print('ready', flush=True)\n"
-        "work_through(functools.partial(linger, pathlib.Path(sys.argv[1])), range(9), workers=2)\n"
+        "run_jobs(functools.partial(linger, pathlib.Path(sys.argv[1])), range(9), workers=2)\n"
     )
     command = subprocess.Popen(
         [sys.executable, "-c", program, str(tmp_path)],

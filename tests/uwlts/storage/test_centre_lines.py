@@ -107,7 +107,7 @@ def test_a_table_gives_encoder_and_time_of_every_profile(tmp_path: Path):
     [
         (np.zeros((2, WIDTH + 1)), "expected profiles in rows"),
         (np.zeros((WIDTH, 3)), "it may be transposed"),
-        (np.full((2, WIDTH), 60_000), "run from 3748 to 3748 px.*check scale"),
+        (np.full((2, WIDTH), 60_000), "range from 3748 to 3748 px.*check scale"),
         (np.zeros((1, 5, WIDTH)), "expected profiles in rows"),
         (np.array(["a"]), "no numbers"),
     ],

@@ -40,7 +40,7 @@ def found(*images: np.ndarray, options: StripeOptions = StripeOptions(), sensor:
         def __len__(self) -> int:
             return count
 
-    capture = Images(header=header, image=images.__getitem__, seen=images.__getitem__, **about)
+    capture = Images(header=header, image=images.__getitem__, read_observation=images.__getitem__, **about)
     return find_stripes(capture, options=options)
 
 

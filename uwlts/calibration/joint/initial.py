@@ -35,7 +35,7 @@ from uwlts.model.parameter_keys import StepHeight
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import stack_pixels
-from uwlts.optics.brightness import BLUR_STD, SheetPoints, brightness_shift_std
+from uwlts.optics.brightness import BLUR_STD, IlluminatedPoints, brightness_shift_std
 from uwlts.optics.camera import directions
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.optics.window import trace_window
@@ -315,7 +315,7 @@ def build_scan_evidence(
         ).points_mm
 
     on_sheet = reconstructed(pixels, stage_mm)
-    sheet = SheetPoints.from_calibration(start, sensor, line, centre, medium_index=medium_index)
+    sheet = IlluminatedPoints.from_calibration(start, sensor, line, centre, medium_index=medium_index)
     beside = sheet.brightness_shift(stripes.width_px, stripes.slopes, stage_direction=tuple(direction.tolist()))
     points = on_sheet + beside
     # Exclude rims, where few points are left and are unreliable, and fast changes of brightness.

@@ -340,7 +340,7 @@ def test_the_command_refreshes_and_says_what_changed(drawn):
     assert f"index of water 2: {WARM.refractive_index(WAVELENGTH):.5f} ± 0.001 before, {new.media[1].index:.5f} ±" in (
         done.stdout
     )
-    assert "now (k = 2, by the calibration)" in done.stdout
+    assert "now (k = 2, from the calibration)" in done.stdout
     std = new.joint.std_of(MediumIndex("water 2"))
     assert abs(new.media[1].index - 1.3312) < 3 * std
     assert std < 9e-4

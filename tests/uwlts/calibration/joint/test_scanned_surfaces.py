@@ -163,7 +163,7 @@ class _Held:
             )
         ]
 
-    def linearised(self, residuals, used):
+    def linearise(self, residuals, used):
         return self
 
 
