@@ -25,7 +25,7 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import CaptureHeader
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.pose_files import trajectory_path
-from uwlts.storage.truth import Truth, TruthHeader, truth_path, write_truth
+from uwlts.storage.truth import Truth, TruthHeader, scene_digest, truth_path, write_truth
 
 
 def record_scene(
@@ -67,6 +67,7 @@ def record_scene(
         artefact=scene.artefact,
         provenance={
             "source": "twin",
+            "scene": scene_digest(scene.model_dump(mode="json")),
             "seed": studio.options.seed,
             "spp": studio.options.spp,
             "effects": [*studio.options.names()],

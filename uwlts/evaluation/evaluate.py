@@ -16,9 +16,10 @@ from uwlts.files.json_files import read_model, write_model
 from uwlts.fitting.least_squares import fit_rigid_transform
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
 from uwlts.model.brief import Brief
+from uwlts.model.sensor import Table
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
-from uwlts.storage.truth import Truth, read_truth
+from uwlts.storage.truth import Truth, TruthHeader, read_truth, scene_digest, truth_path
 
 TOLERANCE_MM = 0.010
 """Tolerance for points from perfect images and true parameters (tests/system/test_campaign.py)."""
@@ -205,6 +206,12 @@ class Evaluation(Brief):
 
 def compare_cloud_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
     """Compare a cloud with the true surface; EvaluationError if truth and cloud do not match."""
+    images = cloud.metadata.get("images")
+    if images is not None and images != len(truth.status):
+        raise EvaluationError(
+            f"the cloud is of a capture of {images} images, the truth of one of {len(truth.status)}: give the truth "
+            "of the cloud's capture"
+        )
     return compare_with_truth(
         cloud.points_mm,
         cloud.frame,
@@ -214,6 +221,37 @@ def compare_cloud_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison
         status=truth.status,
         tolerance_mm=TOLERANCE_MM,
     )
+
+
+def _read_matching_truth(path: str | Path, cloud: PointCloud) -> Truth:
+    """Read a truth file; EvaluationError if it is that of another scene than the cloud's."""
+    header, truth = read_truth(path)
+    if other := _name_other_scene(header, Path(path), cloud.metadata):
+        raise EvaluationError(f"{path} is the truth of another capture: {other}; give the truth of the cloud's capture")
+    return truth
+
+
+def _name_other_scene(header: TruthHeader, path: Path, metadata: Table) -> str | None:
+    """Return the difference between a truth's scene and that of a cloud; None if there is none or it is unknown."""
+    capture = metadata.get("capture")
+    if (digest := metadata.get("scene")) is not None:
+        found = scene_digest(header.scene)
+        return None if found == digest else f"its scene has the digest {found}, that of {capture} {digest}"
+    own, wanted = _kind_of_artefact(header.scene), _kind_of_artefact(metadata)
+    if own is not None and wanted is not None and own != wanted:
+        return f"it shows the artefact '{own}', the cloud '{wanted}'"
+    own, wanted = header.scene.get("medium"), metadata.get("medium")
+    if own is not None and wanted is not None and own != wanted:
+        return f"its medium is {own}, that of the cloud {wanted}"
+    # Captures of earlier versions do not state their scene.
+    if isinstance(capture, str) and path.name != (expected := truth_path(capture).name):
+        return f"the cloud is of {capture}, which does not state its scene, and whose truth is named {expected}"
+    return None
+
+
+def _kind_of_artefact(described: Table) -> object:
+    artefact = described.get("artefact")
+    return artefact.get("kind") if isinstance(artefact, dict) else None
 
 
 def evaluate(
@@ -244,8 +282,8 @@ def evaluate(
     Raises
     ------
     EvaluationError
-        There is neither an artefact nor a truth, an artefact's description is not valid, or the cloud does not show
-        the artefact.
+        There is neither an artefact nor a truth, an artefact's description is not valid, the cloud does not show the
+        artefact, or the truth is that of another capture.
     CaptureError, DescriptionError
         A file cannot be read.
     """
@@ -259,7 +297,7 @@ def evaluate(
     elif isinstance(artefact, dict):
         artefact = parse_artefact(artefact)
     if truth is not None and not isinstance(truth, Truth):
-        truth = read_truth(truth)[1]
+        truth = _read_matching_truth(truth, cloud)
     if artefact is None and truth is None:
         raise EvaluationError(
             "there is no reference for the evaluation: the capture names no artefact. Give `artefact` or `truth`"

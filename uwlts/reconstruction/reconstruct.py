@@ -22,11 +22,12 @@ from uwlts.reconstruction.point_uncertainty import point_uncertainty
 from uwlts.runtime.compiled import compiled
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import resolve_calibration
-from uwlts.storage.capture import Capture, FrameTable, open_capture, sensor_poses
+from uwlts.storage.capture import NO_STAGE, Capture, FrameTable, open_capture, sensor_poses
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
 from uwlts.stripe import StripeSettings, find_stripes
+from uwlts.stripe.capture_stripes import FEWEST_LINES
 
 
 def reconstruct(
@@ -106,6 +107,7 @@ def reconstruct(
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
         alone = scan.header.T_platform_sensor is None and scan.pose_covariance is None
         if alone and mount is None and trajectory is None and clock_offset_s is None and not clock_drift_ppm:
+            _refuse_free_poses(scan)
             stripes = find_stripes(scan, options=stripe, progress=progress)
             return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
         mount = read_mount(mount) if isinstance(mount, str | Path) else mount
@@ -128,6 +130,17 @@ def reconstruct(
             where = cloud.points_mm, cloud.frame, ride
             own = add_platform_uncertainty(own, *where, mount, mount_covariance=apart, correlation_s=pose_correlation_s)
         return replace(cloud, uncertainty=own, warnings=warnings, time_s=scan.time_s[cloud.frame])
+
+
+def _refuse_free_poses(scan: Capture) -> None:
+    """Raise CalibrationError if several laser images have neither a position of the stage nor a pose."""
+    unplaced = np.count_nonzero(scan.laser_on & ~np.isfinite(scan.pose).all(axis=(1, 2)))
+    if scan.header.provenance.get("stage") == NO_STAGE and unplaced and np.count_nonzero(scan.laser_on) > 1:
+        raise CalibrationError(
+            f"{unplaced} laser images of {scan.path.name} have free poses, which are unknown: their stage_mm is only a "
+            "number. Import them with positions of the stage or with poses, or give a trajectory; a capture of a "
+            "target with free poses is for `uwlts calibrate --poses free`"
+        )
 
 
 def reconstruct_stripes(
@@ -167,7 +180,7 @@ def reconstruct_stripes(
     RangeError
         The refractive index is outside the range of media.
     """
-    doubts = check_fits(capture.header, calibration, source=capture.path.name)
+    doubts = check_fits(capture.header, calibration, source=capture.path.name) + _warn_of_repeats(stripes)
     if index is not None and isinstance(calibration, PolynomialCalibration):
         raise CalibrationError(
             "a polynomial calibration is valid only for its own medium, so a refractive index cannot be given; omit it"
@@ -213,12 +226,33 @@ def reconstruct_stripes(
             "medium_index": index,
             "artefact": capture.header.artefact,
             "calibration": digest,
+            "images": len(capture.stage_mm),
+            **{key: value for key, value in capture.header.provenance.items() if key == "scene"},
             **({} if sheet is None else _footprint_metadata(capture, sheet, stripes)),
         },
         lines_by_status=lines,
         rays_by_status={status.name.lower(): int(rays[status]) for status in RayStatus},
         warnings=doubts,
     )
+
+
+def _warn_of_repeats(stripes: CaptureStripes) -> list[str]:
+    """Return a warning if the stripes of neighbouring images are equal, which noise does not allow in two images."""
+    first = np.flatnonzero(np.diff(stripes.frame)) + 1
+    frames, lines, centres = (np.split(each, first) for each in (stripes.frame, stripes.line, stripes.centre_px))
+    repeated = [
+        int(frames[n][0])
+        for n in range(1, len(frames))
+        if len(lines[n]) >= FEWEST_LINES
+        and np.array_equal(lines[n], lines[n - 1])
+        and np.array_equal(centres[n], centres[n - 1])
+    ]
+    if not repeated:
+        return []
+    return [
+        f"the stripe in {len(repeated)} of {len(frames)} images is exactly that in the image before, such as in image "
+        f"{repeated[0]}: the camera or a copy repeated an image, or the images have no noise; check their positions"
+    ]
 
 
 def _lit_sheet(

@@ -132,6 +132,9 @@ def sensor_poses(capture: "Capture | FrameTable") -> np.ndarray:
 CAPTURES = (".h5",)
 """File name endings of captures."""
 
+NO_STAGE = "none: stage_mm counts the poses"
+"""Entry ``stage`` in the provenance of a capture with free poses, where ``stage_mm`` is only a number."""
+
 
 def part_path(path: Path) -> Path:
     """Return the name of an unfinished recording of ``path``."""

@@ -82,4 +82,13 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
             f"{path} has {image.shape[2]} channels, including an alpha channel: grey values under transparency are "
             "undefined; save it without transparency"
         )
-    return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
+    image = image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
+    # OpenCV inverts such images of 8 bit only.
+    if declared.white_is_zero and image.dtype == np.uint16:
+        if declared.bits_per_pixel != 16:
+            raise ImageError(
+                f"{path} is a TIFF file of {declared.bits_per_pixel} bit in which zero is white; save it with zero as "
+                "black (photometric interpretation BlackIsZero)"
+            )
+        image = ~image
+    return image

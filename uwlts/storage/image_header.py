@@ -26,13 +26,17 @@ _SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Declared properties of an image file, before its pixels are decoded."""
+    """Declared properties of an image file, before its pixels are decoded.
+
+    ``white_is_zero`` is the photometric interpretation of TIFF in which large values are dark.
+    """
 
     kind: Literal["PNG", "BMP", "JPEG", "TIFF"]
     width_px: int
     height_px: int
     bits_per_pixel: int
     packed: bool
+    white_is_zero: bool = False
 
     def least_bytes(self) -> float:
         """Return the smallest possible file size in bytes."""
@@ -120,7 +124,9 @@ def _jpeg_header(content: bytes) -> ImageHeader:
             place += 2 + struct.unpack_from(">H", content, place + 2)[0]
 
 
-_WIDTH, _HEIGHT, _BITS, _PACKING, _SAMPLES = 256, 257, 258, 259, 277
+_WIDTH, _HEIGHT, _BITS, _PACKING, _PHOTOMETRIC, _SAMPLES = 256, 257, 258, 259, 262, 277
+_TAGS = (_WIDTH, _HEIGHT, _BITS, _PACKING, _PHOTOMETRIC, _SAMPLES)
+_WHITE_IS_ZERO, _BLACK_IS_ZERO = 0, 1
 
 
 def _tiff_header(content: bytes) -> ImageHeader:
@@ -130,10 +136,10 @@ def _tiff_header(content: bytes) -> ImageHeader:
     (place,) = struct.unpack_from(order + ("Q" if big else "I"), content, 8 if big else 4)
     (count,) = struct.unpack_from(order + ("Q" if big else "H"), content, place)
     place, step, at = place + (8 if big else 2), 20 if big else 12, 12 if big else 8
-    known = {_BITS: 1, _PACKING: 1, _SAMPLES: 1}
+    known = {_BITS: 1, _PACKING: 1, _SAMPLES: 1, _PHOTOMETRIC: _BLACK_IS_ZERO}
     for entry in range(place, place + step * min(count, _MOST_TAGS), step):
         tag, kind = struct.unpack_from(order + "HH", content, entry)
-        if tag in (_WIDTH, _HEIGHT, _BITS, _PACKING, _SAMPLES):
+        if tag in _TAGS:
             # Several values, such as the bits of each colour, are stored elsewhere; the first applies to all.
             (several,) = struct.unpack_from(order + ("Q" if big else "I"), content, entry + 4)
             where, letter = entry + at, {1: "B", 3: "H", 4: "I", 16: "Q"}[kind]
@@ -141,4 +147,11 @@ def _tiff_header(content: bytes) -> ImageHeader:
                 (where,) = struct.unpack_from(order + ("Q" if big else "I"), content, where)
             (known[tag],) = struct.unpack_from(order + letter, content, where)
     bits = known[_BITS] * known[_SAMPLES]
-    return ImageHeader("TIFF", known[_WIDTH], known[_HEIGHT], bits, packed=known[_PACKING] != 1)
+    return ImageHeader(
+        "TIFF",
+        known[_WIDTH],
+        known[_HEIGHT],
+        bits,
+        packed=known[_PACKING] != 1,
+        white_is_zero=known[_PHOTOMETRIC] == _WHITE_IS_ZERO,
+    )

@@ -1,5 +1,7 @@
 """Ground-truth file of a rendered capture, beside it; only the comparison with truth reads it."""
 
+import hashlib
+import json
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -53,6 +55,11 @@ class Truth(Brief):
     crossings: np.ndarray
     depth_mm: np.ndarray
     pose: np.ndarray | None = None
+
+
+def scene_digest(scene: Table) -> str:
+    """Return the digest of a scene's description, by which a rendered capture and its truth know each other."""
+    return hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def truth_path(capture: str | Path) -> Path:

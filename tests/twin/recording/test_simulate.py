@@ -15,7 +15,7 @@ from twin.scene.description import Scene
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
-from uwlts.storage.truth import TruthStatus, read_truth, truth_path
+from uwlts.storage.truth import TruthStatus, read_truth, scene_digest, truth_path
 
 FRAMES = 6
 OPTIONS = Options(spp=16, seed=11)
@@ -78,6 +78,7 @@ def test_a_recording_holds_every_shot_in_its_order(undisturbed, small, scene):
         assert (np.diff(capture.time_s) > 0).all()
         assert capture.header.sensor == small
         assert capture.header.provenance["seed"] == 11
+        assert capture.header.provenance["scene"] == scene_digest(read_truth(truth_path(undisturbed))[0].scene)
         images = [capture.image(index) for index in range(FRAMES)]
         exposure = capture.exposure_ms
     assert all(image.shape == (64, 80) and image.dtype == np.uint8 for image in images)

@@ -22,7 +22,7 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.reconstruction.reconstruct import reconstruct, reconstruct_stripes
 from uwlts.storage.calibration_file import read_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable
+from uwlts.storage.capture import NO_STAGE, Capture, CaptureHeader, Frame, FrameTable
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import StripeOptions, find_stripes
 from uwlts.targets import ChessboardTarget
@@ -49,7 +49,17 @@ def stripe_image(number):
     return np.round(200 * np.exp(-0.5 * (away / 1.2) ** 2)).astype(np.uint8)
 
 
-def write(path, *, medium=FRESH, sensor=None, lasers=(False, True, True, False, True), blank=False, target=None):
+def write(
+    path,
+    *,
+    medium=FRESH,
+    sensor=None,
+    lasers=(False, True, True, False, True),
+    blank=False,
+    target=None,
+    shown=None,
+    **more,
+):
     """A capture of stripes; images with the laser off show one, too, which is not to be found."""
     header = CaptureHeader(
         name="scan",
@@ -59,10 +69,15 @@ def write(path, *, medium=FRESH, sensor=None, lasers=(False, True, True, False, 
         stage_direction=(1, 0, 0),
         saturation_dn=255,
         target=target,
+        **more,
     )
     with CaptureWriter(path, header, dtype=np.uint8) as writer:
         for number, laser in enumerate(lasers):
-            image = np.zeros((HEIGHT, WIDTH), np.uint8) if blank else stripe_image(number)
+            image = (
+                np.zeros((HEIGHT, WIDTH), np.uint8)
+                if blank
+                else stripe_image(number if shown is None else shown[number])
+            )
             writer.append(Frame(image, stage_mm=2.0 * number, laser_on=laser, exposure_ms=1.0, time_s=float(number)))
     return path
 
@@ -288,3 +303,21 @@ def test_rows_of_a_rolling_shutter_are_where_the_stage_was_when_they_were_expose
     np.testing.assert_allclose((rows.points_mm - at_rest.points_mm)[:, 0], speed * delay_s, atol=1e-9)
     np.testing.assert_allclose((rows.points_mm - at_rest.points_mm)[:, 1:], 0, atol=1e-9)
     assert np.ptp(speed * delay_s) > 0.01
+
+
+def test_free_poses_are_refused(tmp_path):
+    free = {"provenance": {"stage": NO_STAGE}}
+    path = write(tmp_path / "free.h5", **free)
+    with pytest.raises(
+        CalibrationError, match="3 laser images of free.h5 have free poses, which are unknown: .* or give a"
+    ):
+        reconstruct(path, CALIBRATION)
+    # The points of a single image need no position.
+    assert len(reconstruct(write(tmp_path / "one.h5", lasers=(True,), **free), CALIBRATION)) == WIDTH
+
+
+def test_a_repeated_image_is_reported(tmp_path, path):
+    assert reconstruct(path, CALIBRATION).warnings == []
+    twice = reconstruct(write(tmp_path / "twice.h5", lasers=4 * (True,), shown=(0, 1, 1, 2)), CALIBRATION)
+    (warning,) = twice.warnings
+    assert "the stripe in 1 of 4 images is exactly that in the image before, such as in image 2" in warning

@@ -1,6 +1,7 @@
 """Import of foreign images as a capture: formats, channels, bits, positions, and refusals with their cause."""
 
 import contextlib
+import struct
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ import tomli_w
 from uwlts import cli
 from uwlts.errors import DescriptionError, ImageError, OutputError
 from uwlts.runtime.console import run
-from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.capture import NO_STAGE, Capture, part_path
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_ import import_images
@@ -77,6 +78,25 @@ def test_every_format_comes_in(tmp_path: Path, suffix: str):
         error = np.abs(capture.image(0).astype(int) - image)
         # JPEG at OpenCV's quality of 95 quantises the cosines by a few grey levels.
         assert error.max() <= (12 if suffix in (".jpg", ".jpeg") else 0)
+
+
+def tiff_of(image: np.ndarray, *, photometric: int, order: str) -> bytes:
+    """Return an uncompressed TIFF file of one strip in an order of bytes, < or >."""
+    (height, width), data = image.shape, image.astype(image.dtype.newbyteorder(order)).tobytes()
+    tags = {256: width, 257: height, 258: 8 * image.itemsize, 259: 1, 262: photometric, 273: 8, 277: 1, 278: height}
+    tags[279] = len(data)
+    entries = b"".join(struct.pack(order + "HHII", tag, 4, 1, value) for tag, value in tags.items())
+    start = {"<": b"II*\0", ">": b"MM\0*"}[order] + struct.pack(order + "I", 8 + len(data))
+    return start + data + struct.pack(order + "H", len(tags)) + entries + bytes(4)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_white_may_be_zero_in_a_tiff(tmp_path: Path, dtype: type, order: str):
+    image = stripe_image().astype(dtype) * (1 if dtype == np.uint8 else 200)
+    for photometric, stored in ((1, image), (0, np.iinfo(dtype).max - image)):
+        (tmp_path / "a.tif").write_bytes(tiff_of(stored, photometric=photometric, order=order))
+        assert np.array_equal(read_image(tmp_path / "a.tif"), image)
 
 
 def test_everything_described_is_in_the_capture(tmp_path: Path):
@@ -251,7 +271,11 @@ def test_free_poses_count_the_images(tmp_path: Path):
     import_images(folder, tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert capture.stage_mm.tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
-        assert "counts the poses" in capture.header.provenance["stage"]
+        assert capture.header.provenance["stage"] == NO_STAGE
+    folder_of(tmp_path, {}, given | {"provenance": {"operator": "me"}})
+    import_images(folder, tmp_path / "a.h5", overwrite=True)
+    with Capture(tmp_path / "a.h5") as capture:
+        assert capture.header.provenance == {"operator": "me", "stage": NO_STAGE}
 
 
 @pytest.mark.parametrize("separator", [",", ";"])

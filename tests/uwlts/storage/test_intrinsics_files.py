@@ -113,7 +113,7 @@ def test_longer_models_pass_where_they_say_no_more(tmp_path: Path):
     [
         (
             ROS.replace("plumb_bob", "equidistant"),
-            "distortion model is 'equidistant'; this program's camera is a pinhole",
+            "another lens model, distortion_model: equidistant; this program's camera is a pinhole",
         ),
         (
             ROS.replace("plumb_bob", "rational_polynomial").replace("0.03125]", "0.03125, 0, 0, 0, 0.1, 0, 0, 0]"),
@@ -141,6 +141,64 @@ def test_what_is_no_such_camera(tmp_path: Path, text: str, words: str):
     (tmp_path / "camera.yaml").write_text(text)
     with pytest.raises(DescriptionError, match=words):
         read_intrinsics(tmp_path / "camera.yaml")
+
+
+KALIBR = """\
+cam0:
+  cam_overlaps: []
+  camera_model: pinhole
+  distortion_coeffs: [-0.125, 0.0625, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [2451.25, 2450.75, 640.5, 511.25]
+  resolution: [1280, 1024]
+  rostopic: /cam0/image_raw
+"""
+
+
+def test_a_file_of_kalibr(tmp_path: Path):
+    (tmp_path / "camera.yaml").write_text(KALIBR)
+    known = read_intrinsics(tmp_path / "camera.yaml")
+    assert known == replace(KNOWN, distortion=KNOWN.distortion.model_copy(update={"k3": 0.0}))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (KALIBR.replace("radtan", "equidistant"), "another lens model, distortion_model: equidistant"),
+        (KALIBR.replace("radtan", "equi"), "another lens model, distortion_model: equi"),
+        (KALIBR.replace("radtan", "fov"), "another lens model, distortion_model: fov"),
+        (KALIBR.replace("pinhole", "omni"), "another lens model, camera_model: omni"),
+        (KALIBR.replace("pinhole", "ds"), "another lens model, camera_model: ds"),
+        (KALIBR.replace("pinhole", "eucm"), "another lens model, camera_model: eucm"),
+        (KALIBR + KALIBR.replace("cam0:", "cam1:"), "has 2 cameras .cam0, cam1.; expected one"),
+        (KALIBR.replace("[2451.25, ", "[0.5, 2451.25, "), "there are 5 intrinsics; expected fx, fy, cx, cy"),
+        (ROS + "fisheye_model: 1\n", "another lens model, fisheye_model: 1"),
+        (ROS + "fisheye: true\n", "another lens model, fisheye: True"),
+        (ROS.replace("plumb_bob", "fisheye"), "another lens model, distortion_model: fisheye"),
+        (ROS.replace("plumb_bob", "Inverse Brown Conrady"), "distortion_model: Inverse Brown Conrady"),
+        (ROS + "model: OPENCV_FISHEYE\n", "another lens model, model: OPENCV_FISHEYE"),
+        (ROS + "Camera.type: KannalaBrandt8\n", "another lens model, Camera.type: KannalaBrandt8"),
+        (ROS + "xi: 1.2\n", "another lens model, xi: 1.2"),
+    ],
+)
+def test_a_foreign_lens_model_is_refused_by_its_name(tmp_path: Path, text: str, words: str):
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(DescriptionError, match=words):
+        read_intrinsics(tmp_path / "camera.yaml")
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
+def test_the_fisheye_mark_of_opencv(tmp_path: Path, suffix: str):
+    entries = {"K": MATRIX, "D": COEFFICIENTS, "image_width": 1280, "image_height": 1024}
+    assert read_intrinsics(written(tmp_path / f"pinhole.{suffix}", entries | {"fisheye_model": 0})) == KNOWN
+    with pytest.raises(DescriptionError, match="another lens model, fisheye_model: 1"):
+        read_intrinsics(written(tmp_path / f"fisheye.{suffix}", entries | {"fisheye_model": 1}))
+
+
+@pytest.mark.parametrize("more", ["camera_model: acA1920-40gm", "model: Pinhole", "type: mono", "fisheye: false"])
+def test_names_that_state_no_foreign_model(tmp_path: Path, more: str):
+    (tmp_path / "camera.yaml").write_text(f"{ROS}{more}\n")
+    assert read_intrinsics(tmp_path / "camera.yaml") == KNOWN
 
 
 def test_a_missing_or_binary_file(tmp_path: Path):

@@ -1,6 +1,8 @@
-"""Camera calibrations of other programs: OpenCV's files and ROS CameraInfo."""
+"""Camera calibrations of other programs: files of OpenCV and Kalibr, and ROS CameraInfo."""
 
 import io
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +19,17 @@ from uwlts.model.sensor import Distortion, Sensor
 # Alternative names, compared without case and underscores.
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "m1")
 _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoef", "d", "d1")
-_BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
-
+_BROWN_CONRADY = ("", "plumbbob", "rationalpolynomial", "radtan", "radialtangential", "brownconrady", "opencv")
+_PINHOLES = ("pinhole", "perspective", "none")
+_MODELS = ("distortionmodel", "distortiontype", "projectionmodel", "lensmodel")
+"""Names that state nothing but the lens model, so that an unknown value is a foreign model."""
+_MAYBE_MODELS = ("cameramodel", "cameratype", "model", "modeltype", "type", "projection", "lens", "lenstype")
+"""Names that may state something else, such as the product, so that only values in `_FOREIGN` are foreign models."""
+_FOREIGN = re.compile(
+    "fisheye|fishlens|equi|kannala|kb[0-9]*$|omni|mei$|mei[^a-z]|scaramuzza|ocam|fov$|ftheta|doublesphere|ds$|eucm|ucm|"
+    "unified|division|spherical|panoram|cylind|stereographic|orthographic|thinprism|inversebrown|telecentric|radialfish"
+)
+_NO = ("", "0", "0.0", "false", "no", "off", "none")
 
 _MOST_BYTES = 2**20
 _LARGEST = 1e9
@@ -51,7 +62,7 @@ class KnownCamera:
 
 
 def read_intrinsics(path: Path) -> KnownCamera:
-    """Read a camera from an OpenCV file (YAML, XML or JSON) or a ROS CameraInfo (YAML).
+    """Read a camera from an OpenCV file (YAML, XML or JSON), a ROS CameraInfo or a Kalibr file of one camera (YAML).
 
     Raises DescriptionError if the file is missing or damaged, lacks camera matrix or distortion, or the camera is not a
     pinhole with Brown-Conrady or rational distortion.
@@ -61,13 +72,8 @@ def read_intrinsics(path: Path) -> KnownCamera:
     )
     # OpenCV's own parser hangs or terminates the process on some damaged files.
     entries = _xml(text, path) if text.lstrip().startswith("<?xml") else _yaml(text, path)
-    known = {key.lower().replace("_", ""): value for key, value in entries.items()}
-    model = str(known.get("distortionmodel") or "").lower()
-    if model not in _BROWN_CONRADY:
-        raise DescriptionError(
-            f"{path}: the distortion model is {shorten(repr(model))}; this program's camera is a pinhole with k1, "
-            "k2, p1, p2, k3 (plumb_bob) or with k4, k5, k6 as well (rational_polynomial): calibrate with one of these"
-        )
+    _refuse_foreign_models(entries, path)
+    known = _unpack_kalibr({_plain_name(key): value for key, value in entries.items()}, path)
     matrix, coefficients = _numbers(known, _MATRIX, path), _numbers(known, _COEFFICIENTS, path)
     if matrix.size != 9:
         raise DescriptionError(f"{path}: the camera matrix has {matrix.size} elements; expected 3 x 3")
@@ -144,7 +150,9 @@ def _yaml(text: str, path: Path) -> dict[str, object]:
     except (yaml.YAMLError, ValueError, TypeError) as error:
         raise DescriptionError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(entries, dict):
-        raise DescriptionError(f"{path} holds no table of names and values; expected ROS CameraInfo or an OpenCV file")
+        raise DescriptionError(
+            f"{path} holds no table of names and values; expected ROS CameraInfo or an OpenCV or Kalibr file"
+        )
     return {str(key): value for key, value in entries.items()}
 
 
@@ -157,6 +165,62 @@ def _refuse_references(text: str) -> None:
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MOST_DEPTH:
             raise ValueError(f"it is nested more than {MOST_DEPTH} deep")
+
+
+def _plain_name(name: object) -> str:
+    """Return the last part of a dotted name in lower case without separators."""
+    return re.sub("[^a-z0-9]", "", str(name).rpartition(".")[2].lower())
+
+
+def _refuse_foreign_models(entries: dict[str, object], path: Path) -> None:
+    """Raise DescriptionError if any entry, also in nested tables, states a lens model that the sensor does not have."""
+    for key, value in _named_values(entries):
+        name, model = _plain_name(key), _plain_name(value)
+        foreign = model not in (*_BROWN_CONRADY, *_PINHOLES)
+        if name in _MODELS:
+            refused = foreign and value is not None
+        elif name in _MAYBE_MODELS:
+            refused = foreign and _FOREIGN.search(model) is not None
+        else:
+            # OpenCV writes fisheye_model: 1, and xi for its omnidirectional model.
+            refused = ("fisheye" in name or name == "xi") and str(value).lower() not in _NO
+        if refused:
+            raise DescriptionError(
+                f"{path} has another lens model, {key}: {shorten(str(value))}; this program's camera is a pinhole with "
+                "k1, k2, p1, p2, k3 (plumb_bob) or with k4, k5, k6 as well (rational_polynomial): calibrate with one "
+                "of these"
+            )
+
+
+def _named_values(value: object) -> Iterator[tuple[str, object]]:
+    """Yield the names and values of all tables, outer ones first; tables and lists of tables are searched."""
+    if isinstance(value, dict):
+        yield from ((str(key), each) for key, each in value.items() if not isinstance(each, dict | list))
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    for each in inner:
+        if isinstance(each, dict | list):
+            yield from _named_values(each)
+
+
+def _unpack_kalibr(known: dict[str, object], path: Path) -> dict[str, object]:
+    """Return the entries of the only camera of a Kalibr file as those of a CameraInfo; other files unchanged."""
+    cameras = {name: each for name, each in known.items() if isinstance(each, dict) and "intrinsics" in each}
+    if not cameras:
+        return known
+    if len(cameras) > 1:
+        raise DescriptionError(
+            f"{path} has {len(cameras)} cameras ({shorten(', '.join(cameras))}); expected one: give a file with only "
+            "the camera of the sensor"
+        )
+    camera = {_plain_name(key): value for key, value in next(iter(cameras.values())).items()}
+    numbers = _numbers(camera, ("intrinsics",), path).tolist()
+    if len(numbers) != 4:
+        raise DescriptionError(f"{path}: there are {len(numbers)} intrinsics; expected fx, fy, cx, cy of a pinhole")
+    fx, fy, cx, cy = numbers
+    camera["cameramatrix"] = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
+    if isinstance(size := camera.get("resolution"), list) and len(size) == 2:
+        camera["imagewidth"], camera["imageheight"] = size
+    return camera
 
 
 def _first(known: dict[str, object], names: tuple[str, ...]) -> object:

@@ -27,6 +27,7 @@ from uwlts.storage.import_.folder_description import (
 )
 from uwlts.storage.import_.grey_values import bits_of, extract_channel, grey_values, is_formula, subtract_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
+from uwlts.storage.import_.mosaic import demosaic, is_mosaic
 from uwlts.stripe import Stripe
 from uwlts.stripe.capture_stripes import (
     BLACK,
@@ -46,6 +47,8 @@ _SIZE_ADVICE = {
 }
 """Advice on an image of another size than the sensor's, by whether it is the first, and whether it is rotated."""
 
+_MOST_EXAMINED = 4  # images of each light in which a mosaic is looked for
+
 
 @dataclass(eq=False)
 class _Content:
@@ -53,7 +56,8 @@ class _Content:
 
     ``saturation_dn`` is that of the files; ``target``: the description has a target. ``black`` has the names of the
     dark images and ``seen`` the number of all, by whether the laser was on. ``with_stripe`` counts the images with a
-    stripe, ``sideways`` those with a stripe across the expected direction.
+    stripe, ``sideways`` those with a stripe across the expected direction. ``mosaics`` has the names of the raw Bayer
+    images among the first of each light, and ``repeats`` the laser images that are equal to the one before.
     """
 
     stripe_along: str
@@ -63,6 +67,9 @@ class _Content:
     seen: dict[bool, int] = field(default_factory=lambda: {False: 0, True: 0})
     with_stripe: int = 0
     sideways: int = 0
+    mosaics: list[str] = field(default_factory=list)
+    repeats: list[str] = field(default_factory=list)
+    _last: np.ndarray | None = None
 
     def add_image(self, image: np.ndarray, *, laser_on: bool, name: str) -> None:
         """Count an image (H, W) from the camera; raises ImageError if most of it is saturated."""
@@ -75,6 +82,13 @@ class _Content:
             )
         if is_black(image, self.saturation_dn):
             self.black[laser_on].append(name)
+            return
+        if self.seen[laser_on] - len(self.black[laser_on]) <= _MOST_EXAMINED and is_mosaic(image):
+            self.mosaics.append(name)
+        if laser_on:
+            if self._last is not None and np.array_equal(image, self._last):
+                self.repeats.append(name)
+            self._last = image
 
     def find_stripe(self, image: np.ndarray) -> None:
         """Look for a stripe in a laser image (H, W) after background subtraction, if any."""
@@ -104,6 +118,17 @@ class _Content:
             for on, light in ((True, "laser"), (False, "lamp"))
             if self.black[on]
         ]
+        if self.mosaics:
+            warnings.append(
+                f"{self.mosaics[0]} looks like a raw Bayer image of a colour camera, whose pixels alternate between "
+                "colours. This shifts the stripe: give the pattern and the laser's channel, such as bayer = 'RGGB' and "
+                "channel = 'red', or convert the images to grey or colour in the camera"
+            )
+        if self.repeats:
+            warnings.append(
+                f"{len(self.repeats)} of {self.seen[True]} laser images are equal to the one before, such as "
+                f"{self.repeats[0]}: the camera or a copy repeated an image, so that positions may be wrong"
+            )
         lasers = self.seen[True]
         if lasers and not self.with_stripe:
             advice = "check which images are laser images, the channel, and the exposure"
@@ -280,6 +305,7 @@ class _Reader:
         bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
         self.dtype = raw.dtype
         values = grey_values(raw, bits=bits, aligned=given.aligned, name=name)
+        values = values if given.bayer is None else demosaic(values, given.bayer, name=name)
         return extract_channel(values, channel, name=name), bits
 
     def _require_size(self, name: str, declared: ImageHeader) -> None:
@@ -303,7 +329,9 @@ def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, 
     """Return the provenance of the capture."""
     remarks: Table = {"source": "imported images", "uwlts": __version__, "folder": folder.resolve().name}
     remarks |= {"bits": bits, "stage": stage_remark(given)}
-    remarks |= {key: getattr(given, key) for key in ("channel", "lamp_channel", "intrinsics") if getattr(given, key)}
+    remarks |= {
+        key: getattr(given, key) for key in ("bayer", "channel", "lamp_channel", "intrinsics") if getattr(given, key)
+    }
     if zero_dn:
         background = any(row.background is not None for row in frames)
         name, done = ("background", "subtracted from the laser images, ") if background else ("laser_images", "")

@@ -10,9 +10,10 @@ from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json, re
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.library import find_description, load_sensor, merge_tables, read_table, validate_description
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
-from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.capture import NO_STAGE, CaptureHeader
 from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.grey_values import Channel
+from uwlts.storage.import_.mosaic import BayerPattern
 from uwlts.targets import parse_target
 
 NAME = "import.toml"
@@ -67,7 +68,8 @@ class ImportDescription(Description):
     ``header`` names a capture's header as JSON, which replaces all fields that it contains. Other files are relative to
     the description, images to their folder. ``sensor`` is a name, the path of a description, or a table with an
     optional ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; images that are
-    both ``laser`` and ``lamp`` show the laser on the lit target. ``table`` is a CSV file with the values of each image.
+    both ``laser`` and ``lamp`` show the laser on the lit target. ``bayer`` is the pattern of a colour camera's raw
+    images. ``table`` is a CSV file with the values of each image.
     With ``centre_lines`` the laser files contain centre lines of one or more profiles.
     """
 
@@ -83,6 +85,7 @@ class ImportDescription(Description):
     table: str | None = None
     channel: Channel | None = None
     lamp_channel: Channel | None = None
+    bayer: BayerPattern | None = None
     bits: Annotated[int, Field(ge=8, le=16)] | None = None
     aligned: Literal["low", "high"] = "low"
     saturation_dn: Annotated[int, Field(gt=0)] | None = None
@@ -127,8 +130,11 @@ def capture_header(
     Files named in the description are relative to the folder ``beside``. Raises DescriptionError if medium, target,
     direction or header are missing, unknown or not valid, and EvaluationError if the artefact is not valid.
     """
+    # A description with its own provenance must not hide that there is no stage.
+    mark: Table = {"stage": NO_STAGE} if given.stage.free else {}
     if given.header is not None:
-        return read_header(beside / given.header)
+        header = read_header(beside / given.header)
+        return header.model_copy(update={"provenance": header.provenance | mark})
     if given.stage.direction is None and not given.stage.free:
         raise DescriptionError(
             "stage.direction is missing: give the unit vector in which the stage moves the sensor, in the OCS, "
@@ -141,7 +147,7 @@ def capture_header(
     table = {"name": given.name or name, "sensor": sensor, "saturation_dn": saturation_dn}
     table |= {"stage_direction": given.stage.direction or (1.0, 0.0, 0.0), "medium_name": given.medium}
     table |= {"medium": sensor.medium(given.medium or ""), "target": given.target, "artefact": given.artefact}
-    table |= {"provenance": remarks if given.provenance is None else given.provenance}
+    table |= {"provenance": (remarks if given.provenance is None else given.provenance) | mark}
     return validate_description(CaptureHeader, table, "the header from the description")
 
 

@@ -15,7 +15,7 @@ from uwlts.errors import DescriptionError, ImageError
 from uwlts.files.inputs import record_input
 from uwlts.files.reading import is_regular_file, read_text
 from uwlts.model.calibration import is_rigid
-from uwlts.storage.capture import POSE_ROUNDED
+from uwlts.storage.capture import NO_STAGE, POSE_ROUNDED
 from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_.folder_description import ImportDescription, Patterns
 from uwlts.stripe import Stripe
@@ -252,7 +252,7 @@ def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool
 def stage_remark(given: ImportDescription) -> str:
     """Return the source of the positions, for the capture's provenance."""
     if given.stage.free:
-        return "none: stage_mm counts the poses"
+        return NO_STAGE
     if given.stage.start_mm is not None:
         return f"from {given.stage.start_mm:g} mm in steps of {given.stage.step_mm:g} mm"
     return "positions as listed"
