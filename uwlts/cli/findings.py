@@ -18,7 +18,7 @@ from uwlts.cli.options import (
     wrote_files,
     wrote_page,
 )
-from uwlts.runtime.command_line import Call, command_from, show, warn
+from uwlts.runtime.command_line import Call, command_from, show
 
 _INSPECTIONS = [(uwlts, f"inspect_{kind}") for kind in ("pipe", "weld", "flange")]
 """Functions that provide the options of an inspection."""
@@ -93,7 +93,6 @@ def inspect(
 
     measured = read_cloud(call.given.pop("cloud"))
     options = call.given if datum is None else call.given | {"datum": datum}
-    warn(*measured.warnings)
     found = inspect_cloud(measured, kind, **options)
     show(found.lines())
     if coloured:

@@ -121,7 +121,7 @@ def reconstruct(
         cloud = reconstruct_stripes(
             table, stripes, calibration, index=index, with_uncertainty=known, mount_by=common if known else None
         )
-        warnings = [*cloud.warnings, *(trajectory.warnings if trajectory is not None else ())]
+        warnings = cloud.warnings
         if mount is None and scan.header.T_platform_sensor is not None:
             warnings = [*warnings, "the mount has its design values: calibrate it (uwlts mount) and give `mount`"]
         own = cloud.uncertainty

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import open_regular, parse_json, require_regular_file, shorten
+from uwlts.files.reading import log_warnings, open_regular, parse_json, require_regular_file, shorten
 from uwlts.files.writing import refuse_unsuitable, require_ending, write_atomically
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.cloud import (
@@ -189,6 +189,7 @@ def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None)
             cloud, total = _read_rows(Path(path), lambda count: _every(count, at_most))
         if not len(cloud) and cloud.warnings:
             raise CaptureError(f"no point is left: {'; '.join(cloud.warnings)}")
+        log_warnings(path, cloud.warnings)
         return cloud, total
 
 
@@ -226,6 +227,7 @@ def read_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Iter
     while start < total:
         with _naming(path):
             part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
+            log_warnings(path, part.warnings)
         yield part
         start += most
 

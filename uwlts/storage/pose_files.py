@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
+from uwlts.files.reading import log_warnings
 from uwlts.files.writing import write_atomically
 from uwlts.model.calibration import is_rigid
 from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
@@ -136,7 +137,8 @@ def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray, covariance: np
     same = np.append(False, (np.diff(times) == 0) & (poses[1:] == poses[:-1]).all(axis=(1, 2)))
     warnings = []
     if count := int(np.count_nonzero(same)):
-        warnings = [f"{path.name}: {count} of {len(times)} poses repeat the previous one at the same time; omitted"]
+        warnings = [f"{count} of {len(times)} poses repeat the previous one at the same time and are omitted"]
+        log_warnings(path, warnings)
     try:
         known = None if covariance is None else covariance[~same]
         return Trajectory(times[~same], poses[~same], known, warnings=warnings)

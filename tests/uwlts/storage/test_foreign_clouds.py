@@ -132,13 +132,14 @@ def test_rounded_coordinates_may_coincide(tmp_path: Path):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("suffix", [".ply", ".xyz"])
-def test_points_without_coordinates_are_omitted_and_counted(tmp_path: Path, suffix: str, value: float):
+def test_points_without_coordinates_are_omitted_and_counted(tmp_path: Path, suffix: str, value: float, caplog):
     points = np.random.default_rng(3).uniform(1, 2, (50, 3))
     points[[4, 9, 20], [0, 1, 2]] = value
     _write(tmp_path / f"a{suffix}", points)
     found = read_cloud(tmp_path / f"a{suffix}")
     assert np.abs(found.points_mm - np.delete(points, [4, 9, 20], axis=0)).max() < 1e-6
     assert found.warnings == ["3 of 50 points without finite coordinates are omitted"]
+    assert caplog.messages == [f"warning: {tmp_path}/a{suffix}: {found.warnings[0]}"]
     assert [len(part) for part in read_parts(tmp_path / f"a{suffix}", 25)] in ([22, 25], [25, 22])
 
 
