@@ -18,7 +18,8 @@ from twin.scene.motion import Light, Shot
 from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Bracket, Description, NotNegative, Positive
-from uwlts.storage.pose_files import Unit, read_trajectory
+from uwlts.storage.number_tables import Unit
+from uwlts.storage.pose_files import read_trajectory
 
 Poses = Callable[[np.ndarray], np.ndarray]
 """Poses (N, 4, 4) at times (N,) in s."""

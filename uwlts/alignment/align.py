@@ -31,7 +31,8 @@ from uwlts.reconstruction.path_uncertainty import correct_path_uncertainty
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
-from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
+from uwlts.storage.number_tables import Unit
+from uwlts.storage.pose_files import PoseFormat, read_trajectory
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def align_trajectory(
     trajectory: Trajectory | str | os.PathLike[str],
     *,
     pose_format: PoseFormat = "quaternion-xyzw",
-    pose_unit: Unit = "mm",
+    pose_unit: Unit | None = None,
     clock_offset_s: float = 0.0,
     clock_drift_ppm: float = 0.0,
     drift_mm: float | None = None,

@@ -20,7 +20,7 @@ from uwlts.fitting.point_spacing import POINTS_PER_DISC
 from uwlts.model.sensor import Description, Positive, Vector
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 from uwlts.storage.cloud_files import read_cloud
-from uwlts.storage.pose_files import MM_PER_UNIT, Unit, check_unit
+from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
 
 _SAMPLES_PER_DISC = 60
 """Samples of a mesh in a disc: twice the points of a cloud, so that the cloud's noise dominates."""

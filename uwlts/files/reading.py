@@ -5,13 +5,14 @@ and no output replaces it. Limits are checked before parsing; the reader checks 
 """
 
 import json
+import logging
 import math
 import os
 import re
 import stat
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from pydantic import JsonValue
 
 Content = TypeVar("Content")
+_LOG = logging.getLogger("uwlts")
 
 MiB = 2**20
 MOST_TOML_BYTES = MiB
@@ -101,6 +103,12 @@ def _printable_name(path: str | Path) -> str:
 def shorten(text: str, most: int = 300) -> str:
     """Shorten a text for a message."""
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
+
+
+def log_warnings(path: str | Path, warnings: Iterable[str]) -> None:
+    """Log warnings about the content of a file; without further settings, Python prints them on standard error."""
+    for warning in warnings:
+        _LOG.warning("warning: %s: %s", path, warning)
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, error: type[Error] = CaptureError, called: str = "file") -> bytes:

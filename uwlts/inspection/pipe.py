@@ -23,6 +23,11 @@ _OVERLAP = 0.6
 _BEYOND_CUT = 0.1
 """Largest angle of findings beyond the cut, rad. Farther points only serve as surroundings: on the other side of
 the cut the same blemishes are found with more surroundings."""
+_SMALLEST_MM, _USUAL_MM = 5.0, (20.0, 5000.0)
+"""Smallest diameter that a triangulation sensor could inspect, and usual diameters of pipes."""
+_OTHER_UNITS = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
+_THICKEST = 5
+"""Ratio of diameter to wall below which a pipe is unusual; in ASME B36.10M it is larger from 1 1/2 inches on."""
 _FEWEST_POINTS = 500
 """Fewest points for a search on a pipe's surface."""
 
@@ -88,6 +93,7 @@ def inspect_pipe(
     if len(cloud) < _FEWEST_POINTS:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST_POINTS} are needed for a pipe")
     form = fit_pipe(cloud, largest_ovality=largest_ovality)
+    of_size = _check_size(2 * form.radius_mm, wall_mm)
     chosen = np.flatnonzero(np.abs(form.distance_mm) < FORM_RULE.off_pipe * form.radius_mm)
     off = _note_points_off(form, chosen)
     search = _search_form(cloud, form, chosen, false_alarm)
@@ -101,8 +107,27 @@ def inspect_pipe(
     deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
-    notes = *_note_limits(cloud, form, search), *off, *of_sections, *of_blemishes
+    notes = *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *of_blemishes
     return Inspection("pipe", (*features, *blemishes), deviation, level, notes)
+
+
+def _check_size(diameter_mm: float, wall_mm: float | None) -> list[str]:
+    """Return a note if the size of a pipe is unusual; raises EvaluationError if it is impossible."""
+    thinnest = max(_SMALLEST_MM, 2 * (wall_mm or 0))
+    if diameter_mm < thinnest:
+        least = max(_USUAL_MM[0], _THICKEST * (wall_mm or 0))
+        likely = [name for name, mm in _OTHER_UNITS.items() if least < mm * diameter_mm < _USUAL_MM[1]]
+        wall = "" if wall_mm is None else f" and a wall of {wall_mm:g} mm"
+        raise EvaluationError(
+            f"the pipe has a diameter of {diameter_mm:.4g} mm{wall}, which is impossible: the coordinates must be in "
+            f"mm{', but seem to be in ' if likely else ''}{' or '.join(likely)}"
+        )
+    if wall_mm is not None and diameter_mm < _THICKEST * wall_mm:
+        return [
+            f"the wall of {wall_mm:g} mm is unusually thick for a diameter of {diameter_mm:.4g} mm: check the unit of "
+            "the coordinates (mm) and the wall"
+        ]
+    return []
 
 
 def _search_form(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, false_alarm: float) -> BlemishSearch:

@@ -1,6 +1,7 @@
 """Trajectory of a platform: poses at known times, and interpolation between them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from uwlts.model.calibration import is_rigid
 _ROUNDED = 1e-6
 _LARGEST_DRIFT_PPM = 10_000.0
 """A hundred times the drift of the worst quartz; larger values indicate a wrong unit."""
+_UNIX_S = 946_684_800.0, 4_102_444_800.0
+"""Unix times from 2000 to 2100."""
 COVARIANCE_COLUMNS = {f"cov_{i}{j}": (i, j) for i in range(6) for j in range(i, 6)}
 """Names of a file's columns with the upper triangle of each covariance, and their row and column in it."""
 
@@ -34,6 +37,8 @@ class Trajectory(Brief):
         ``T_base_platform``, mm.
     covariance : (N, 6, 6) float64, optional
         Of each pose: translation in mm, and small rotation in rad about the base's axes, R_true = exp(rotation) R.
+    warnings : list of str
+        Omissions by the reader of a file, for example of repeated poses.
 
     Raises
     ------
@@ -44,6 +49,7 @@ class Trajectory(Brief):
     times_s: np.ndarray
     poses: np.ndarray
     covariance: np.ndarray | None = None
+    warnings: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         times, poses = np.array(self.times_s, dtype=np.float64), np.array(self.poses, dtype=np.float64)
@@ -53,8 +59,10 @@ class Trajectory(Brief):
             )
         if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
             wrong = int(np.argmin(np.append(np.inf, np.diff(times)) > 0))
+            before = f", pose {wrong} at {format_time(times[wrong - 1])}" if wrong else ""
             raise DescriptionError(
-                f"the times of a trajectory must be finite and increase: pose {wrong + 1} is at {times[wrong]:g} s"
+                "the times of a trajectory must be finite and increase: "
+                f"pose {wrong + 1} is at {format_time(times[wrong])}{before}"
             )
         if not is_rigid(poses, within=_ROUNDED):
             raise DescriptionError("the poses of a trajectory must be rigid transforms with 0 0 0 1 as last row")
@@ -74,7 +82,9 @@ class Trajectory(Brief):
             names += COVARIANCE_COLUMNS
             table = np.column_stack([table, *(self.covariance[:, i, j] for i, j in COVARIANCE_COLUMNS.values())])
         with write_atomically(path, overwrite=overwrite) as aside:
-            np.savetxt(aside, table, fmt="%.12g", delimiter=",", header=",".join(names), comments="")
+            # Unix times need more digits than positions.
+            formats = ["%.16g", *["%.12g"] * (len(names) - 1)]
+            np.savetxt(aside, table, fmt=formats, delimiter=",", header=",".join(names), comments="")
 
     @cached_property
     def _positions(self) -> CubicSpline:
@@ -105,13 +115,22 @@ class Trajectory(Brief):
         first, last = self.times_s[[0, -1]]
         if outside := int(np.count_nonzero(~((wanted >= first) & (wanted <= last)))):
             raise DescriptionError(
-                f"{outside} of {wanted.size} times, {wanted.min():.3f} to {wanted.max():.3f} s, are outside the "
-                f"trajectory from {first:.3f} to {last:.3f} s: check the offset of the clocks"
+                f"{outside} of {wanted.size} times, {format_time(wanted.min())} to {format_time(wanted.max())}, are "
+                f"outside the trajectory from {format_time(first)} to {format_time(last)}: check the offset of the "
+                "clocks"
             )
         poses = np.tile(np.eye(4), (len(wanted), 1, 1))
         poses[:, :3, :3] = self._rotations(wanted).as_matrix()
         poses[:, :3, 3] = self._positions(wanted)
         return poses
+
+
+def format_time(time_s: float) -> str:
+    """Return a time in s for a message, with the date if it is a Unix time after 2000."""
+    text = f"{time_s:.9f}".rstrip("0").rstrip(".") + " s"
+    if not _UNIX_S[0] < time_s < _UNIX_S[1]:
+        return text
+    return f"{text} ({datetime.fromtimestamp(time_s, UTC):%Y-%m-%d %H:%M:%S.%f} UTC)"
 
 
 def convert_to_platform_clock(times_s: np.ndarray, *, offset_s: float, drift_ppm: float) -> np.ndarray:

@@ -25,7 +25,8 @@ from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import NO_STAGE, Capture, FrameTable, open_capture, sensor_poses
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 from uwlts.storage.mount_files import read_mount
-from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
+from uwlts.storage.number_tables import Unit
+from uwlts.storage.pose_files import PoseFormat, read_trajectory
 from uwlts.stripe import StripeSettings, find_stripes
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 
@@ -37,7 +38,7 @@ def reconstruct(
     mount: Mount | str | Path | None = None,
     trajectory: Trajectory | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
-    pose_unit: Unit = "mm",
+    pose_unit: Unit | None = None,
     clock_offset_s: float | None = None,
     clock_drift_ppm: float = 0.0,
     pose_correlation_s: float | None = None,
@@ -64,8 +65,8 @@ def reconstruct(
         Format of the trajectory: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg
         (intrinsic axes), euler-zyx-deg (extrinsic axes) or another order, -rad for radians; tum; or for a ROS bag ros,
         ros:/TOPIC, ros:PARENT>CHILD (frames).
-    pose_unit : {"mm", "m"}
-        Unit of the trajectory's positions.
+    pose_unit : {"mm", "m"}, optional
+        Unit of the trajectory's positions; by default that in the names of its columns, else mm.
     clock_offset_s : float, optional
         Offset from the times of the images to those of the trajectory; by default that of the mount.
     clock_drift_ppm : float, optional

@@ -33,7 +33,8 @@ from uwlts.registration.merging import merge_clouds
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
-from uwlts.storage.pose_files import PoseFormat, Unit, read_poses, write_poses
+from uwlts.storage.number_tables import Unit
+from uwlts.storage.pose_files import PoseFormat, read_poses, write_poses
 
 _ROUNDS = 60
 _STILL_MM = 1e-5
@@ -220,7 +221,7 @@ def register(
     *,
     poses: np.ndarray | str | os.PathLike[str] | None = None,
     pose_format: PoseFormat = "matrix",
-    pose_unit: Unit = "mm",
+    pose_unit: Unit | None = None,
     start_std_mm: float | None = None,
     start_std_deg: float | None = None,
     search: bool = False,

@@ -16,7 +16,8 @@ from uwlts.storage.cloud_files import CLOUD_ENDINGS, is_cloud, read_cloud
 from uwlts.storage.hdf5_file import read_format
 from uwlts.storage.mesh_file import READ_FORMATS as MESH_FORMATS, SurfaceMesh, has_faces, read_mesh
 from uwlts.storage.mount_files import read_mount
-from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
+from uwlts.storage.number_tables import Unit
+from uwlts.storage.pose_files import PoseFormat, read_trajectory
 from uwlts.storage.truth import FORMAT as TRUTH, Truth, read_truth
 
 _READABLE = (
@@ -26,7 +27,7 @@ _READABLE = (
 
 
 def read(
-    path: str | Path, *, pose_format: PoseFormat = "quaternion-xyzw", pose_unit: Unit = "mm"
+    path: str | Path, *, pose_format: PoseFormat = "quaternion-xyzw", pose_unit: Unit | None = None
 ) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Trajectory:
     """Read a file of the program, whose content determines the type of the result.
 
@@ -41,8 +42,8 @@ def read(
         The file.
     pose_format : str
         Format of a trajectory, as for `reconstruct`; by default that of `Trajectory.save`.
-    pose_unit : {"mm", "m"}
-        Unit of a trajectory's positions.
+    pose_unit : {"mm", "m"}, optional
+        Unit of a trajectory's positions; by default that in the names of its columns, else mm.
 
     Returns
     -------

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -32,6 +32,10 @@ WATER = "water"
 """Prefix of error names for a medium's index, which may drift between scans."""
 _BLOCK = 8192
 """Points whose covariances are summed together: their parts fit in the processor's cache."""
+FEW_ZEROS = 3
+"""Largest number of measured points at exactly 0 0 0."""
+_MIXED = np.sqrt([2.0, 3.0, 5.0])
+"""Weights whose sum of coordinates differs between places."""
 _FARTHEST_MM = 1e12
 """Coordinates of maps in mm reach 1e10; squares and products of larger ones would overflow."""
 
@@ -148,7 +152,7 @@ class PointCloud(Brief):
     rays_by_status : dict
         The same for stripe centres by the name of their `RayStatus`.
     warnings : list of str
-        The same: evidence that the calibration is not that of the sensor.
+        Evidence that the calibration is not that of the sensor; and omissions and doubts of the reader of a file.
 
     Raises
     ------
@@ -214,6 +218,7 @@ class PointCloud(Brief):
             uncertainty=None if known is None else known[selection],
             time_s=None if self.time_s is None else self.time_s[selection],
             metadata=self.metadata,
+            warnings=self.warnings,
         )
 
     @property
@@ -230,17 +235,46 @@ def make_foreign_cloud(
     line: np.ndarray | None = None,
     deviation_mm: np.ndarray | None = None,
     time_s: np.ndarray | None = None,
+    omitted: Mapping[str, np.ndarray] | None = None,
 ) -> PointCloud:
-    """Make a cloud of another program, without uncertainty; raises CaptureError like `PointCloud`."""
+    """Make a cloud of another program, without uncertainty; raises CaptureError like `PointCloud`.
+
+    ``omitted`` maps reasons to masks (N,) of points that are omitted, with a warning. Unmeasured points are omitted as
+    well (`omit_points`).
+    """
+    chosen, warnings = omit_points(points_mm, omitted or {})
     unknown = np.full(len(points_mm), NO_INDEX)
     return PointCloud(
-        points_mm,
-        np.full(len(points_mm), np.nan) if intensity is None else intensity,
-        unknown if frame is None else frame,
-        unknown if line is None else line,
-        deviation_mm=deviation_mm,
-        time_s=time_s,
+        points_mm[chosen],
+        (np.full(len(points_mm), np.nan) if intensity is None else intensity)[chosen],
+        (unknown if frame is None else frame)[chosen],
+        (unknown if line is None else line)[chosen],
+        deviation_mm=None if deviation_mm is None else deviation_mm[chosen],
+        time_s=None if time_s is None else time_s[chosen],
+        warnings=warnings,
     )
+
+
+def omit_points(points_mm: np.ndarray, omitted: Mapping[str, np.ndarray]) -> tuple[slice | np.ndarray, list[str]]:
+    """Return the selection of points (N, 3) that are not omitted or unmeasured, and a warning for each reason.
+
+    Programs mark unmeasured points by NaN, infinity, or the place 0 0 0. Points at 0 0 0 are omitted if there are more
+    than a few, and many more than at any other place.
+    """
+    finite, zero = np.isfinite(points_mm).all(axis=1), (points_mm == 0).all(axis=1)
+    reasons = {"without finite coordinates": ~finite, **omitted}
+    if (count := np.count_nonzero(zero)) > FEW_ZEROS:
+        others = points_mm[finite & ~zero]
+        # Points in rounded coordinates may coincide anywhere.
+        repeated = np.unique(np.sort(others @ _MIXED), return_counts=True)[1].max(initial=1)
+        if count > FEW_ZEROS * repeated:
+            reasons["at exactly 0 0 0"] = zero
+    unwanted, warnings = np.zeros(len(points_mm), bool), []
+    for reason, mask in reasons.items():
+        if count := int(np.count_nonzero(mask)):
+            warnings.append(f"{count} of {len(points_mm)} points {reason} are omitted")
+            unwanted |= mask
+    return (~unwanted if warnings else slice(None)), warnings
 
 
 def concatenate_clouds(parts: Sequence[PointCloud]) -> PointCloud:
@@ -263,6 +297,7 @@ def concatenate_clouds(parts: Sequence[PointCloud]) -> PointCloud:
         else None,
         time_s=np.concatenate(times) if len(times) == len(parts) else None,
         metadata=parts[0].metadata,
+        warnings=list(dict.fromkeys(warning for part in parts for warning in part.warnings)),
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import open_regular, parse_json, require_regular_file, shorten
+from uwlts.files.reading import log_warnings, open_regular, parse_json, require_regular_file, shorten
 from uwlts.files.writing import refuse_unsuitable, require_ending, write_atomically
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.cloud import (
@@ -27,6 +27,7 @@ from uwlts.storage.cloud import (
     PointUncertainty,
     concatenate_clouds,
     metadata_json,
+    omit_points,
 )
 from uwlts.storage.copc_file import is_copc, read_copc
 from uwlts.storage.foreign_clouds import (
@@ -64,6 +65,8 @@ _LONGEST_PLY_HEADER = 2**24
 _MOST_PROPERTIES = 1000
 _TYPE_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _TYPE_BYTES |= {f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)}
+_IN_ASCII = bytes(range(128)) + b"?" * 128
+"""Comments may hold any bytes, such as names in UTF-8 or Latin-1."""
 _Rows = Callable[[int], slice]
 
 
@@ -178,11 +181,16 @@ def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None)
     """
     with _naming(path):
         if is_copc(path):
-            return read_copc(path, at_most=at_most)
-        if _is_foreign(path):
+            cloud, total = read_copc(path, at_most=at_most)
+        elif _is_foreign(path):
             whole = read_foreign(Path(path))
-            return whole.select(_every(len(whole), at_most)), len(whole)
-        return _read_rows(Path(path), lambda count: _every(count, at_most))
+            cloud, total = whole.select(_every(len(whole), at_most)), len(whole)
+        else:
+            cloud, total = _read_rows(Path(path), lambda count: _every(count, at_most))
+        if not len(cloud) and cloud.warnings:
+            raise CaptureError(f"no point is left: {'; '.join(cloud.warnings)}")
+        log_warnings(path, cloud.warnings)
+        return cloud, total
 
 
 def read_region(
@@ -219,6 +227,7 @@ def read_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Iter
     while start < total:
         with _naming(path):
             part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
+            log_warnings(path, part.warnings)
         yield part
         start += most
 
@@ -340,9 +349,8 @@ def _metadata(comments: list[str]) -> Table:
 
 
 def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
-    require_ply_size(path, called="cloud")
     try:
-        ply = PlyData.read(str(path))
+        ply = PlyData.read(open_ply(path, called="cloud"))
     except OSError as error:
         raise CaptureError(f"{path} cannot be read: {error.strerror or error}") from error
     except (PlyParseError, ValueError, MemoryError, ArithmeticError, LookupError) as error:
@@ -351,9 +359,9 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
     whole = ply["vertex"].data
     vertices, names = whole[rows(len(whole))], whole.dtype.names or ()
-    if missing := [axis for axis in "xyz" if axis not in names]:
+    known = {name.lower().removeprefix("scalar_"): name for name in names} | {name: name for name in names}
+    if missing := [axis for axis in "xyz" if axis not in known]:
         raise CaptureError(f"the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
-    known = {name.removeprefix("scalar_"): name for name in names} | {name: name for name in names}
 
     def column(name: str, default: float, kind: type = np.float32) -> np.ndarray:
         if name not in known:
@@ -370,6 +378,8 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
             raise CaptureError(f"{np.count_nonzero(wrong)} values of {name} are no whole numbers")
         return values.astype(np.int32)
 
+    chosen, warnings = omit_points(np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]), {})
+    vertices = vertices[chosen]
     uncertainty, count = None, sum(f"pattern{m}_x" in known for m in range(len(known)))
     wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
     if count and known.keys() >= set(wanted):
@@ -391,12 +401,16 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         uncertainty=uncertainty,
         time_s=column("time", np.nan, np.float64) if "time" in known else None,
         metadata=metadata,
+        warnings=warnings,
     )
     return cloud, len(whole)
 
 
-def require_ply_size(path: Path, *, called: str) -> None:
-    """Raise CaptureError if a PLY file is shorter than its header declares; the reader finds other faults."""
+def open_ply(path: Path, *, called: str) -> str | BytesIO:
+    """Return the path of a PLY file or, if its comments are not in ASCII, its content with these bytes replaced.
+
+    Raises CaptureError if the file is shorter than its header declares; the reader finds other faults.
+    """
     with open_regular(path, called=called) as file:
         start, size = file.read(_LONGEST_PLY_HEADER), os.fstat(file.fileno()).st_size
     header, end, _ = start.partition(b"end_header")
@@ -420,6 +434,10 @@ def require_ply_size(path: Path, *, called: str) -> None:
             f"{path} is not a complete PLY file: early end-of-file, its header declares at least {least:,} bytes of "
             f"values, and the file has {size:,}"
         )
+    if header.isascii():
+        return str(path)
+    content = path.read_bytes()
+    return BytesIO(content[: len(header)].translate(_IN_ASCII) + content[len(header) :])
 
 
 class _CloudHeader(Description):

@@ -20,7 +20,14 @@ from uwlts.files.reading import open_regular
 from uwlts.files.writing import write_atomically
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud, make_foreign_cloud
-from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, las_middle, load_library, shorten_error
+from uwlts.storage.las_file import (
+    INTENSITY_LIMITS,
+    LAZ_STEP_M,
+    las_middle,
+    load_library,
+    shorten_error,
+    unwanted_points,
+)
 
 SUFFIX = ".copc.laz"
 
@@ -192,7 +199,8 @@ def read_copc(
     intensity = columns.pop("amplitude", found["intensity"])
     if np.isnan(columns.get("deviation_mm", np.nan)).all():
         columns.pop("deviation_mm", None)
-    return make_foreign_cloud(1e3 * np.column_stack([found.x, found.y, found.z]), intensity=intensity, **columns), total
+    points = 1e3 * np.column_stack([found.x, found.y, found.z])
+    return make_foreign_cloud(points, intensity=intensity, omitted=unwanted_points(found), **columns), total
 
 
 def _query(reader: Any, box: Any, at_most: int | None) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import require_regular_file
-from uwlts.storage.cloud import PointCloud, make_foreign_cloud
+from uwlts.storage.cloud import FEW_ZEROS, PointCloud, make_foreign_cloud
 from uwlts.storage.las_file import load_library, shorten_error
 
 PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"
@@ -121,18 +121,28 @@ def read_e57(path: Path) -> PointCloud:
                 | {"time_s": _times(pye57, file, number)}
                 for number in range(file.scan_count)
             ]
+            headers = [file.get_header(number) for number in range(file.scan_count)]
+            total = sum(header.point_count for header in headers)
+            origins = [header.translation if header.has_pose() else np.zeros(3) for header in headers]
     except (pye57.libe57.E57Exception, OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
         raise CaptureError(f"{path} is not a complete E57 file: {shorten_error(error)}") from error
     if not scans:
         raise CaptureError(f"{path} is an E57 file without scans")
-    points = 1e3 * np.concatenate([np.column_stack([scan[f"cartesian{axis}"] for axis in "XYZ"]) for scan in scans])
+    placed = [np.column_stack([scan[f"cartesian{axis}"] for axis in "XYZ"]) for scan in scans]
+    points = 1e3 * np.concatenate(placed)
+    # Unmeasured points at 0 0 0 of their scan.
+    at_scanner = np.concatenate([(xyz == origin).all(axis=1) for xyz, origin in zip(placed, origins, strict=True)])
     lit = all("intensity" in scan for scan in scans)
     timed = all(scan["time_s"] is not None for scan in scans)
-    return make_foreign_cloud(
+    cloud = make_foreign_cloud(
         points,
         intensity=np.concatenate([scan["intensity"] for scan in scans]) if lit else None,
         time_s=np.concatenate([scan["time_s"] for scan in scans]) if timed else None,
+        omitted={"at the position of their scanner": at_scanner} if np.count_nonzero(at_scanner) > FEW_ZEROS else {},
     )
+    if total > len(points):
+        cloud.warnings.insert(0, f"{total - len(points)} of {total} points marked as invalid are omitted")
+    return cloud
 
 
 def _times(pye57: Any, file: Any, number: int) -> np.ndarray | None:

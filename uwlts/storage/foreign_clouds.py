@@ -1,5 +1,6 @@
 """Clouds in formats of other programs and scanners: text, LAS, E57; LAZ, COPC and MCAP are only written here."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,19 +13,21 @@ from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
 from uwlts.storage.mcap_clouds import covariance_columns, mcap_content
-from uwlts.storage.pose_files import read_columns
+from uwlts.storage.number_tables import read_number_table
 
 TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
-"""Columns x, y, z by name, or the first three, in mm; and optionally intensity."""
+"""Columns x, y, z by name, or the first three, in mm or the unit of their names; and optionally intensity."""
 FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57")
 WRITTEN_FORMATS = (".xyz", ".laz", ".e57", ".las", ".mcap")
 
 
 def read_foreign(path: Path) -> PointCloud:
-    """Read all points of a file in one of `FOREIGN_FORMATS`: text in mm; LAS and E57 in m, as they prescribe.
+    """Read all points of a file in one of `FOREIGN_FORMATS`.
 
-    The scans of an E57 file are combined, each at its pose. Raises CaptureError if the file is damaged or foreign,
-    SetupError if the library for its format is not installed.
+    Text is in mm or the unit that the names of its columns state; LAS and E57 are in m, as they prescribe. The scans
+    of an E57 file are combined, each at its pose.
+
+    Raises CaptureError if the file is damaged or foreign, SetupError if the library for its format is not installed.
     """
     match path.suffix.lower():
         case ".las":
@@ -37,20 +40,17 @@ def read_foreign(path: Path) -> PointCloud:
 
 def _read_text(path: Path) -> PointCloud:
     try:
-        columns = read_columns(path, {}, named=False)
+        table = read_number_table(path, {}, named=False)
+        columns, scale = table.columns, table.mm_per_unit()
     except DescriptionError as error:
         raise CaptureError(str(error)) from error
-    # CloudCompare's first line begins with two slashes.
-    columns = {name.lstrip("/").strip(): values for name, values in columns.items()}
     axes = [columns[axis] for axis in "xyz" if axis in columns]
     if len(axes) < 3:
         if "0" not in columns or len(columns) < 3:
             raise CaptureError(f"{path} has the columns {', '.join(columns)}; expected x, y and z in mm")
         axes = [columns[number] for number in "012"]
-    points = np.column_stack(axes)
-    seen = np.isfinite(points).all(axis=1)
-    intensity = columns.get("intensity")
-    return make_foreign_cloud(points[seen], intensity=None if intensity is None else intensity[seen])
+    cloud = make_foreign_cloud(scale * np.column_stack(axes), intensity=columns.get("intensity"))
+    return replace(cloud, warnings=[*table.notes, *cloud.warnings])
 
 
 def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np.ndarray | None = None) -> None:

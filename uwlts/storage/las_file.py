@@ -7,7 +7,7 @@ import struct
 from io import BytesIO
 from pathlib import Path
 from types import ModuleType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,8 @@ LAZ_STEP_M = 1e-7
 
 _REACH_M = LAZ_STEP_M * (2**31 - 1)
 INTENSITY_LIMITS = 0, 2**16 - 1
+_NOISE_CLASSES = 7, 18
+"""Low and high noise."""
 _START = 104
 """Bytes of a LAS header up to its number of variable length records (LAS 1.4, 2.4)."""
 _RECORD = 54
@@ -97,6 +99,7 @@ def read_las(path: Path) -> PointCloud:
         names = set(found.point_format.dimension_names)
         column = {name: np.asarray(found[name]) for name in names & {"frame", "line", "deviation_mm", "gps_time"}}
         intensity = np.asarray(found["amplitude" if "amplitude" in names else "intensity"], np.float32)
+        omitted = unwanted_points(found)
     except (
         OSError,
         RuntimeError,
@@ -110,8 +113,20 @@ def read_las(path: Path) -> PointCloud:
     times = column.pop("gps_time", None)
     # Programs write 0 if times are unknown.
     return make_foreign_cloud(
-        points, intensity=intensity, time_s=None if times is None or not times.any() else times, **column
+        points,
+        intensity=intensity,
+        time_s=None if times is None or not times.any() else times,
+        omitted=omitted,
+        **column,
     )
+
+
+def unwanted_points(found: Any) -> dict[str, np.ndarray]:
+    """Return masks (N,) of LAS points that are marked as unwanted, by reason (LAS 1.4, tables 8, 16 and 17)."""
+    return {
+        "marked as withheld": np.asarray(found.withheld, bool),
+        "classified as noise": np.isin(np.asarray(found.classification), _NOISE_CLASSES),
+    }
 
 
 def load_library(name: Literal["laspy", "lazrs", "copclib", "pye57"], format: str) -> ModuleType:

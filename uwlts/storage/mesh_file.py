@@ -17,7 +17,7 @@ from uwlts.files.reading import open_regular, require_regular_file
 from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
-from uwlts.storage.cloud_files import require_ply_size
+from uwlts.storage.cloud_files import open_ply
 
 MESH_FORMATS = (".stl", ".ply", ".glb")
 READ_FORMATS = (".ply", ".stl", ".obj")
@@ -135,16 +135,14 @@ def read_mesh(path: str | Path) -> SurfaceMesh:
     path = Path(path)
     is_ply = path.suffix.lower() == ".ply"
     try:
-        if is_ply:
-            require_ply_size(path, called="mesh")
-        else:
-            require_regular_file(path, called="mesh")
-        loaded: Any = trimesh.load(path, force="mesh", process=False)
+        require_regular_file(path, called="mesh")
+        source = open_ply(path, called="mesh") if is_ply else str(path)
+        loaded: Any = trimesh.load(source, file_type=path.suffix[1:].lower(), force="mesh", process=False)
         if path.suffix.lower() == ".stl":
             # STL repeats each vertex for every triangle.
             loaded.merge_vertices()
         vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64)
-        known = PlyData.read(str(path))["vertex"].data if is_ply else np.empty(len(vertices), [])
+        known = PlyData.read(open_ply(path, called="mesh"))["vertex"].data if is_ply else np.empty(len(vertices), [])
     except CaptureError:
         raise
     except Exception as error:

@@ -15,17 +15,8 @@ from uwlts.model.mount import FORMAT, VERSION, Mount
 from uwlts.model.sensor import Description, Positive
 from uwlts.storage.cloud_files import is_cloud, read_cloud
 from uwlts.storage.import_.matching import natural_key
-from uwlts.storage.pose_files import (
-    FARTHEST_MM,
-    MM_PER_UNIT,
-    Unit,
-    check_matrices,
-    check_unit,
-    pose_rows,
-    poses_from_rows,
-    read_columns,
-    scale_positions,
-)
+from uwlts.storage.number_tables import NumberTable, Unit, read_number_table
+from uwlts.storage.pose_files import FARTHEST_MM, check_matrices, read_poses
 
 Artefact = Literal["sphere", "plane", "step", "ring"]
 _SIZES: dict[Artefact, str] = {"sphere": "radius", "step": "height", "ring": "radius"}
@@ -49,8 +40,8 @@ class MountDescription(Description):
     radius_mm: Positive | None = None
     height_mm: Positive | None = None
     pose_format: str = "matrix"
-    profile_unit: Unit = "mm"
-    pose_unit: Unit = "mm"
+    profile_unit: Unit | None = None
+    pose_unit: Unit | None = None
     axis: SensorAxis | None = None
     scale: bool = False
     time: bool = False
@@ -86,8 +77,8 @@ def read_mount_evidence(
     radius_mm: float | None,
     height_mm: float | None,
     pose_format: str,
-    profile_unit: Unit,
-    pose_unit: Unit,
+    profile_unit: Unit | None,
+    pose_unit: Unit | None,
     axis: SensorAxis | None,
     scale: bool,
     time: bool,
@@ -119,8 +110,7 @@ def read_mount_evidence(
         names, profiles, times = read_profiles(profiles, unit=profile_unit, digests=digests)
         profile_times_s = times if profile_times_s is None else profile_times_s
     if isinstance(poses, str | Path):
-        rows, times = pose_rows(Path(poses), digests)
-        poses = scale_positions(poses_from_rows(rows, pose_format, Path(poses)), pose_unit)
+        poses, times = read_poses(poses, pose_format=pose_format, unit=pose_unit, digests=digests)
         pose_times_s = times if pose_times_s is None else pose_times_s
     checked = [_checked_profile(profile, number) for number, profile in enumerate(profiles)]
     matrices = check_matrices(np.asarray(poses, dtype=np.float64), "poses")
@@ -197,7 +187,7 @@ def _checked_times(
 
 
 def read_profiles(
-    path: str | Path, *, unit: Unit = "mm", digests: dict[str, str] | None = None
+    path: str | Path, *, unit: Unit | None = None, digests: dict[str, str] | None = None
 ) -> tuple[list[str], list[np.ndarray], np.ndarray | None]:
     """Read names, profiles (N, 2) or (N, 3) in mm, and times of profiles (or None) from files.
 
@@ -207,7 +197,6 @@ def read_profiles(
     frame n. Raises DescriptionError for anything else.
     """
     path, digests = Path(path), {} if digests is None else digests
-    scale = MM_PER_UNIT[check_unit(unit)]
     if path.is_dir():
         files = sorted(
             (each for each in path.iterdir() if each.suffix.lower() == ".csv"), key=lambda p: natural_key(p.name)
@@ -216,20 +205,21 @@ def read_profiles(
             raise DescriptionError(f"{path} holds no CSV files: expected one for each pose")
         names, profiles, times = [], [], []
         for file in files:
-            columns = read_columns(file, digests)
+            table = read_number_table(file, digests)
             names.append(file.stem)
-            profiles.append(_points_of(columns, file) * scale)
-            times.append(_one_time(columns))
+            profiles.append(_points_of(table, unit))
+            times.append(_one_time(table.columns))
     elif path.suffix.lower() in (".ply", ".h5") and is_cloud(path):
         digests[path.name] = hash_file(path)
         cloud = read_cloud(path)
         frames = np.unique(cloud.frame)
         return [str(frame) for frame in frames], [cloud.points_mm[cloud.frame == frame] for frame in frames], None
     else:
-        columns = read_columns(path, digests)
+        table = read_number_table(path, digests)
+        columns = table.columns
         if "pose" not in columns:
             raise DescriptionError(f"{path} has no column 'pose', the pose to which each point belongs")
-        poses, points = columns["pose"], _points_of(columns, path) * scale
+        poses, points = columns["pose"], _points_of(table, unit)
         if not np.isfinite(poses).all():
             raise DescriptionError(f"{path}: some cells of the column 'pose' are empty or not a number")
         labels = list(dict.fromkeys(poses.tolist()))
@@ -246,10 +236,14 @@ def _one_time(columns: dict[str, np.ndarray]) -> float:
     return float(times[0]) if times is not None and len(times) else np.nan
 
 
-def _points_of(columns: dict[str, np.ndarray], path: Path) -> np.ndarray:
+def _points_of(table: NumberTable, unit: Unit | None) -> np.ndarray:
+    """Return the points (N, 2) or (N, 3) of a table in mm."""
+    columns = table.columns
     if not {"x", "z"} <= columns.keys():
-        raise DescriptionError(f"{path} has the columns {', '.join(columns)}; expected x and z, and y for 3D points")
-    return np.column_stack([columns[name] for name in ("x", "y", "z") if name in columns])
+        raise DescriptionError(
+            f"{table.path} has the columns {', '.join(columns)}; expected x and z, and y for 3D points"
+        )
+    return np.column_stack([columns[name] for name in "xyz" if name in columns]) * table.mm_per_unit(unit=unit)
 
 
 def read_mount(path: str | Path) -> Mount:

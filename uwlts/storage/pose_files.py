@@ -1,97 +1,40 @@
 """Files of platform poses: matrices, quaternions, rotation vectors and Euler angles, in tables of numbers."""
 
 import re
-from io import BytesIO
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
-import pyarrow as pa
-from pyarrow import csv
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
-from uwlts.files.reading import read_bytes
-from uwlts.files.writing import hash_file, write_atomically
+from uwlts.files.reading import log_warnings
+from uwlts.files.writing import write_atomically
 from uwlts.model.calibration import is_rigid
 from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
+from uwlts.storage.number_tables import ROTATION_NAMES, NumberTable, Unit, read_number_table
 from uwlts.storage.ros_bags import read_bag_poses
 
-Unit = Literal["mm", "m"]
 PoseFormat = str
 """matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg, angle-rad."""
-MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
 FARTHEST_MM = 1e7
 """Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
 
-_MOST_BYTES = 512 * 2**20
 _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
 _EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
 _FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
-_MOST_POSES = 20_000
-
-
-def check_unit(unit: Unit) -> Unit:
-    if unit not in get_args(Unit):
-        raise DescriptionError(f"the unit is {unit!r}; expected mm or m")
-    return unit
-
-
-_COLUMN_NAMES = re.compile(r"(?:_| *[\[(])(?:mm|m)[\])]?$")
-
-
-def read_columns(path: Path, digests: dict[str, str], *, named: bool = True) -> dict[str, np.ndarray]:
-    """Read the columns of a CSV file with commas, semicolons (then decimal commas), tabs or blanks.
-
-    Lines that begin with # are skipped. Names are those of the first line, in lower case and without unit. Without
-    names, two columns are x and z, and others are numbered.
-    """
-    content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
-    digests[path.name] = hash_file(path)
-    lines = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").split(b"\n")
-    lines = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
-    if not lines:
-        raise DescriptionError(f"{path} is empty: expected a table of numbers")
-    first = lines[0]
-    delimiter = next((mark for mark in (b";", b"\t", b",") if mark in first), b" ")
-    if delimiter == b" ":
-        lines = [b" ".join(line.split()) for line in lines]
-    cells = [cell.strip().strip('"') for cell in lines[0].decode("utf-8", "replace").split(delimiter.decode())]
-    has_names = not any(_is_number(cell) for cell in cells)
-    if has_names:
-        names = [_COLUMN_NAMES.sub("", cell.lower()) if cell.lower() != "time_s" else "time_s" for cell in cells]
-        lines = lines[1:]
-    else:
-        names = ["x", "z"] if named and len(cells) == 2 else [str(number) for number in range(len(cells))]
-    if len(set(names)) < len(names):
-        raise DescriptionError(f"{path} has the columns {', '.join(names)}: expected each name once")
-    try:
-        table = csv.read_csv(
-            BytesIO(b"\n".join(lines) + b"\n"),
-            read_options=csv.ReadOptions(column_names=names, use_threads=False),
-            parse_options=csv.ParseOptions(delimiter=delimiter.decode()),
-            convert_options=csv.ConvertOptions(
-                column_types=dict.fromkeys(names, pa.float64()),
-                null_values=["", "NaN", "nan", "NAN", "-nan", "null", "None"],
-                decimal_point="," if delimiter == b";" and any(b"," in line for line in lines) else ".",
-            ),
-        )
-    except (pa.ArrowInvalid, pa.ArrowException) as error:
-        raise DescriptionError(f"{path} is no table of numbers: {str(error).splitlines()[0]}") from error
-    return {name: table[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in names}
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text.replace(",", ".") or "nan")
-    except ValueError:
-        return False
-    return True
+_MOST_POSES = 1_000_000
+_LATEST_S = 1e11
+"""Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns."""
 
 
 def read_poses(
-    path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit = "mm"
+    path: str | Path,
+    *,
+    pose_format: PoseFormat = "matrix",
+    unit: Unit | None = None,
+    digests: dict[str, str] | None = None,
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Read ``T_base_platform`` (P, 4, 4) in mm, and times (P,) or None, from a CSV file with one pose per line.
 
@@ -102,15 +45,18 @@ def read_poses(
     single column ``angle-deg`` or ``angle-rad`` is the angle of a rotary table that turns the object about its z axis:
     the poses are those of the sensor's side relative to the object.
 
-    Raises DescriptionError for a wrong number of columns, numbers that are not finite, matrices that are not rigid,
-    quaternions that are not of unit length, and angles in rad that look like degrees.
+    Names decide the order of columns where they say it: x, y, z; qw, qx, qy, qz; roll, pitch, yaw or rx, ry, rz. Units
+    in names (``x_m``, ``yaw [deg]``) are obeyed; without them positions are in ``unit``, by default mm.
+
+    Raises DescriptionError if names or their units contradict the format or ``unit``, and for a wrong number of
+    columns, numbers that are not finite, matrices that are not rigid, quaternions that are not of unit length, and
+    angles in rad that look like degrees.
     """
-    path = Path(path)
-    rows, times = pose_rows(path, {})
-    return scale_positions(poses_from_rows(rows, pose_format, path), unit), times
+    table = read_number_table(Path(path), {} if digests is None else digests, named=False)
+    return _poses(table, pose_format, unit)
 
 
-def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit = "mm") -> Trajectory:
+def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None) -> Trajectory:
     """Read the trajectory of a platform from a file like that of `read_poses`, with a column ``time_s``.
 
     With the format ``tum``, of the RGB-D benchmark of TU Munich, each line has the time in s, the position in m and the
@@ -128,19 +74,29 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
         if covariance is not None:
             units = np.array([1e3] * 3 + [1.0] * 3)
             covariance = covariance * units[:, None] * units
-        return _trajectory(
-            path, times, scale_positions(poses_from_rows(rows, "quaternion-xyzw", path), "m"), covariance
-        )
-    columns = read_columns(path, {}, named=False)
-    covariance = _covariances(columns, path, MM_PER_UNIT[check_unit(unit)])
-    rows, times = _rows_of(columns, path)
+        rows[:, :3] *= 1e3
+        return _trajectory(path, times, poses_from_rows(rows, "quaternion-xyzw", path), covariance)
+    table = read_number_table(path, {}, named=False)
     if pose_format == "tum":
-        if rows.shape[1] != 8:
-            raise DescriptionError(f"{path} has {rows.shape[1]} columns; expected time, x, y, z and a quaternion (tum)")
-        times, rows, pose_format, unit = rows[:, 0], rows[:, 1:], "quaternion-xyzw", "m"
+        if len(table.columns) != 8:
+            raise DescriptionError(
+                f"{path} has {len(table.columns)} columns; expected time, x, y, z and a quaternion (tum)"
+            )
+        if "time_s" not in table.columns:
+            first = next(iter(table.columns))
+            table = replace(
+                table, columns={"time_s" if name == first else name: c for name, c in table.columns.items()}
+            )
+        pose_format, unit = "quaternion-xyzw", "m"
+    covariance = _covariances(table.columns, path, table.mm_per_unit(unit=unit))
+    poses, times = _poses(table, pose_format, unit)
     if times is None:
         raise DescriptionError(f"{path} has no column time_s: a trajectory needs the time of each pose")
-    return _trajectory(path, times, scale_positions(poses_from_rows(rows, pose_format, path), unit), covariance)
+    if "time_s" not in table.units and np.abs(times).max(initial=0) > _LATEST_S:
+        raise DescriptionError(
+            f"{path} has times up to {times.max():.9g}: expected s, or a unit in the name, such as 'time [ns]'"
+        )
+    return _trajectory(path, times, poses, covariance)
 
 
 def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False) -> None:
@@ -177,33 +133,78 @@ def trajectory_path(capture: str | Path) -> Path:
 
 
 def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray, covariance: np.ndarray | None) -> Trajectory:
+    """Return a trajectory without the repetitions of a pose at the same time."""
+    same = np.append(False, (np.diff(times) == 0) & (poses[1:] == poses[:-1]).all(axis=(1, 2)))
+    warnings = []
+    if count := int(np.count_nonzero(same)):
+        warnings = [f"{count} of {len(times)} poses repeat the previous one at the same time and are omitted"]
+        log_warnings(path, warnings)
     try:
-        return Trajectory(times, poses, covariance)
+        known = None if covariance is None else covariance[~same]
+        return Trajectory(times[~same], poses[~same], known, warnings=warnings)
     except DescriptionError as error:
         raise DescriptionError(f"{path}: {error}") from error
 
 
-def pose_rows(path: Path, digests: dict[str, str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read the numbers (P, K) of the poses in a file, and their times (P,) or None."""
-    return _rows_of(read_columns(path, digests, named=False), path)
-
-
-def _rows_of(columns: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    columns = {name: values for name, values in columns.items() if name not in COVARIANCE_COLUMNS}
+def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the poses (P, 4, 4) in mm of a table, and their times (P,) or None."""
+    path = table.path
+    columns = {name: values for name, values in table.columns.items() if name not in COVARIANCE_COLUMNS}
     times = columns.pop("time_s", None)
     columns.pop("pose", None)
-    rows = np.column_stack(list(columns.values())) if columns else np.empty((0, 0))
+    names = _order_names([*columns], pose_format, path)
+    for name in names:
+        stated = table.units.get(name, "")
+        if name in ROTATION_NAMES and stated and stated != pose_format.rpartition("-")[2]:
+            raise DescriptionError(
+                f"{path} has {name} in {stated}, but the format {pose_format} was given: choose a format that ends "
+                "with the angles' unit, -deg or -rad"
+            )
+    rows = np.column_stack([columns[name] for name in names]) if columns else np.empty((0, 0))
     if len(rows) > _MOST_POSES:
         raise DescriptionError(f"{path} has {len(rows):,} poses; this program reads up to {_MOST_POSES:,}")
     wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(wrong):
         raise DescriptionError(f"{path}: pose {wrong[0] + 1} has a number that is missing or not finite")
-    return rows, times
+    poses = poses_from_rows(rows, pose_format, path)
+    poses[:, :3, 3] *= table.mm_per_unit(unit=unit)
+    return poses, times
 
 
-def scale_positions(matrices: np.ndarray, unit: Unit) -> np.ndarray:
-    matrices[:, :3, 3] *= MM_PER_UNIT[check_unit(unit)]
-    return matrices
+def _order_names(names: list[str], pose_format: PoseFormat, path: Path) -> list[str]:
+    """Return the names of columns in the order of the format; raises DescriptionError if they contradict it."""
+    kinds = {
+        "quaternion": ("qw", "qx", "qy", "qz"),
+        "euler": ("roll", "pitch", "yaw"),
+        "turns": ("rx", "ry", "rz"),
+        "angle": ("angle",),
+    }
+    named = next((kind for kind, parts in kinds.items() if set(parts) <= set(names)), None)
+    allowed = {"turns": ("rotvec", "euler")}.get(named or "", (named,))
+    form, _, order = pose_format.partition("-")
+    if named and form not in allowed:
+        raise DescriptionError(
+            f"{path} has the columns {', '.join(names)}, but the format {pose_format} was given: choose the format "
+            "that the names describe"
+        )
+    found: list[str] = [axis for axis in "xyz" if axis in names]
+    if len(found) < 3 or named is None or len(names) != len(found) + len(kinds[named]):
+        if [name for name in names[:3] if name in found] != found:
+            raise DescriptionError(
+                f"{path} has the columns {', '.join(names)}: expected x, y and z first, or names of all columns, such "
+                "as qw, qx, qy, qz"
+            )
+        return names
+    match named:
+        case "quaternion":
+            return [*found, *(f"q{axis}" for axis in order)]
+        case "euler" | "turns" if form == "euler":
+            axes = order[:3].lower()
+            if len(set(axes)) < 3:
+                raise DescriptionError(f"{path} names its angles by axis, but {pose_format} turns twice about one axis")
+            return [*found, *(kinds[named]["xyz".index(axis)] for axis in axes)]
+        case _:
+            return [*found, *kinds[named]]
 
 
 def poses_from_rows(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
@@ -258,20 +259,22 @@ def check_matrices(matrices: np.ndarray, source: object) -> np.ndarray:
     """Return rigid matrices (P, 4, 4) with exact rotations; raises DescriptionError if they are not rigid."""
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
         raise DescriptionError(f"{source}: the poses have the shape {matrices.shape}; expected (P, 4, 4)")
-    for number, matrix in enumerate(matrices):
-        if not np.isfinite(matrix).all():
-            raise DescriptionError(f"{source}: pose {number + 1} has a number that is not finite")
-        if np.abs(matrix[:3, 3]).max() > FARTHEST_MM:
-            raise DescriptionError(f"{source}: pose {number + 1} is beyond {FARTHEST_MM:g} mm: is its unit right?")
-        if not is_rigid(matrix, within=_ROUNDED):
-            hint = ""
-            if is_rigid(matrix.T, within=_ROUNDED):
-                hint = " It is given column by column: expected row by row"
-            elif np.linalg.det(matrix[:3, :3]) < 0:
-                hint = " It is a reflection"
-            raise DescriptionError(
-                f"{source}: pose {number + 1} is not a rotation and a shift (with 0 0 0 1 as last row).{hint}"
-            )
+    for wrong, problem in (
+        (~np.isfinite(matrices).all(axis=(1, 2)), "has a number that is not finite"),
+        (np.abs(matrices[:, :3, 3]).max(axis=1) > FARTHEST_MM, f"is beyond {FARTHEST_MM:g} mm: is its unit right?"),
+    ):
+        if wrong.any():
+            raise DescriptionError(f"{source}: pose {int(np.argmax(wrong)) + 1} {problem}")
+    if not is_rigid(matrices, within=_ROUNDED):
+        number = next(n for n, matrix in enumerate(matrices) if not is_rigid(matrix, within=_ROUNDED))
+        matrix, hint = matrices[number], ""
+        if is_rigid(matrix.T, within=_ROUNDED):
+            hint = " It is given column by column: expected row by row"
+        elif np.linalg.det(matrix[:3, :3]) < 0:
+            hint = " It is a reflection"
+        raise DescriptionError(
+            f"{source}: pose {number + 1} is not a rotation and a shift (with 0 0 0 1 as last row).{hint}"
+        )
     result = np.array(matrices)
     left, _, right = np.linalg.svd(matrices[:, :3, :3])
     result[:, :3, :3], result[:, 3] = left @ right, (0, 0, 0, 1)

@@ -24,7 +24,7 @@ from uwlts.inspection.flat import _fit_circle
 from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
-from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty, make_foreign_cloud
 
 NOISE_MM, IMAGE_MM = 0.02, 0.004
 RADIUS_MM = 150.0
@@ -178,6 +178,28 @@ def test_outliers_and_holes_are_no_blemishes():
 
 def bell(u, v, at, diameter, depth):
     return -depth * np.square(np.maximum(1 - ((u - at[0]) ** 2 + (v - at[1]) ** 2) / (diameter / 2) ** 2, 0))
+
+
+@pytest.mark.parametrize(
+    ("mm_per_unit", "wall_mm", "message"),
+    [
+        (1000.0, 9.0, r"0.\d+ mm and a wall of 9 mm.*seem to be in m$"),
+        (1000.0, None, "impossible.*seem to be in m$"),
+        (25.4, 9.0, "seem to be in cm or inches"),
+        (10.0, 9.0, "seem to be in cm or inches"),
+    ],
+)
+def test_a_pipe_in_other_units_is_refused(mm_per_unit, wall_mm, message):
+    rng = np.random.default_rng(6)
+    u, angle = rng.uniform(0, 100, 4000), rng.uniform(-1.2, 1.2, 4000)
+    points = np.column_stack([u, 60 * np.sin(angle), 400 - 60 * np.cos(angle)]) + rng.normal(0, 0.02, (4000, 3))
+    cloud = make_foreign_cloud(points / mm_per_unit)
+    with pytest.raises(uwlts.Error, match=message):
+        uwlts.inspect_pipe(cloud, wall_mm=wall_mm)
+    cloud = make_foreign_cloud(points)
+    noted = "unusually thick"
+    assert not any(noted in note for note in uwlts.inspect_pipe(cloud, wall_mm=wall_mm).notes)
+    assert any(noted in note for note in uwlts.inspect_pipe(cloud, wall_mm=30.0).notes)
 
 
 def test_pits_are_found_and_measured():

@@ -37,7 +37,7 @@ def test_known_poses_are_kept():
 
 def test_times_outside_are_refused():
     trajectory = uwlts.Trajectory(np.array([10.0, 11.0]), helix(np.array([0.0, 1.0])))
-    with pytest.raises(uwlts.Error, match=r"2 of 3 times, 9.5.*to 11.2.*trajectory from 10.000 to 11.000 s.*clocks"):
+    with pytest.raises(uwlts.Error, match=r"2 of 3 times, 9.5.*to 11.2.*trajectory from 10 s to 11 s.*clocks"):
         trajectory.poses_at(np.array([9.5, 10.2, 11.2]))
 
 
@@ -81,3 +81,44 @@ def test_other_files_are_refused(tmp_path, text, pose_format, message):
     (tmp_path / "path.csv").write_text(text)
     with pytest.raises(uwlts.Error, match=message):
         uwlts.read(tmp_path / "path.csv", pose_format=pose_format)
+
+
+def test_repeated_poses_are_dropped_and_counted(tmp_path):
+    rows = [f"{1.7e9 + time:.2f} {time} 0 0 0 0 0 1" for time in (0.0, 0.25, 0.25, 0.25, 0.5)]
+    (tmp_path / "a.tum").write_text("\n".join(rows))
+    found = uwlts.read(tmp_path / "a.tum", pose_format="tum")
+    assert (found.times_s - 1.7e9).tolist() == [0, 0.25, 0.5] and found.poses[:, 0, 3].tolist() == [0, 250, 500]
+    assert "2 of 5 poses repeat" in found.warnings[0]
+    found.save(tmp_path / "b.csv")
+    assert uwlts.read(tmp_path / "b.csv").times_s.tolist() == found.times_s.tolist()
+
+
+def test_different_poses_at_a_time_are_refused_with_date_and_seconds(tmp_path):
+    rows = [f"{time} {x} 0 0 0 0 0 1" for time, x in ((1.7e9, 0), (1700000000.25, 1), (1700000000.25, 2))]
+    (tmp_path / "a.tum").write_text("\n".join(rows))
+    with pytest.raises(uwlts.Error, match=r"pose 3 is at 1700000000.25 s \(2023-11-14 22:13:20.25\d* UTC\), pose 2 at"):
+        uwlts.read(tmp_path / "a.tum", pose_format="tum")
+
+
+@pytest.mark.parametrize(
+    ("header", "start"),
+    [
+        ("timestamp [ns]", 1700000000 * 10**9),
+        ("time_us", 1700000000 * 10**6),
+        ("Time (s)", 1700000000),
+        ("t", 1700000000),
+    ],
+)
+def test_times_in_other_units(tmp_path, header, start):
+    factor = start // 1700000000
+    rows = [f"{start + factor * second},{second},0,0,1,0,0,0" for second in range(3)]
+    names = f"#{header},p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+    (tmp_path / "a.csv").write_text("\n".join([names, *rows]))
+    found = uwlts.read(tmp_path / "a.csv")
+    # Half a unit in the last place of 1.7e18 ns.
+    np.testing.assert_allclose(found.times_s - 1.7e9, [0, 1, 2], atol=2.4e-7)
+    assert found.poses[:, 0, 3].tolist() == [0, 1000, 2000] and (found.poses[:, :3, :3] == np.eye(3)).all()
+    (tmp_path / "a.csv").write_text("\n".join([names.replace(f"#{header}", "time"), *rows]))
+    if factor == 10**9:
+        with pytest.raises(uwlts.Error, match="expected s, or a unit in the name"):
+            uwlts.read(tmp_path / "a.csv")

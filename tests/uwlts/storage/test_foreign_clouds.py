@@ -74,6 +74,100 @@ def test_every_scan_of_e57_at_its_pose(tmp_path: Path):
     assert np.abs(found.points_mm - expected).max() < 1e-9 and np.isnan(found.intensity).all()
 
 
+def ply(points: np.ndarray, *, comment: bytes = b"", names: str = "x y z") -> bytes:
+    properties = "".join(f"property float {name}\n" for name in names.split()).encode()
+    start = b"ply\nformat binary_little_endian 1.0\n" + comment + b"element vertex %d\n" % len(points) + properties
+    return start + b"end_header\n" + points.astype("<f4").tobytes()
+
+
+@pytest.mark.parametrize("text", ["Gebäude 3", "Ж \u2192"])
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_ply_comments_hold_any_bytes(tmp_path: Path, text: str, encoding: str):
+    comment = b"comment " + text.encode(encoding, "replace") + b"\nobj_info \xff\xfe\n"
+    (tmp_path / "a.ply").write_bytes(ply(np.arange(12.0).reshape(4, 3), comment=comment))
+    assert read_cloud(tmp_path / "a.ply").points_mm.tolist() == np.arange(12.0).reshape(4, 3).tolist()
+
+
+@pytest.mark.parametrize("name", ["intensity", "Intensity", "scalar_Intensity", "SCALAR_INTENSITY"])
+def test_ply_names_in_any_capitals(tmp_path: Path, name: str):
+    (tmp_path / "a.ply").write_bytes(ply(np.arange(8.0).reshape(2, 4), names=f"X Y Z {name}"))
+    found = read_cloud(tmp_path / "a.ply")
+    assert found.intensity.tolist() == [3, 7] and found.points_mm.tolist() == [[0, 1, 2], [4, 5, 6]]
+
+
+def _write(path: Path, points: np.ndarray) -> None:
+    """Write points in mm as other programs do."""
+    match path.suffix:
+        case ".ply":
+            path.write_bytes(ply(points))
+        case ".xyz":
+            np.savetxt(path, points)
+        case ".las":
+            table = laspy.LasData(laspy.LasHeader(version="1.2", point_format=0))
+            table.header.scales = np.full(3, 1e-6)
+            table.x, table.y, table.z = 1e-3 * points.T
+            table.write(str(path))
+        case _:
+            with pye57.E57(str(path), mode="w") as file:
+                columns = {f"cartesian{axis}": 1e-3 * each for axis, each in zip("XYZ", points.T, strict=True)}
+                file.write_scan_raw(columns, translation=np.array([0.0, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".xyz", ".las", ".e57"])
+@pytest.mark.parametrize(("zeros", "kept"), [(300, 1000), (3, 1003)])
+def test_points_at_zero_are_omitted_and_counted(tmp_path: Path, suffix: str, zeros: int, kept: int):
+    """Around the origin a few points at zero may be measured."""
+    points = np.vstack([np.random.default_rng(3).uniform(-9, 9, (1000, 3)), np.zeros((zeros, 3))])
+    _write(tmp_path / f"a{suffix}", points)
+    found = read_cloud(tmp_path / f"a{suffix}")
+    assert len(found) == kept
+    assert [warning.split(" points")[0] for warning in found.warnings] == ([] if zeros == 3 else ["300 of 1300"])
+    assert read_thinned_cloud(tmp_path / f"a{suffix}", 100)[0].warnings or zeros == 3
+
+
+def test_rounded_coordinates_may_coincide(tmp_path: Path):
+    (tmp_path / "a.ply").write_bytes(ply(np.random.default_rng(3).integers(-3, 4, (5000, 3)).astype(float)))
+    assert len(read_cloud(tmp_path / "a.ply")) == 5000
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("suffix", [".ply", ".xyz"])
+def test_points_without_coordinates_are_omitted_and_counted(tmp_path: Path, suffix: str, value: float, caplog):
+    points = np.random.default_rng(3).uniform(1, 2, (50, 3))
+    points[[4, 9, 20], [0, 1, 2]] = value
+    _write(tmp_path / f"a{suffix}", points)
+    found = read_cloud(tmp_path / f"a{suffix}")
+    assert np.abs(found.points_mm - np.delete(points, [4, 9, 20], axis=0)).max() < 1e-6
+    assert found.warnings == ["3 of 50 points without finite coordinates are omitted"]
+    assert caplog.messages == [f"warning: {tmp_path}/a{suffix}: {found.warnings[0]}"]
+    assert [len(part) for part in read_parts(tmp_path / f"a{suffix}", 25)] in ([22, 25], [25, 22])
+
+
+@pytest.mark.parametrize(("version", "point_format"), [("1.2", 0), ("1.4", 6)])
+def test_noise_and_withheld_points_of_las(tmp_path: Path, version: str, point_format: int):
+    table = laspy.LasData(laspy.LasHeader(version=version, point_format=point_format))
+    table.x = table.y = table.z = np.arange(1.0, 7.0)
+    table.classification = np.array([1, 7, 18, 2, 2, 2], np.uint8)
+    table.withheld = np.array([0, 0, 0, 1, 0, 0], np.uint8)
+    table.intensity = np.arange(6, dtype=np.uint16)
+    table.write(str(tmp_path / "a.las"))
+    found = read_cloud(tmp_path / "a.las")
+    assert found.intensity.tolist() == [0, 4, 5] and found.points_mm[:, 0].tolist() == [1000, 5000, 6000]
+    assert [warning.split(" are")[0] for warning in found.warnings] == [
+        "1 of 6 points marked as withheld",
+        "2 of 6 points classified as noise",
+    ]
+
+
+def test_invalid_points_of_e57_are_counted(tmp_path: Path):
+    with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
+        columns = {f"cartesian{axis}": np.arange(1.0, 6.0) for axis in "XYZ"}
+        file.write_scan_raw(columns | {"cartesianInvalidState": np.array([0, 1, 0, 2, 0], np.int8)})
+    found = read_cloud(tmp_path / "a.e57")
+    assert found.points_mm[:, 0].tolist() == [1000, 3000, 5000]
+    assert found.warnings == ["2 of 5 points marked as invalid are omitted"]
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [

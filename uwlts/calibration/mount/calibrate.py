@@ -23,7 +23,8 @@ from uwlts.model.trajectory import Trajectory
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, Artefact, MountEvidence, SensorAxis, read_mount_evidence
-from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
+from uwlts.storage.number_tables import Unit
+from uwlts.storage.pose_files import PoseFormat, read_poses
 
 _MOST_POINTS = 100_000
 """Points of all profiles together; more take time without lower uncertainty, as pose errors dominate."""
@@ -44,8 +45,8 @@ def calibrate_mount(
     height_mm: float | None = None,
     calibration: Calibration | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
-    profile_unit: Unit = "mm",
-    pose_unit: Unit = "mm",
+    profile_unit: Unit | None = None,
+    pose_unit: Unit | None = None,
     axis: SensorAxis | None = None,
     scale: bool = False,
     time: bool = False,
@@ -88,9 +89,9 @@ def calibrate_mount(
         matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved axes),
         euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table.
     profile_unit
-        Unit of the profiles.
+        Unit of the profiles; by default that in the names of columns, else mm.
     pose_unit
-        Unit of the positions.
+        Unit of the positions; by default that in the names of columns, else mm.
     axis
         Set if the sphere or target stands on a rotary table with unknown axis. Direction in the sensor's frame nearest
         to the axis about which positive angles turn counter-clockwise. The mount then maps to a frame whose z axis is

@@ -1,0 +1,139 @@
+"""Tables of other programs: separators, encodings, names and units are recognised, contradictions are refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import uwlts
+from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.pose_files import read_poses
+
+POINTS_MM = [[0.5, 2.0, 400.25], [1.5, -2.0, 401.5], [2.5, 0.0, 402.75]]
+
+
+def text_of(header: str, separator: str, scale: float, comma: bool = False) -> str:
+    rows = [separator.join(f"{scale * value:.9f}" for value in point) for point in POINTS_MM]
+    text = "\n".join([*([header] if header else []), *rows]) + "\n"
+    return text.replace(".", ",") if comma else text
+
+
+@pytest.mark.parametrize(
+    ("header", "separator", "scale"),
+    [
+        ("x_m,y_m,z_m", ",", 1e-3),
+        ("X [m];Y [m];Z [m]", ";", 1e-3),
+        ("x(cm)\ty(cm)\tz(cm)", "\t", 0.1),
+        ("x [µm],y [µm],z [µm]", ",", 1e3),
+        ("x_inch,y_inch,z_inch", ",", 1 / 25.4),
+        ("# x [m] y [m] z [m]", " ", 1e-3),
+        ("//Xmm Ymm Zmm", " ", 1.0),
+        ("Position X / mm,Position Y / mm,Position Z / mm", ",", 1.0),
+        ("X (millimetres),Y (millimetres),Z (millimetres)", ",", 1.0),
+        ("# scanned in Basel, twice\n", ",", 1.0),
+        ("3", " ", 1.0),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+def test_units_in_names_are_obeyed(tmp_path: Path, header: str, separator: str, scale: float, encoding: str):
+    (tmp_path / "a.csv").write_bytes(text_of(header, separator, scale).encode(encoding))
+    found = read_cloud(tmp_path / "a.csv")
+    # Nine decimals in inches are 1e-8 mm.
+    assert np.abs(found.points_mm - POINTS_MM).max() < 2e-6 and not found.warnings
+
+
+@pytest.mark.parametrize("separator", [";", "\t", " ", "  "])
+@pytest.mark.parametrize("header", ["", "X Y Z", "3"])
+def test_decimal_commas(tmp_path: Path, separator: str, header: str):
+    (tmp_path / "a.txt").write_text(text_of(header, separator, 1.0, comma=True))
+    found = read_cloud(tmp_path / "a.txt")
+    assert np.abs(found.points_mm - POINTS_MM).max() < 1e-9
+    assert any("decimal commas" in warning for warning in found.warnings) == separator.isspace() * (separator != "\t")
+
+
+def test_columns_are_taken_by_name_and_the_others_left(tmp_path: Path):
+    (tmp_path / "a.csv").write_text("Intensity,nx,Z_m,Y_m,X_m,\n7,1,0.3,0.2,0.1,\n8,1,0.6,0.5,0.4,\n")
+    found = read_cloud(tmp_path / "a.csv")
+    assert np.abs(found.points_mm - [[100, 200, 300], [400, 500, 600]]).max() < 1e-9
+    assert found.intensity.tolist() == [7, 8]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x_m,y_mm,z_m\n1,2,3\n", "x in m, y in mm"),
+        ("x,y,z_m\n1,2,3\n", "x in no stated unit"),
+        ("x [furlong],y [furlong],z [furlong]\n1,2,3\n", "unknown unit"),
+        ("x_deg,y_deg,z_deg\n1,2,3\n", "unknown unit"),
+        ("5\n1 2 3\n4 5 6\n", "states 5 rows"),
+        ("1,25,2,05,3,50\n4,25,5,05,6,50\n", "both decimal and separators"),
+        ("x,y,z\n1,2\n", "no table of numbers"),
+        ("x,p_x,y,z\n1,2,3,4\n", "each name once"),
+    ],
+)
+def test_contradictions_are_refused(tmp_path: Path, text: str, message: str):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(uwlts.Error, match=message):
+        read_cloud(tmp_path / "a.csv")
+
+
+def test_a_unit_in_prose_is_doubted(tmp_path: Path):
+    (tmp_path / "a.xyz").write_text("# coordinates in metres\n1 2 3\n4 5 6\n")
+    found = read_cloud(tmp_path / "a.xyz")
+    assert found.points_mm[0].tolist() == [1, 2, 3] and "another unit" in found.warnings[0]
+
+
+TURN = Rotation.from_euler("zyx", [0.3, -0.2, 0.5])
+X, Y, Z, W = (f"{value:.12f}" for value in TURN.as_quat())
+
+
+@pytest.mark.parametrize("pose_format", ["quaternion-xyzw", "quaternion-wxyz"])
+@pytest.mark.parametrize(
+    ("header", "rotation"),
+    [
+        ("x_m,y_m,z_m,qw,qx,qy,qz", (W, X, Y, Z)),
+        ("x [m],y [m],z [m],qx,qy,qz,qw", (X, Y, Z, W)),
+        ("# p_x [m], p_y [m], p_z [m], q_z, q_y, q_x, q_w", (Z, Y, X, W)),
+        ("position.x_m,position.y_m,position.z_m,rotation.x,rotation.y,rotation.z,rotation.w", (X, Y, Z, W)),
+    ],
+)
+def test_names_decide_the_order_of_a_quaternion(tmp_path: Path, pose_format: str, header: str, rotation: tuple[str]):
+    (tmp_path / "a.csv").write_text("\n".join([header, ",".join(("0.1", "0.2", "0.3", *rotation))]) + "\n")
+    poses, _ = read_poses(tmp_path / "a.csv", pose_format=pose_format)
+    assert poses[0, :3, :3] == pytest.approx(TURN.as_matrix(), abs=1e-9)
+    assert poses[0, :3, 3] == pytest.approx([100, 200, 300])
+
+
+@pytest.mark.parametrize(
+    ("header", "angles"),
+    [
+        ("roll_rad,pitch_rad,yaw_rad", (0.5, -0.2, 0.3)),
+        ("Yaw [rad],Pitch [rad],Roll [rad]", (0.3, -0.2, 0.5)),
+        ("rx,ry,rz", (0.5, -0.2, 0.3)),
+        ("a,b,c", (0.3, -0.2, 0.5)),
+    ],
+)
+def test_names_decide_the_axes_of_euler_angles(tmp_path: Path, header: str, angles: tuple[float]):
+    (tmp_path / "a.csv").write_text(f"X_mm,Y_mm,Z_mm,{header}\n1,2,3,{','.join(map(str, angles))}\n")
+    poses, _ = read_poses(tmp_path / "a.csv", pose_format="euler-zyx-rad")
+    assert poses[0, :3, :3] == pytest.approx(TURN.as_matrix(), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "pose_format", "unit", "message"),
+    [
+        ("x_m,y_m,z_m,roll,pitch,yaw", "euler-zyx-deg", "mm", "names columns in m"),
+        ("x_mm,y_mm,z_mm,roll,pitch,yaw", "euler-zyx-deg", "m", "names columns in mm"),
+        ("x,y,z,roll_rad,pitch_rad,yaw_rad", "euler-zyx-deg", None, "roll|yaw in rad"),
+        ("x,y,z,roll [deg],pitch [deg],yaw [deg]", "euler-zyx-rad", None, "in deg, but"),
+        ("x,y,z,roll [turn],pitch [turn],yaw [turn]", "euler-zyx-rad", None, "unknown unit"),
+        ("x,y,z,roll,pitch,yaw", "rotvec-deg", None, "the format that the names describe"),
+        ("x,y,z,roll,pitch,yaw", "euler-zyz-deg", None, "twice about one axis"),
+        ("a,b,c,x,y,z", "rotvec-rad", None, "x, y and z first"),
+    ],
+)
+def test_names_that_contradict_the_format_are_refused(tmp_path, header, pose_format, unit, message):
+    (tmp_path / "a.csv").write_text(f"{header}\n1,2,3,0.1,0.2,0.3\n")
+    with pytest.raises(uwlts.Error, match=message):
+        read_poses(tmp_path / "a.csv", pose_format=pose_format, unit=unit)

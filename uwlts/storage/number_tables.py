@@ -1,0 +1,296 @@
+"""Tables of numbers in text files of other programs: their separators, encodings, names and units."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from io import BytesIO
+from itertools import takewhile
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import csv
+
+from uwlts.errors import DescriptionError
+from uwlts.files.reading import read_bytes, shorten
+from uwlts.files.writing import hash_file
+
+Unit = Literal["mm", "m"]
+MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
+ROTATION_NAMES = ("qw", "qx", "qy", "qz", "rx", "ry", "rz", "roll", "pitch", "yaw", "angle")
+"""Names of columns with rotations, as `read_number_table` returns them; it returns positions as x, y, z."""
+
+_MOST_BYTES = 512 * 2**20
+_LENGTHS = {"nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1e3, "km": 1e6}
+_LENGTHS |= {"micron": 1e-3, "in": 25.4, "inch": 25.4, "ft": 304.8, "feet": 304.8, "yd": 914.4}
+_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "gon": np.pi / 200}
+_TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+_SAME_UNITS = {"degree": "deg", "°": "deg", "radian": "rad", "grad": "gon", "second": "s", '"': "in", "foot": "ft"}
+_SAME_UNITS |= {
+    f"{name}{ending}": unit
+    for prefix, unit in (("", "m"), ("milli", "mm"), ("centi", "cm"), ("micro", "um"), ("kilo", "km"))
+    for name in (f"{prefix}metre", f"{prefix}meter")
+    for ending in ("", "s")
+}
+_SAME_UNITS |= {f"{name}s": unit for name, unit in _SAME_UNITS.items() if name in ("degree", "radian", "second")}
+_SAME_UNITS |= {"microns": "um", "micron": "um", "inches": "in", "inch": "in", "feet": "ft"}
+_UNITS = _LENGTHS | _ANGLES | _TIMES
+_UNITS_OF = {"time_s": _TIMES} | dict.fromkeys("xyz", _LENGTHS) | dict.fromkeys(ROTATION_NAMES[4:], _ANGLES)
+"""Units of the columns whose units are converted or checked."""
+_SAME_NAMES = {name: name for name in ROTATION_NAMES} | {"heading": "yaw"}
+_TIME_NAMES = ("time", "t", "timestamp", "stamp", "time_s")
+_IN_BRACKETS = re.compile(r"(.*?)[\s_]*[\[(<](.*)[\])>]")
+_AT_END = re.compile(r"(.+?)[\s_/.\-]+([^\s_/.\-]+)|([xyz])(mm|cm|um|m)")
+_POSITION = re.compile(
+    r"(?:(?:.*[._ /])?(?:p|t|pos|position|trans|translation|coord|coordinate|point)(?:[._ ](?:.*[._ ])?)?)?([xyz])"
+    r"(?:[._ ]?(?:pos|position|coord|coordinate))?"
+)
+_QUATERNION = re.compile(
+    r"(?:.*[._ /])?(?:(?:q|quat|quaternion|orientation)(?:[._ ](?:.*[._ ])?)?([wxyz])|(?:rot|rotation)[._ ]?(w))"
+)
+_ROTATION = re.compile(r"(?:.*[._ /])?(?:r|rot|rotation|rotvec)[._ ]?([xyz])")
+_DECIMAL_COMMA = re.compile(rb"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?")
+_UNIT_IN_COMMENT = re.compile(
+    r"\b(?:in|units?)\b[\s:=]*(?:the |are |is )?[\[(]?(m|cm|um|µm|in|inch(?:es)?|ft|feet|(?:centi)?met(?:re|er)s?)\b"
+)
+_COMMENTS = (b"#", b"//", b"%", b"!")
+
+
+@dataclass(frozen=True, eq=False)
+class NumberTable:
+    """Columns (N,) by name, the units that their names state, and notes on doubtful readings.
+
+    Times are in s. Other columns are in the unit that their name states.
+    """
+
+    path: Path
+    columns: dict[str, np.ndarray]
+    units: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def mm_per_unit(self, axes: Iterable[str] = "xyz", *, unit: Unit | None = None) -> float:
+        """Return the length unit of columns in mm, from their names or else ``unit``; by default 1.
+
+        Raises DescriptionError if the names contradict each other or ``unit``.
+        """
+        stated = {name: self.units.get(name, "") for name in axes if name in self.columns}
+        if len(found := set(stated.values())) > 1:
+            texts = ", ".join(f"{name} in {each or 'no stated unit'}" for name, each in stated.items())
+            raise DescriptionError(f"{self.path} has {texts}; expected one unit in the names of all axes")
+        in_names = next(iter(found), "")
+        if unit is not None and in_names and _LENGTHS[in_names] != MM_PER_UNIT[check_unit(unit)]:
+            raise DescriptionError(
+                f"{self.path} names columns in {in_names}, but the unit {unit} was given: leave the unit out, or "
+                "correct the names"
+            )
+        return _LENGTHS[in_names] if in_names else MM_PER_UNIT[check_unit(unit or "mm")]
+
+
+def check_unit(unit: Unit) -> Unit:
+    if unit not in get_args(Unit):
+        raise DescriptionError(f"the unit is {unit!r}; expected mm or m")
+    return unit
+
+
+def read_number_table(path: Path, digests: dict[str, str], *, named: bool = True) -> NumberTable:
+    """Read a table of numbers, separated by commas, semicolons, tabs or blanks.
+
+    With separators other than commas, numbers may have decimal commas. Lines that begin with #, //, % or ! are
+    comments; the last comment before the numbers names the columns if it contains x and z, or an angle. A first line
+    with the number of rows is recognised, as are UTF-8, UTF-16 and Latin-1. Names are in lower case and without unit.
+    Usual names for times, positions, quaternions and Euler angles become ``time_s``, ``x``, ``qw``, ``roll`` and so
+    on. Without names, two columns are x and z, and others are numbered.
+
+    Raises DescriptionError if the file is no such table, rows are missing, or a name states an unknown unit.
+    """
+    content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
+    digests[path.name] = hash_file(path)
+    lines = [line.strip(b" ") for line in _decode_wide(content, path).splitlines() if line.strip()]
+    comments = [*takewhile(lambda line: line.startswith(_COMMENTS), lines)]
+    lines = [line for line in lines if not line.startswith(_COMMENTS)]
+    if not lines:
+        raise DescriptionError(f"{path} is empty: expected a table of numbers")
+    lines, counted = _without_count(lines)
+    sample = lines[1] if len(lines) > 1 and not _is_row(lines[0]) else lines[0]
+    delimiter, comma = _separators(sample)
+    header = None
+    if not _is_row(lines[0]):
+        header, *lines = lines
+        if not lines:
+            raise DescriptionError(f"{path} has no rows after the names of its columns")
+    else:
+        count = len(_cells(sample, delimiter))
+        candidates = [each for each in comments if len(_name_cells(each, delimiter, count)) == count]
+        header = next((each for each in reversed(candidates) if _names_columns(each, delimiter, count)), None)
+    if counted not in (None, len(lines)):
+        raise DescriptionError(
+            f"{path} states {counted} rows in its first line and has {len(lines)}: it is incomplete or has several "
+            "parts"
+        )
+    if delimiter == b" ":
+        lines = [b" ".join(line.split()) for line in lines]
+    notes: list[str] = []
+    comma = comma or (delimiter != b"," and any(b"," in line for line in lines))
+    if comma and delimiter == b" ":
+        notes.append("commas between digits were read as decimal commas, blanks as separators")
+    if (
+        header is None
+        and delimiter == b","
+        and any(re.match(rb"-?0\d", cell) for line in lines[:50] for cell in line.split(b","))
+    ):
+        raise DescriptionError(
+            f"{path} has cells such as '00' between commas: commas seem to be both decimal and separators. "
+            "Export it with another separator"
+        )
+    count = len(_cells(lines[0], delimiter))
+    cells = [] if header is None else _name_cells(header, delimiter, count)
+    units: dict[str, str] = {}
+    said = [_text(each) for each in comments[:1000] if _UNIT_IN_COMMENT.search(_text(each).lower())]
+    if header is not None:
+        names = []
+        for number, cell in enumerate(cells):
+            name, unit = _name_and_unit(cell, path)
+            names.append(name or f"column {number + 1}")
+            units |= {names[-1]: unit} if unit else {}
+        if "qw" in names:
+            names = [f"q{name[1]}" if name in ("rx", "ry", "rz") else name for name in names]
+    else:
+        names = ["x", "z"] if named and count == 2 else [str(number) for number in range(count)]
+    if len(set(names)) < len(names):
+        raise DescriptionError(f"{path} has the columns {', '.join(names)}: expected each name once")
+    try:
+        table = csv.read_csv(
+            BytesIO(b"\n".join(lines) + b"\n"),
+            read_options=csv.ReadOptions(column_names=names, use_threads=False),
+            parse_options=csv.ParseOptions(delimiter=delimiter.decode()),
+            convert_options=csv.ConvertOptions(
+                column_types=dict.fromkeys(names, pa.float64()),
+                null_values=["", "NaN", "nan", "NAN", "-nan", "null", "None"],
+                decimal_point="," if comma else ".",
+            ),
+        )
+    except (pa.ArrowInvalid, pa.ArrowException) as error:
+        raise DescriptionError(f"{path} is no table of numbers: {str(error).splitlines()[0]}") from error
+    columns = {name: table[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in names}
+    if lines[0].endswith(delimiter) and (header is None or not cells[-1]) and np.isnan(columns[names[-1]]).all():
+        del columns[names[-1]]
+    if "time_s" in columns:
+        columns["time_s"] = columns["time_s"] * _TIMES[units.get("time_s", "s")]
+    if said and not units.keys() & set("xyz"):
+        notes.append(f"a comment may state another unit than that of the coordinates: {shorten(said[0], 100)}")
+    return NumberTable(path, columns, units, notes)
+
+
+def _decode_wide(content: bytes, path: Path) -> bytes:
+    """Return the content without byte order mark, UTF-16 as UTF-8."""
+    start = content[:1000]
+    kind = ""
+    if start.startswith((b"\xff\xfe", b"\xfe\xff")):
+        kind = "utf-16"
+    elif start.count(0) > 0.4 * len(start) > 1:
+        kind = "utf-16-le" if start[1::2].count(0) > start[::2].count(0) else "utf-16-be"
+    try:
+        return content.decode(kind).encode() if kind else content.removeprefix(b"\xef\xbb\xbf")
+    except UnicodeDecodeError as error:
+        raise DescriptionError(f"{path} is no table of numbers: it is no complete text in UTF-16") from error
+
+
+def _without_count(lines: list[bytes]) -> tuple[list[bytes], int | None]:
+    """Remove a first line with the number of rows alone, if the next line has more cells; return it too."""
+    if len(lines) > 1 and lines[0].isdigit() and len(lines[0]) < 12:
+        further = len(_cells(lines[1], _separators(lines[1])[0]))
+        return (lines[1:], int(lines[0])) if further > 1 else (lines, None)
+    return lines, None
+
+
+def _separators(line: bytes) -> tuple[bytes, bool]:
+    """Return the separator of a line, and whether commas are decimal although blanks separate the numbers."""
+    for mark in (b";", b"\t"):
+        if mark in line:
+            return mark, False
+    words = line.split()
+    if len(words) > 1 and b"," in line and all(map(_DECIMAL_COMMA.fullmatch, words)):
+        return b" ", True
+    return (b"," if b"," in line else b" "), False
+
+
+def _cells(line: bytes, delimiter: bytes) -> list[bytes]:
+    return line.split() if delimiter == b" " else line.split(delimiter)
+
+
+def _is_row(line: bytes) -> bool:
+    """Return whether one of the cells is a number."""
+    cells = [cell.strip().strip(b'"') for cell in _cells(line, _separators(line)[0])]
+    return any(_is_number(cell) for cell in cells) or not any(cells)
+
+
+def _is_number(text: bytes) -> bool:
+    try:
+        float(text.replace(b",", b"."))
+    except ValueError:
+        return False
+    return True
+
+
+def _name_cells(line: bytes, delimiter: bytes, count: int) -> list[str]:
+    """Return the names in a line, separated like the numbers or, if their count differs then, in another way."""
+    text = re.sub(r"\s+(?=[\[(<])", "", re.sub(r"^(?:#|//|%|!)+\s*", "", _text(line)))
+    mark = delimiter.decode()
+    ways = [text.split(mark) if mark != " " else text.split(), re.split(r"[,;\t]", text), re.split(r"[,;\s]+", text)]
+    found = next((cells for cells in ways if len(cells) == count), ways[0])
+    return [cell.strip().strip('"').strip() for cell in found]
+
+
+def _text(line: bytes) -> str:
+    try:
+        return line.decode()
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
+
+
+def _names_columns(line: bytes, delimiter: bytes, count: int) -> bool:
+    """Return whether a comment names columns: x and z, or an angle."""
+    names = {_split_unit(cell)[0] for cell in _name_cells(line, delimiter, count)}
+    return {"x", "z"} <= names or "angle" in names
+
+
+def _split_unit(cell: str) -> tuple[str, str | None]:
+    """Return the usual name of a column, and the unit in brackets or after a known name; None without."""
+    text = cell.lower().removeprefix("scalar_")
+    unit = None
+    if match := _IN_BRACKETS.fullmatch(text):
+        text, unit = match[1], _plain_unit(match[2]) or None
+    elif match := _AT_END.fullmatch(text):
+        stem, last = match[1] or match[3], _plain_unit(match[2] or match[4])
+        if last in _UNITS and _usual_name(stem) in _UNITS_OF:
+            text, unit = stem, last
+    return _usual_name(text.strip()), unit
+
+
+def _plain_unit(unit: str) -> str:
+    unit = unit.strip().replace("µ", "u").replace("μ", "u")
+    return _SAME_UNITS.get(unit, unit)
+
+
+def _usual_name(name: str) -> str:
+    if name in _TIME_NAMES:
+        return "time_s"
+    if name in _SAME_NAMES:
+        return _SAME_NAMES[name]
+    if match := _QUATERNION.fullmatch(name):
+        return f"q{match[1] or match[2]}"
+    if match := _POSITION.fullmatch(name):
+        return match[1]
+    match = _ROTATION.fullmatch(name)
+    return f"r{match[1]}" if match else name
+
+
+def _name_and_unit(cell: str, path: Path) -> tuple[str, str | None]:
+    """Return name and unit of a column; raises DescriptionError if the unit is none of such a column."""
+    name, unit = _split_unit(cell)
+    if unit is not None and unit not in (known := _UNITS_OF.get(name, {unit: 1.0})):
+        raise DescriptionError(
+            f"{path} has a column {shorten(repr(cell))} with an unknown unit; expected one of {', '.join(known)}"
+        )
+    return name, unit
