@@ -55,7 +55,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def use_lanes(count: int) -> None:
-    """Compile this process's kernels for vectors of so many numbers: 4 as for SSE, 8 for AVX2, 16 for AVX-512."""
+    """Compile this process's kernels for vectors of ``count`` numbers: 4 as for SSE, 8 for AVX2, 16 for AVX-512."""
     import drjit
 
     drjit.eval(drjit.llvm.Float(0.0))  # starts LLVM, which takes the processor's own

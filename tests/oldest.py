@@ -1,7 +1,7 @@
 """Print the oldest allowed version of each dependency as requirements of pip: ``python -m tests.oldest test``.
 
-The arguments name the extras whose dependencies count besides the project's own, those that they include in turn too.
-Versions that are pinned have no oldest one, and are left out.
+The arguments name extras of the project. Their dependencies, including those of extras that they name, are added to the
+project's own. Pinned versions are left out.
 """
 
 import argparse

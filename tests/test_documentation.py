@@ -24,7 +24,7 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["p
 
 
 def _check(command: str, *, folder: Path = ROOT, abridged: bool = False) -> None:
-    """Fail unless the program takes all words of a command line, of which arguments may lack where it is abridged."""
+    """Check that the program accepts a command line; an abridged one may lack arguments."""
     program, *words = words_of(command)
     match Path(program).name:
         case "uwlts" | "twin":

@@ -19,7 +19,7 @@ from uwlts.runtime.command_line import DerivedCommand, option_type
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "optuna", "nicegui"}
 LISTENS = {"progress", "report", "warn"}
-"""Parameters by which functions show what they do; commands print it."""
+"""Parameters for callbacks that report progress; commands print the reports instead."""
 APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
 MOST_NAMES = 48
 """Public names of `uwlts`: the functions of its commands, what they return that can be saved, and what they take."""

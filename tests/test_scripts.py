@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def _is_script(path: Path) -> bool:
-    """Whether a module does something when it is run."""
+    """Return True if a module has an `if __name__ == "__main__"` block."""
     return any(
         isinstance(each, ast.If) and ast.unparse(each.test) == "__name__ == '__main__'"
         for each in ast.parse(path.read_text(encoding="utf-8")).body

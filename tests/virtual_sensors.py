@@ -55,10 +55,10 @@ def sensor_at(z: float = 0.0, *, x: float = 0.0) -> np.ndarray:
 
 
 def camera_axes(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """Columns X, Y, Z (3, 3) of the OCS in the camera frame and its origin (3,), from the sensor's baseline and angle.
+    """Return columns X, Y, Z (3, 3) of the OCS in the camera frame and its origin (3,), by baseline and angle.
 
-    Written from the words of the description: the laser stands beside the camera, above it or to its right, its axis
-    leans towards the camera's by the triangulation angle, and the roll turns the sheet about that axis.
+    An independent implementation of the description: the laser is beside the camera, above it or to its right. Its axis
+    leans towards the camera's axis by the triangulation angle, and the roll turns the sheet about the laser's axis.
     """
     laser = sensor.laser
     towards = _TOWARDS_LASER[sensor.camera.stripe_along]
@@ -90,7 +90,7 @@ def oracle_window(
 
 
 def oracle_fan(sensor: Sensor, medium: Medium) -> Fan:
-    """The sensor's fan in closed form; its origin lies at `laser_origin`."""
+    """Return the sensor's fan in closed form; its origin is at `laser_origin`."""
     laser, window = sensor.laser, sensor.laser.window
     index = medium.refractive_index(laser.wavelength_nm)
     return Fan(
@@ -110,10 +110,10 @@ def oracle_fan(sensor: Sensor, medium: Medium) -> Fan:
 
 
 def oracle_paths(sensor: Sensor, medium: Medium, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Paths of light from points (N, 3) of the OCS to the camera by Fermat's principle.
+    """Find the paths of light from points (N, 3) of the OCS to the camera by Fermat's principle.
 
-    Unit directions (N, 3) at the pupil in the camera frame, and the path's part in the medium, from the window's outer
-    face (N, 3) in the OCS and its length (N,).
+    Returns the unit directions (N, 3) at the pupil in the camera frame. For the part of the path in the medium, returns
+    the points (N, 3) on the window's outer face, in the OCS, and the lengths (N,).
     """
     axes, standoff = camera_axes(sensor)
     faces, indices = oracle_window(sensor.camera.window, medium)
@@ -145,10 +145,11 @@ def window_transmittance(
 
 
 def lens_factor(sensor: Sensor, medium: Medium, rays: np.ndarray, *, wavelength_nm: float = 635.0) -> np.ndarray:
-    """Irradiance on the image sensor per radiance before the window, for unit directions (N, 3) at the pupil.
+    """Return irradiance on the image sensor per radiance before the window, for unit directions (N, 3) at the pupil.
 
-    Radiance over the index squared stays along a ray but for the window's losses. A thin lens of focal length f and
-    diameter f / N, its image at f (1 + m), collects the solid angle pi / 4 / (N (1 + m))^2, and cos^4 off the axis.
+    Radiance divided by the squared index is constant along a ray, except for the window's losses. A thin lens of focal
+    length f and diameter f / N has its image at f (1 + m). It collects the solid angle pi / 4 / (N (1 + m))^2, times
+    cos^4 of the angle to the axis.
     """
     camera, window = sensor.camera, sensor.camera.window
     index = medium.refractive_index(wavelength_nm)
@@ -179,9 +180,9 @@ def seen_at(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
 
 
 def stripe_on_plate(sensor: Sensor, medium: Medium, lines: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where profile lines see the sheet X = 0 on the plane Z = ``z``: y (N,) and the coordinate across the stripe (N,).
+    """Return y (N,) on the plane Z = ``z`` and the coordinate across the stripe (N,) of the sheet X = 0 on lines.
 
-    A secant search along the sheet for the y that appears on the line.
+    Uses a secant search along the sheet for the y that appears on each line.
     """
     along, across = (0, 1) if sensor.camera.stripe_along == "width" else (1, 0)
 

@@ -1,7 +1,7 @@
-"""How much of a surface in which nothing changed `uwlts compare` claims to have changed.
+"""False positives of `uwlts compare`: fraction of an unchanged surface that is reported as changed.
 
 Clouds are drawn with the errors that they state: noise of single points, the position of each image, and a shift and a
-tilt that all points share. Prints the rows of the table in docs/results/comparison.md; numbers choose some of them.
+tilt that all points share. Prints the rows of the table in docs/results/comparison.md; numbers select rows.
 """
 
 import numpy as np

@@ -57,10 +57,10 @@ def circles_table() -> str:
 
 
 def ellipses_of_contours(image: np.ndarray) -> np.ndarray:
-    """Centres (N, 2) as the thesis finds them (section 4.5), with the same steps from OpenCV.
+    """Return centres (N, 2) found with the steps of the thesis (section 4.5), by OpenCV.
 
-    Median of 5 x 5, threshold (Otsu's) after the background is taken off, holes filled, particles on the border and
-    small ones removed, an ellipse fitted to the particle's outline.
+    Steps: median filter of 5 x 5, subtraction of the background, and Otsu's threshold. Then holes are filled, small
+    particles and those on the border removed, and an ellipse is fitted to each particle's outline.
     """
     calm = cv2.medianBlur(image, 5).astype(np.float32)
     size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)

@@ -1,13 +1,13 @@
-"""Agreement of two versions of the code: the same captures through both, and all numbers of what they write.
+"""Compare two versions of the code: process the same captures with both, and compare all numbers that they write.
 
     git worktree add /tmp/old v0.1
     python docs/studies/code_agreement.py /tmp/old --folder runs/agreement
     python docs/studies/code_agreement.py /tmp/old --folder runs/agreement --only joint reconstruct
 
-Inputs are made once by the older checkout (`code_agreement_inputs.py`), and its results are kept as long as its commit
-and the command lines stay. Each version runs all jobs in one process, as ``python -m uwlts`` does. Numbers have to
-agree to 1e-9 (relative), and neither version may write files or keys that the other one does not; texts that differ are
-listed, as wording may change. The exit code is 1 where anything else differs.
+Inputs are made once by the older checkout (`code_agreement_inputs.py`). Its results are reused until its commit or the
+command lines change. Each version runs all jobs in one process, as ``python -m uwlts`` does. Numbers must agree to 1e-9
+(relative), and both versions must write the same files and keys. Texts may differ and are listed. The exit code is 1 if
+anything else differs.
 """
 
 import argparse
@@ -156,7 +156,7 @@ JOBS: dict[str, str] = {
         uwlts info inputs/scans/spheres.h5
         uwlts info evaluate/spheres.json""",
 }
-"""Command lines of each job, in the order in which they need each other's files."""
+"""Command lines of each job. A job may use files of the jobs above it."""
 
 NEW_JOBS: dict[str, str] = {"verify": JOBS["verify"].replace("--limit", "--limit-mm")}
 """Jobs whose command lines the new code spells otherwise."""
@@ -311,13 +311,13 @@ def run_command(line: str) -> int:
         return 0
     sys.argv = [program, *arguments]
     try:
-        # Version 0.1 has no ``python -m uwlts``.
+        # ``python -m uwlts`` does not exist in version 0.1.
         module = program if importlib.util.find_spec(f"{program}.__main__") else f"{program}.cli"
         runpy.run_module(module, run_name="__main__")
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     except Exception:
-        # The other jobs go on: a crash is a difference like others.
+        # A crash counts as a difference; the other jobs continue.
         traceback.print_exc()
         return CRASHED
     return 0

@@ -1,4 +1,4 @@
-"""What inspections find in rendered scans, and how right their figures are.
+"""Detection rates and errors of inspections of rendered scans.
 
     python docs/studies/inspection_scenes.py runs/inspection      # and render, as it says
     cd runs/inspection/calibration && uwlts calibrate --air target-bare.h5 target-air.h5 --water target-water.h5 \
@@ -6,9 +6,9 @@
     python docs/studies/inspection.py runs/inspection docs/pictures
     python docs/studies/inspection.py runs/inspection-5 5         # pits and welds of another draw
 
-Prints the tables of the documentation: the probability of detection of pits by their depth (hit or miss, logistic in
-the logarithm of the depth, with the bound of its likelihood ratio: MIL-HDBK-1823A, appendix G), errors and coverage of
-all values against the closed form, and what is claimed to have changed where nothing has.
+Prints the tables of the documentation: probability of detection of pits, errors and coverage of all values against the
+closed form, and false claims of change. The probability of detection is a logistic function of the logarithm of the
+depth, fitted to hits and misses, with the bound of its likelihood ratio (MIL-HDBK-1823A, appendix G).
 """
 
 from dataclasses import replace
@@ -70,7 +70,7 @@ def distances(pits: Pits, places: np.ndarray) -> np.ndarray:
 
 
 def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
-    """The feature that lies on each pit, the deepest of several."""
+    """Return the feature at each pit (None if there is no feature), the deepest of several."""
     result: list[Feature | None] = [None] * len(pits.depth)
     for feature in reversed(found.select(*HOLLOWS)):
         away = distances(pits, feature.place_mm)
@@ -81,7 +81,7 @@ def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
 
 
 def false_ones(found: Inspection, pits: Pits) -> int:
-    """Features that lie on no pit."""
+    """Count the features outside all pits."""
     return sum(
         bool(np.all(distances(pits, each.place_mm) > pits.diameter / 2 + 0.5)) for each in found.select(*BLEMISHES)
     )
@@ -167,7 +167,7 @@ def true_weld(weld: Weld) -> dict[str, float]:
     left, right = np.median(angles, axis=0)
     undercuts = dict.fromkeys(("undercut left", "undercut right", "largest undercut"), weld.undercut_depth_mm)
     crest = sections.max(axis=1)
-    # Sections are as long as profiles are apart, 1 mm; three of them.
+    # A section is as long as the distance between profiles, 1 mm; this is the mean of three sections.
     highest = float(np.convolve(crest, np.full(12, 1 / 12), "valid").max())
     sizes = {"height": float(crest.mean()), "largest height": highest, "width": float(np.median(toes))} | undercuts
     return sizes | {"toe angle left": left, "toe angle right": right, "misalignment": 0.0}

@@ -16,16 +16,16 @@ from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.sensor import Sensor
 
 FINE_SPP = 256
-"""Samples of the stripe itself: with 16, the few places in the pupil shift a blurred stripe by up to 0.2 px."""
+"""Samples of the stripe itself: with 16, the few points in the pupil shift a blurred stripe by up to 0.2 px."""
 SMOOTHED_LINES = 33
-"""Scattered light of a plate varies slowly along the stripe; its random walks' noise is averaged over so many lines."""
+"""Lines over which noise of random walks is averaged: scattered light of a plate varies slowly along the stripe."""
 APART = 3.0
 """From 2 renewal lengths of travel on, speckle is new."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Place(Case):
-    """A case of which one frame is rendered; ``turned_deg`` turns a plate about X (slanted stripe) and Y (depth)."""
+    """Case with a single rendered frame; ``turned_deg`` turns a plate about X (slanted stripe) and Y (depth)."""
 
     turned_deg: tuple[float, float] = (0.0, 0.0)
 
@@ -138,7 +138,7 @@ CONVEX = ALL.remove("secondary-light")
 
 
 def places() -> dict[str, Place]:
-    """What every method is tried on with all effects."""
+    """Return the cases, with all effects, on which every method is tested."""
     square = {f"plane, {name}": Place(z_mm=z, spp=8) for name, z in PLACES.items()}
     return square | {
         "sphere, near": Place(thing="spheres", z_mm=-40.0, spp=8),
@@ -179,9 +179,9 @@ LEVELS = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
 
 @dataclass(frozen=True)
 class Spread:
-    """Bias (mean), standard deviation, and the latter of means of five lines, px; std in mm; share of lines found.
+    """Bias (mean), standard deviation of single lines and of means of five lines, px; std in mm; fraction found.
 
-    Centres more than 2 px off, at limbs and edges, are left out and counted in ``far_off``.
+    Errors above 2 px, at limbs and edges, are left out and counted in ``far_off``.
     """
 
     bias_px: float

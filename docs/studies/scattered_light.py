@@ -4,8 +4,9 @@
     python docs/studies/scattered_light.py reference coastal FILE.npz       # plain means of many walks per cell
     python docs/studies/scattered_light.py compare PICTURE.svg REFERENCE.npz,FRAMES.npz[,MORE.npz] ...
 
-The reference takes the plain means of 4,800 random walks per cell, of 64,800 within 48 px of the stripe, in some 4 min
-of processor time; `tests/data/scattered-WATER.npz` are such. Grey values are scaled to a stripe's peak of 200.
+The reference is the plain mean of 4,800 random walks per cell, or 64,800 within 48 px of the stripe. It takes about
+4 min of processor time; `tests/data/scattered-WATER.npz` are examples. Grey values are scaled to a stripe's peak of
+200.
 """
 
 import argparse
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
 SEEDS = 16
 SPP = 16
 PARTS, WALKS, MORE_WALKS, NEAR_PX = 12, 400, 5000, 48
-"""The reference's walks per cell are drawn in parts, whose scatter tells its error; more of them near the stripe."""
+"""Number of parts of the reference, random walks per cell and part, and more of them within NEAR_PX of the stripe.
+
+The scatter of the parts gives the error of the reference.
+"""
 PEAK_DN = 200.0
 AWAY_PX = (0, 16, 32)
 

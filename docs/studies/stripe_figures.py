@@ -41,11 +41,11 @@ def line_contrast(f_number: float) -> float:
 
 
 def predicted_std_px(f_number: float, width_px: float, *, mass: bool = False) -> float:
-    """Speckle's error of a Gaussian line of a full width at half maximum, by propagation, pixels being independent.
+    """Return the standard deviation by speckle of the centre of a Gaussian profile, px, with independent pixels.
 
-    With the line f of standard deviation s and the contrast C the variance of the matched filter's centre is
-    C^2 int x^2 f^4 / (int x^2 f^2 / s^2)^2 = C^2 s / sqrt(2 pi), that of the centre of mass
-    C^2 int x^2 f^2 / (int f)^2 = C^2 s / (4 sqrt(pi)).
+    Let f be the profile with standard deviation s, and C the contrast. The variance of the matched filter's centre is
+    `C^2 int x^2 f^4 / (int x^2 f^2 / s^2)^2 = C^2 s / sqrt(2 pi)`. The variance of the centre of mass is
+    `C^2 int x^2 f^2 / (int f)^2 = C^2 s / (4 sqrt(pi))`.
     """
     sigma = width_px / FWHM_PER_SIGMA
     return line_contrast(f_number) * math.sqrt(sigma / (4 * math.sqrt(math.pi) if mass else math.sqrt(2 * math.pi)))

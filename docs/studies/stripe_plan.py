@@ -47,7 +47,7 @@ ROWS = {
 
 
 class Plan:
-    """The cases of the study, each with so many frames; fewer where random walks make them slow."""
+    """Cases of the study and their number of frames, which is smaller for cases with slow random walks."""
 
     def __init__(self, frames: int):
         self.frames = frames
@@ -112,7 +112,7 @@ class Plan:
         }
 
     def unknown(self) -> dict[tuple[str, str], Case]:
-        """What the thesis does not say, changed one at a time; by change and place."""
+        """Return cases that each change one parameter unknown from the thesis, by change and place."""
         sensor = load_sensor("thesis")
         window, focus = sensor.camera.window, sensor.camera.focus_distance_mm
         # Near the axis a flat layer of index n looks n times thinner.

@@ -1,10 +1,10 @@
 """Wrong and lost points on scenes with mirrors and inside corners: the brightest peak, and the direct stripe.
 
 ``python docs/studies/stripe_reflections.py`` prints the tables of docs/results/reflections.md and draws their
-picture. A point is wrong that lies more than 3 px from every place where the laser lights a surface: where the sheet's
-middle meets one, and where the light that comes straight from surfaces has a stripe, which lies elsewhere if an edge
-cuts the sheet. A profile line on which the sheet's middle lights a surface is lost without a right point. The numbers
-of the rule were chosen on the named scenes as a small camera sees them, and on no others.
+picture. A point is correct within 3 px of a true position, otherwise wrong. True positions are the intersections of the
+sheet's middle with surfaces, and the stripes of direct light, which differ if an edge cuts the sheet. A profile line is
+lost if the sheet's middle lights a surface there and no point is correct. The parameters of the rule were chosen only
+on the named scenes, with a small camera.
 """
 
 import math
@@ -224,8 +224,8 @@ OTHERS = {
 class Rendered:
     """Images (F, H, W) of a scene, as `find_stripes` takes them, and the sensor.
 
-    ``lit`` (N, 3) are image, line and place of where the sheet's middle lights a surface, ``direct`` (M, 3) those of
-    the stripes of light straight from surfaces.
+    ``lit`` (N, 3) contains image, line and position of the points lit by the sheet's middle. ``direct`` (M, 3) contains
+    those of the stripes of direct light.
     """
 
     images: np.ndarray

@@ -3,12 +3,12 @@
     python -m docs.studies.trajectory_alignment --seeds 0 1 2
     python -m docs.studies.trajectory_alignment --seeds 0 1 2 --navigation
 
-The vehicle and the sea bed are those of `tests/uwlts/path_views.py`, with 0.3 m and 1 deg of drift of which only the
-size is given; ``--walk`` adds a random walk, a multiple of the drift, ``--loop`` takes 4 m with one crossing. With
-``--navigation`` vehicle, sea and navigation are those of `scenes/vehicle-pass.toml`, and the navigation states its
-covariance. ``--crossings-given`` closes the crossings at their true places instead of searching for them, with fewer
-nodes: a tenth of the time. First it prints for kinds of drift by which factor three exact crossings lower the path
-error (`bounds`).
+The vehicle and the sea bed are those of `tests/uwlts/path_views.py`, with a drift of 0.3 m and 1 deg. Only the size of
+the drift is given to the alignment. ``--walk`` adds a random walk, a multiple of the drift; ``--loop`` uses 4 m with
+one crossing. With ``--navigation``, vehicle, sea and navigation are those of `scenes/vehicle-pass.toml`, and the
+navigation states its covariance. ``--crossings-given`` closes the crossings at their true poses instead of searching
+for them, with fewer nodes: a tenth of the time. First it prints the factors (`bounds`) that three exact crossings can
+reduce the path error by, for several kinds of drift.
 """
 
 import argparse
@@ -111,9 +111,9 @@ def vehicle_ride(seed: int) -> tuple[PointCloud, uwlts.Trajectory, uwlts.Traject
 def errors(
     cloud: PointCloud, reported: uwlts.Trajectory, true: uwlts.Trajectory, sensor: np.ndarray, drift: dict[str, float]
 ) -> str:
-    """Errors of the path and of lengths between the passes of each crossing, before and after, in words.
+    """Return, as text, errors of the path and of lengths between the passes of each crossing, before and after.
 
-    Those of the path are less that of its first position, which no surface determines.
+    The error of the first position, which no surface determines, is subtracted from those of the path.
     """
     try:
         found = uwlts.align_trajectory(cloud, reported, **drift)
@@ -148,9 +148,9 @@ def errors(
 def given_crossings(
     cloud: PointCloud, reported: uwlts.Trajectory, true: uwlts.Trajectory, sensor: np.ndarray, drift: dict[str, float]
 ) -> str:
-    """Errors of the path, in words, with each crossing closed at its true place instead of searched for.
+    """Return, as text, errors of the path with each crossing closed at its true pose, without a search.
 
-    Fewer nodes than usual take a tenth of the time; they follow no random walk within a crossing.
+    Fewer nodes than usual take a tenth of the time. They cannot follow a random walk within a crossing.
     """
     assert cloud.time_s is not None
     options = AlignmentOptions(intervals=50, most_nodes=120)
@@ -202,12 +202,13 @@ def _true_pairs(places: list[np.ndarray]) -> list[tuple[int, int]]:
 
 
 def bounds(*, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave: float = 0.0) -> str:
-    """Times by which three exact crossings lower the rms error of a path, in words: the drift is a Gaussian process.
+    """Return, as text, the factors that three exact crossings can reduce the rms error of a path by.
 
-    The parts of its variance at the end are those of a steady rate, of a rate that walks at random, and of a random
-    walk; ``wave`` is the amplitude of that of `ride`. Given is the displacement within each crossing, or that at two
-    places, which determines the rates there, too. A linear Gaussian estimate by the true covariance has the least error
-    of all. `align_trajectory` knows the size of the drift alone: it takes its own model with the likeliest walk.
+    The drift is a Gaussian process. ``rate``, ``wandering`` and ``walk`` are the parts of its variance at the end for a
+    steady rate, a rate with a random walk, and a random walk. ``wave`` is the amplitude of the wave of `ride`. The
+    known displacement is that within each crossing, or at two positions of it, which also determines the rates. The
+    linear Gaussian estimate with the true covariance has the smallest possible error. `align_trajectory` knows only the
+    size of the drift: it uses its own model with the most likely walk.
     """
     found = []
     for apart in (0.0, SWATH_MM / LENGTH_MM):

@@ -2,7 +2,7 @@
 
     python docs/studies/vehicle_loop.py FOLDER
 
-The sensor is as drawn, and images are 2.5 mm apart.
+The sensor matches its drawings. The distance between images is 2.5 mm.
 """
 
 from pathlib import Path

@@ -36,7 +36,7 @@ CORES = 2
 
 @dataclass(frozen=True)
 class Row:
-    """One measured value and its limit; ``ok`` tells whether it is kept."""
+    """Measured value and its limit; ``ok`` is True if the value is within the limit."""
 
     name: str
     value: float
@@ -229,9 +229,9 @@ def studies() -> list[Row]:
 
 
 def datasets() -> list[Row]:
-    """Frames of a data set per second, single scattering, 640 x 512 pixels, from the light to the labelled files.
+    """Measure frames per second of a data set: single scattering, 640 x 512 pixels, from light to labelled files.
 
-    Two workers share memory and caches, for which a tenth is allowed.
+    Two workers share memory and caches, so their limit is a tenth below twice the rate of one.
     """
     from tests.bench.dataset import rate_hz
 

@@ -22,7 +22,7 @@ AS_OFTEN = 8
 
 
 class _InMemory:
-    """A capture whose images were read beforehand, or as if taken again so many times, an image a second."""
+    """Capture with all images in memory, optionally repeated several times, one image per second."""
 
     def __init__(self, capture: Capture, times: int = 1):
         self.capture = capture

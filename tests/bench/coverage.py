@@ -1,4 +1,4 @@
-"""How often stated 95 % intervals hold the truth: ``python -m tests.bench.coverage [campaigns] [--varied]``.
+"""Coverage of the stated 95 % intervals: ``python -m tests.bench.coverage [campaigns] [--varied]``.
 
 Campaigns are simulated by Fermat's principle (`tests.uwlts.simulated_campaign`), calibrated jointly, and a sphere
 standard is scanned and measured with each calibration. With ``--varied``, campaigns in water use other sensors than the
@@ -121,10 +121,9 @@ VARIATIONS = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a campaign measured, and the seconds that its calibration and its figures' uncertainties took.
+    """Results of a campaign, and the seconds taken by its calibration and by the uncertainties of its figures.
 
-    ``pulls`` (K,) are the errors of the calibration's parameters, made independent and of variance one by its
-    covariance.
+    ``pulls`` (K,) are the errors of the calibration's parameters, whitened with its covariance.
     """
 
     measured: list[Measured]
@@ -228,7 +227,7 @@ def _scan(
 
 
 def _empty_capture(folder: Path, sensor: Sensor, medium: str, positions: np.ndarray) -> Capture:
-    """A capture that tells sensor, medium and stage; what its images would show is given."""
+    """Return a capture with sensor, medium and stage, but without images; their contents are given elsewhere."""
     header = CaptureHeader(
         name="spheres",
         sensor=sensor,
@@ -267,7 +266,7 @@ def attempt(campaign: Campaign, send: Any = None) -> Outcome | None:
 
 
 def varied_campaigns(count: int) -> int:
-    """Run so many campaigns of each variation and print, for each, how often the truth is where it is said to be."""
+    """Run ``count`` campaigns of each variation and print the coverage of their stated intervals."""
     table = Table(
         "campaigns in water",
         "refused",

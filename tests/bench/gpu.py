@@ -24,7 +24,7 @@ PROCESSES = (1, 2, 4, 8)
 
 
 def frame_seconds(water: str, samples_at_once: int) -> float:
-    """Median seconds of the light of one frame, rendered in parts of at most so many samples."""
+    """Return the median seconds to render the light of one frame in parts of at most ``samples_at_once`` samples."""
     use_variant(GPU)
     from tests.bench.light import in_named_water
     from twin.light import renderer as module

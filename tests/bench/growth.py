@@ -1,7 +1,7 @@
-"""How cost grows with frames, image size, samples, points and evidence images: ``python -m tests.bench.growth``.
+"""Growth of cost with frames, image size, samples, points and evidence images: ``python -m tests.bench.growth``.
 
-Processor time over two decades of each, the exponents fitted, drawn into ``docs/pictures/growth.svg``. Short ones
-are measured several times, of which the fastest counts.
+Measures processor time over two decades of each, fits the exponents, and draws ``docs/pictures/growth.svg``. For short
+runs, the fastest of several repetitions is used.
 """
 
 import tempfile

@@ -1,10 +1,10 @@
-"""Mutation testing, the share of small faults that the tests find: ``python -m tests.bench.mutants [package ...]``.
+"""Mutation testing, the fraction of small faults that tests detect: ``python -m tests.bench.mutants [package ...]``.
 
-From each package mutants are drawn at random by Cosmic Ray's operators: another arithmetic operator, comparison, sign,
-number, truth value, a loop that is left out. Annotations are not changed. Each is tried in a copy of the checkout on
-the tests that run the changed line, shortest first, then on the others of their files; slow ones are left out, but with
-``--again FILE``, which tries the survivors of earlier results on all. A mutant that no test notices survives; whether
-it changes a result at all is for the reader to judge. Needs ``pip install -e '.[mutants]'``.
+Mutants of each package are drawn at random with Cosmic Ray's operators: another arithmetic operator, comparison, sign,
+number or truth value, or a loop left out. Annotations are not changed. Each mutant is tested in a copy of the checkout:
+first with the tests that run the changed line, shortest first, then with the other tests of their files. Slow tests
+are left out. ``--again FILE`` runs all tests on the survivors of earlier results. A mutant survives if no test fails;
+the reader decides if it changes a result at all. Needs ``pip install -e '.[mutants]'``.
 """
 
 import argparse
@@ -64,7 +64,7 @@ class Mutant:
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a mutant: ``killed``, ``survived`` or ``not run`` by any test; the line before and after."""
+    """Fate of a mutant: ``killed``, ``survived`` or ``not run`` by any test; the line before and after the change."""
 
     mutant: Mutant
     outcome: str
@@ -125,7 +125,7 @@ def copied(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Tests:
-    """What tests ran: ``of_line``, those that ran a line of a file; ``seconds`` each took."""
+    """Tests by the lines and files that they run, and their durations in ``seconds``."""
 
     of_line: dict[tuple[str, int], set[str]]
     of_file: dict[str, set[str]]
@@ -157,7 +157,7 @@ class Tests:
             for line, contexts in data.contexts_by_lineno(path).items():
                 for context in filter(None, contexts):
                     test, phase = context.rsplit("|", 1)
-                    # What a fixture runs may serve any test of the file.
+                    # A fixture may be used by any test of the file.
                     tests = {test} if phase == "run" else {t for t in seconds if t.startswith(test.split("::")[0])}
                     of_line.setdefault((file, line), set()).update(tests)
                     of_file.setdefault(file, set()).update(tests)

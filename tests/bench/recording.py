@@ -31,12 +31,12 @@ SERVED = 300
 
 @dataclass(frozen=True)
 class Recorded:
-    """Frames per second that reached the disk, by a straight line through their moments, and how many were lost.
+    """Frames per second written to disk, by a straight line through their times, and the number of lost frames.
 
-    From the first to the last alone, a first frame that is stored 10 ms late would raise 60 frames per second by 0.1.
+    With the first and the last frame only, a first frame stored 10 ms late would raise 60 frames per second by 0.1.
 
-    ``followed`` of them were read from the growing file, their stripe found and turned into points, by a second
-    process, at ``followed_hz`` from the first to the last; it was done ``behind_s`` after the recording.
+    A second process read ``followed`` frames from the growing file and reconstructed them, at ``followed_hz`` from the
+    first to the last. It finished ``behind_s`` after the recording.
     """
 
     rate_hz: float

@@ -33,10 +33,10 @@ def timed(batch: Batch) -> tuple[float, bytes]:
 
 
 def screening() -> tuple[float, float]:
-    """Designs per second of the thesis's baseline and angle, by two workers, and the engine's share of their time.
+    """Return designs per second (thesis's baseline and angle, two workers) and the engine's fraction of the time.
 
-    The engine is all that is not judging: handing out work, taking results back, writing the parts. Starting the
-    workers is left out.
+    The engine is everything except the evaluation of designs: distributing work, collecting results and writing the
+    parts. The start of the workers is left out.
     """
     study = load_study("baseline-angle")
     sampling = {"kind": "sobol", "designs": BATCHES * BATCH, "batch": BATCH}

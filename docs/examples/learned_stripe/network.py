@@ -49,9 +49,9 @@ def _convolved(x: jax.Array, layer: tuple[jax.Array, jax.Array]) -> jax.Array:
 
 
 def logits(weights: Weights, lines: jax.Array) -> jax.Array:
-    """Logits (B, P + 1) of the pixels and of "no stripe", of lines (B, P) in shares of the full scale."""
+    """Return logits (B, P + 1) of the pixels and of "no stripe", for lines (B, P) scaled to a full scale of 1."""
     given = iter(weights)
-    # The root evens out the shot noise; the share of the line's highest pixel shows faint stripes.
+    # The square root makes shot noise uniform; division by the line's maximum shows faint stripes.
     lines = jnp.maximum(lines, 0.0)
     x = jnp.stack([jnp.sqrt(lines), lines / (lines.max(axis=1, keepdims=True) + 1e-3)], axis=-1)
     passed = []

@@ -47,12 +47,12 @@ def read_lines(folders: list[Path], split: str) -> tuple[np.ndarray, np.ndarray]
 
 
 def batches(lines: np.ndarray, truth: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Random parts of random lines, half of them turned about; a part that misses its stripe has none."""
+    """Yield random crops of random lines, half of them reversed; a crop beside the stripe is labelled `NO_STRIPE`."""
     longest = lines.shape[1] - CROP_PX
     while True:
         chosen = rng.integers(0, len(lines), BATCH)
         centre = truth[chosen]
-        # Most parts show the stripe, and near their border it has no whole profile.
+        # Most crops contain the stripe; near their border its profile is cut off.
         first = np.where(centre >= 0, centre - rng.uniform(0, CROP_PX, BATCH), rng.uniform(0, longest, BATCH))
         first = np.clip(first, 0, longest).astype(int)
         part = lines[chosen[:, None], first[:, None] + np.arange(CROP_PX)].astype(np.float32) / 255.0
@@ -79,7 +79,7 @@ def loss(weights: Weights, lines: jax.Array, centre: jax.Array) -> jax.Array:
 
 
 def trained(lines: np.ndarray, truth: np.ndarray, *, minutes: float, seed: int) -> Weights:
-    """Weights after so many minutes; the learning rate falls to zero over them."""
+    """Train for ``minutes`` and return the weights; the learning rate decreases to zero over this time."""
     weights = new_weights(seed)
     optimiser = optax.inject_hyperparams(optax.adam)(learning_rate=RATE)
     state = optimiser.init(weights)
