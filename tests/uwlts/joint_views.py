@@ -46,7 +46,7 @@ def seen(sensor: Sensor, points, *, index, window):
 
 
 def lit_points(sensor: Sensor, *, normal, point, index, bow=0.0, count=200):
-    """Where the fan, through the laser's window, lights a plane: (count, 3), camera frame."""
+    """Return the points (count, 3) of a plane lit by the fan through the laser's window, camera frame."""
     pose, window = laser_pose(sensor), sensor.laser.window
     module = np.stack([pose.normal, pose.fan, pose.axis])
     angle = np.linspace(-1, 1, count) * np.radians(sensor.laser.fan_angle_deg / 2)
@@ -95,14 +95,14 @@ def step_views(sensor: Sensor, *, noise=Noise(), tilts=(0.01, -0.02, 0.03)):
 
 
 def gathered(sensor: Sensor, series, steps=()) -> Gathered:
-    """What captures with these views would give; ``sensor`` is what the drawings say."""
+    """Return the evidence of captures with these views; ``sensor`` is the description by the drawings."""
     return Gathered(sensor, {"water": MEDIUM}, list(series), list(steps), [], {}, [])
 
 
 def assert_derivatives(evidence, parameters, global_values, local, *, within):
-    """Derivatives of the evidence's residuals are those by central differences, ``within`` the largest of each.
+    """Compare derivatives of residuals with central differences, to ``within`` times the largest of each column.
 
-    Where residuals vanish, their scale does not matter.
+    If residuals vanish, the derivatives of their scale do not matter.
     """
     vector, count = np.concatenate([global_values, local]), len(global_values)
     found = evidence.residuals(parameters, global_values, local)

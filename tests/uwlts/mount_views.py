@@ -45,17 +45,17 @@ def sphere_campaign(
     smooth_mm: float = 0.0,
     rays: int = RAYS,
 ) -> Campaign:
-    """A campaign: the sensor looks down from all sides, the sphere anywhere in the middle of its field of view.
+    """Simulate a campaign: the sensor looks down from all sides, with the sphere near the middle of its field of view.
 
-    The robot reports other positions than it has, by ``robot_mm`` in each coordinate, and lengths too short by
-    ``scale``. The plane lies 1.1 radius below the sphere's centre, square to z of the base. The profiler errs along
-    each profile by ``smooth_mm`` (rms) as well, alike within some 8 mm.
+    The positions reported by the robot have errors of ``robot_mm`` in each coordinate and are too short by the factor
+    ``scale``. The plane is 1.1 radii below the sphere's centre, square to z of the base. The profiler has an additional
+    error of ``smooth_mm`` (rms), correlated over about 8 mm of a profile.
     """
     profiles, reported = [], []
     for _ in range(poses):
         turn = rng.uniform(-1, 1, 3) * np.radians(tilt_deg)
         looking_down = Rotation.from_euler("x", np.pi) * Rotation.from_rotvec(turn)
-        # Where the sphere's centre lies in the sensor's frame.
+        # The sphere's centre in the sensor's frame.
         place = np.array([rng.uniform(-35, 35), rng.uniform(-0.7, 0.7) * RADIUS_MM, STANDOFF_MM + rng.uniform(-30, 30)])
         base_sensor = np.eye(4)
         base_sensor[:3, :3] = looking_down.as_matrix()
@@ -89,7 +89,7 @@ def profile_of(
     sphere: bool = True,
     count: int = RAYS,
 ) -> np.ndarray:
-    """What the fan of a sensor at ``T_base_sensor`` sees: x and z (N, 2), with noise along z and gaps, mm."""
+    """Return the profile of a sensor at ``T_base_sensor``: x and z (N, 2) in mm, with noise along z and gaps."""
     angles = np.radians(np.linspace(-18, 18, count))
     rays = np.column_stack([np.sin(angles), np.zeros(count), np.cos(angles)])
     directions, origin = rays @ base_sensor[:3, :3].T, base_sensor[:3, 3]
@@ -120,9 +120,9 @@ def errors_of(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def step_campaign(
     rng: np.random.Generator, *, height_mm: float, poses: int = 20, noise_mm: float = 0.03, tilt_deg: float = 25.0
 ) -> Campaign:
-    """A block with its edge along y of the base, through the place of the sphere, seen by an ideal robot.
+    """Simulate a campaign on a block with its edge along y of the base, at the sphere's position, by an ideal robot.
 
-    Its top lies ``height_mm`` above the table, and reaches to x = 55 mm before that place; beyond lies the table again.
+    The top of the block is ``height_mm`` above the table and extends 55 mm from the edge towards -x.
     """
     profiles, reported = [], []
     for _ in range(poses):
@@ -203,7 +203,7 @@ def _ring_axes() -> np.ndarray:
 def _ring_profile(
     base_sensor: np.ndarray, axes: np.ndarray, rng: np.random.Generator, *, noise_mm: float, table: bool
 ) -> np.ndarray:
-    """The nearest of what each ray meets: face, both walls, and the table on which the ring stands."""
+    """Return the nearest intersection of each ray with the ring's face, its walls, or the table under it."""
     angles = np.radians(np.linspace(-18, 18, RAYS))
     rays = np.column_stack([np.sin(angles), np.zeros(RAYS), np.cos(angles)])
     # In the ring's frame, with the middle of its face as origin.

@@ -1,7 +1,7 @@
-"""Profiles of a sphere by a sensor whose calibration is wrong by a draw from its own covariance, on a robot.
+"""Profiles of a sphere by a sensor on a robot, with calibration errors drawn from the calibration's covariance.
 
-The true sensor has parameters of its own: stripe centres are where its rays meet its sheet on the sphere. What is
-measured of them is by the calibration.
+Stripe centres are calculated with the true parameters, from rays that meet the sheet on the sphere. Profiles are
+calculated from them with the calibration.
 """
 
 import numpy as np

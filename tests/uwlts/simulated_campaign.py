@@ -1,4 +1,4 @@
-"""Whole campaigns by Fermat's principle: all that the sensor's description states an uncertainty for is drawn anew."""
+"""Whole campaigns by Fermat's principle: all quantities with an uncertainty in the sensor's description are drawn."""
 
 from dataclasses import dataclass, replace
 
@@ -19,22 +19,22 @@ SPHERES = SphereStandard(kind="spheres", diameters_mm=(50.12, 50.14), spacings_m
 PLACES_MM = {"near": -40.0, "standoff": 15.0, "far": 85.0}
 FORMULA = 1.5e-5
 """Error that Quan and Fry state for their formula of the index of water."""
-# A finder of stripes gives up where a surface leans away further: the cosine of the angle of incidence.
+# No stripe is found on surfaces with a smaller cosine of the angle of incidence.
 _LEAST_COSINE = 0.4
 _FEWEST_LIT = 50
 _LENGTHENED = 12.93 / 12.5
-"""Of the focal length, as of the sensor as built against its drawings."""
+"""Ratio of the true focal length to that of the drawings, as for the sensor as built."""
 _TRACED = 60
 
 
 @dataclass(frozen=True)
 class ModelErrors:
-    """Errors that the joint calibration has no parameters for and the description does not mention.
+    """Errors that the joint calibration does not model and the description does not mention.
 
-    ``distortion`` are coefficients added to the lens's. The target is a saddle, ``saddle_mm`` high at its edges'
-    middles, and printed wider along x by the share ``stretch``. Its gloss moves the stripe on it by ``gloss_px``.
-    Waist and aperture make circles and stripe ``noise`` times as noisy as usual in the focus, and 100 mm before and
-    behind it by the share ``blur`` of that more.
+    ``distortion`` contains coefficients added to those of the lens. The target is a saddle, ``saddle_mm`` high at the
+    middles of its edges, and stretched along x by the fraction ``stretch``. Its gloss moves the stripe by ``gloss_px``.
+    In the focus, the noise of circles and stripe is ``noise`` times the usual one. At 100 mm from the focus, it is
+    larger by the fraction ``blur``.
     """
 
     distortion: tuple[tuple[str, float], ...] = ()
@@ -47,12 +47,13 @@ class ModelErrors:
 
 @dataclass(frozen=True, eq=False)
 class Reality:
-    """What a sensor, its stage and its standards really are where drawings and certificates say something else.
+    """True properties of a sensor, its stage and its standards, which differ from drawings and certificates.
 
-    ``lean`` (2,) are the slopes of the stage's direction against the target's normal, ``warmer_k`` by how much the
-    water is warmer than its thermometer says. ``target_saddle_mm`` is twice the height of the middles of the target's
-    sides across x, ``stretch`` (2,) that of its columns and rows, ``gloss_px`` by how much it moves the stripe on it.
-    ``circles_px`` and ``stripe_px`` are their noise in the focus, which grows by ``blur`` of it within 100 mm.
+    ``lean`` (2,) are the slopes of the stage's direction against the target's normal. ``warmer_k`` is the error of the
+    thermometer: true minus measured temperature of the water. ``target_saddle_mm`` is twice the height of the middles
+    of the target's sides across x, and ``stretch`` (2,) the relative stretch of its columns and rows. The target's
+    gloss moves the stripe by ``gloss_px``. ``circles_px`` and ``stripe_px`` are the noise in the focus, which grows by
+    the fraction ``blur`` within 100 mm.
     """
 
     sensor: Sensor
@@ -163,9 +164,9 @@ class FanRays:
 
     @classmethod
     def of(cls, real: Reality, index: float, count: int) -> "FanRays":
-        """Through where they light two planes; behind the window light runs straight.
+        """Construct rays from the points lit on two planes; behind the window, light runs straight.
 
-        A spline through so many rays is right to 1e-5 mm between them: they are smooth over the fan.
+        Rays are smooth over the fan: a spline through `_TRACED` rays has errors of 1e-5 mm between them.
         """
         frame = camera_from_object(real.sensor)
         between, wanted = np.linspace(-1, 1, _TRACED), np.linspace(-1, 1, count)
@@ -186,11 +187,11 @@ class FanRays:
         return cls(near, far - near)
 
     def on_plane(self, normal: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
-        """Where they meet a plane (N, 3); its distance along the normal may differ from ray to ray."""
+        """Return the intersections (N, 3) with a plane; its distance along the normal may differ from ray to ray."""
         return self.points + ((offset - self.points @ normal) / (self.steps @ normal))[:, None] * self.steps
 
     def on_sphere(self, centre: np.ndarray, radius: float) -> np.ndarray:
-        """Where those that meet a sphere do so first (M, 3)."""
+        """Return the first intersections (M, 3) of the rays that meet a sphere."""
         from_centre, length = self.points - centre, np.linalg.norm(self.steps, axis=1, keepdims=True)
         along = self.steps / length
         half = np.sum(from_centre * along, axis=1)
@@ -208,7 +209,7 @@ def stripe_noise(real: Reality, pixels: np.ndarray, z_mm: float) -> np.ndarray:
 def target_series(
     real: Reality, *, view: ViewMedium, index: float, positions: np.ndarray, spacings: int, rays: int
 ) -> Series:
-    """The bent target on the stage with the stripe on it; every so many circles of it, for speed."""
+    """Simulate the bent target on the stage with the stripe on it; uses only circles every ``spacings``, for speed."""
     sensor = real.sensor
     frame = camera_from_object(sensor)
     placed = turn(*real.rng.normal(0, 0.005, 2), np.pi / 2 + real.rng.normal(0, 0.01))
