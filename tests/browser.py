@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 VARIABLE = "CHROMIUM"
 NAMES = ("chromium-headless-shell", "chromium", "google-chrome", "google-chrome-stable", "chromium-browser")
-"""Names on PATH. Ubuntu's chromium-browser is only a script that asks for a snap, and is refused where it is."""
+"""Names on PATH. On Ubuntu, chromium-browser is a script that asks for a snap; it is rejected."""
 SOFTWARE_WEBGL = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
@@ -62,7 +62,7 @@ def find_chromium() -> Path:
 
 
 def _started(path: Path) -> Path:
-    """The path of a Chromium that starts here, with all its libraries; SetupError where it does not."""
+    """Return the path of a Chromium that starts, with all its libraries; SetupError if it does not start."""
     if not os.access(path, os.X_OK) or path.is_dir():
         raise SetupError(f"{path}: it is not there, or no program")
     try:

@@ -28,7 +28,7 @@ def oldest(*extras: str) -> list[str]:
 
 
 def requirements(project: dict[str, Any], extras: tuple[str, ...]) -> Iterator[Requirement]:
-    """Requirements of a project table and of its extras, those that they include in turn too."""
+    """Yield requirements of a project table and of its extras, including extras that these name."""
     lists = [project["dependencies"], *(project["optional-dependencies"][extra] for extra in extras)]
     for one in (Requirement(line) for lines in lists for line in lines):
         if one.name == project["name"]:

@@ -54,7 +54,7 @@ def stock_scene(
 ) -> mi.Scene:
     """Mitsuba scene of the sensor's camera and laser before objects.
 
-    ``pixel_px`` sensor pixels make one film pixel; the sheet's profile is thrown with ``across_texels``.
+    ``pixel_px`` sensor pixels make one film pixel; the projected profile of the sheet has ``across_texels`` texels.
     """
     shapes = {
         f"object_{index}": _shape(thing, pose, sensor, medium)
@@ -84,11 +84,11 @@ def stock_irradiance(
 ) -> np.ndarray:
     """Irradiance (runs, H, W) on the image sensor in W/mm2 from independent runs of a stock integrator.
 
-    ``max_depth`` counts as Mitsuba does: 2 is light that met one surface, or was scattered once, between laser and
-    camera; -1 is all orders.
+    ``max_depth`` is as in Mitsuba: 2 is light with one reflection or one scattering event between laser and camera; -1
+    is all orders.
     """
     built = stock_scene(sensor, medium, scene, pixel_px=pixel_px)
-    # Russian roulette adds noise to what it saves time for; here it starts late.
+    # Russian roulette saves time but adds noise; here it starts late.
     walker = mi.load_dict({"type": integrator, "max_depth": max_depth, "rr_depth": 16})
     radiance = [np.array(mi.render(built, integrator=walker, spp=spp, seed=run))[..., 0] for run in range(runs)]
     return np.stack(radiance).astype(float) * blocks(per_radiance(sensor), pixel_px)

@@ -1,4 +1,4 @@
-"""The rules of the packages: who may import whom (import-linter's contracts), and one name for one class."""
+"""Rules of the packages: permitted imports (contracts of import-linter), and unique class names."""
 
 import ast
 import shutil

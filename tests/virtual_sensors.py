@@ -18,7 +18,7 @@ _TOWARDS_LASER = {"width": np.array([0.0, -1.0, 0.0]), "height": np.array([1.0, 
 
 
 def altered(sensor: Sensor, changes: dict[str, Any]) -> Sensor:
-    """The sensor with nested ``changes`` laid over its description."""
+    """Return the sensor with nested ``changes`` of its description."""
     return Sensor.model_validate(merge_tables(sensor.model_dump(), changes))
 
 
@@ -79,7 +79,7 @@ def laser_origin(sensor: Sensor) -> np.ndarray:
 def oracle_window(
     window: Window, medium: Medium, *, wavelength_nm: float = 635.0
 ) -> tuple[list[fermat.Face], list[float]]:
-    """Faces and indices of a window before a module that looks along +z; none if it is taken off."""
+    """Return faces and indices of a window before a module that looks along +z; no faces if it is not mounted."""
     if not window.mounted:
         return [], [1.0]
     turned = Rotation.from_euler("xy", [window.tilt_x_deg, window.tilt_y_deg], degrees=True)
@@ -104,7 +104,7 @@ def oracle_fan(sensor: Sensor, medium: Medium) -> Fan:
         extinction=medium.absorption_per_mm(laser.wavelength_nm) + medium.scattering_per_mm(laser.wavelength_nm),
         waist_radius=laser.waist_radius_mm,
         waist_distance=laser.waist_distance_mm,
-        # A beam of quality M2 opens by M2 times the diffraction of its waist (ISO 11146-1).
+        # The divergence of a beam is M2 times the diffraction limit of its waist (ISO 11146-1).
         divergence=laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm / (math.pi * laser.waist_radius_mm * index),
     )
 
@@ -137,7 +137,7 @@ def extinction(medium: Medium, *, wavelength_nm: float = 635.0) -> float:
 def window_transmittance(
     cosine: np.ndarray, window: Window, medium_index: float, *, absorption_per_mm: float
 ) -> np.ndarray:
-    """Both faces and the glass between them, for the cosine of the angle in air."""
+    """Return the transmittance of both faces and the glass, for the cosine of the angle in air."""
     glass = window.index(635.0)
     in_glass = np.sqrt(1 - (1 - cosine**2) / glass**2)
     faces = fresnel_transmittance(cosine, n1=1.0, n2=glass) * fresnel_transmittance(in_glass, n1=glass, n2=medium_index)

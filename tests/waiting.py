@@ -1,4 +1,4 @@
-"""Waiting for what other threads and processes do."""
+"""Waiting for results of other threads and processes."""
 
 import time
 from collections.abc import Callable

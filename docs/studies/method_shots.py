@@ -138,7 +138,7 @@ CONVEX = ALL.remove("secondary-light")
 
 
 def places() -> dict[str, Place]:
-    """Return the cases, with all effects, on which every method is tested."""
+    """Return the test cases of all methods, with all effects."""
     square = {f"plane, {name}": Place(z_mm=z, spp=8) for name, z in PLACES.items()}
     return square | {
         "sphere, near": Place(thing="spheres", z_mm=-40.0, spp=8),

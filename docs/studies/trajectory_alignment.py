@@ -204,8 +204,8 @@ def _true_pairs(places: list[np.ndarray]) -> list[tuple[int, int]]:
 def bounds(*, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave: float = 0.0) -> str:
     """Return, as text, the factors that three exact crossings can reduce the rms error of a path by.
 
-    The drift is a Gaussian process. ``rate``, ``wandering`` and ``walk`` are the parts of its variance at the end for a
-    steady rate, a rate with a random walk, and a random walk. ``wave`` is the amplitude of the wave of `ride`. The
+    The drift is a Gaussian process. Its variance at the end is the sum of ``rate`` (steady rate), ``wandering`` (rate
+    with a random walk) and ``walk`` (random walk). ``wave`` is the amplitude of the wave of `ride`. The
     known displacement is that within each crossing, or at two positions of it, which also determines the rates. The
     linear Gaussian estimate with the true covariance has the smallest possible error. `align_trajectory` knows only the
     size of the drift: it uses its own model with the most likely walk.

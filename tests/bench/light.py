@@ -83,7 +83,7 @@ def equal_noise_advantage() -> tuple[float, str]:
     """
     bare = {"window": {"mounted": False}}
     sensor = altered(load_sensor("thesis"), {"camera": bare, "laser": bare})
-    # A projector's light opens from a point: as wide at the stand-off as the sheet, whose waist is there.
+    # A projector's light starts from a point. At the stand-off, it is as wide as the sheet at its waist.
     sigma = 0.5 * sensor.laser.waist_radius_mm / sensor.laser.waist_distance_mm
     waist = 1e-6 * sensor.laser.wavelength_nm / (2 * np.pi * sigma)
     thrown = altered(sensor, {"laser": {"waist_radius_mm": waist, "beam_quality_m2": 1.0}})
@@ -147,7 +147,7 @@ def campaign(folder: Path) -> tuple[int, float, float, float]:
         )
     seconds = time.perf_counter() - start
     steps = np.diff(moments)
-    # The spheres in water are the last half of the campaign; both thirds hold near, stand-off and far.
+    # The spheres in water are the last half of the campaign; both thirds contain near, stand-off and far.
     late, early = (np.median(part) for part in (steps[-38:], steps[-6 * 38 : -5 * 38]))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return len(moments), seconds, peak, float(late / early)

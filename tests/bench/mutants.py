@@ -37,7 +37,7 @@ TESTS = {
     "twin/sensor": ["tests/twin/sensor", "tests/twin/light"],
 }
 """Packages, and folders of the tests that run them."""
-# These change no result, or end every test at once, as bitwise operators between floating-point numbers do.
+# These change no result, or make every test fail, such as bitwise operators between floating-point numbers.
 _LEFT_OUT = {"NoOp", "RemoveDecorator", "ExceptionReplacer", "VariableReplacer", "VariableInserter"}
 _BITWISE = {"BitAnd", "BitOr", "BitXor", "LShift", "RShift"}
 _LONGEST_S = 240.0  # of the tests for one mutant
@@ -83,7 +83,7 @@ def annotated_lines(source: str) -> set[tuple[int, int]]:
 
 
 def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
-    """So many mutants of a package, from any place in it at most one."""
+    """Draw ``number`` mutants of a package, at most one from each place."""
     from cosmic_ray.ast import ast_nodes, get_ast
     from cosmic_ray.plugins import get_operator, operator_names
 
@@ -108,7 +108,7 @@ def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
 
 
 def copied(folder: Path) -> Path:
-    """The checkout's files, as they are now, without what Git ignores."""
+    """Copy the current files of the checkout, without those ignored by Git."""
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -164,7 +164,7 @@ class Tests:
         return cls(of_line, of_file, seconds)
 
     def chosen(self, mutant: Mutant, lines: Sequence[int]) -> Iterator[str]:
-        """Tests for a mutant: of its statement's lines, or of its file where no test but the import runs them."""
+        """Yield tests for a mutant: of its statement's lines, or of its file if only the import runs them."""
         first: set[str] = set().union(*(self.of_line.get((mutant.file, line), set()) for line in lines))
         first = first or self.of_file.get(mutant.file, set())
         files = {test.split("::")[0] for test in first}
@@ -179,7 +179,7 @@ class Tests:
 
 
 def statement_lines(source: str, line: int) -> range:
-    """Lines of the smallest statement that holds a line, without the body of what it heads."""
+    """Return the lines of the smallest statement that contains a line, without the body of a compound statement."""
     best = range(line, line + 1)
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or line):
@@ -237,7 +237,7 @@ def of_package(package: str, mutants: list[Mutant], *, slow: bool, workers: int,
 
 
 def read(path: Path) -> list[Result]:
-    """Results as `main` keeps them."""
+    """Read results stored by `main`."""
     return [Result(**each | {"mutant": Mutant(**each["mutant"])}) for each in json.loads(path.read_text())]
 
 

@@ -1,4 +1,4 @@
-"""From a camera to the disk: a thousand full frames at 60 per second, none lost, and followed live meanwhile."""
+"""Recording from a camera to disk: a thousand full frames at 60 per second without losses, and followed live."""
 
 import itertools
 import multiprocessing
@@ -47,9 +47,9 @@ class Recorded:
 
 
 def recording(*, live: bool = False) -> Recorded:
-    """A camera that gives 60 frames per second: it repeats a capture of frames with a stripe and noise.
+    """Record from a camera with 60 frames per second, which repeats a capture of frames with a stripe and noise.
 
-    What nobody fetches in time is lost, as with a real one.
+    Frames that are not fetched in time are lost, as with a real camera.
     """
     sensor = load_sensor("thesis")
     with tempfile.TemporaryDirectory() as folder:
@@ -64,9 +64,9 @@ def recording(*, live: bool = False) -> Recorded:
 
 
 def gige_recording() -> Recorded:
-    """A GigE Vision camera on the loopback interface, its images sent at the speed of a 1 Gbit/s cable.
+    """Record from a GigE Vision camera on the loopback interface that sends images at the speed of a 1 Gbit/s cable.
 
-    It exposes at its frame rate, and images wait in its memory for the cable, as in a real one.
+    It exposes at its frame rate, and images wait in its memory for the cable, as in a real camera.
     """
     sensor = load_sensor("thesis")
     images = itertools.cycle(_images(sensor))
@@ -150,7 +150,7 @@ def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multipr
 
 
 def following_rate() -> float:
-    """Frames per second that a follower shows, with stripe and points, where nothing has to be read."""
+    """Return frames per second that a follower shows, with stripe and points, without reading of files."""
     sensor = load_sensor("thesis")
     view = RecordingView(Board("bench"), _header(sensor), nominal_calibration(sensor, sensor.medium("air")))
     frames = [Frame(image, float(k), True, 1.0, float(k)) for k, image in enumerate(_images(sensor))]

@@ -1,4 +1,4 @@
-"""Speed of design studies: designs judged by formulas, what the engine costs, and one design verified by rendering."""
+"""Speed of design studies: evaluation by formulas, cost of the engine, and verification of a design by rendering."""
 
 import os
 import subprocess
@@ -26,7 +26,7 @@ if __name__ == "__main__":
 
 
 def timed(batch: Batch) -> tuple[float, bytes]:
-    """Seconds of a processor that judging a batch takes, and the part."""
+    """Return the processor time in s to evaluate a batch, and the part."""
     start = time.process_time()
     content = evaluate_batch(batch)
     return time.process_time() - start, content
@@ -54,7 +54,7 @@ def screening() -> tuple[float, float]:
 
 
 def verification() -> float:
-    """Seconds to verify the thesis's sensor by rendering, with the start of Python."""
+    """Return the seconds to verify the thesis's sensor by rendering, including the start of Python."""
     with tempfile.TemporaryDirectory() as folder:
         # A file, since the processes that render begin by reading it.
         script = Path(folder) / "alone.py"

@@ -51,9 +51,9 @@ class Reality:
 
     ``lean`` (2,) are the slopes of the stage's direction against the target's normal. ``warmer_k`` is the error of the
     thermometer: true minus measured temperature of the water. ``target_saddle_mm`` is twice the height of the middles
-    of the target's sides across x, and ``stretch`` (2,) the relative stretch of its columns and rows. The target's
-    gloss moves the stripe by ``gloss_px``. ``circles_px`` and ``stripe_px`` are the noise in the focus, which grows by
-    the fraction ``blur`` within 100 mm.
+    of the target's sides across x. ``stretch`` (2,) is the relative stretch of its columns and rows. The target's gloss
+    moves the stripe by ``gloss_px``. ``circles_px`` and ``stripe_px`` are the noise in the focus, which grows by the
+    fraction ``blur`` within 100 mm.
     """
 
     sensor: Sensor

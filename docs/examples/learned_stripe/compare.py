@@ -4,8 +4,8 @@
 
 Only lines with a visible stripe and a Cramer-Rao bound below one pixel are evaluated. A line is found if the method's
 centre is within `NEAR_PX` of the true one. A centre farther away, or on a line without a stripe, is false. Errors are
-those of the found lines. The bound is for detector noise without speckle. Real images have no known truth: for them,
-the table shows the scatter of the centres about a smooth stripe.
+those of the found lines. The bound is for detector noise without speckle. The truth of real images is unknown: for
+them, the table shows the scatter of the centres about a smooth stripe.
 """
 
 from __future__ import annotations

@@ -445,8 +445,8 @@ def test_captures_that_are_no_scan_of_a_known_surface(tmp_path, artefact, pose, 
 def test_what_blur_and_the_sheets_thickness_leave_is_common_to_all_points():
     """The blur contributes a uniformly distributed fraction, light beside the sheet twice its thickness uncertainty.
 
-    On a plane square to the laser's axis, shift the sheet by d. The points then move as for a pixel shift of d divided
-    by the size of a pixel there, because the camera's rays cross the old sheet or the plane.
+    On a plane square to the laser's axis, a shift of the sheet by d moves the points as a pixel shift does. This shift
+    is d divided by the size of a pixel there, because the camera's rays cross the old sheet or the plane.
     """
     square = Body((0.0, 0.0, 40.0), None, (0.0, 0.0, 1.0))
     stripes, _ = scan_of(SENSOR, (square,), PlaneStandard(), stage_mm=STAGE, count=300)
