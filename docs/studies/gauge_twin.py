@@ -29,7 +29,7 @@ def step(height_mm: float) -> dict:
 
 
 def main(folder: Path) -> None:
-    """Render, reconstruct, measure and judge."""
+    """Render, reconstruct, measure and evaluate."""
     folder.mkdir(parents=True, exist_ok=True)
     calibration = uwlts.nominal("thesis", medium="water")
     rows, seed = [], 0

@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def denser(waypoints: list[dict], times: int) -> list[dict]:
-    """Waypoints with others between those that are turned the same way."""
+    """Insert waypoints between neighbours with the same orientation."""
     result = []
     for first, second in pairwise(waypoints):
         result.append(first)

@@ -28,7 +28,7 @@ from uwlts.storage.truth import Truth, read_truth, truth_path
 Form = tuple[float, float, float]
 VIEWS, PIPE_MM, OVALITY_MM, SPHERES_MM = 5, 300.0, 1.2, 16.0
 ROBOT_STD_MM, ROBOT_STD_DEG = 0.05, 0.02
-"""Of a robot's poses: 0.05 mm, and as much at the pipe's radius."""
+"""Standard deviations of a robot's poses: 0.05 mm, and a rotation of equal effect at the pipe's radius."""
 
 
 def truth_of(path: Path) -> tuple[Platform, Truth]:

@@ -16,7 +16,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder with the saved points")
     folder = parser.parse_args().folder
-    # After the arguments: the help does not need it.
+    # Imported late: the help text does not need it.
     import open3d
 
     for path in sorted(folder.glob("mesh-*.npz")):

@@ -26,7 +26,7 @@ SEEN_MM = 1.0
 
 
 def off_pipe(points: np.ndarray) -> np.ndarray:
-    """Distances (N,) of points from the corroded pipe, along its radius, less what its slopes make of that."""
+    """Return the distances (N,) of points from the corroded pipe along its normal, from radius and slopes."""
     away = np.hypot(points[:, 1], AXIS_Z_MM - points[:, 2])
     angle = np.arctan2(points[:, 1], AXIS_Z_MM - points[:, 2])
 

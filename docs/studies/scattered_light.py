@@ -52,7 +52,7 @@ def render(kind: str, water: str, out: Path, *, seed: int) -> None:
 
 
 def reference(renderer: "Renderer", distance: np.ndarray, *, seed: int) -> np.ndarray:
-    """Means (rows, columns) of what walks found per cell of an image (H, W) of distances from the stripe."""
+    """Return means (rows, columns) of random walks per cell, for an image (H, W) of distances from the stripe."""
     import twin.light.multiple_scattering as ways
     from twin.light.illumination import make_lights
     from twin.light.pose import SensorPose
@@ -79,7 +79,7 @@ def away_from(direct: np.ndarray) -> np.ndarray:
 
 
 def spectrum(errors: np.ndarray, side: int = 256) -> tuple[np.ndarray, np.ndarray]:
-    """Radially averaged amplitude in grey levels over spatial frequency in 1/px of the upper corner's squares."""
+    """Return the radially averaged amplitude in grey levels by spatial frequency in 1/px, of the upper corner."""
     window = np.outer(np.hanning(side), np.hanning(side))
     power = (np.abs(np.fft.fft2(errors[:, :side, :side] * window)) ** 2).mean(axis=0) / (window**2).sum()
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
@@ -89,7 +89,7 @@ def spectrum(errors: np.ndarray, side: int = 256) -> tuple[np.ndarray, np.ndarra
 
 
 def compare(picture: Path, groups: list[list[Path]]) -> None:
-    """Print the errors of frames against the reference that each group begins with, and draw their spectra."""
+    """Print the errors of frames against the reference, the first file of each group, and draw their spectra."""
     import matplotlib
 
     matplotlib.use("Agg")

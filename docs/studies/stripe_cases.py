@@ -26,9 +26,9 @@ METHODS = {
 }
 VERTEX = "5x5 mean, parabola through 3 px"
 PLATE = {"kind": "plate", "width_mm": 200.0, "height_mm": 300.0, "finish": "painted"}
-"""The thesis's painted plane, so large that no end of the stripe is in view."""
+"""The thesis's painted plane, large enough that both ends of the stripe are out of view."""
 FACING = math.cos(math.radians(60))
-"""Surfaces turned farther away from the laser are left out: there the stripe ends, which is a matter of its own."""
+"""Surfaces with a larger angle of incidence are left out, because the stripe ends there."""
 CROP_PX, FAR_OFF_PX = 28, 2.0
 _SCALE_Z, _SCALE_DEGREE = np.arange(-80.0, 131.0, 15.0), 5
 
@@ -138,7 +138,7 @@ class Spread:
 @cache
 def measure(case: Case) -> Frames:
     """Render the case's frames, find the stripe in them, and compare with the truth."""
-    # Mitsuba looks for its variant when it is imported.
+    # Mitsuba needs its variant when it is imported.
     from twin.recording.frame_truth import find_true_stripe
     from twin.recording.sensor_simulator import SensorSimulator
 

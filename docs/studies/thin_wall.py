@@ -1,6 +1,6 @@
 """Mesh of a rendered plate of 2 mm thickness, scanned from both sides, and Open3D's Poisson reconstruction of it.
 
-    python docs/studies/thin_wall.py runs/inspection                # plate, scenes and campaign.
+    python docs/studies/thin_wall.py runs/inspection                # plate, scenes and campaign
     twin record runs/inspection/plate.toml --out runs/inspection/plate
     python docs/studies/thin_wall.py runs/inspection docs/pictures  # after docs/studies/inspection.py's calibration
     python docs/studies/poisson_mesh.py runs/inspection             # in an environment with Open3D
@@ -29,7 +29,7 @@ THICKNESS_MM, OUTER_MM, HOLE_MM = 2.0, 24.0, 6.0
 """Thickness and radii."""
 SIDES = {"front": 0.0, "back": 180.0}
 _EDGE_MM = 0.5
-"""Vertices so near to an edge are not judged by the faces: the camera's blur ends there."""
+"""Vertices within this distance of an edge are not compared with the faces, because of the camera's blur."""
 
 
 def plate_mesh() -> trimesh.Trimesh:
@@ -126,7 +126,7 @@ def draw(path: Path, meshes: dict[str, trimesh.Trimesh], points: np.ndarray) -> 
 
 
 def main(folder: Path, pictures: Path | None = None) -> None:
-    """Write the scenes; or, with a folder for pictures, judge what was rendered."""
+    """Write the scenes; with a folder for pictures, evaluate the rendered scans instead."""
     if pictures is None:
         write_scenes(folder)
     else:

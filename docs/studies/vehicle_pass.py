@@ -29,9 +29,9 @@ from uwlts.storage.pose_files import trajectory_path
 from uwlts.storage.truth import Truth
 
 INSIDE_MM = 70.0
-"""Points so near to the middle of a crossing belong to it: the swath is 185 mm wide."""
+"""Largest distance of the points of a crossing from its middle: the swath is 185 mm wide."""
 PAIRS = 20_000
-"""Lengths that are drawn in each crossing."""
+"""Number of lengths drawn in each crossing."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Figures:
 
 
 def aligned_pass(path: Path) -> Figures:
-    """Calibrate the mount, reconstruct and align one pass; what is off by the truth."""
+    """Calibrate the mount, reconstruct and align one pass; return its errors from the truth."""
     motion, truth = truth_of(path)
     assert isinstance(motion, Vehicle) and truth.pose is not None
     robot = captured(path.parent / path.name.replace("vehicle-pass", "robot-sphere"))
@@ -104,7 +104,7 @@ def aligned_pass(path: Path) -> Figures:
     covariance = found.trajectory.covariance_at(times + offset)
     assert covariance is not None
     variance = np.einsum("nii->n", covariance[:, :3, :3])
-    # The alignment takes the start as exact.
+    # The alignment assumes an exact start.
     stated = np.sqrt(np.einsum("nii->ni", covariance[:, :3, :3]))
     return figures(
         after,
@@ -129,12 +129,12 @@ def crossings_of(places: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _area(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Signed area between vectors (N, 2) and another (2,) or as many."""
+    """Return the signed areas between vectors (N, 2) and one vector (2,) or N vectors."""
     return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
 
 
 def length_error(cloud: PointCloud, truth: Truth, crossing: tuple[int, int]) -> float:
-    """Root mean square error of lengths from points of one pass of a crossing to points of the other, mm."""
+    """Return the rms error of lengths between points of both passes of a crossing, mm."""
     assert cloud.frame is not None and cloud.line is not None and truth.pose is not None
     middle = truth.pose[list(crossing), :2, 3].mean(axis=0)
     place = truth.point_mm[cloud.frame, cloud.line]

@@ -1,6 +1,6 @@
-"""Profiles of a sphere before a plane, a plane, a step or a ring by a profiler on a robot: rays met with the surfaces.
+"""Profiles of a sphere before a plane, a plane, a step or a ring, by a profiler on a robot.
 
-Independent of the code under test: every ray of the fan is intersected in the base frame with the surfaces as they are.
+Independent of the code under test: every ray of the fan is intersected with the surfaces in the base frame.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ MOUNT_STD = np.array([0.05, 0.08, 0.03, 4e-4, 2e-4, 3e-4])
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
-    """Profiles (N, 2) with NaN where a ray met nothing, and the poses (P, 4, 4) that the robot reports, mm."""
+    """Profiles (N, 2), NaN for rays that miss all surfaces, and the poses (P, 4, 4) reported by the robot, mm."""
 
     profiles: list[np.ndarray]
     poses: np.ndarray
@@ -104,7 +104,7 @@ def profile_of(
             length = np.where(under > 0, np.minimum(length, -half - np.sqrt(under)), length)
     seen = np.where(np.isfinite(length), length, np.nan)
     profile = np.column_stack([rays[:, 0] * seen, rays[:, 2] * seen + noise_mm * rng.standard_normal(count)])
-    # A gap somewhere, and single points without an echo.
+    # A gap at a random position, and single missing points.
     gap = int(rng.integers(count - 25))
     profile[gap : gap + 25] = np.nan
     profile[rng.random(count) < 0.03] = np.nan
@@ -150,7 +150,7 @@ def _step_profile(
     at_top, at_table = origin[0] + top * directions[:, 0], origin[0] + table * directions[:, 0]
     with np.errstate(divide="ignore"):
         side = (SPHERE_MM[0] - origin[0]) / directions[:, 0]
-    # A ray that leaves the space above the block below its top meets the side that faces it, or misses the block.
+    # A ray that is not on the top but reaches the table's level below it meets the side of the block.
     length = np.where(on_top(at_top), top, np.where(on_top(at_table), side, table))
     profile = np.column_stack([rays[:, 0] * length, rays[:, 2] * length + noise_mm * rng.standard_normal(RAYS)])
     profile[rng.random(RAYS) < 0.03] = np.nan
@@ -169,9 +169,10 @@ def ring_campaign(
     tilt_deg: float = 30.0,
     towards_sensor: bool = False,
 ) -> Campaign:
-    """A ring gauge (`RING_MM`) whose face looks along `RING_AXIS`, on a table; the sheet meets its bore or its outside.
+    """Simulate a campaign on a ring gauge (`RING_MM`) on a table, with its face normal along `RING_AXIS`.
 
-    With ``towards_sensor`` the profiler's z grows towards the sensor, and x the other way.
+    The sheet meets its bore or its outer wall. With ``towards_sensor``, the profiler's z grows towards the sensor, and
+    its x is reversed.
     """
     axes = _ring_axes()
     profiles, reported = [], []
@@ -232,7 +233,7 @@ def _ring_profile(
 
 
 def known_mount(transform: np.ndarray, **changed: Any) -> Mount:
-    """A mount as a calibration finds it, with the standard uncertainties `MOUNT_STD` (mm, rad)."""
+    """Return a mount as from a calibration, with the standard uncertainties `MOUNT_STD` (mm, rad)."""
     fields: dict[str, Any] = {
         "T_platform_sensor": tuple(map(tuple, transform.tolist())),
         "covariance": tuple(map(tuple, np.diag(MOUNT_STD**2).tolist())),

@@ -1,6 +1,6 @@
-"""Scans of a pipe from several sides: rays of a laser fan met with the surface as it is, by Newton's method.
+"""Scans of a pipe from several sides: rays of a laser fan intersected with the surface by Newton's method.
 
-Independent of the code under test, which gets points, their stated uncertainty, and poses that are wrong.
+Independent of the code under test, which gets points, their stated uncertainty, and wrong poses.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def oval(angle: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 @cache
 def _pits() -> RectBivariateSpline:
-    """Height over angle and length of pits and bumps of 8 to 16 mm, as a smooth function."""
+    """Return the height by angle and length of pits and bumps of 8 to 16 mm, as a smooth function."""
     rng = np.random.default_rng(99)
     angle, along = np.linspace(-np.pi, np.pi, 945), np.linspace(-80, 80, 161)
     height = np.zeros((len(angle), len(along)))
@@ -128,9 +128,9 @@ def views(
     one_sensor: bool = False,
     **how: object,
 ) -> tuple[list[PointCloud], np.ndarray, np.ndarray]:
-    """Scans from ``count`` sides, their true poses (N, 4, 4) in the frame of the first, and wrong poses.
+    """Return scans from ``count`` sides, their true poses (N, 4, 4) in the frame of the first, and wrong poses.
 
-    ``one_sensor``: all are by one calibration, else each by its own.
+    With ``one_sensor``, all scans have the same calibration errors, otherwise each has its own.
     """
     true = np.array([side_pose(angle) for angle in 2 * np.pi * np.arange(count) / count])
     if one_sensor:

@@ -21,7 +21,7 @@ _FACING = np.cos(np.radians(75))
 
 
 def square_sensor() -> Sensor:
-    """The sensor as built, but its laser's window square to the sheet, which so stays a plane in the water."""
+    """Return the sensor as built, with the laser's window square to the sheet, which is then a plane in water."""
     laser = built_sensor().laser
     window = laser.window.model_copy(update={"tilt_y_deg": 0.0})
     return built_sensor().model_copy(update={"laser": laser.model_copy(update={"window": window})})
@@ -35,7 +35,7 @@ def stage_direction(sensor: Sensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Body:
-    """A sphere; with ``axis`` a cylinder through the point; without ``radius`` a plane with that normal. OCS, mm."""
+    """Sphere; with ``axis``, a cylinder through the point; without ``radius``, a plane with that normal (OCS, mm)."""
 
     point: tuple[float, float, float]
     radius: float | None = None

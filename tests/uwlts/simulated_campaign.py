@@ -18,7 +18,7 @@ from uwlts.model.sensor import Medium, Sensor
 SPHERES = SphereStandard(kind="spheres", diameters_mm=(50.12, 50.14), spacings_mm=(99.18,))
 PLACES_MM = {"near": -40.0, "standoff": 15.0, "far": 85.0}
 FORMULA = 1.5e-5
-"""Error that Quan and Fry state for their formula of the index of water."""
+"""Error of the formula of Quan and Fry for the index of water, as they state."""
 # No stripe is found on surfaces with a smaller cosine of the angle of incidence.
 _LEAST_COSINE = 0.4
 _FEWEST_LIT = 50
@@ -74,11 +74,11 @@ class Reality:
     blur: float
 
     def noisier(self, z_mm: float) -> float:
-        """Noise at a depth of the OCS as a multiple of that in the focus."""
+        """Return the noise at a depth of the OCS, divided by that in the focus."""
         return 1 + self.blur * abs(z_mm) / 100
 
     def index(self, medium: Medium, drift_k: float = 0.0) -> float:
-        """Index of a medium; that of water is of the second order in the temperature, also beyond 30 degC."""
+        """Return the index of a medium; for water, quadratic in the temperature, also beyond 30 degC."""
         if medium.kind == "air":
             return 1.0
         wavelength, at = self.sensor.laser.wavelength_nm, np.array([10.0, 20.0, 30.0])
@@ -91,9 +91,10 @@ class Reality:
 def drawn_reality(
     described: Sensor, rng: np.random.Generator, *, spread: float = 1.0, errors: ModelErrors = ModelErrors()
 ) -> Reality:
-    """A sensor built from drawings; what they state no uncertainty for differs as in the sensor as built.
+    """Draw a sensor built from drawings.
 
-    All that they state an uncertainty for differs by ``spread`` times as much as they say.
+    Quantities with a stated uncertainty are drawn with ``spread`` times this uncertainty. All others differ as in the
+    sensor as built.
     """
     stated = described.uncertainty
     known = stated.model_copy(
@@ -201,7 +202,7 @@ class FanRays:
 
 
 def stripe_noise(real: Reality, pixels: np.ndarray, z_mm: float) -> np.ndarray:
-    """Pixels (N, 2) of a stripe along the width at a depth of the OCS, with its noise across."""
+    """Add noise across the stripe to its pixels (N, 2) at a depth of the OCS."""
     noise = real.rng.normal(0, real.stripe_px * real.noisier(z_mm), len(pixels))
     return pixels + np.column_stack([np.zeros(len(pixels)), noise])
 
@@ -247,7 +248,7 @@ def target_series(
 
 
 def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -> list[tuple[StepEvidence, ViewMedium]]:
-    """The stripe over a block on a plate, one image at each depth of the OCS."""
+    """Simulate the stripe over a block on a plate, one image at each depth of the OCS."""
     frame, fan = camera_from_object(real.sensor), FanRays.of(real, index, rays)
     found = []
     for depth in depths:
@@ -258,7 +259,7 @@ def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -
         shift = real.rng.uniform(-12.0, 12.0)
         on_top = np.abs((top - middle) @ rotation[:, 1] - shift) < 30.0
         lit = np.where(on_top[:, None], top, base)
-        # The block's side and its shadow, and the plate's ends.
+        # Excludes the block's side and its shadow, and the plate's ends.
         along = np.abs((lit - middle) @ rotation[:, 1] - shift)
         lit = lit[on_top | ((along > 34.0) & (along < 75.0))]
         pixels = seen(real.sensor, lit, index=index, window=True)
@@ -272,7 +273,7 @@ def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -
 def evidence(
     real: Reality, described: Sensor, *, wet: bool, images: int = 6, spacings: int = 2, rays: int = 150
 ) -> Gathered:
-    """Target images without and with the camera's window, in air or in water, and for the latter some of a step."""
+    """Simulate target images without and with the camera's window, in air or in water, and images of a step."""
     water = described.media["water"]
     index = real.index(water) if wet else 1.0
     size = {"spacings": spacings, "rays": rays}
@@ -292,7 +293,7 @@ def evidence(
 
 @dataclass(frozen=True, eq=False)
 class ScanStripes:
-    """Stripe centres of a scan: image, column and row (N,) of each, and what the stage says (F,) in mm."""
+    """Stripe centres of a scan: image, column and row (N,) of each, and reported stage positions (F,) in mm."""
 
     frame: np.ndarray
     line: np.ndarray
@@ -303,9 +304,9 @@ class ScanStripes:
 def scan_of_spheres(
     real: Reality, *, index: float, place: str, positions: np.ndarray, lean: np.ndarray, rays: int = 800
 ) -> ScanStripes:
-    """Stripes on the sphere standard, the sensor moved across it along the sheet's normal but for a lean (2,)."""
+    """Simulate stripes on the sphere standard; the sensor moves along the sheet's normal, except for a lean (2,)."""
     frame, fan = camera_from_object(real.sensor), FanRays.of(real, index, rays)
-    # A beam tilted into the line optics turns the sheet's normal as a whole.
+    # A beam with a tilt at the line optics rotates the sheet's normal.
     frame[:3, :3] = frame[:3, :3] @ turn(0.0, real.bow, 0.0)
     direction = frame[:3, :3] @ [1.0, *lean]
     direction /= np.linalg.norm(direction)

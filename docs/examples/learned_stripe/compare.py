@@ -65,7 +65,7 @@ def methods(model: Path) -> dict[str, StripeOptions]:
 
 
 def judge(folder: Path, options: dict[str, StripeOptions]) -> dict[str, Tally]:
-    """Tallies of all methods on the test scenes of a data set."""
+    """Return the tallies of all methods on the test scenes of a data set."""
     tallies = {name: Tally() for name in options}
     for sample in twin.load_dataset(folder, split="test", names=("image", "centre_px", "status", "bound_px")):
         for name, how in options.items():
@@ -75,7 +75,7 @@ def judge(folder: Path, options: dict[str, StripeOptions]) -> dict[str, Tally]:
 
 
 def smooth_scatter(images: Sequence[np.ndarray], along: str, how: StripeOptions) -> tuple[float, float]:
-    """Share of the lines with a centre, and the centres' scatter in px about a parabola over `SMOOTH_LINES` lines."""
+    """Return the fraction of lines with a centre, and the centres' scatter in px about parabolas of `SMOOTH_LINES`."""
     found, lines, left = 0, 0, []
     for image in images:
         centre = extract_stripe(image, stripe_along=along, options=how).centre_px

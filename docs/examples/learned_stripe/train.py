@@ -22,17 +22,17 @@ from twin.datasets.data_set import LineStatus
 
 CROP_PX, BATCH = 256, 256
 SPREAD_PX = 0.8
-"""Standard deviation of the map that is asked for about the true centre."""
+"""Standard deviation of the target map about the true centre."""
 CENTRE_WEIGHT = 1.0
-"""Of the centre's error in px beside the map's cross entropy."""
+"""Weight of the centre's error in px relative to the map's cross entropy."""
 RATE = 3e-3
 NO_STRIPE = -1.0
 
 
 def read_lines(folders: list[Path], split: str) -> tuple[np.ndarray, np.ndarray]:
-    """Lines (N, P) of uint8 and the true centre (N,) on each, `NO_STRIPE` where none is.
+    """Return lines (N, P) of uint8 and the true centre (N,) on each, `NO_STRIPE` on lines without a stripe.
 
-    Left out are faint stripes, and those whose centre cannot be known to a pixel, as under saturated daylight.
+    Faint stripes are left out, and stripes whose centre cannot be known to a pixel, as under saturated daylight.
     """
     images, truths = [], []
     for folder in folders:
@@ -106,7 +106,7 @@ def trained(lines: np.ndarray, truth: np.ndarray, *, minutes: float, seed: int) 
 
 
 def main() -> None:
-    """Train, judge on the validation scenes, write the model."""
+    """Train, evaluate on the validation scenes, and write the model."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path, help="data sets of twin dataset with the label centre")
     parser.add_argument("--out", type=Path, required=True, help="ONNX model to write")
