@@ -1,6 +1,6 @@
-"""Finds and starts the Chromium in which tests open web pages.
+"""Find and start the Chromium used by tests of web pages.
 
-`python -m tests.browser` prints the one in use. Exit status 0, or 1 if there is none.
+`python -m tests.browser` prints its path. The exit status is 0, or 1 if there is no Chromium.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 VARIABLE = "CHROMIUM"
 NAMES = ("chromium-headless-shell", "chromium", "google-chrome", "google-chrome-stable", "chromium-browser")
-"""Names on PATH. Ubuntu's chromium-browser is only a script that asks for a snap, and is refused where it is."""
+"""Names on PATH. On Ubuntu, chromium-browser is a script that asks for a snap; it is rejected."""
 SOFTWARE_WEBGL = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
@@ -45,7 +45,7 @@ or let the environment variable {VARIABLE} name a Chromium or Chrome."""
 def find_chromium() -> Path:
     """Return the Chromium named by the variable CHROMIUM, otherwise one on PATH.
 
-    Only one that starts is taken. SetupError, with what was found and how to install one, where there is none.
+    Only a Chromium that starts is used. Otherwise raises SetupError with the findings and installation instructions.
     """
     if chosen := os.environ.get(VARIABLE):
         try:
@@ -62,7 +62,7 @@ def find_chromium() -> Path:
 
 
 def _started(path: Path) -> Path:
-    """The path of a Chromium that starts here, with all its libraries; SetupError where it does not."""
+    """Return the path of a Chromium that starts, with all its libraries; SetupError if it does not start."""
     if not os.access(path, os.X_OK) or path.is_dir():
         raise SetupError(f"{path}: it is not there, or no program")
     try:
@@ -78,9 +78,10 @@ def _started(path: Path) -> Path:
 
 @contextmanager
 def open_chromium(path: Path) -> Iterator[Browser]:
-    """A headless Chromium with software WebGL, driven from this thread, in which Playwright's event loop then runs.
+    """Open a headless Chromium with software WebGL; Playwright's event loop runs in this thread.
 
-    As usual for Playwright, Chromium's sandbox stays off: root and most containers have none, and the pages are ours.
+    Chromium's sandbox is off, as usual with Playwright: it is not available to root and in most containers, and all
+    pages are our own.
     """
     from playwright.sync_api import sync_playwright
 

@@ -1,4 +1,4 @@
-"""Chooses Mitsuba's variant before any test module imports the renderer, and loads the sensor most tests start from."""
+"""Select Mitsuba's variant before any test module imports the renderer, and load the sensor used by most tests."""
 
 import ctypes
 import fcntl
@@ -55,7 +55,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def use_lanes(count: int) -> None:
-    """Compile this process's kernels for vectors of so many numbers: 4 as for SSE, 8 for AVX2, 16 for AVX-512."""
+    """Compile this process's kernels for vectors of ``count`` numbers: 4 as for SSE, 8 for AVX2, 16 for AVX-512."""
     import drjit
 
     drjit.eval(drjit.llvm.Float(0.0))  # starts LLVM, which takes the processor's own
@@ -64,11 +64,11 @@ def use_lanes(count: int) -> None:
     library._Z19jit_llvm_set_targetPKcS0_j(b"haswell", b"+avx2,+fma", count)
 
 
-# A shell starts what runs in its background with SIGINT ignored, and children inherit that: here Ctrl-C is tested.
+# Shells start background jobs with SIGINT ignored, and children inherit this. The tests need Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# These tests serve cameras and pages at fixed ports of this machine, or look for
-# what is served: only one of them can run at a time.
+# These tests serve cameras and pages at fixed ports of this machine, or search for
+# them: only one of these tests can run at a time.
 SERVING = {
     "test_desk.py",
     "test_desk_calibration.py",
@@ -89,12 +89,12 @@ SERVING = {
 }
 
 NICE = 5
-"""Niceness of test processes beside the one that serves: its tests judge times."""
+"""Niceness of test processes other than the serving one, which checks times."""
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """Give whole files to each process; those that serve all to the same one, so that none waits for another."""
+    """Distribute whole files to processes; all files that serve run in the same one, so that they do not wait."""
     from xdist.scheduler import LoadFileScheduling
 
     class ByFile(LoadFileScheduling):
@@ -107,7 +107,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
 
 @pytest.fixture(scope="module", autouse=True)
 def serving_alone(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Let only one of several test processes serve cameras and pages, and the others leave processor time to it."""
+    """Let only one test process serve cameras and pages; the others run at lower priority."""
     if request.path.name not in SERVING:
         if "PYTEST_XDIST_WORKER" in os.environ:
             os.nice(max(0, NICE - os.nice(0)))
@@ -120,7 +120,7 @@ def serving_alone(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def thesis() -> Sensor:
-    """The thesis's sensor as its drawings say."""
+    """Return the thesis's sensor according to its drawings."""
     return load_sensor("thesis")
 
 
@@ -134,8 +134,8 @@ def thesis_as_built() -> Sensor:
 def chromium() -> "Iterator[Browser]":
     """A headless Chromium with WebGL, as Playwright's Browser; without one the test fails.
 
-    Playwright's event loop runs in this thread as long as the browser is there, so that asyncio.run is refused: it
-    ends with the module and does not disturb the next.
+    Playwright's event loop runs in this thread while the browser is open, so asyncio.run cannot be used. The browser is
+    closed at the end of the module.
     """
     try:
         path = find_chromium()

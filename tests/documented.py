@@ -1,4 +1,4 @@
-"""Blocks of the documentation's pages: command lines, Python, and what else stands indented or fenced."""
+"""Blocks of the documentation's pages: command lines, Python, and other indented or fenced text."""
 
 import re
 import shlex
@@ -20,7 +20,7 @@ PROGRAMS = (*APPS, "cd", "make", "pip", ".venv/bin/pip", "pytest", "python", "py
 """First words of a command line."""
 _SHELL = ("", "bash", "console", "sh", "shell")
 _SITE = ("{toctree}", "{eval-rst}")
-"""Fences that Sphinx turns into parts of the site; `make docs` refuses those with errors."""
+"""Fences for directives of Sphinx; `make docs` rejects errors in them."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Block:
 
     @property
     def commands(self) -> list[str]:
-        """Command lines without prompts and comments; lines after a prompt's are what the command prints."""
+        """Return command lines without prompts and comments; lines after a prompt line are the command's output."""
         lines = self.text.splitlines()
         prompted = [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]
         return [re.split(r"\s+#\s", line)[0].strip() for line in prompted or lines if line.strip()]
@@ -64,12 +64,12 @@ def mentioned_commands(page: Path) -> list[tuple[int, str]]:
 
 
 def words_of(command: str) -> list[str]:
-    """Words of a command line as a shell splits them; patterns of names stay as they are."""
+    """Return the words of a command line as a shell splits them; patterns of names are not expanded."""
     return shlex.split(command)
 
 
 def _raw_blocks(lines: list[str]) -> Iterator[tuple[int, str | None, str]]:
-    """First line's number, what is written behind the fence (None: indented) and text of each block."""
+    """Yield the first line's number, the text behind the fence (None: indented) and the text of each block."""
     at = 0
     while at < len(lines):
         if fence := re.match(r"(\s*)(`{3,}|~{3,})\s*(.*)", lines[at]):

@@ -1,7 +1,7 @@
 """Print the oldest allowed version of each dependency as requirements of pip: ``python -m tests.oldest test``.
 
-The arguments name the extras whose dependencies count besides the project's own, those that they include in turn too.
-Versions that are pinned have no oldest one, and are left out.
+The arguments name extras of the project. Their dependencies, including those of extras that they name, are added to the
+project's own. Pinned versions are left out.
 """
 
 import argparse
@@ -28,7 +28,7 @@ def oldest(*extras: str) -> list[str]:
 
 
 def requirements(project: dict[str, Any], extras: tuple[str, ...]) -> Iterator[Requirement]:
-    """Requirements of a project table and of its extras, those that they include in turn too."""
+    """Yield requirements of a project table and of its extras, including extras that these name."""
     lists = [project["dependencies"], *(project["optional-dependencies"][extra] for extra in extras)]
     for one in (Requirement(line) for lines in lists for line in lines):
         if one.name == project["name"]:

@@ -1,8 +1,9 @@
 """Soak test, a long scan from the operator's page: ``python -m tests.soak [images]``, 100,000 images by default.
 
-Camera and controller speak their real protocols; the camera sends drawn stripes, since rendering would take days. A
-headless browser looks on all the time. Every tenth of the way a line states the rate and the memory of desk and
-browser; the exit status is 1 where either grew by more than a quarter after the first fifth, or an image is missing.
+Camera and controller speak their real protocols. The camera sends drawn stripes, since rendering would take days. A
+headless browser shows the page during the scan. After each tenth of the scan, a line states the rate and the memory of
+desk and browser. The exit status is 1 if either memory grew by more than a quarter after the first fifth, or an image
+is missing.
 """
 
 import re
@@ -38,7 +39,7 @@ def memory_mib(process: int) -> float:
 
 
 def heap_mib(page: "Page") -> float:
-    """Memory of the page's scripts after what is not needed any more is freed, MiB."""
+    """Return the memory of the page's scripts after garbage collection, MiB."""
     session = page.context.new_cdp_session(page)
     session.send("HeapProfiler.collectGarbage")
     used = session.send("Runtime.getHeapUsage")["usedSize"] / 2**20
@@ -47,7 +48,7 @@ def heap_mib(page: "Page") -> float:
 
 
 def main(images: int = 100_000) -> int:
-    """Run the soak; the exit status."""
+    """Run the soak test and return the exit status."""
     with tempfile.TemporaryDirectory() as place:
         return _soak(Path(place), images)
 

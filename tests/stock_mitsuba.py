@@ -1,10 +1,10 @@
 """The tests' sensors, media and scenes as stock Mitsuba scenes, rendered by Mitsuba's own integrators.
 
-The twin and Mitsuba's integrators share the shapes, the BSDFs and nothing of the light transport. What stock can say
-is limited: it cannot connect to a light through a smooth dielectric, so windows are left off and the medium's index is
-1, and a light without extent must be a point. The sheet is therefore one that opens from its origin, a fan that is
-Gaussian in angle across, which is what the twin's sheet becomes with its waist there (`opened_from_its_origin`).
-Everything stands in the sensor's object coordinate system (OCS), mm.
+The twin and Mitsuba's integrators share the shapes and the BSDFs, but no light transport. Stock Mitsuba has two limits.
+It cannot connect to a light through a smooth dielectric, so windows are left off and the medium's index is 1. A light
+without extent must be a point. Therefore the sheet is a fan from a point, with a Gaussian profile in angle. The twin's
+sheet has this form if its waist is at the origin (`opened_from_its_origin`). All coordinates are in the sensor's object
+coordinate system (OCS), mm.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _ACROSS_SIGMAS, _ACROSS_TEXELS = 10.0, 640
 
 
 def opened_from_its_origin(sensor: Sensor, *, sigma_deg: float, fan_angle_deg: float) -> Sensor:
-    """The sensor without windows and with a sheet that is a Gaussian of ``sigma_deg`` in angle across.
+    """Return the sensor without windows, with a sheet that has a Gaussian profile of ``sigma_deg`` in angle.
 
     A waist w0 at the origin gives w = w0 s / zR far away, and zR = pi w0^2 / (M2 lambda): M2 = 2 pi w0 sigma / lambda.
-    The waist lies 0.01 mm before the origin; from 300 mm on w is within 4e-5 of that.
+    The waist is 0.01 mm before the origin; beyond 300 mm, w differs from this by less than 4e-5.
     """
     quality = 2 * math.pi * _WAIST_MM * math.radians(sigma_deg) / (1e-6 * sensor.laser.wavelength_nm)
     laser = {
@@ -54,7 +54,7 @@ def stock_scene(
 ) -> mi.Scene:
     """Mitsuba scene of the sensor's camera and laser before objects.
 
-    ``pixel_px`` sensor pixels make one film pixel; the sheet's profile is thrown with ``across_texels``.
+    ``pixel_px`` sensor pixels make one film pixel; the projected profile of the sheet has ``across_texels`` texels.
     """
     shapes = {
         f"object_{index}": _shape(thing, pose, sensor, medium)
@@ -84,11 +84,11 @@ def stock_irradiance(
 ) -> np.ndarray:
     """Irradiance (runs, H, W) on the image sensor in W/mm2 from independent runs of a stock integrator.
 
-    ``max_depth`` counts as Mitsuba does: 2 is light that met one surface, or was scattered once, between laser and
-    camera; -1 is all orders.
+    ``max_depth`` is as in Mitsuba: 2 is light with one reflection or one scattering event between laser and camera; -1
+    is all orders.
     """
     built = stock_scene(sensor, medium, scene, pixel_px=pixel_px)
-    # Russian roulette adds noise to what it saves time for; here it starts late.
+    # Russian roulette saves time but adds noise; here it starts late.
     walker = mi.load_dict({"type": integrator, "max_depth": max_depth, "rr_depth": 16})
     radiance = [np.array(mi.render(built, integrator=walker, spp=spp, seed=run))[..., 0] for run in range(runs)]
     return np.stack(radiance).astype(float) * blocks(per_radiance(sensor), pixel_px)
@@ -111,10 +111,10 @@ def per_radiance(sensor: Sensor) -> np.ndarray:
 
 
 def _camera(sensor: Sensor, pixel_px: int) -> dict[str, Any]:
-    """Mitsuba's pinhole camera: it looks along +z too, but x is to the left and y upwards in its image.
+    """Return Mitsuba's pinhole camera: it also looks along +z, but in its image x points left and y up.
 
-    Its film's edges are the outer edges of the sensor's outer pixels, so the principal point in the middle of the
-    image needs no shift by half a pixel.
+    The edges of its film are the outer edges of the outermost pixels. Therefore the principal point in the middle of
+    the image needs no shift by half a pixel.
     """
     camera = sensor.camera
     axes, standoff = camera_axes(sensor)
@@ -141,16 +141,16 @@ def _camera(sensor: Sensor, pixel_px: int) -> dict[str, Any]:
 
 
 def projector(sensor: Sensor, across_texels: int) -> dict[str, Any]:
-    """The sheet as Mitsuba's projector at the fan's origin.
+    """Return the sheet as Mitsuba's projector at the fan's origin.
 
-    Between the fan angles a and a + da flows P da / A of an even fan of full angle A. At the point (x, y, 1) before the
-    origin, 1 + y^2 from it within the sheet (squared) and r^2 = 1 + x^2 + y^2 altogether, the angle tan(a) = y gives
-    da = dy / (1 + y^2), and the Gaussian across has the standard deviation sigma r. The plane z = 1 thus receives
+    In a uniform fan of full angle A and power P, the power between the angles a and a + da is P da / A. For the point
+    (x, y, 1), tan(a) = y gives da = dy / (1 + y^2). Its squared distance from the origin is r^2 = 1 + x^2 + y^2, and
+    the Gaussian profile has the standard deviation sigma r. The plane z = 1 thus receives
 
         E1(x, y) = P / A / (1 + y^2) exp(-(x / (sigma r))^2 / 2) / (sqrt(2 pi) sigma r),
 
-    and any plane z the irradiance E1 / z^2. Mitsuba's projector gives pi times its texture there (as if the texture
-    were radiance on a diffuse screen), so the texture is E1 / pi. Its aspect ratio is that of the texture's sides.
+    and any plane z receives the irradiance E1 / z^2. Mitsuba's projector gives pi times its texture there (as if the
+    texture were radiance on a diffuse screen), so the texture is E1 / pi. Its aspect ratio is that of the texture.
     """
     laser = sensor.laser
     fan = math.radians(laser.fan_angle_deg)
@@ -182,10 +182,11 @@ def projector(sensor: Sensor, across_texels: int) -> dict[str, Any]:
 
 
 def homogeneous(medium: Medium, *, wavelength_nm: float) -> dict[str, Any]:
-    """Mitsuba's description of the medium.
+    """Return Mitsuba's description of the medium.
 
-    Water's molecules scatter as a mixture of Mitsuba's Rayleigh and even scattering: with the share w of the former the
-    function is (4 - w + 3 w cos^2) / (16 pi), in which 3 w / (4 - w) must be k, so w = 4 k / (3 + k).
+    Molecular scattering of water is a mixture of Mitsuba's Rayleigh and isotropic scattering. With the fraction w of
+    Rayleigh scattering, the phase function is (4 - w + 3 w cos^2) / (16 pi). The anisotropy 3 w / (4 - w) must equal
+    k, so w = 4 k / (3 + k).
     """
     match medium.phase:
         case "henyey-greenstein" if medium.asymmetry == 0:
@@ -204,7 +205,7 @@ def homogeneous(medium: Medium, *, wavelength_nm: float) -> dict[str, Any]:
 
 
 def _shape(thing: AnyObject, pose: np.ndarray, sensor: Sensor, medium: Medium) -> dict[str, Any]:
-    """Mitsuba's description of an object at its pose (4, 4) in the OCS."""
+    """Return Mitsuba's description of an object at its pose (4, 4) in the OCS."""
     if thing.mirror_share() > 0:
         raise ValueError("stock Mitsuba cannot connect to a point light by way of a mirror")
     wavelength = sensor.laser.wavelength_nm

@@ -1,4 +1,4 @@
-"""The rules of the packages: who may import whom (import-linter's contracts), and one name for one class."""
+"""Rules of the packages: permitted imports (contracts of import-linter), and unique class names."""
 
 import ast
 import shutil
@@ -10,7 +10,7 @@ import uwlts
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Each would break a contract of pyproject.toml: late, conditional and relative imports, and those by way of a package.
+# Each would break a contract of pyproject.toml: late, conditional, relative and indirect imports.
 FORBIDDEN = {
     "twin/scene/bent_a.py": "import uwlts.optics.window",
     "twin/scene/bent_b.py": "import numpy as np, uwlts.optics.camera as c",
@@ -88,7 +88,7 @@ def test_no_two_public_classes_have_one_name():
 
 
 def _external(call: ast.Call) -> bool:
-    """Whether the name is a literal that names neither of the two packages."""
+    """Return True if the call's first argument is a literal name outside the two packages."""
     first = call.args[0] if call.args else None
     return isinstance(first, ast.Constant) and str(first.value).split(".")[0] not in ("uwlts", "twin")
 

@@ -19,12 +19,12 @@ MOST_README_LINES = 100
 MOST_HOW_TO_LINES = 80
 FOLDERS = ("uwlts", "twin", "tests", "docs", "scenes")
 WRITTEN_LATER = {"docs/_build/html", "uwlts/targets/plain_circles.py"}
-"""Named by the documentation, but made by its reader: the built site, and the example of a new target."""
+"""Files that the documentation names but its reader creates: the built site, and the example of a new target."""
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
 
 
 def _check(command: str, *, folder: Path = ROOT, abridged: bool = False) -> None:
-    """Fail unless the program takes all words of a command line, of which arguments may lack where it is abridged."""
+    """Check that the program accepts a command line; an abridged one may lack arguments."""
     program, *words = words_of(command)
     match Path(program).name:
         case "uwlts" | "twin":

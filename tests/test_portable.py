@@ -1,4 +1,4 @@
-"""Every module can be imported where the libraries of POSIX systems are missing, as on Windows."""
+"""Every module can be imported without the libraries of POSIX systems, as on Windows."""
 
 import subprocess
 import sys

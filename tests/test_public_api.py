@@ -19,10 +19,10 @@ from uwlts.runtime.command_line import DerivedCommand, option_type
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "optuna", "nicegui"}
 LISTENS = {"progress", "report", "warn"}
-"""Parameters by which functions show what they do; commands print it."""
+"""Parameters for callbacks that report progress; commands print the reports instead."""
 APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
 MOST_NAMES = 48
-"""Public names of `uwlts`: the functions of its commands, what they return that can be saved, and what they take."""
+"""Largest number of public names of `uwlts`: functions of its commands, their savable results, and their arguments."""
 
 
 def commands() -> Iterator[tuple[str, str]]:
@@ -51,7 +51,7 @@ LEFT_OUT = {
     "PR08": "a description can begin with a name",
     "YD01": "the docstring of a context manager says what it yields",
 }
-"""Checks of numpydoc that are not asked for, with the reason."""
+"""Disabled checks of numpydoc, with the reason."""
 
 
 @pytest.mark.parametrize("package", [uwlts, twin, uwlts.report], ids=["uwlts", "twin", "report"])
@@ -101,7 +101,7 @@ def test_commands_take_what_their_functions_take(program: str, name: str):
     for parameter, one in inspect.signature(command.function).parameters.items():
         if parameter in LISTENS or one.kind is one.VAR_KEYWORD or option_type(hints[parameter]) is None:
             continue
-        # A word among several that an option takes is a tuple on the command line; so is nothing at all.
+        # An option with several words is a tuple on the command line, also if it is empty.
         several = tuple in (option_type(hints[parameter]), getattr(option_type(hints[parameter]), "__origin__", None))
         default = () if several and one.default is None else one.default
         if type(None) in get_args(option_type(hints[parameter])):

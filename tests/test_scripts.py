@@ -1,4 +1,4 @@
-"""Scripts of benches, tests and studies: each explains itself, and refuses a wrong option before it does anything."""
+"""Scripts of benchmarks, tests and studies: each has a help text, and rejects a wrong option before any work."""
 
 import ast
 import runpy
@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def _is_script(path: Path) -> bool:
-    """Whether a module does something when it is run."""
+    """Return True if a module has an `if __name__ == "__main__"` block."""
     return any(
         isinstance(each, ast.If) and ast.unparse(each.test) == "__name__ == '__main__'"
         for each in ast.parse(path.read_text(encoding="utf-8")).body
@@ -19,7 +19,7 @@ def _is_script(path: Path) -> bool:
 
 
 PROCESSES = {"tests/fuzz/running.py", "tests/uwlts/stripe/test_unchanged.py"}
-"""Not for the command line of a user: a child process, and a test that writes its data again."""
+"""Scripts that users do not run: a child process, and a test that can rewrite its data."""
 SCRIPTS = [
     path
     for folder in ("docs/studies", "tests")

@@ -18,7 +18,7 @@ _TOWARDS_LASER = {"width": np.array([0.0, -1.0, 0.0]), "height": np.array([1.0, 
 
 
 def altered(sensor: Sensor, changes: dict[str, Any]) -> Sensor:
-    """The sensor with nested ``changes`` laid over its description."""
+    """Return the sensor with nested ``changes`` of its description."""
     return Sensor.model_validate(merge_tables(sensor.model_dump(), changes))
 
 
@@ -55,10 +55,10 @@ def sensor_at(z: float = 0.0, *, x: float = 0.0) -> np.ndarray:
 
 
 def camera_axes(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """Columns X, Y, Z (3, 3) of the OCS in the camera frame and its origin (3,), from the sensor's baseline and angle.
+    """Return columns X, Y, Z (3, 3) of the OCS in the camera frame and its origin (3,), by baseline and angle.
 
-    Written from the words of the description: the laser stands beside the camera, above it or to its right, its axis
-    leans towards the camera's by the triangulation angle, and the roll turns the sheet about that axis.
+    An independent implementation of the description: the laser is beside the camera, above it or to its right. Its axis
+    leans towards the camera's axis by the triangulation angle, and the roll turns the sheet about the laser's axis.
     """
     laser = sensor.laser
     towards = _TOWARDS_LASER[sensor.camera.stripe_along]
@@ -79,7 +79,7 @@ def laser_origin(sensor: Sensor) -> np.ndarray:
 def oracle_window(
     window: Window, medium: Medium, *, wavelength_nm: float = 635.0
 ) -> tuple[list[fermat.Face], list[float]]:
-    """Faces and indices of a window before a module that looks along +z; none if it is taken off."""
+    """Return faces and indices of a window before a module that looks along +z; no faces if it is not mounted."""
     if not window.mounted:
         return [], [1.0]
     turned = Rotation.from_euler("xy", [window.tilt_x_deg, window.tilt_y_deg], degrees=True)
@@ -90,7 +90,7 @@ def oracle_window(
 
 
 def oracle_fan(sensor: Sensor, medium: Medium) -> Fan:
-    """The sensor's fan in closed form; its origin lies at `laser_origin`."""
+    """Return the sensor's fan in closed form; its origin is at `laser_origin`."""
     laser, window = sensor.laser, sensor.laser.window
     index = medium.refractive_index(laser.wavelength_nm)
     return Fan(
@@ -104,16 +104,16 @@ def oracle_fan(sensor: Sensor, medium: Medium) -> Fan:
         extinction=medium.absorption_per_mm(laser.wavelength_nm) + medium.scattering_per_mm(laser.wavelength_nm),
         waist_radius=laser.waist_radius_mm,
         waist_distance=laser.waist_distance_mm,
-        # A beam of quality M2 opens by M2 times the diffraction of its waist (ISO 11146-1).
+        # The divergence of a beam is M2 times the diffraction limit of its waist (ISO 11146-1).
         divergence=laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm / (math.pi * laser.waist_radius_mm * index),
     )
 
 
 def oracle_paths(sensor: Sensor, medium: Medium, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Paths of light from points (N, 3) of the OCS to the camera by Fermat's principle.
+    """Find the paths of light from points (N, 3) of the OCS to the camera by Fermat's principle.
 
-    Unit directions (N, 3) at the pupil in the camera frame, and the path's part in the medium, from the window's outer
-    face (N, 3) in the OCS and its length (N,).
+    Returns the unit directions (N, 3) at the pupil in the camera frame. For the part of the path in the medium, returns
+    the points (N, 3) on the window's outer face, in the OCS, and the lengths (N,).
     """
     axes, standoff = camera_axes(sensor)
     faces, indices = oracle_window(sensor.camera.window, medium)
@@ -137,7 +137,7 @@ def extinction(medium: Medium, *, wavelength_nm: float = 635.0) -> float:
 def window_transmittance(
     cosine: np.ndarray, window: Window, medium_index: float, *, absorption_per_mm: float
 ) -> np.ndarray:
-    """Both faces and the glass between them, for the cosine of the angle in air."""
+    """Return the transmittance of both faces and the glass, for the cosine of the angle in air."""
     glass = window.index(635.0)
     in_glass = np.sqrt(1 - (1 - cosine**2) / glass**2)
     faces = fresnel_transmittance(cosine, n1=1.0, n2=glass) * fresnel_transmittance(in_glass, n1=glass, n2=medium_index)
@@ -145,10 +145,11 @@ def window_transmittance(
 
 
 def lens_factor(sensor: Sensor, medium: Medium, rays: np.ndarray, *, wavelength_nm: float = 635.0) -> np.ndarray:
-    """Irradiance on the image sensor per radiance before the window, for unit directions (N, 3) at the pupil.
+    """Return irradiance on the image sensor per radiance before the window, for unit directions (N, 3) at the pupil.
 
-    Radiance over the index squared stays along a ray but for the window's losses. A thin lens of focal length f and
-    diameter f / N, its image at f (1 + m), collects the solid angle pi / 4 / (N (1 + m))^2, and cos^4 off the axis.
+    Radiance divided by the squared index is constant along a ray, except for the window's losses. A thin lens of focal
+    length f and diameter f / N has its image at f (1 + m). It collects the solid angle pi / 4 / (N (1 + m))^2, times
+    cos^4 of the angle to the axis.
     """
     camera, window = sensor.camera, sensor.camera.window
     index = medium.refractive_index(wavelength_nm)
@@ -179,9 +180,9 @@ def seen_at(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
 
 
 def stripe_on_plate(sensor: Sensor, medium: Medium, lines: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where profile lines see the sheet X = 0 on the plane Z = ``z``: y (N,) and the coordinate across the stripe (N,).
+    """Return y (N,) on the plane Z = ``z`` and the coordinate across the stripe (N,) of the sheet X = 0 on lines.
 
-    A secant search along the sheet for the y that appears on the line.
+    Uses a secant search along the sheet for the y that appears on each line.
     """
     along, across = (0, 1) if sensor.camera.stripe_along == "width" else (1, 0)
 

@@ -1,11 +1,11 @@
-"""Waiting for what other threads and processes do."""
+"""Waiting for results of other threads and processes."""
 
 import time
 from collections.abc import Callable
 
 
 def within(seconds: float, condition: Callable[[], bool]) -> bool:
-    """Whether a condition comes true in so many seconds; asked every 0.01 s, and at least twice."""
+    """Return True if a condition becomes true within ``seconds``; test it every 0.01 s, at least twice."""
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:

@@ -1,8 +1,8 @@
-"""Agreement of the project's M3C2-EP with py4dgeo's on the same clouds; needs `pip install py4dgeo`.
+"""Agreement of the project's M3C2-EP with that of py4dgeo on the same clouds; needs `pip install py4dgeo`.
 
-py4dgeo knows the covariance of a point by a terrestrial scanner's range and angles, with lengths in m. The clouds here
-have just that error, so that both get the same: a scanner 2 m before a wavy surface, noise of 0.03 mm along the beam
-and 15 urad across, and a dent of 0.5 mm. Prints how far distances and standard uncertainties differ.
+py4dgeo models the covariance of a point by range and angles of a terrestrial scanner, with lengths in m. The clouds
+have these errors, so both programs get the same input: a scanner 2 m before a wavy surface with a dent of 0.5 mm, and
+noise of 0.03 mm along the beam and 15 urad across. Prints the differences of distances and standard uncertainties.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ DISC_MM, DEEP_MM = 4.0, 6.0
 
 
 def scanned(rng: np.random.Generator, *, dent: float) -> PointCloud:
-    """A cloud with the errors of a scanner, which it states."""
+    """Return a cloud with the errors of a scanner and their covariance."""
     x, y = rng.uniform(-30, 30, (2, 14_000))
     z = 2.0 * np.sin(x / 9.0) + 1.5 * np.cos(y / 7.0) + dent * (np.hypot(x - 10, y - 5) < 5)
     points = np.column_stack([x, y, z])
@@ -44,7 +44,7 @@ def scanned(rng: np.random.Generator, *, dent: float) -> PointCloud:
 
 def main() -> None:
     """Compare and print."""
-    # The help does not need it.
+    # Imported late: the help text does not need it.
     from py4dgeo import Epoch
     from py4dgeo.m3c2ep import M3C2EP
 

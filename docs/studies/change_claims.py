@@ -1,7 +1,7 @@
-"""How much of a surface in which nothing changed `uwlts compare` claims to have changed.
+"""False positives of `uwlts compare`: fraction of an unchanged surface that is reported as changed.
 
 Clouds are drawn with the errors that they state: noise of single points, the position of each image, and a shift and a
-tilt that all points share. Prints the rows of the table in docs/results/comparison.md; numbers choose some of them.
+tilt that all points share. Prints the rows of the table in docs/results/comparison.md; numbers select rows.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ def flat(x, y):
 
 
 def scanned(rng: np.random.Generator, surface, *, common: bool, calibration: np.ndarray | None = None) -> PointCloud:
-    """A cloud in lines of a stage, of its own calibration or of one with given errors (2,), in standard deviations."""
+    """Return a scanned cloud; errors of its calibration (2,) in standard deviations are drawn unless given."""
     axis = np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM)
     x, y = np.meshgrid(axis, axis)
     image = np.repeat(np.arange(len(axis))[None], len(axis), axis=0).ravel()
@@ -45,7 +45,7 @@ def scanned(rng: np.random.Generator, surface, *, common: bool, calibration: np.
 
 
 def main(*rows_drawn: int) -> None:
-    """Print the rows of the table, those of these numbers or all."""
+    """Print all rows of the table, or those with the given numbers."""
     rows = (
         ("two scans, noise and images only", wavy, False, False, None, False),
         ("two scans of one calibration", wavy, True, True, None, False),

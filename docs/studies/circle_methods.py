@@ -1,4 +1,4 @@
-"""Centres of the target's circles: the thesis's processing and `uwlts.targets` beside their true images."""
+"""Errors of the centres of the target's circles: the thesis's processing and `uwlts.targets`."""
 
 import math
 
@@ -57,10 +57,10 @@ def circles_table() -> str:
 
 
 def ellipses_of_contours(image: np.ndarray) -> np.ndarray:
-    """Centres (N, 2) as the thesis finds them (section 4.5), with the same steps from OpenCV.
+    """Return centres (N, 2) found with the steps of the thesis (section 4.5), by OpenCV.
 
-    Median of 5 x 5, threshold (Otsu's) after the background is taken off, holes filled, particles on the border and
-    small ones removed, an ellipse fitted to the particle's outline.
+    Steps: median filter of 5 x 5, subtraction of the background, and Otsu's threshold. Then holes are filled, small
+    particles and those on the border removed, and an ellipse is fitted to each particle's outline.
     """
     calm = cv2.medianBlur(image, 5).astype(np.float32)
     size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
@@ -78,16 +78,16 @@ def ellipses_of_contours(image: np.ndarray) -> np.ndarray:
 
 
 def _errors(centres: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Centre minus truth (T, 2) of the nearest centre to each true one, NaN where none is near."""
+    """Return the nearest centre minus each true centre (T, 2), NaN if no centre is near."""
     distance, index = cKDTree(centres).query(truth)
     return np.where((distance < NEAREST_PX)[:, None], centres[index] - truth, np.nan)
 
 
 def _true_images(sensor: Sensor, plate: CirclePlate, stage_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids (T, 2) of the images of the circles that are wholly in view, and images of their centres, px.
+    """Return centroids (T, 2) of the images of all circles completely in view, and the images of their centres, px.
 
-    A pinhole in air, written down from the sensor's triangle of baseline and angle. The area's centroid of the image
-    of the rim, which is an ellipse, is the ellipse's centre.
+    The camera is a pinhole in air, calculated from the sensor's baseline and angle. The image of a circle is an
+    ellipse, and its centroid is the ellipse's centre.
     """
     camera, angle = sensor.camera, math.radians(sensor.laser.triangulation_angle_deg)
     axis = np.array([0.0, math.sin(angle), math.cos(angle)])

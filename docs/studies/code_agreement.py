@@ -1,13 +1,13 @@
-"""Agreement of two versions of the code: the same captures through both, and all numbers of what they write.
+"""Compare two versions of the code: process the same captures with both, and compare all numbers that they write.
 
     git worktree add /tmp/old v0.1
     python docs/studies/code_agreement.py /tmp/old --folder runs/agreement
     python docs/studies/code_agreement.py /tmp/old --folder runs/agreement --only joint reconstruct
 
-Inputs are made once by the older checkout (`code_agreement_inputs.py`), and its results are kept as long as its commit
-and the command lines stay. Each version runs all jobs in one process, as ``python -m uwlts`` does. Numbers have to
-agree to 1e-9 (relative), and neither version may write files or keys that the other one does not; texts that differ are
-listed, as wording may change. The exit code is 1 where anything else differs.
+Inputs are made once by the older checkout (`code_agreement_inputs.py`). Its results are reused until its commit or the
+command lines change. Each version runs all jobs in one process, as ``python -m uwlts`` does. Numbers must agree to 1e-9
+(relative), and both versions must write the same files and keys. Texts may differ and are listed. The exit code is 1 if
+anything else differs.
 """
 
 import argparse
@@ -156,14 +156,14 @@ JOBS: dict[str, str] = {
         uwlts info inputs/scans/spheres.h5
         uwlts info evaluate/spheres.json""",
 }
-"""Command lines of each job, in the order in which they need each other's files."""
+"""Command lines of each job. A job may use files of the jobs above it."""
 
 NEW_JOBS: dict[str, str] = {"verify": JOBS["verify"].replace("--limit", "--limit-mm")}
-"""Jobs whose command lines the new code spells otherwise."""
+"""Jobs with different command lines in the new code."""
 SAID = ("design", "verify", "info")
-"""Jobs whose results are what they print."""
+"""Jobs with printed results."""
 CRASHED = 70
-"""Exit code of a command that ends with a traceback, as sysexits.h numbers errors within software."""
+"""Exit code of a command that ends with a traceback: internal software error in sysexits.h."""
 
 
 def main() -> None:
@@ -196,7 +196,7 @@ def main() -> None:
         found.differences += [f"{job}: only the new code writes {name}" for name in sorted(files[1] - files[0])]
         ends = [json.loads((side / "ended.json").read_text()) for side in sides]
         codes = [end["codes"] for end in ends]
-        # A command that judges ends with 1; from 2 on it has failed, and shows nothing.
+        # Exit code 1 is a negative verdict; 2 or more is a failure without results.
         if codes[0] != codes[1] or max(codes[0]) > 1:
             found.differences.append(f"{job}: exit codes {codes[0]}, now {codes[1]}: see {job}/warned.txt")
         for name in sorted((files[0] & files[1]) - {"ended.json", "said.txt", "warned.txt"}):
@@ -204,7 +204,7 @@ def main() -> None:
         for name in ("said.txt", "warned.txt"):
             said = compare(*(dict(of_text((side / name).read_text())) for side in sides), name=f"{job}/{name}")
             if job not in SAID:
-                # Numbers that are printed stand in files too: here only the texts are of interest.
+                # Printed numbers are also in files: only the texts are compared here.
                 said = Agreement(texts=said.differences + said.texts)
             _add(found, said)
         times = [sum(end["seconds"]) for end in ends]
@@ -227,7 +227,7 @@ def _add(total: Any, part: Any) -> None:
 
 
 def make_inputs(old: Path, folder: Path) -> str:
-    """Make the inputs by the older checkout unless they are complete; return the digest of what describes them."""
+    """Make missing inputs with the older checkout; return the digest of their description."""
     script = HERE.with_name("code_agreement_inputs.py")
     described = hashlib.sha256(script.read_bytes()).hexdigest()
     begun, complete = folder / "begun", folder / "complete"
@@ -251,7 +251,7 @@ def run_side(root: Path, folder: Path, jobs: list[str], other: dict[str, str], *
         (folder / "inputs").symlink_to("../inputs")
     lines, before, wanted = JOBS | other, _state(root) + keep, {}
     for job, text in lines.items():
-        # Jobs use the results of those before them.
+        # Jobs use the results of earlier jobs.
         before = hashlib.sha256((before + text).encode()).hexdigest()
         ended = folder / job / "ended.json"
         if job in jobs and not (keep and ended.exists() and json.loads(ended.read_text())["state"] == before):
@@ -265,7 +265,7 @@ def run_side(root: Path, folder: Path, jobs: list[str], other: dict[str, str], *
 
 
 def _state(root: Path) -> str:
-    """Commit of a checkout, and the changes in it that are not committed."""
+    """Return the commit of a checkout and its uncommitted changes."""
 
     def git(*arguments: str) -> str:
         return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True).stdout
@@ -275,7 +275,7 @@ def _state(root: Path) -> str:
 
 def _python(root: Path, *arguments: object, cwd: Path) -> None:
     cwd.mkdir(parents=True, exist_ok=True)
-    # Sums by several threads would add in another order each time.
+    # With several threads, the order of sums would vary.
     environment = os.environ | {"PYTHONPATH": str(root), "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, *map(str, arguments)], cwd=cwd, env=environment, check=False)
     if done.returncode:
@@ -283,7 +283,7 @@ def _python(root: Path, *arguments: object, cwd: Path) -> None:
 
 
 def work(order: dict[str, Any]) -> None:
-    """Run command lines in this process and folder, with what they print in files."""
+    """Run command lines in this process and folder, and write their output to files."""
     for package in ("uwlts", "twin"):
         found = Path(str(importlib.import_module(package).__file__)).parents[1]
         if found != Path(order["root"]):
@@ -304,20 +304,20 @@ def work(order: dict[str, Any]) -> None:
 
 
 def run_command(line: str) -> int:
-    """Exit code of a command line, run as ``python -m PROGRAM.cli``; ``copy`` copies a file."""
+    """Run a command line as ``python -m PROGRAM.cli`` and return its exit code; ``copy`` copies a file."""
     program, *arguments = shlex.split(line)
     if program == "copy":
         shutil.copyfile(*arguments)
         return 0
     sys.argv = [program, *arguments]
     try:
-        # Version 0.1 has no ``python -m uwlts``.
+        # ``python -m uwlts`` does not exist in version 0.1.
         module = program if importlib.util.find_spec(f"{program}.__main__") else f"{program}.cli"
         runpy.run_module(module, run_name="__main__")
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     except Exception:
-        # The other jobs go on: a crash is a difference like others.
+        # A crash counts as a difference; the other jobs continue.
         traceback.print_exc()
         return CRASHED
     return 0

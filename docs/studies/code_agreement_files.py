@@ -1,4 +1,4 @@
-"""All numbers of the project's files, and how far those of two files differ; reads without the project's own code."""
+"""Read all numbers of the project's files without its own code, and compare those of two files."""
 
 import contextlib
 import json
@@ -23,15 +23,15 @@ from plyfile import PlyData
 
 RELATIVE = 1e-9
 FLOORS = {"mm": 1e-9, "px": 2e-9, "rad": 2e-12, "deg": 2e-10, "s": 1e-9, "um": 1e-6, "step": 1.0, "": 2e-12}
-"""Absolute differences that do not count, by the unit in a name: no measurement resolves them.
+"""Absolute differences that are ignored, by the unit in a name: no measurement resolves them.
 
-They are 1e4 roundings of double precision (2.2e-16) of usual sizes, which are 500 mm, 1000 px, 1 rad, 60 deg, 500 s,
-and 1 without a unit; and one step of coordinates that are stored as integers.
+They are 1e4 rounding errors of double precision (2.2e-16) of typical values: 500 mm, 1000 px, 1 rad, 60 deg, 500 s, and
+1 without a unit. Coordinates stored as integers may differ by one step.
 """
 SINGLE = 2.0 * np.finfo(np.float32).eps
-"""Relative difference of numbers stored with single precision: one rounding to either side."""
+"""Relative difference of numbers in single precision: one rounding in each direction."""
 NOT_COMPARED = re.compile(r"(version|software|date|issued|sha256|digest|seal|seconds|platform|created|made|host)$")
-"""Keys of what differs between any two runs or versions."""
+"""Keys of values that differ between any two runs or versions."""
 DIGEST = re.compile(r"\b[0-9a-f]{16,64}\b")
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*:\d\d)")
 
@@ -40,7 +40,7 @@ Values = dict[str, np.ndarray | str]
 
 @dataclass
 class Agreement:
-    """Difference of two sets of values: count of numbers, the largest relative difference, and what disagrees."""
+    """Difference of two sets of values: count of numbers, largest relative difference, and list of disagreements."""
 
     numbers: int = 0
     largest: float = 0.0
@@ -49,7 +49,7 @@ class Agreement:
 
 
 def compare(old: Values, new: Values, name: str) -> Agreement:
-    """Compare values of the same keys; texts that differ are noted but do not count as a difference."""
+    """Compare values of the same keys; different texts are noted, but do not count."""
     found = Agreement()
     found.differences += [f"{name}: only the old code writes {key}" for key in sorted(old.keys() - new.keys())]
     found.differences += [f"{name}: only the new code writes {key}" for key in sorted(new.keys() - old.keys())]
@@ -75,13 +75,13 @@ def compare(old: Values, new: Values, name: str) -> Agreement:
 
 
 def _difference(one: np.ndarray, other: np.ndarray, key: str) -> tuple[float, int]:
-    """Largest relative difference above the floor, and the number of values that differ by more than allowed."""
+    """Return the largest relative difference above the floor, and the number of values with too large a difference."""
     if one.dtype.kind not in "fc":
         count = int(np.count_nonzero(one != other))
         return (1.0 if count else 0.0), count
     single = one.dtype.itemsize < 8
     one, other = one.astype(float), other.astype(float)
-    # NaN and infinity have to stand at the same places.
+    # NaN and infinity must be at the same positions.
     same = (one == other) | (np.isnan(one) & np.isnan(other))
     with np.errstate(invalid="ignore"):
         off = np.where(same, 0.0, np.abs(one - other))
@@ -96,7 +96,7 @@ def _difference(one: np.ndarray, other: np.ndarray, key: str) -> tuple[float, in
 
 def _floor(values: np.ndarray, key: str) -> Any:
     if "covariance" in key and values.ndim >= 2 and values.shape[-1] == values.shape[-2]:
-        # Of a covariance by the standard deviations that belong to it.
+        # Divide a covariance by its standard deviations.
         std = np.sqrt(np.abs(np.einsum("...ii->...i", values)))
         return RELATIVE * std[..., :, None] * std[..., None, :]
     units = re.findall(r"_(mm2|mm|px|rad|deg|um|step|s)\b", key)
@@ -106,7 +106,7 @@ def _floor(values: np.ndarray, key: str) -> Any:
 
 
 def read_values(path: Path) -> Values:
-    """All numbers and texts of a file by their names; none of a page or another kind of file that shows others."""
+    """Return all numbers and texts of a file by name; nothing for a page or another file that displays results."""
     match "".join(path.suffixes[-2:]) if path.name.endswith(".copc.laz") else path.suffix:
         case ".json":
             return dict(_of_table(json.loads(path.read_text(encoding="utf-8"))))
@@ -141,7 +141,7 @@ def read_values(path: Path) -> Values:
 
 
 def of_text(text: str) -> Iterator[tuple[str, np.ndarray | str]]:
-    """Numbers in a text, in their order, and the words between them; digests are words."""
+    """Yield the numbers in a text, in order, and the words between them; digests are words."""
     text = DIGEST.sub("DIGEST", text)
     yield "numbers", np.array([float(each) for each in NUMBER.findall(text)])
     yield "words", NUMBER.sub("#", text)
@@ -172,7 +172,7 @@ def _of_table(value: Any, key: str = "") -> Iterator[tuple[str, np.ndarray | str
 
 
 def _array(value: Any) -> np.ndarray | None:
-    """Nested lists as an array if they hold nothing but numbers (None is not a number)."""
+    """Return nested lists as an array if they contain only numbers (None is not a number)."""
     try:
         array = np.array(value, dtype=object)
         if array.size and all(isinstance(each, int | float) and not isinstance(each, bool) for each in array.flat):

@@ -1,4 +1,4 @@
-"""Small but complete inputs of the agreement of two versions of the code: rendered scans, profiles, photographs.
+"""Small but complete inputs for the comparison of two versions of the code: rendered scans, profiles, photographs.
 
 `code_agreement.py` runs this with the packages of the older checkout: ``python code_agreement_inputs.py FOLDER``.
 """
@@ -41,7 +41,7 @@ pit_depth_mm = 2.6
 position_mm = [0.0, 0.0, 50.0]
 reflectance = 0.4
 """
-"""The pipe when its pits have become deeper."""
+"""The pipe with deeper pits."""
 WELD = """
 base = "weld"
 [[objects]]
@@ -106,7 +106,7 @@ DRIFT_MM, DRIFT_DEG = 60.0, 0.3
 
 
 def main() -> None:
-    """Make all inputs that the folder lacks."""
+    """Make all missing inputs in the folder."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     folder: Path = parser.parse_args().folder
@@ -121,7 +121,7 @@ def main() -> None:
 
 
 def render(folder: Path) -> None:
-    """Render the scans of the stage and the platforms; what is complete is kept."""
+    """Render the scans of the stage and the platforms; complete scans are kept."""
     plan = folder / "campaign.toml"
     recordings = [_recording(name, **each) for name, each in RECORDINGS.items()]
     plan.write_text(CAMPAIGN + "".join(recordings), encoding="utf-8")
@@ -189,11 +189,11 @@ def write_gauge(path: Path) -> None:
 
 
 def write_network(path: Path) -> None:
-    """Write a network for the stripe method ``learned``: the centroid of what is bright."""
+    """Write a network for the stripe method ``learned``: the centroid of bright pixels."""
     from tests.uwlts.stripe.test_learned import centroid_model
 
     model = onnx.load(centroid_model(path))
-    # Made for lines of another length; those of this sensor have 512 px.
+    # Built for another line length; lines of this sensor have 512 px.
     (place,) = (each for each in model.graph.initializer if each.name == "place")
     place.CopyFrom(onnx.numpy_helper.from_array(np.arange(512, dtype=np.float32), "place"))
     onnx.save(model, path)

@@ -1,9 +1,9 @@
-"""Spheres scanned without stops, by the served twin through its real protocols, against a scan that stops.
+"""Continuous scan of spheres by the served twin through its real protocols, compared with a scan that stops.
 
-The twin is a process of its own. Frames of its free-running camera are exposed in true time and rendered afterwards, so
-that time stamps, the stage's reports and their latency are those of the protocols. Spheres are compared with their
-certificate and with a scan that stops, the latency that is measured with the one that is put in: time stamps of the
-camera are shifted by so much.
+The twin runs in its own process. Its free-running camera exposes frames in real time and renders them afterwards.
+Therefore time stamps, the stage's reports and their latency are those of the protocols. Spheres are compared with their
+certificate and with a scan that stops. The time stamps of the camera are shifted by a known latency, which is compared
+with the measured one.
 
     python docs/studies/continuous_scan.py
 """
@@ -38,7 +38,7 @@ settling_s = 0.05
 
 
 def spheres(cloud, stops: np.ndarray | None = None) -> tuple[str, np.ndarray]:
-    """Figures of a cloud of spheres, how far its centres lie from others along X, and its centres (2, 3)."""
+    """Return the figures of a cloud of spheres as text, with shifts along X from ``stops``, and its centres (2, 3)."""
     result = uwlts.evaluate(cloud)
     centres = np.array([sphere.centre_mm for sphere in result.artefact.spheres])
     text = f"spacing {1e3 * result.sphere_spacing.value_mm:+6.1f} um, std {1e3 * result.std.value_mm:5.1f} um"

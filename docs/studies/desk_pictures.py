@@ -1,9 +1,9 @@
-"""The pictures of the desk's page: the twin's two spheres are scanned and measured in a real browser.
+"""Pictures of the desk's page: the twin's two spheres are scanned and measured in a real browser.
 
     python docs/studies/desk_pictures.py runs/inspection/calibration/calibration.json runs/desk docs/pictures
 
-The calibration is that of docs/studies/inspection_scenes.py, so that the served sensor is built as the one that it
-belongs to. Needs Chromium (`python -m tests.browser`).
+The calibration is that of docs/studies/inspection_scenes.py; the served sensor is the one that it belongs to. Needs
+Chromium (`python -m tests.browser`).
 """
 
 import re

@@ -1,10 +1,10 @@
-"""A gauge study planned in the twin: steps of three heights, set up at three distances, scanned twice each.
+"""Gauge study in the twin: steps of three heights, set up at three distances, scanned twice each.
 
     python docs/studies/gauge_twin.py runs/gauge
     uwlts gauge runs/gauge/heights.csv --tolerance 0.2
 
-Who sets up the sensor at another distance is another operator; noise, speckle and stage positions are drawn anew for
-each scan. Writes the table of docs/results/gauge.md and prints the study.
+Each distance counts as an operator. Noise, speckle and stage positions are drawn for each scan. Writes the table of
+docs/results/gauge.md and prints the study.
 """
 
 from pathlib import Path
@@ -29,7 +29,7 @@ def step(height_mm: float) -> dict:
 
 
 def main(folder: Path) -> None:
-    """Render, reconstruct, measure and judge."""
+    """Render, reconstruct, measure and evaluate."""
     folder.mkdir(parents=True, exist_ok=True)
     calibration = uwlts.nominal("thesis", medium="water")
     rows, seed = [], 0

@@ -1,4 +1,4 @@
-"""What inspections find in rendered scans, and how right their figures are.
+"""Detection rates and errors of inspections of rendered scans.
 
     python docs/studies/inspection_scenes.py runs/inspection      # and render, as it says
     cd runs/inspection/calibration && uwlts calibrate --air target-bare.h5 target-air.h5 --water target-water.h5 \
@@ -6,9 +6,9 @@
     python docs/studies/inspection.py runs/inspection docs/pictures
     python docs/studies/inspection.py runs/inspection-5 5         # pits and welds of another draw
 
-Prints the tables of the documentation: the probability of detection of pits by their depth (hit or miss, logistic in
-the logarithm of the depth, with the bound of its likelihood ratio: MIL-HDBK-1823A, appendix G), errors and coverage of
-all values against the closed form, and what is claimed to have changed where nothing has.
+Prints the tables of the documentation: probability of detection of pits, errors and coverage of all values against the
+closed form, and false claims of change. The probability of detection is a logistic function of the logarithm of the
+depth, fitted to hits and misses, with the bound of its likelihood ratio (MIL-HDBK-1823A, appendix G).
 """
 
 from dataclasses import replace
@@ -35,7 +35,7 @@ HEAD = ["of", "value", "number", "bias", "spread", "stated std", "truth within t
 
 
 def cloud_of(folder: Path, water: str, name: str) -> uwlts.PointCloud:
-    """The cloud of a recording, reconstructed once."""
+    """Return the cloud of a recording, reconstructed once."""
     path = folder / water / f"{name}.cloud.h5"
     if not path.exists():
         cloud = uwlts.reconstruct(folder / water / f"{name}.h5", folder / "calibration" / "calibration.json")
@@ -70,7 +70,7 @@ def distances(pits: Pits, places: np.ndarray) -> np.ndarray:
 
 
 def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
-    """The feature that lies on each pit, the deepest of several."""
+    """Return the feature at each pit (None if there is no feature), the deepest of several."""
     result: list[Feature | None] = [None] * len(pits.depth)
     for feature in reversed(found.select(*HOLLOWS)):
         away = distances(pits, feature.place_mm)
@@ -81,16 +81,16 @@ def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
 
 
 def false_ones(found: Inspection, pits: Pits) -> int:
-    """Features that lie on no pit."""
+    """Count the features outside all pits."""
     return sum(
         bool(np.all(distances(pits, each.place_mm) > pits.diameter / 2 + 0.5)) for each in found.select(*BLEMISHES)
     )
 
 
 def detection(depth: np.ndarray, hit: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Depths a90 and a90/95 and the logistic's parameters (2,): depth of 90 % and slope in the logarithm.
+    """Return depths a90 and a90/95, and the logistic's parameters (2,): depth of 90 % and slope in the logarithm.
 
-    The bound is that of the profile likelihood at 95 %, one-sided, which also exists where hits and misses do not mix.
+    The bound is that of the one-sided profile likelihood at 95 %. It also exists if hits and misses do not overlap.
     """
     x = np.log(depth)
 
@@ -167,14 +167,14 @@ def true_weld(weld: Weld) -> dict[str, float]:
     left, right = np.median(angles, axis=0)
     undercuts = dict.fromkeys(("undercut left", "undercut right", "largest undercut"), weld.undercut_depth_mm)
     crest = sections.max(axis=1)
-    # Sections are as long as profiles are apart, 1 mm; three of them.
+    # A section is as long as the distance between profiles, 1 mm; this is the mean of three sections.
     highest = float(np.convolve(crest, np.full(12, 1 / 12), "valid").max())
     sizes = {"height": float(crest.mean()), "largest height": highest, "width": float(np.median(toes))} | undercuts
     return sizes | {"toe angle left": left, "toe angle right": right, "misalignment": 0.0}
 
 
 def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> list[tuple[Feature, dict[str, float]]]:
-    """Features and true values of those chosen (P,) bool of the pits that were found."""
+    """Return features and true values of the found pits among those chosen, (P,) bool."""
     return [
         (each, true_values(diameter, depth, each["edge depth"].value))
         for each, diameter, depth, one in zip(found, pits.diameter, pits.depth, chosen, strict=True)
@@ -183,7 +183,7 @@ def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> li
 
 
 def small_pits_in(folder: Path, water: str, draw: int = 0) -> tuple[list[list[str]], list[list[str]], dict]:
-    """Rows of detection and of figures, and what a curve of each diameter is drawn from."""
+    """Return rows of detection and of figures, and the data of the curve of each diameter."""
     pits, inspected = small_pits(draw), uwlts.inspect_pipe(cloud_of(folder, water, "pipe-after"))
     found = matched(inspected, pits)
     hit = np.array([each is not None for each in found])
@@ -235,7 +235,7 @@ def welds_in(folder: Path, water: str) -> list[list[str]]:
 
 
 def unchanged_in(folder: Path, water: str, draw: int = 0) -> None:
-    """Print where change is claimed beside the pits, which is where nothing changed."""
+    """Print false claims of change, outside the pits."""
     before = cloud_of(folder, water, "pipe-before")
     for name, pits in (("pipe-after", small_pits(draw)), ("pipe-corroded", large_pits(draw))):
         change = uwlts.compare_clouds(cloud_of(folder, water, name), before, same_water=True)
@@ -268,7 +268,7 @@ def draw_again(folder: Path, draw: int) -> None:
 
 
 def main(folder: Path, pictures: str) -> None:
-    """Print all tables and draw the pictures into a folder; or, of the number of another draw, print its tables."""
+    """Print all tables and draw the pictures into a folder; with the number of another draw, only print its tables."""
     if pictures.isdecimal():
         draw_again(folder, int(pictures))
     else:

@@ -6,9 +6,10 @@
     twin record runs/inspection/coastal.toml --out runs/inspection/coastal
     twin record runs/inspection/flanges.toml --out runs/inspection/flanges
 
-A pipe of 300 mm diameter and 0.5 % ovality: smooth, with a grid of small pits for the probability of detection, and
-with large pits; and one seen from six sides; welds; a thin plate from both sides. All surfaces are known in closed form
-(`radius_mm`). A number after the folder draws other pits and welds, for `twin record --seed` of the same number.
+The objects are a pipe of 300 mm diameter and 0.5 % ovality, welds, and a thin plate seen from both sides. The pipe is
+smooth, has a grid of small pits for the probability of detection, or has large pits; one is seen from six sides. All
+surfaces are known in closed form (`radius_mm`). A number after the folder draws other pits and welds, for
+`twin record --seed` of the same number.
 """
 
 from dataclasses import dataclass
@@ -24,14 +25,14 @@ DIAMETER_MM, OVALITY, AXIS_Z_MM = 300.0, 0.005, 150.0
 OVAL_AT = np.radians(20.0)
 """Direction of the largest diameter, from -z towards y."""
 SAG_MM = 0.002
-"""Largest distance of facets from the surface: a tenth of the points' noise."""
+"""Largest distance of facets from the surface, a tenth of the points' noise."""
 SIDES_DEG = tuple(range(0, 360, 60))
 WATERS = ("clear", "coastal")
 
 
 @dataclass(frozen=True)
 class Pits:
-    """Pits (P,): places along the axis and along the round pipe's circumference, diameters and depths, mm."""
+    """Pits (P,): positions along the axis and along the round pipe's circumference, diameters and depths, mm."""
 
     along: np.ndarray
     around: np.ndarray
@@ -43,7 +44,7 @@ NO_PITS = Pits(*(np.zeros(0) for _ in range(4)))
 
 
 def small_pits(draw: int = 0) -> Pits:
-    """A grid of pits of 2, 3 and 5 mm diameter whose depths run evenly, in logarithms, from 0.006 to 0.4 mm."""
+    """Return a grid of pits of 2, 3 and 5 mm diameter, with depths from 0.006 to 0.4 mm in equal logarithmic steps."""
     along, around = np.meshgrid(7.0 * np.arange(-4, 5), 7.0 * (np.arange(22) - 10.5), indexing="ij")
     count, rng = along.size, np.random.default_rng(21 + draw)
     order = rng.permutation(count)
@@ -54,7 +55,7 @@ def small_pits(draw: int = 0) -> Pits:
 
 
 def large_pits(draw: int = 0) -> Pits:
-    """Pits of 0.3 to 5 mm depth, as corrosion leaves them, apart from each other."""
+    """Return separate pits of 0.3 to 5 mm depth, as left by corrosion."""
     along = [-18.0, 16.0, -14.0, 12.0, -17.0, 15.0, 0.0, -1.0, 2.0]
     around = [-58.0, -55.0, -22.0, -18.0, 22.0, 24.0, 52.0, 0.0, -40.0]
     diameter = [10.0, 16.0, 20.0, 14.0, 24.0, 12.0, 18.0, 3.0, 5.0]
@@ -69,7 +70,7 @@ def large_pits(draw: int = 0) -> Pits:
 
 
 def welds(draw: int = 0) -> list[dict[str, Any]]:
-    """Objects of welds with undercuts: one of round figures, and more by a draw other than 0."""
+    """Return welds with undercuts: a standard one, and random ones if the draw is not 0."""
     weld = {"kind": "weld", "beads": 1, "plate_mm": [80.0, 120.0], "length_mm": 60.0, "width_mm": 12.0}
     weld |= {"height_mm": 2.0, "undercut_depth_mm": 0.5, "undercut_width_mm": 2.5, "finish": "painted"}
     rng, result = np.random.default_rng(draw), [weld]
@@ -82,7 +83,7 @@ def welds(draw: int = 0) -> list[dict[str, Any]]:
 
 
 def radius_mm(along: np.ndarray, angle: np.ndarray, pits: Pits) -> np.ndarray:
-    """Distance from the axis at places along it and angles from -z towards y; pits are depth (1 - t^2)^2 deep."""
+    """Return the distance from the axis at positions along it and angles from -z to y; pits are depth (1 - t^2)^2."""
     loss = np.zeros(np.broadcast(along, angle).shape)
     for x, s, diameter, depth in zip(pits.along, pits.around, pits.diameter, pits.depth, strict=True):
         t2 = ((along - x) ** 2 + (DIAMETER_MM / 2 * angle - s) ** 2) / (diameter / 2) ** 2

@@ -1,4 +1,4 @@
-"""What the stripe's light lets any method know about its place: the Cramer-Rao bound and the limit of speckle."""
+"""Lower limits of the error of any stripe centre: Cramer-Rao bound and speckle limit."""
 
 import math
 
@@ -13,12 +13,12 @@ WINDOW_PX = 16
 
 
 def bound_px(shot: Rendered, *, speckle: bool, level: float = 1.0) -> float:
-    """Least standard deviation of the centre on one line, px, the median over the lines (Cramer-Rao).
+    """Return the Cramer-Rao bound of the centre's standard deviation on one line, px, median over the lines.
 
-    A pixel of f electrons of signal has the variance f + d + r^2 + q^2 / 12, d of dark current, r of readout and fixed
-    pattern, q electrons per grey level; speckle of contrast C over a pixel adds (C f)^2. The information about a shift
-    is sum (df/dx)^2 / variance: for gamma-distributed speckle (1 / C^2 patterns) this is exact, and only the place is
-    unknown. df/dx is that of a cubic spline through the noise-free pixels.
+    A pixel with f signal electrons has the variance f + d + r^2 + q^2 / 12. The terms are dark current d, noise r of
+    readout and fixed pattern, and q electrons per grey level. Speckle of contrast C over a pixel adds (C f)^2. The
+    information about a shift is sum (df/dx)^2 / variance. This is exact for gamma-distributed speckle (1 / C^2
+    patterns). Only the position is unknown. df/dx is that of a cubic spline through the noise-free pixels.
     """
     detector = shot.sensor.detector
     light = shot.electrons(level=level).astype(float)
@@ -49,11 +49,11 @@ def grain_px(shot: Rendered) -> float:
 
 
 def spot_limit_px(shot: Rendered) -> float:
-    """Standard deviation, px on the image sensor, of the centroid of a round spot's image: C lambda / (2 pi sin u').
+    """Return the speckle limit of the centroid of a round spot's image, px: C lambda / (2 pi sin u').
 
     Dorsch, Haeusler and Herrmann, Laser triangulation: fundamental uncertainty in distance measurement, Applied Optics
-    33 (1994) 1306-1314. C is the speckle's contrast over points, u' the half angle of the light cone that meets the
-    image sensor, sin u' = 1 / (2 N (1 + m)): C lambda N (1 + m) / pi.
+    33 (1994) 1306-1314. C is the speckle's contrast over points, and u' the half angle of the light cone at the image
+    sensor. With sin u' = 1 / (2 N (1 + m)), the limit is C lambda N (1 + m) / pi.
     """
     return float(np.median(shot.contrast())) * grain_px(shot) / math.pi
 

@@ -16,16 +16,16 @@ from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.sensor import Sensor
 
 FINE_SPP = 256
-"""Samples of the stripe itself: with 16, the few places in the pupil shift a blurred stripe by up to 0.2 px."""
+"""Samples of the stripe itself: with 16, the few points in the pupil shift a blurred stripe by up to 0.2 px."""
 SMOOTHED_LINES = 33
-"""Scattered light of a plate varies slowly along the stripe; its random walks' noise is averaged over so many lines."""
+"""Lines over which noise of random walks is averaged: scattered light of a plate varies slowly along the stripe."""
 APART = 3.0
-"""From 2 renewal lengths of travel on, speckle is new."""
+"""Distance in renewal lengths; beyond 2, the speckle is independent."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Place(Case):
-    """A case of which one frame is rendered; ``turned_deg`` turns a plate about X (slanted stripe) and Y (depth)."""
+    """Case with a single rendered frame; ``turned_deg`` turns a plate about X (slanted stripe) and Y (depth)."""
 
     turned_deg: tuple[float, float] = (0.0, 0.0)
 
@@ -41,7 +41,7 @@ class Place(Case):
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """Light of a place without speckle and noise, and the truth (L,) in px where the surface faces the laser."""
+    """Light of a case without speckle and noise, and the truth (L,) in px on surfaces that face the laser."""
 
     sensor: Sensor
     index: float
@@ -51,7 +51,7 @@ class Rendered:
     exposure_ms: float
 
     def electrons(self, *, level: float = 1.0, speckle: int | None = None) -> np.ndarray:
-        """Mean electrons (H, W), with the speckle pattern of a number; ``level`` scales the automatic exposure."""
+        """Return mean electrons (H, W), with the speckle pattern of a number; ``level`` scales the exposure."""
         factors = 1.0 if speckle is None else self._grain(speckle)
         light = electrons_per_ms(
             self.frame.irradiance(factors),
@@ -99,7 +99,7 @@ class Rendered:
 
 @cache
 def render(place: Place) -> Rendered:
-    """The place's light: the stripe with many samples, the light around it with all effects of the place."""
+    """Render the light of a case: the stripe with many samples, the light around it with all effects of the case."""
     from twin.recording.frame_truth import find_true_stripe
     from twin.recording.sensor_simulator import SensorSimulator
 
@@ -112,7 +112,7 @@ def render(place: Place) -> Rendered:
     frame = fine.renderer.laser_frame(pose, spp=FINE_SPP)
     around = whole.renderer.laser_frame(pose, spp=place.spp).scattered
     if place.thing == "plane":
-        # A running sum of single precision may end a little below zero.
+        # A running sum in single precision may be slightly negative.
         around = np.maximum(cv2.blur(around, (SMOOTHED_LINES, 1), borderType=cv2.BORDER_REPLICATE), 0)
     truth = find_true_stripe(whole.renderer, pose)
     used = np.isfinite(truth.centre_px) & (-truth.normal[:, 2] >= FACING)
@@ -128,17 +128,17 @@ def render(place: Place) -> Rendered:
 
 
 def _fixed(sensor: Sensor):
-    """Any exposure, so that none is looked for."""
+    """Return the sensor with a fixed exposure, so that no automatic exposure is searched."""
     return sensor.exposure.model_copy(update={"laser_ms": 1.0})
 
 
 PLACES = {"near": -60.0, "stand-off": 0.0, "far": 90.0}
 CONVEX = ALL.remove("secondary-light")
-"""For the pipe, which does not light itself."""
+"""Effects for the convex pipe, which does not illuminate itself."""
 
 
 def places() -> dict[str, Place]:
-    """What every method is tried on with all effects."""
+    """Return the test cases of all methods, with all effects."""
     square = {f"plane, {name}": Place(z_mm=z, spp=8) for name, z in PLACES.items()}
     return square | {
         "sphere, near": Place(thing="spheres", z_mm=-40.0, spp=8),
@@ -149,7 +149,7 @@ def places() -> dict[str, Place]:
 
 
 def sweeps() -> dict[str, Place]:
-    """One thing changed on the plane."""
+    """Return cases that each change one parameter on the plane."""
     turned = {
         f"turned {angle:+.0f}\N{DEGREE SIGN} about {'XY'[axis]}, {name}": Place(
             z_mm=PLACES[name], spp=8, turned_deg=(angle, 0.0) if axis == 0 else (0.0, angle)
@@ -174,14 +174,14 @@ def sweeps() -> dict[str, Place]:
 
 
 LEVELS = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
-"""Exposure over the automatic one, which brings the brightest light to 0.8 of the full well."""
+"""Exposures divided by the automatic one, which sets the brightest light to 0.8 of the full well."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Bias (mean), standard deviation, and the latter of means of five lines, px; std in mm; share of lines found.
+    """Bias (mean), standard deviation of single lines and of means of five lines, px; std in mm; fraction found.
 
-    Centres more than 2 px off, at limbs and edges, are left out and counted in ``far_off``.
+    Errors above 2 px, at limbs and edges, are left out and counted in ``far_off``.
     """
 
     bias_px: float
@@ -193,7 +193,7 @@ class Spread:
 
     @classmethod
     def of(cls, error_px: np.ndarray, mm_per_px: np.ndarray, used: np.ndarray) -> "Spread":
-        """From errors (F, L), NaN where nothing was found."""
+        """Calculate from errors (F, L), NaN on lines without a centre."""
         near = np.abs(error_px) <= 2.0
         error = np.where(near, error_px, np.nan)
         count = error.shape[1] // 5 * 5
@@ -210,5 +210,5 @@ class Spread:
 
 
 def round_to_zero(value: float) -> float:
-    """No negative zero in tables."""
+    """Return zero for values that round to zero, so that tables do not show a negative zero."""
     return 0.0 if math.isclose(value, 0.0, abs_tol=5e-4) else value

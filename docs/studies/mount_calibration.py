@@ -26,7 +26,7 @@ from uwlts.model.mount import Mount, SphereFound
 
 
 def held_out_ratio(mount: Mount, campaign: Campaign) -> float:
-    """Scatter of a new campaign's points about a sphere of their own, over the same by the true mount."""
+    """Return the scatter of a new campaign's points about their best sphere, divided by that with the true mount."""
 
     def rms(transform: np.ndarray) -> float:
         off = []

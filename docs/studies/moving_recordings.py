@@ -1,8 +1,8 @@
-"""Recordings for the studies of moving sensors: sensors with imperfections, their calibrations, and scans by each.
+"""Recordings for the studies of moving sensors: sensors with imperfections, their calibrations, and their scans.
 
-Of each sensor the images of a joint calibration are rendered and its calibration is made, in FOLDER/sensor-SENSOR, then
-scenes are rendered with it, once for each seed of the platform's errors, to FOLDER/sensor-SENSOR/SCENE-SEED.h5. Of
-straight paths ``--denser N`` takes N images for one:
+The images of a joint calibration are rendered for each sensor and calibrated, in FOLDER/sensor-SENSOR. Then each scene
+is rendered once for each seed of the platform's errors, to FOLDER/sensor-SENSOR/SCENE-SEED.h5. ``--denser N``
+multiplies the number of images on straight paths by N:
 
     python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 2 3 4 5 --seeds 0 1
 """
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def denser(waypoints: list[dict], times: int) -> list[dict]:
-    """Waypoints with others between those that are turned the same way."""
+    """Insert waypoints between neighbours with the same orientation."""
     result = []
     for first, second in pairwise(waypoints):
         result.append(first)

@@ -6,8 +6,8 @@
     twin simulate vehicle-pipe --sensor thesis-small --out FOLDER/vehicle.h5
     python docs/studies/moving_scenes.py FOLDER
 
-The mount for a pipe is that of the robot's capture of the same seed by the same sensor, and the pipe's poses are known
-as well as that robot's.
+The mount for a pipe is that of the robot's capture with the same seed and sensor. The pipe's poses have the same
+uncertainty as those of that robot.
 """
 
 from pathlib import Path
@@ -28,7 +28,7 @@ from uwlts.storage.truth import Truth, read_truth, truth_path
 Form = tuple[float, float, float]
 VIEWS, PIPE_MM, OVALITY_MM, SPHERES_MM = 5, 300.0, 1.2, 16.0
 ROBOT_STD_MM, ROBOT_STD_DEG = 0.05, 0.02
-"""Of a robot's poses: 0.05 mm, and as much at the pipe's radius."""
+"""Standard deviations of a robot's poses: 0.05 mm, and a rotation of equal effect at the pipe's radius."""
 
 
 def truth_of(path: Path) -> tuple[Platform, Truth]:
@@ -67,10 +67,10 @@ def rotary(path: Path) -> str:
 
 
 def pipe(path: Path, calibration: Calibration, mount: Mount) -> np.ndarray:
-    """What is off, mm (4, 4): `form`, and the largest closure as stated.
+    """Return errors (4, 4) in mm: those of `form`, and the largest stated closure.
 
-    Of views as the poses have them, and registered: freely, with the start known as well as the robot's poses, and with
-    the spheres besides.
+    The rows are: views placed by the poses; registered freely; registered with the robot's pose uncertainty as prior;
+    and registered with this prior and the spheres.
     """
     cloud = uwlts.reconstruct(path, calibration, mount=mount)
     view = cloud.frame * VIEWS // (int(cloud.frame.max()) + 1)
@@ -115,7 +115,7 @@ def form(points: np.ndarray, view: np.ndarray) -> Form:
 
 
 def vehicle(path: Path) -> str:
-    """How far points are off with what the navigation reports, and with the true path and mount."""
+    """Return the point errors, as text, with the reported path, and with the true path and mount."""
     motion, truth = truth_of(path)
     reported = uwlts.read(str(path).replace(".h5", ".trajectory.csv"))
     with uwlts.read(path) as capture:

@@ -1,10 +1,10 @@
-"""A 300 mm pipe from five sides: diameter, ovality and closure of the registered scans against the truth.
+"""Pipe of 300 mm scanned from five sides: diameter, ovality and closure of the registered scans against the truth.
 
     python -m docs.studies.pipe_views --campaigns 5 --one-sensor
 
-Scans are those of `tests/uwlts/pipe_views.py`: an oval pipe, noise of 0.02 mm along the rays, errors that all points of
-a scan share (scale, bow and tilt of 0.03 mm at the ends of the stripe, times ``--systematic``), and a start that is
-wrong by up to 2 mm and 0.5 deg. These errors are those of each scan, or of all scans of a campaign (``--one-sensor``).
+Scans are those of `tests/uwlts/pipe_views.py`: an oval pipe with noise of 0.02 mm along the rays. Initial poses have
+errors of up to 2 mm and 0.5 deg. All points of a scan share a scale, a bow and a tilt of 0.03 mm at the ends of the
+stripe, times ``--systematic``. They are drawn for each scan, or once for all scans of a campaign (``--one-sensor``).
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""Screened Poisson reconstruction by Open3D of the points that rendered_mesh.py and thin_wall.py saved.
+"""Screened Poisson reconstruction, by Open3D, of the points saved by rendered_mesh.py and thin_wall.py.
 
-Runs where `pip install open3d` is, apart from the project's environment; normals are Open3D's own from 30 neighbours,
-turned to the side from which each point was seen; the depth of its octree gives cells of about half a millimetre.
+Needs an environment with Open3D (`pip install open3d`), separate from that of the project. Normals are Open3D's own,
+from 30 neighbours, and point towards the sensor. The depth of the octree gives cells of about half a millimetre.
 """
 
 import argparse
@@ -16,7 +16,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder with the saved points")
     folder = parser.parse_args().folder
-    # After the arguments: the help does not need it.
+    # Imported late: the help text does not need it.
     import open3d
 
     for path in sorted(folder.glob("mesh-*.npz")):

@@ -1,10 +1,10 @@
 """Meshes of rendered scans against their true surfaces, and Open3D's Poisson reconstruction of the same points.
 
     python docs/studies/rendered_mesh.py runs/inspection            # after docs/studies/inspection.py
-    python docs/studies/poisson_mesh.py runs/inspection             # where Open3D is installed
+    python docs/studies/poisson_mesh.py runs/inspection             # in an environment with Open3D
     python docs/studies/rendered_mesh.py runs/inspection            # again, with its meshes
 
-Errors are of the vertices, along the normal, against the closed form of a corroded pipe and of a flange's face.
+Errors are those of the vertices, along the normal, against the closed form of a corroded pipe and of a flange's face.
 """
 
 from pathlib import Path
@@ -22,11 +22,11 @@ from twin.scene.forms import Flange
 from twin.scene.forms.flange import flange_face
 
 SEEN_MM = 1.0
-"""Farther from all points a vertex lies where nothing was seen."""
+"""Largest distance from a vertex to the nearest point; beyond it, the surface was not seen."""
 
 
 def off_pipe(points: np.ndarray) -> np.ndarray:
-    """Distances (N,) of points from the corroded pipe, along its radius, less what its slopes make of that."""
+    """Return the distances (N,) of points from the corroded pipe along its normal, from radius and slopes."""
     away = np.hypot(points[:, 1], AXIS_Z_MM - points[:, 2])
     angle = np.arctan2(points[:, 1], AXIS_Z_MM - points[:, 2])
 
@@ -39,7 +39,7 @@ def off_pipe(points: np.ndarray) -> np.ndarray:
 
 
 def off_flange(folder: Path, water: str):
-    """Distances from a flange's face, NaN where there is none."""
+    """Return a function for distances from a flange's face; they are NaN beside the face."""
     flange = load_scene(str(folder / f"flange-{water}.toml")).objects[0]
     assert isinstance(flange, Flange)
 
@@ -50,7 +50,7 @@ def off_flange(folder: Path, water: str):
 
 
 def row(name: str, vertices: np.ndarray, std: np.ndarray | None, off: np.ndarray, points: np.ndarray) -> list[str]:
-    """A row of the table: number, rms, bias, coverage, and what lies where nothing was seen."""
+    """Return a row of the table: number, rms, bias, coverage, and vertices on surfaces that were not seen."""
     beyond = KDTree(points).query(vertices)[0] > SEEN_MM
     known = np.isfinite(off) & ~beyond
     error = off[known]

@@ -30,7 +30,7 @@ RADIUS_MM = 19.05
 
 
 def scatter_mm(captured: CapturedProfiles, mount: np.ndarray, centre_mm: np.ndarray) -> float:
-    """Root mean square distance of the points on a sphere of known radius from that which fits them best."""
+    """Return the root mean square distance of points from the best-fitting sphere of known radius."""
     placed = captured.poses @ mount
     points = np.vstack([p @ pose[:3, :3].T + pose[:3, 3] for p, pose in zip(captured.profiles, placed, strict=True)])
     for _ in range(5):
@@ -84,7 +84,7 @@ def main(folder: Path) -> None:
 
 
 def profiles_of_poses(captured: CapturedProfiles, poses: np.ndarray) -> CapturedProfiles:
-    """The same profiles with other poses."""
+    """Return the same profiles with other poses."""
     return CapturedProfiles(**{**vars(captured), "poses": poses})
 
 

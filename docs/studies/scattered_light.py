@@ -4,8 +4,9 @@
     python docs/studies/scattered_light.py reference coastal FILE.npz       # plain means of many walks per cell
     python docs/studies/scattered_light.py compare PICTURE.svg REFERENCE.npz,FRAMES.npz[,MORE.npz] ...
 
-The reference takes the plain means of 4,800 random walks per cell, of 64,800 within 48 px of the stripe, in some 4 min
-of processor time; `tests/data/scattered-WATER.npz` are such. Grey values are scaled to a stripe's peak of 200.
+The reference is the plain mean of 4,800 random walks per cell, or 64,800 within 48 px of the stripe. It takes about
+4 min of processor time; `tests/data/scattered-WATER.npz` are examples. Grey values are scaled to a stripe's peak of
+200.
 """
 
 import argparse
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
 SEEDS = 16
 SPP = 16
 PARTS, WALKS, MORE_WALKS, NEAR_PX = 12, 400, 5000, 48
-"""The reference's walks per cell are drawn in parts, whose scatter tells its error; more of them near the stripe."""
+"""Number of parts of the reference, random walks per cell and part, and more of them within NEAR_PX of the stripe.
+
+The scatter of the parts gives the error of the reference.
+"""
 PEAK_DN = 200.0
 AWAY_PX = (0, 16, 32)
 
@@ -48,7 +52,7 @@ def render(kind: str, water: str, out: Path, *, seed: int) -> None:
 
 
 def reference(renderer: "Renderer", distance: np.ndarray, *, seed: int) -> np.ndarray:
-    """Means (rows, columns) of what walks found per cell of an image (H, W) of distances from the stripe."""
+    """Return means (rows, columns) of random walks per cell, for an image (H, W) of distances from the stripe."""
     import twin.light.multiple_scattering as ways
     from twin.light.illumination import make_lights
     from twin.light.pose import SensorPose
@@ -75,7 +79,7 @@ def away_from(direct: np.ndarray) -> np.ndarray:
 
 
 def spectrum(errors: np.ndarray, side: int = 256) -> tuple[np.ndarray, np.ndarray]:
-    """Radially averaged amplitude in grey levels over spatial frequency in 1/px of the upper corner's squares."""
+    """Return the radially averaged amplitude in grey levels by spatial frequency in 1/px, of the upper corner."""
     window = np.outer(np.hanning(side), np.hanning(side))
     power = (np.abs(np.fft.fft2(errors[:, :side, :side] * window)) ** 2).mean(axis=0) / (window**2).sum()
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
@@ -85,7 +89,7 @@ def spectrum(errors: np.ndarray, side: int = 256) -> tuple[np.ndarray, np.ndarra
 
 
 def compare(picture: Path, groups: list[list[Path]]) -> None:
-    """Print the errors of frames against the reference that each group begins with, and draw their spectra."""
+    """Print the errors of frames against the reference, the first file of each group, and draw their spectra."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""Dark beside shining surfaces at one exposure and in a bracket of three, against the true stripe.
+"""Dark surfaces beside shiny ones, at one exposure and in a bracket of three, compared with the true stripe.
 
 ``python docs/studies/stripe_brackets.py`` prints the table of docs/results/stripe-methods.md.
 """

@@ -1,4 +1,4 @@
-"""One case of the study: frames of an object with some effects, and how far the stripe's centres lie from the truth."""
+"""One case of the study: frames of an object with some effects, and the errors of the stripe's centres."""
 
 import math
 from dataclasses import dataclass
@@ -26,19 +26,19 @@ METHODS = {
 }
 VERTEX = "5x5 mean, parabola through 3 px"
 PLATE = {"kind": "plate", "width_mm": 200.0, "height_mm": 300.0, "finish": "painted"}
-"""The thesis's painted plane, so large that no end of the stripe is in view."""
+"""The thesis's painted plane, large enough that both ends of the stripe are out of view."""
 FACING = math.cos(math.radians(60))
-"""Surfaces turned farther away from the laser are left out: there the stripe ends, which is a matter of its own."""
+"""Surfaces with a larger angle of incidence are left out, because the stripe ends there."""
 CROP_PX, FAR_OFF_PX = 28, 2.0
 _SCALE_Z, _SCALE_DEGREE = np.arange(-80.0, 131.0, 15.0), 5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """What is rendered: an object of the thesis at Z, the effects, and what differs from its sensor.
+    """Rendered case: an object of the thesis at Z, the effects, and changes of the thesis's sensor.
 
-    ``level`` is the brightest light as a share of the full well; the automatic exposure's unless given. ``camera`` and
-    ``laser`` are pairs of a description's key and value.
+    ``level`` is the brightest light as a fraction of the full well; by default, that of the automatic exposure.
+    ``camera`` and ``laser`` are pairs of a description's key and value.
     """
 
     thing: str = "plane"
@@ -53,7 +53,7 @@ class Case:
     laser: tuple[tuple[str, float], ...] = ()
 
     def scene(self) -> Scene:
-        """The shipped scene, moved to Z, with so many frames evenly spread over its scan."""
+        """Return the shipped scene, moved to Z, with `frames` positions evenly spread over its scan."""
         shipped = load_scene(self.thing).motion
         step = shipped.count * shipped.step_mm / self.frames
         start = shipped.start_mm + (step - shipped.step_mm) / 2
@@ -77,12 +77,12 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Errors of a case by method: centre minus truth in px (F, L), NaN where either is missing.
+    """Errors of a case by method: centre minus truth in px (F, L), NaN if either is missing.
 
-    ``mm_per_px`` (F, L) is how far a point moves along its surface's normal, away from the surface, for one px, and
-    ``step_mm`` (F, L, 3) how it moves in space; ``point_mm`` (F, L, 3) is the true point; ``used`` (F, L) shows
-    where the surface faces the laser; ``width_px`` is the median full width at half maximum. ``crop`` is a piece of
-    the first image about the middle of the stripe, with its first row and column.
+    ``step_mm`` (F, L, 3) is the displacement of a point for one px, and ``mm_per_px`` (F, L) its component along the
+    outward normal of the surface. ``point_mm`` (F, L, 3) is the true point. ``used`` (F, L) marks surfaces that face
+    the laser. ``width_px`` is the median full width at half maximum. ``crop`` is a part of the first image about the
+    middle of the stripe, with its first row and column.
     """
 
     error_px: dict[str, np.ndarray]
@@ -106,8 +106,8 @@ class Frames:
 class Spread:
     """Bias (median), standard deviation and its standard error from frame to frame; px, and mm along the normal.
 
-    ``robust`` is the standard deviation from the median absolute deviation; ``found`` is the share of lines found,
-    ``far_off`` that of centres more than `FAR_OFF_PX` from the truth.
+    ``robust`` is the standard deviation from the median absolute deviation. ``found`` is the fraction of lines found,
+    and ``far_off`` the fraction of centres more than `FAR_OFF_PX` from the truth.
     """
 
     bias_px: float
@@ -138,7 +138,7 @@ class Spread:
 @cache
 def measure(case: Case) -> Frames:
     """Render the case's frames, find the stripe in them, and compare with the truth."""
-    # Mitsuba looks for its variant when it is imported.
+    # Mitsuba needs its variant when it is imported.
     from twin.recording.frame_truth import find_true_stripe
     from twin.recording.sensor_simulator import SensorSimulator
 
@@ -188,7 +188,7 @@ def _vertex(image: np.ndarray) -> np.ndarray:
 
 
 def step_per_px(case: Case, z_mm: np.ndarray) -> np.ndarray:
-    """How a point at Z (F, L) of the sheet moves, (F, L, 3) mm, when its centre moves by one px on its line."""
+    """Return the displacements (F, L, 3) in mm of points at Z (F, L) in the sheet for one px on their line."""
     row_of_z, y_of_z = _scale(case.medium)
     per_row = 1 / polynomial.polyval(z_mm, polynomial.polyder(row_of_z)[:, None], tensor=False)
     along = polynomial.polyval(z_mm, polynomial.polyder(y_of_z)[:, None], tensor=False)

@@ -1,8 +1,8 @@
-"""How real stripes and generated ones differ: width, height, speckle, haze and background, in a table and a picture.
+"""Compare real and generated stripes by width, height, speckle, haze and background, in a table and a picture.
 
     python docs/studies/stripe_domain.py --generated runs/clean runs/turbid runs/shiny --real etna=height bust=height
 
-Real images are folders of files with the direction in which their stripe runs. Without --out the table is printed only.
+Real images are given as FOLDER=DIRECTION, with the direction of their stripe. Without --out, only the table is printed.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ FIGURES = {
     "noise": "scatter of the background, % of full scale",
 }
 _SMOOTH = 41
-"""Lines over which the height of a surface hardly changes."""
+"""Lines over which the height of a surface is nearly constant."""
 _FULL = 255.0
 _FEWEST = 100
-"""Lines with a stripe from which an image counts."""
+"""Fewest lines with a stripe for an image to be used."""
 
 
 def figures_of(image: np.ndarray, along: str) -> dict[str, np.ndarray] | None:
-    """Figures of the lines of an image (H, W) uint8, by their names; None where it hardly shows a stripe."""
+    """Return figures of the lines of an image (H, W) uint8 by name; None if fewer than `_FEWEST` show a stripe."""
     stripe = extract_stripe(image, stripe_along=along, options=StripeOptions(end_lines=0))
     lines = stripe.lines
     if len(lines) < _FEWEST:

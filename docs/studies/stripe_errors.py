@@ -1,4 +1,4 @@
-"""The stripe centre's error by each effect, against truth: numbers, tables and plots of stripe-errors.md.
+"""Errors of the stripe centre by each effect, compared with the truth: numbers, tables and plots of stripe-errors.md.
 
     python docs/studies/stripe_errors.py
 
@@ -44,13 +44,13 @@ def methods_table(plan: Plan) -> str:
 
 
 def _spread(frames: Frames, method: str, thing: str) -> float:
-    """Standard deviation in mm; of spheres the robust one, as a few points at their limbs are far off."""
+    """Return the standard deviation in mm; for spheres the robust one, because of outliers at their limbs."""
     spread = frames.spread(method)
     return spread.std_mm if thing == "plane" else spread.robust_mm
 
 
 def unknown_table(plan: Plan) -> str:
-    """Spread in mm with what the thesis does not say changed."""
+    """Return a table of the spread in mm by changes of parameters unknown from the thesis."""
     cases, rows = plan.unknown(), []
     head = [f"plane, {NAME_CORE}: std mm", *PLACES["plane"], *(f"stand-off, {name}" for name in (MASS, FILTERED))]
     for name in dict.fromkeys(name for name, _ in cases):

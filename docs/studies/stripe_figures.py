@@ -1,4 +1,4 @@
-"""The plots of the study of the stripe's errors, from cases that are measured already."""
+"""Plots of the study of stripe errors, from measured cases."""
 
 import math
 from collections.abc import Sequence
@@ -41,18 +41,18 @@ def line_contrast(f_number: float) -> float:
 
 
 def predicted_std_px(f_number: float, width_px: float, *, mass: bool = False) -> float:
-    """Speckle's error of a Gaussian line of a full width at half maximum, by propagation, pixels being independent.
+    """Return the standard deviation by speckle of the centre of a Gaussian profile, px, with independent pixels.
 
-    With the line f of standard deviation s and the contrast C the variance of the matched filter's centre is
-    C^2 int x^2 f^4 / (int x^2 f^2 / s^2)^2 = C^2 s / sqrt(2 pi), that of the centre of mass
-    C^2 int x^2 f^2 / (int f)^2 = C^2 s / (4 sqrt(pi)).
+    Let f be the profile with standard deviation s, and C the contrast. The variance of the matched filter's centre is
+    `C^2 int x^2 f^4 / (int x^2 f^2 / s^2)^2 = C^2 s / sqrt(2 pi)`. The variance of the centre of mass is
+    `C^2 int x^2 f^2 / (int f)^2 = C^2 s / (4 sqrt(pi))`.
     """
     sigma = width_px / FWHM_PER_SIGMA
     return line_contrast(f_number) * math.sqrt(sigma / (4 * math.sqrt(math.pi) if mass else math.sqrt(2 * math.pi)))
 
 
 def distances_mm(z_mm: tuple[float, ...]) -> list[float]:
-    """Distance outside the camera's window of places of the sheet's middle line."""
+    """Return the distances of points on the sheet's middle line from the outside of the camera's window."""
     sensor = load_sensor("thesis")
     standoff = check_design(sensor, sensor.media["water"]).standoff_mm
     return [standoff + z * camera_from_object(sensor)[2, 2] for z in z_mm]
@@ -166,14 +166,14 @@ def _exposure(plan: Plan, path: Path) -> None:
 
 
 def _strips(plan: Plan, path: Path) -> None:
-    """The same piece of the stripe under effects, enlarged, with the true centres (line) and those found (dots)."""
+    """Plot an enlarged part of the stripe with several effects, with true centres (line) and found ones (dots)."""
     cases = plan.pictures()
     waters, names = (list(dict.fromkeys(key[axis] for key in cases)) for axis in (0, 1))
     figure, panels = new_figure(2.2 * len(names), 2.3 * len(waters), rows=len(waters), columns=len(names))
     for axes, (water, name) in zip(panels, product(waters, names), strict=True):
         frames = measure(cases[water, name])
         first_row, first = frames.crop_at
-        # The square root lifts the dark, as displays do.
+        # The square root brightens dark pixels, like the gamma of displays.
         axes.imshow(np.sqrt(frames.crop), cmap="gray", vmin=0.0, vmax=np.sqrt(255.0), interpolation="nearest")
         truth, error = (v[0, first : first + CROP_PX] for v in (frames.truth_px, frames.error_px[CROSSING]))
         axes.plot(truth - first_row, color=TRUE, linewidth=1)

@@ -1,4 +1,4 @@
-"""Methods of finding the stripe's centre and the circles' centres compared: tables of stripe-methods.md.
+"""Comparison of methods for the centres of stripe and circles: tables of stripe-methods.md.
 
     python docs/studies/stripe_methods.py [--frames 4]
 
@@ -71,7 +71,7 @@ def _mean_error(s: Spread, place: Place, frames: int) -> str:
 
 
 def sweep_table(frames: int) -> str:
-    """Bias and standard deviation in px where one thing differs."""
+    """Return bias and standard deviation in px with one changed parameter."""
     rows = []
     for name, place in sweeps().items():
         cells = [name]
@@ -115,7 +115,7 @@ def limits_table(frames: int) -> str:
 
 
 def lateral_table(frames: int) -> str:
-    """Standard deviations of single lines and of means of five neighbouring ones, px, and what edges lose."""
+    """Return standard deviations of single lines and of means of five neighbours, px, and the lines lost at edges."""
     rows = []
     for name in (FIT, FIT_FIVE, MASS, FILTERED):
         cells = [name]

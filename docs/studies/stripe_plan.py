@@ -1,4 +1,4 @@
-"""Which cases the study of the stripe's errors renders, and the thesis's values that they are set beside."""
+"""Cases of the study of stripe errors, and values of the thesis for comparison."""
 
 from stripe_cases import Case
 
@@ -32,7 +32,7 @@ THESIS_STD = {
 
 
 def exactly(*names: str) -> Effects:
-    """Nothing but some effects."""
+    """Return only the named effects."""
     return ALL.remove(*(name for name in ALL.names() if name not in names))
 
 
@@ -47,7 +47,7 @@ ROWS = {
 
 
 class Plan:
-    """The cases of the study, each with so many frames; fewer where random walks make them slow."""
+    """Cases of the study and their number of frames, which is smaller for cases with slow random walks."""
 
     def __init__(self, frames: int):
         self.frames = frames
@@ -57,7 +57,7 @@ class Plan:
         return Case(**{"effects": effects, "frames": max(2, self.frames // 2) if walks else self.frames} | changes)
 
     def effects(self, thing: str) -> dict[tuple[str, str], Case]:
-        """By row and place; of the spheres not everything but one."""
+        """Return cases by row and place; spheres have no rows with one effect left out."""
         rows = {name: effects for name, effects in ROWS.items() if thing == "plane" or not name.startswith("all but")}
         return {
             (name, place): self.case(effects, thing=thing, z_mm=z)
@@ -80,7 +80,7 @@ class Plan:
         }
 
     def turbidity(self) -> dict[tuple[str, float], Case]:
-        """Few frames and samples, for random walks take long in turbid water."""
+        """Return cases with few frames and samples, because random walks take long in turbid water."""
         rows = {
             "scattered once": exactly("haze"),
             "scattered once or more often": ROWS["only scatter"],
@@ -112,10 +112,10 @@ class Plan:
         }
 
     def unknown(self) -> dict[tuple[str, str], Case]:
-        """What the thesis does not say, changed one at a time; by change and place."""
+        """Return cases that each change one parameter unknown from the thesis, by change and place."""
         sensor = load_sensor("thesis")
         window, focus = sensor.camera.window, sensor.camera.focus_distance_mm
-        # Near the axis a flat layer of index n looks n times thinner.
+        # Near the axis, the apparent thickness of a flat layer is its thickness divided by its index.
         in_water = (focus - window.distance_mm - window.thickness_mm) / sensor.media["water"].refractive_index(635.0)
         sharp = window.distance_mm + window.thickness_mm / window.glass + in_water
         changes = {

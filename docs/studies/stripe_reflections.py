@@ -1,10 +1,10 @@
 """Wrong and lost points on scenes with mirrors and inside corners: the brightest peak, and the direct stripe.
 
 ``python docs/studies/stripe_reflections.py`` prints the tables of docs/results/reflections.md and draws their
-picture. A point is wrong that lies more than 3 px from every place where the laser lights a surface: where the sheet's
-middle meets one, and where the light that comes straight from surfaces has a stripe, which lies elsewhere if an edge
-cuts the sheet. A profile line on which the sheet's middle lights a surface is lost without a right point. The numbers
-of the rule were chosen on the named scenes as a small camera sees them, and on no others.
+picture. A point is correct within 3 px of a true position, otherwise wrong. True positions are the intersections of the
+sheet's middle with surfaces, and the stripes of direct light, which differ if an edge cuts the sheet. A profile line is
+lost if the sheet's middle lights a surface there and no point is correct. The parameters of the rule were chosen only
+on the named scenes, with a small camera.
 """
 
 import math
@@ -47,7 +47,7 @@ def block(size: tuple[float, float, float], at: tuple[float, float, float], **mo
 
 
 def corner(side: str, *, high: float = 40.0, **finish: Any) -> list[Thing]:
-    """A floor and a wall on it: beside the stripe's middle (y, -y), or along it and in view of the camera (x)."""
+    """Return a floor with a wall: beside the stripe's middle (y, -y), or along it and in view of the camera (x)."""
     z = -0.5 * high + 10.0
     wall = {
         "y": ((100, 40, high), (0, 50, z)),
@@ -126,7 +126,7 @@ OTHERS_DRAWN = tuple(range(5000, 5015))
 
 
 def drawn(seed: int) -> tuple[str, Scene]:
-    """A random scene and its name: things on a mirror, or an inside corner of shining faces, in some water."""
+    """Return name and random scene: objects on a mirror, or an inside corner of shiny faces, in a random water."""
     rng = np.random.default_rng(seed)
 
     def between(low: float, high: float) -> float:
@@ -162,7 +162,7 @@ def drawn(seed: int) -> tuple[str, Scene]:
 def other(
     baseline_mm: float, angle_deg: float, *, along: str = "width", focal_mm: float = 6.25, **detector: Any
 ) -> Sensor:
-    """The small sensor with another baseline and angle, focused where camera and laser cross."""
+    """Return the small sensor with another baseline and angle, focused at the crossing of camera and laser axes."""
     sensor, angle = load_sensor("thesis-small"), math.radians(angle_deg)
     camera = {"focus_distance_mm": baseline_mm / math.tan(angle), "stripe_along": along, "focal_length_mm": focal_mm}
     laser = {"baseline_mm": baseline_mm, "triangulation_angle_deg": angle_deg}
@@ -217,15 +217,15 @@ OTHERS = {
         ),
     ),
 }
-"""Other sensors, and what they see."""
+"""Other sensors and their scenes."""
 
 
 @dataclass(frozen=True)
 class Rendered:
     """Images (F, H, W) of a scene, as `find_stripes` takes them, and the sensor.
 
-    ``lit`` (N, 3) are image, line and place of where the sheet's middle lights a surface, ``direct`` (M, 3) those of
-    the stripes of light straight from surfaces.
+    ``lit`` (N, 3) contains image, line and position of the points lit by the sheet's middle. ``direct`` (M, 3) contains
+    those of the stripes of direct light.
     """
 
     images: np.ndarray
@@ -235,7 +235,7 @@ class Rendered:
 
     @property
     def capture(self) -> Any:
-        """What `find_stripes` needs of a capture."""
+        """Return an object with the attributes of a capture that `find_stripes` needs."""
         count = len(self.images)
         about = {"header": SimpleNamespace(sensor=self.sensor, saturation_dn=255), "path": Path("rendered.h5")}
         about |= {
@@ -272,13 +272,13 @@ def rendered(of: Scene, sensor: Sensor, options: Options = Options()) -> Rendere
 
 
 def rendered_small(of: Scene, sensor: Sensor, seed: int) -> Rendered:
-    """Three images of a scene, by fewer samples: small cameras need no more."""
+    """Render three images of a scene with fewer samples, which suffice for small cameras."""
     motion = of.motion.model_copy(update={"start_mm": -STEP_MM, "count": 3})
     return rendered(of.model_copy(update={"motion": motion}), sensor, Options(spp=8, seed=seed))
 
 
 def direct_light(of: Scene, sensor: Sensor, options: Options) -> np.ndarray:
-    """Image, line and place (M, 3) of the stripes of the light that comes straight from surfaces, without mirrors."""
+    """Return image, line and position (M, 3) of the stripes of direct light from surfaces, without mirrors."""
     from twin.recording.sensor_simulator import SensorSimulator
 
     studio = SensorSimulator(sensor, of, replace(options, effects=ALL.remove(*LONGER_WAYS)))
@@ -291,7 +291,7 @@ def direct_light(of: Scene, sensor: Sensor, options: Options) -> np.ndarray:
 
 
 def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, int]:
-    """Percent of the points that are wrong, percent of the lit lines without a right one, and the number of points."""
+    """Return the percentage of wrong points, that of lit lines without a correct point, and the number of points."""
     stripes, wrong, right = find_stripes(of.capture, options=options), 0, 0
     lines, places = np.unique(of.lit[:, :2], axis=0), np.concatenate([of.lit, of.direct])
     for number in range(len(of.images)):
@@ -305,7 +305,7 @@ def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, 
 
 
 def groups() -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]:
-    """The images of all tables, rendered when they are asked for."""
+    """Yield the images of all tables, rendered on demand."""
     small, full = load_sensor("thesis-small"), load_sensor("thesis")
     yield "named, small camera: chosen on", ((name, rendered_small(of, small, 0)) for name, of in NAMED.items())
     yield (
@@ -337,7 +337,7 @@ def rows() -> Iterator[str]:
 
 
 def draw(of: Rendered) -> None:
-    """Picture of the corner: image, all candidates, and what both rules take."""
+    """Draw the corner: image, all candidates, and the stripes selected by both rules."""
     import matplotlib.pyplot as plt
 
     number = FRAMES // 2

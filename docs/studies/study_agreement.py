@@ -1,4 +1,4 @@
-"""Formulas against rendering for quite different designs: prints the table of docs/results/designs.md.
+"""Comparison of formulas and rendering for very different designs: prints the table of docs/results/designs.md.
 
 Run from the project's folder: ``python docs/studies/study_agreement.py`` (about half a minute per design on two cores).
 """

@@ -1,13 +1,13 @@
 """Mesh of a rendered plate of 2 mm thickness, scanned from both sides, and Open3D's Poisson reconstruction of it.
 
-    python docs/studies/thin_wall.py runs/inspection                # the plate, its scenes and their campaign
+    python docs/studies/thin_wall.py runs/inspection                # plate, scenes and campaign
     twin record runs/inspection/plate.toml --out runs/inspection/plate
     python docs/studies/thin_wall.py runs/inspection docs/pictures  # after docs/studies/inspection.py's calibration
-    python docs/studies/poisson_mesh.py runs/inspection             # where Open3D is installed
+    python docs/studies/poisson_mesh.py runs/inspection             # in an environment with Open3D
     python docs/studies/thin_wall.py runs/inspection docs/pictures  # again, with its mesh
 
-A round plate with a hole stands square to the laser; turned by 180 deg about the scan's direction it shows its back.
-The turn is known, as of a rotary table.
+A round plate with a hole stands square to the laser. A known rotation by 180 deg about the scan's direction, as by a
+rotary table, shows its back.
 """
 
 from dataclasses import replace
@@ -29,7 +29,7 @@ THICKNESS_MM, OUTER_MM, HOLE_MM = 2.0, 24.0, 6.0
 """Thickness and radii."""
 SIDES = {"front": 0.0, "back": 180.0}
 _EDGE_MM = 0.5
-"""Vertices so near to an edge are not judged by the faces: the camera's blur ends there."""
+"""Vertices within this distance of an edge are not compared with the faces, because of the camera's blur."""
 
 
 def plate_mesh() -> trimesh.Trimesh:
@@ -81,7 +81,7 @@ def side_cloud(folder: Path, side: str) -> uwlts.PointCloud:
 
 
 def row(name: str, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> list[str]:
-    """A row of the table: errors of both faces, their distance, and what lies in the hole or beyond the points."""
+    """Return a row of the table: errors of the faces, thickness, coverage, area over the hole, vertices far away."""
     radius, z = np.hypot(vertices[:, 0], vertices[:, 1]), vertices[:, 2]
     on = (radius > HOLE_MM + _EDGE_MM) & (radius < OUTER_MM - _EDGE_MM)
     errors, shares = [], []
@@ -126,7 +126,7 @@ def draw(path: Path, meshes: dict[str, trimesh.Trimesh], points: np.ndarray) -> 
 
 
 def main(folder: Path, pictures: Path | None = None) -> None:
-    """Write the scenes; or, with a folder for pictures, judge what was rendered."""
+    """Write the scenes; with a folder for pictures, evaluate the rendered scans instead."""
     if pictures is None:
         write_scenes(folder)
     else:

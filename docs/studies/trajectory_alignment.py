@@ -3,12 +3,12 @@
     python -m docs.studies.trajectory_alignment --seeds 0 1 2
     python -m docs.studies.trajectory_alignment --seeds 0 1 2 --navigation
 
-The vehicle and the sea bed are those of `tests/uwlts/path_views.py`, with 0.3 m and 1 deg of drift of which only the
-size is given; ``--walk`` adds a random walk, a multiple of the drift, ``--loop`` takes 4 m with one crossing. With
-``--navigation`` vehicle, sea and navigation are those of `scenes/vehicle-pass.toml`, and the navigation states its
-covariance. ``--crossings-given`` closes the crossings at their true places instead of searching for them, with fewer
-nodes: a tenth of the time. First it prints for kinds of drift by which factor three exact crossings lower the path
-error (`bounds`).
+The vehicle and the sea bed are those of `tests/uwlts/path_views.py`, with a drift of 0.3 m and 1 deg. Only the size of
+the drift is given to the alignment. ``--walk`` adds a random walk, a multiple of the drift; ``--loop`` uses 4 m with
+one crossing. With ``--navigation``, vehicle, sea and navigation are those of `scenes/vehicle-pass.toml`, and the
+navigation states its covariance. ``--crossings-given`` closes the crossings at their true poses instead of searching
+for them, with fewer nodes: a tenth of the time. First it prints the factors (`bounds`) that three exact crossings can
+reduce the path error by, for several kinds of drift.
 """
 
 import argparse
@@ -42,16 +42,18 @@ PASS_MM = np.array(
 """Crosses itself at (700, 0), (2000, 0) and (2000, 1600)."""
 SWATH_MM, LENGTH_MM = 140.0, 19_400.0
 INSIDE_MM, PAIRS = 60.0, 20_000
-"""Points so near to the middle of a crossing belong to it; lengths that are drawn there."""
+"""Largest distance of the points of a crossing from its middle, and number of lengths drawn there."""
 NEAR = 200
-"""Images about a crossing, half a metre, which one pass takes."""
+"""Images of one pass at a crossing, half a metre."""
 BESIDE = 6
-"""Pieces within which pairs are of one crossing."""
+"""Largest difference in pieces between pairs of the same crossing."""
 LOOP_DRIFT = {"drift_mm": 60.0, "drift_deg": 0.3}
 CROSSINGS = (0.057, 0.500), (0.124, 0.608), (0.351, 0.691)
-"""Of the pass, as parts of its length."""
+"""Crossings of the pass, as fractions of its length."""
 GRID, DRIFTS, EXACT = np.linspace(0.01, 1, 100), 200, 1e-7
-"""Places on the path, as parts of its length, drifts that are drawn, and the variance of what is seen: 0.1 mm of 0.3 m.
+"""Positions on the path as fractions of its length, number of drawn drifts, and variance of exact crossings.
+
+The variance corresponds to 0.1 mm for a drift of 0.3 m.
 """
 KINDS = {
     "steady rate": {"rate": 1.0},
@@ -62,7 +64,7 @@ KINDS = {
     "random walk": {"walk": 1.0},
 }
 RIDE = {"rate": (1.2**3 - 0.7**3) / 1.5, "wave": 0.2}
-"""Of `ride`: a rate of 0.7 to 1.2 times the drift, and a wave of a fifth of it."""
+"""Drift of `ride`: a rate of 0.7 to 1.2 times the drift, and a wave of a fifth of it."""
 
 
 def main() -> None:
@@ -90,7 +92,7 @@ def main() -> None:
 
 
 def vehicle_ride(seed: int) -> tuple[PointCloud, uwlts.Trajectory, uwlts.Trajectory, np.ndarray]:
-    """Cloud by the reported path, the reported path, the true one, and the sensor's true poses (F, 4, 4)."""
+    """Return the cloud along the reported path, the reported and true paths, and the true sensor poses (F, 4, 4)."""
     scene = tomllib.loads((Path(__file__).parents[2] / "scenes/vehicle-pass.toml").read_text())
     described = scene["motion"] | {"errors_seed": seed, "true_mount": scene["motion"]["mount"]}
     vehicle = Vehicle.model_validate(described)
@@ -111,9 +113,9 @@ def vehicle_ride(seed: int) -> tuple[PointCloud, uwlts.Trajectory, uwlts.Traject
 def errors(
     cloud: PointCloud, reported: uwlts.Trajectory, true: uwlts.Trajectory, sensor: np.ndarray, drift: dict[str, float]
 ) -> str:
-    """Errors of the path and of lengths between the passes of each crossing, before and after, in words.
+    """Return, as text, errors of the path and of lengths between the passes of each crossing, before and after.
 
-    Those of the path are less that of its first position, which no surface determines.
+    The error of the first position, which no surface determines, is subtracted from those of the path.
     """
     try:
         found = uwlts.align_trajectory(cloud, reported, **drift)
@@ -148,9 +150,9 @@ def errors(
 def given_crossings(
     cloud: PointCloud, reported: uwlts.Trajectory, true: uwlts.Trajectory, sensor: np.ndarray, drift: dict[str, float]
 ) -> str:
-    """Errors of the path, in words, with each crossing closed at its true place instead of searched for.
+    """Return, as text, errors of the path with each crossing closed at its true pose, without a search.
 
-    Fewer nodes than usual take a tenth of the time; they follow no random walk within a crossing.
+    Fewer nodes than usual take a tenth of the time. They cannot follow a random walk within a crossing.
     """
     assert cloud.time_s is not None
     options = AlignmentOptions(intervals=50, most_nodes=120)
@@ -186,7 +188,7 @@ def given_crossings(
 
 
 def _true_pairs(places: list[np.ndarray]) -> list[tuple[int, int]]:
-    """The pair of pieces that overlaps most at each crossing, in the order of time."""
+    """Return the pair of pieces with the largest overlap at each crossing, in order of time."""
     trees = [KDTree(each) for each in places]
     overlaps = {
         (first, second): sum(map(bool, trees[first].query_ball_point(places[second], SWATH_MM / 20)))
@@ -202,12 +204,13 @@ def _true_pairs(places: list[np.ndarray]) -> list[tuple[int, int]]:
 
 
 def bounds(*, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave: float = 0.0) -> str:
-    """Times by which three exact crossings lower the rms error of a path, in words: the drift is a Gaussian process.
+    """Return, as text, the factors that three exact crossings can reduce the rms error of a path by.
 
-    The parts of its variance at the end are those of a steady rate, of a rate that walks at random, and of a random
-    walk; ``wave`` is the amplitude of that of `ride`. Given is the displacement within each crossing, or that at two
-    places, which determines the rates there, too. A linear Gaussian estimate by the true covariance has the least error
-    of all. `align_trajectory` knows the size of the drift alone: it takes its own model with the likeliest walk.
+    The drift is a Gaussian process. Its variance at the end is the sum of ``rate`` (steady rate), ``wandering`` (rate
+    with a random walk) and ``walk`` (random walk). ``wave`` is the amplitude of the wave of `ride`. The known
+    displacement is that within each crossing, or at two positions of it, which also determines the rates. The linear
+    Gaussian estimate with the true covariance has the smallest possible error. `align_trajectory` knows only the size
+    of the drift: it uses its own model with the most likely walk.
     """
     found = []
     for apart in (0.0, SWATH_MM / LENGTH_MM):
@@ -242,7 +245,7 @@ def bounds(*, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave
 
 
 def _estimated(covariance: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gain (G, Q) and standard deviations (G,) of an estimate on the grid, and covariance (Q, Q) of what is seen."""
+    """Return gain (G, Q) and standard deviations (G,) of an estimate on the grid, and observation covariance (Q, Q)."""
     of_seen = seen @ covariance @ seen.T + EXACT * np.eye(len(seen))
     shared = covariance[: len(GRID)] @ seen.T
     gain = np.linalg.solve(of_seen, shared.T).T
@@ -251,7 +254,7 @@ def _estimated(covariance: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _twice_log_likelihood(values: np.ndarray, covariance: np.ndarray) -> float:
-    """Of columns (Q, K), less a constant."""
+    """Return twice the log likelihood of columns (Q, K), without a constant."""
     root = np.linalg.cholesky(covariance)
     return float(-np.sum(np.linalg.solve(root, values) ** 2) - 2 * values.shape[1] * np.sum(np.log(np.diag(root))))
 
@@ -282,7 +285,7 @@ def _crossings(places: np.ndarray) -> list[tuple[int, int]]:
 def _length_error(
     points: np.ndarray, truth: np.ndarray, frame: np.ndarray, places: np.ndarray, crossing: tuple[int, int]
 ) -> float:
-    """Error (rms) of lengths from points of one pass of a crossing to points of the other, mm."""
+    """Return the rms error of lengths between points of both passes of a crossing, mm."""
     near = np.linalg.norm(truth[:, :2] - places[list(crossing)].mean(axis=0), axis=1) < INSIDE_MM
     rng = np.random.default_rng(0)
     ends = [rng.choice(np.flatnonzero(near & (np.abs(frame - number) < NEAR)), PAIRS) for number in crossing]

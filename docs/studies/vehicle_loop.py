@@ -2,7 +2,7 @@
 
     python docs/studies/vehicle_loop.py FOLDER
 
-The sensor is as drawn, and images are 2.5 mm apart.
+The sensor matches its drawings. The distance between images is 2.5 mm.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from uwlts.storage.pose_files import trajectory_path
 
 SPEED_MM_S, RADIUS_MM, SEED = 150.0, 150.0, 4
 BIAS_MM_S, GYRO_DEG_S = 4.0, 0.03
-"""Of the navigation: some 45 mm and 0.35 deg after the 12 s of the loop."""
+"""Errors of the navigation: about 45 mm and 0.35 deg after the 12 s of the loop."""
 
 SCENE = """
 title = "Loop over the sea floor"
@@ -58,7 +58,7 @@ reflectance = 0.3
 
 
 def loop() -> str:
-    """Waypoints to the right, round three quarters of a circle, and down across the way there at (100, 0)."""
+    """Return waypoints to the right, round three quarters of a circle, and down across the first leg at (100, 0)."""
     straight = [(x, 0.0, 0.0) for x in (-250.0, -100.0, 100.0, 250.0)]
     turns = np.arange(30.0, 271.0, 30.0)
     angle = np.radians(turns)

@@ -1,13 +1,14 @@
 """Pass of a vehicle over 20 m with three crossings, rendered: errors of its path and of lengths, before and after.
 
-Five sensors with imperfections, each with its joint calibration and a mount by 15 poses of a sphere on a robot, take
-two passes each with other errors of the navigation:
+Five sensors with imperfections take two passes each, with different errors of the navigation. Each sensor has a joint
+calibration and a mount calibration from 15 poses of a sphere on a robot:
 
     for k in 1 2 3 4 5; do python docs/studies/moving_recordings.py FOLDER robot-sphere vehicle-pass \\
         --sensor thesis-small --sensors $k --seeds $((2 * k - 2)) $((2 * k - 1)); done
     python docs/studies/vehicle_pass.py FOLDER
 
-The offset of the clocks is given. Figures of each pass are kept beside its capture. ``--again`` calculates them anew.
+The offset of the clocks is given. The figures of each pass are stored beside its capture. ``--again`` recalculates
+them.
 """
 
 import argparse
@@ -28,18 +29,18 @@ from uwlts.storage.pose_files import trajectory_path
 from uwlts.storage.truth import Truth
 
 INSIDE_MM = 70.0
-"""Points so near to the middle of a crossing belong to it: the swath is 185 mm wide."""
+"""Largest distance of the points of a crossing from its middle: the swath is 185 mm wide."""
 PAIRS = 20_000
-"""Lengths that are drawn in each crossing."""
+"""Number of lengths drawn in each crossing."""
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Errors of one pass, mm, before and after: of the path (rms), of it up to the last crossing, of lengths (rms).
+    """Rms errors of one pass, mm, before and after: of the path, the path up to the last crossing, and lengths.
 
-    ``own_mm`` are those of the path (rms) less that of its first position, of which no surface tells. ``stated_mm`` are
-    the root of the mean variance of the path after, whole and up to the last crossing. ``within`` is the share of
-    coordinates whose error, less the first one, is within twice the stated uncertainty.
+    ``own_mm`` are errors of the path (rms) relative to its first position, which no surface determines. ``stated_mm``
+    are root-mean variances of the corrected path, whole and up to the last crossing. ``within`` is the fraction of
+    coordinates with an error, relative to the first position, within twice the stated uncertainty.
     """
 
     path_mm: tuple[float, float]
@@ -54,7 +55,7 @@ class Figures:
 
 
 def aligned_pass(path: Path) -> Figures:
-    """Calibrate the mount, reconstruct and align one pass; what is off by the truth."""
+    """Calibrate the mount, reconstruct and align one pass; return its errors from the truth."""
     motion, truth = truth_of(path)
     assert isinstance(motion, Vehicle) and truth.pose is not None
     robot = captured(path.parent / path.name.replace("vehicle-pass", "robot-sphere"))
@@ -103,7 +104,7 @@ def aligned_pass(path: Path) -> Figures:
     covariance = found.trajectory.covariance_at(times + offset)
     assert covariance is not None
     variance = np.einsum("nii->n", covariance[:, :3, :3])
-    # The alignment takes the start as exact.
+    # The alignment assumes an exact start.
     stated = np.sqrt(np.einsum("nii->ni", covariance[:, :3, :3]))
     return figures(
         after,
@@ -119,7 +120,7 @@ def crossings_of(places: np.ndarray) -> list[tuple[int, int]]:
     found = []
     start, step = places[:-1], np.diff(places, axis=0)
     for k in range(2, len(step)):
-        # Where segment k meets an earlier one: start + a step = start_k + b step_k.
+        # Intersections of segment k with earlier ones: start + a step = start_k + b step_k.
         apart, area = start[k] - start[: k - 1], _area(step[: k - 1], step[k])
         with np.errstate(divide="ignore", invalid="ignore"):
             a, b = _area(apart, step[k]) / area, _area(apart, step[: k - 1]) / area
@@ -128,12 +129,12 @@ def crossings_of(places: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _area(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Signed area between vectors (N, 2) and another (2,) or as many."""
+    """Return the signed areas between vectors (N, 2) and one vector (2,) or N vectors."""
     return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
 
 
 def length_error(cloud: PointCloud, truth: Truth, crossing: tuple[int, int]) -> float:
-    """Root mean square error of lengths from points of one pass of a crossing to points of the other, mm."""
+    """Return the rms error of lengths between points of both passes of a crossing, mm."""
     assert cloud.frame is not None and cloud.line is not None and truth.pose is not None
     middle = truth.pose[list(crossing), :2, 3].mean(axis=0)
     place = truth.point_mm[cloud.frame, cloud.line]

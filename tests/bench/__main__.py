@@ -1,7 +1,7 @@
-"""Measures speed and memory against the project's limits: ``python -m tests.bench``; writes ``runs/bench.json``.
+"""Compare speed and memory with the project's limits: ``python -m tests.bench``; writes ``runs/bench.json``.
 
-Names of sections after it measure only these. Medians after a warm-up, so without compilation. Limits are for two
-cores.
+With names of sections as arguments, only these are measured. Times are medians after a warm-up, without compilation.
+Limits are for two cores.
 """
 
 import json
@@ -19,8 +19,8 @@ from pathlib import Path
 
 from cyclopts import App
 
-# As the commands do (`uwlts.runtime.console.run`), before NumPy is imported: what is measured on one core must not wait
-# for a thread of the matrix library on another one, which took half of the time where that had other work.
+# As in the commands (`uwlts.runtime.console.run`), before NumPy is imported: measurements on one core must not wait for
+# a matrix library's thread on another, busy core, which took half of the time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2
@@ -36,7 +36,7 @@ CORES = 2
 
 @dataclass(frozen=True)
 class Row:
-    """One measured value and its limit; ``ok`` tells whether it is kept."""
+    """Measured value and its limit; ``ok`` is True if the value is within the limit."""
 
     name: str
     value: float
@@ -46,17 +46,17 @@ class Row:
 
 
 def at_most(name: str, value: float, unit: str, limit: float) -> Row:
-    """A row whose value must not exceed the limit."""
+    """Return a row with a value that must not exceed the limit."""
     return Row(name, round(float(value), 4), unit, limit, bool(value <= limit))
 
 
 def at_least(name: str, value: float, unit: str, limit: float) -> Row:
-    """A row whose value must reach the limit."""
+    """Return a row with a value that must reach the limit."""
     return Row(name, round(float(value), 4), unit, limit, bool(value >= limit))
 
 
 def median_seconds(action: Callable[[int], object], *, warm_up: int = 3, runs: int = 15) -> float:
-    """Median duration of ``action(k)`` after a warm-up."""
+    """Return the median duration of ``action(k)`` after a warm-up."""
     seconds = []
     for k in range(warm_up + runs):
         start = time.perf_counter()
@@ -103,7 +103,7 @@ def rendering() -> list[Row]:
 def light() -> list[Row]:
     """Time and noise of frames with all effects at the default samples, and the advantage over stock Mitsuba.
 
-    The limits of time were set for the noise that 64 samples had then.
+    The time limits were set for the noise of 64 samples in an earlier version.
     """
     from tests.bench import light as bench_light
 
@@ -124,7 +124,7 @@ def light() -> list[Row]:
 
 
 def campaign() -> list[Row]:
-    """A campaign of the thesis: recording it, calibrating jointly from it and measuring with that on one core."""
+    """Record a campaign of the thesis, calibrate jointly from it, and measure with the calibration on one core."""
     from tests.bench.calibration import joint_calibration, measuring_rate
     from tests.bench.light import campaign as recorded
 
@@ -229,9 +229,9 @@ def studies() -> list[Row]:
 
 
 def datasets() -> list[Row]:
-    """Frames of a data set per second, single scattering, 640 x 512 pixels, from the light to the labelled files.
+    """Measure frames per second of a data set: single scattering, 640 x 512 pixels, from light to labelled files.
 
-    Two workers share memory and caches, for which a tenth is allowed.
+    Two workers share memory and caches, so their limit is a tenth below twice the rate of one.
     """
     from tests.bench.dataset import rate_hz
 
@@ -275,7 +275,7 @@ def demo() -> list[Row]:
 
 
 def commands() -> list[Row]:
-    """Time until a command answers and the package is there."""
+    """Time until a command answers and the package is imported."""
 
     def seconds(*arguments: str) -> float:
         return median_seconds(lambda k: subprocess.run([sys.executable, *arguments], check=True, capture_output=True))

@@ -18,11 +18,11 @@ from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 
 AS_OFTEN = 8
-"""So many times a scan's images are measured along a trajectory: some hundred, as moving sensors take."""
+"""Repetitions of a scan's images along a trajectory: about a hundred images, as in scans by moving sensors."""
 
 
 class _InMemory:
-    """A capture whose images were read beforehand, or as if taken again so many times, an image a second."""
+    """Capture with all images in memory, optionally repeated several times, one image per second."""
 
     def __init__(self, capture: Capture, times: int = 1):
         self.capture = capture
@@ -43,7 +43,7 @@ class _InMemory:
 
 
 def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibration, float, float]:
-    """The calibration, the seconds to find targets and stripes in all images, and those of the estimate."""
+    """Return the calibration, the seconds to find targets and stripes in all images, and those of the estimate."""
     options = CalibrationOptions()
     with ExitStack() as stack:
         opened = [[stack.enter_context(Capture(path)) for path in paths] for paths in (targets, steps)]
@@ -55,10 +55,10 @@ def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibrati
 
 
 def measuring_rate(scans: list[Path], calibration: Calibration) -> tuple[float, float]:
-    """Frames per second from images in memory to points with their covariance, of scans that follow a first one.
+    """Return frames per second from images in memory to points with covariance, for scans after a first one.
 
-    The median over scans that are measured in turn: with the stage's positions, and of `AS_OFTEN` as many images along
-    a trajectory of known covariance with a mount.
+    The two values are medians over the scans: with the stage's positions, and with `AS_OFTEN` times as many images
+    along a trajectory of known covariance with a mount.
     """
     mount = known_mount(np.eye(4), time_offset_s=0.0, time_offset_std_s=1e-4)
     with ExitStack() as stack:
@@ -83,7 +83,7 @@ def measuring_rate(scans: list[Path], calibration: Calibration) -> tuple[float, 
 
 
 def _trajectory(times_s: np.ndarray) -> Trajectory:
-    """Poses along X, 2 mm/s, a third as many as images, of a navigation that drifts by 0.3 m and 1 deg."""
+    """Return poses along X at 2 mm/s, one for three images, of a navigation with a drift of 0.3 m and 1 deg."""
     at = np.linspace(times_s[0], times_s[-1], len(times_s) // 3)
     poses = np.tile(np.eye(4), (len(at), 1, 1))
     poses[:, 0, 3] = 2.0 * at

@@ -1,4 +1,4 @@
-"""How often stated 95 % intervals hold the truth: ``python -m tests.bench.coverage [campaigns] [--varied]``.
+"""Coverage of the stated 95 % intervals: ``python -m tests.bench.coverage [campaigns] [--varied]``.
 
 Campaigns are simulated by Fermat's principle (`tests.uwlts.simulated_campaign`), calibrated jointly, and a sphere
 standard is scanned and measured with each calibration. With ``--varied``, campaigns in water use other sensors than the
@@ -56,12 +56,12 @@ NORMAL_95 = 1.96
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
 SPACING, DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
 KNOWN_BETTER = {"drift_k": 0.05, "stage_alignment_deg": 0.005}
-"""A scan in the same water, on an aligned stage: what is left is mostly the calibration's own uncertainty."""
+"""A scan in the same water, on an aligned stage, so that the calibration's own uncertainty dominates."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One figure of one scan: its error, what is stated of it by noise and by the calibration, mm."""
+    """Figure of a scan: its error, and its stated uncertainties by noise and by the calibration, mm."""
 
     scan: str
     place: str
@@ -78,7 +78,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Variation:
-    """Another kind of campaign: changes of the sensor's description, ``spread`` and ``errors`` of `drawn_reality`."""
+    """Variation of a campaign: changes of the sensor's description, ``spread`` and ``errors`` of `drawn_reality`."""
 
     name: str = "as described"
     changes: dict[str, Any] = field(default_factory=dict)
@@ -88,7 +88,7 @@ class Variation:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A seed, and whether the target is seen in water as well as in air."""
+    """Campaign by its seed; the target is seen in air, and optionally also in water."""
 
     seed: int
     wet: bool
@@ -116,15 +116,14 @@ VARIATIONS = (
     Variation("stripe on the target 0.1 px off by gloss", errors=ModelErrors(gloss_px=0.1)),
     Variation("the same, stated", {"uncertainty": {"target_stripe_px": 0.1}}, errors=ModelErrors(gloss_px=0.1)),
 )
-"""Sizes of model errors: distortion that moves the image's corner by 0.1 to 1 px; boards and gloss as they are met."""
+"""Sizes of model errors: distortion that moves the image's corner by 0.1 to 1 px; boards and gloss of usual quality."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a campaign measured, and the seconds that its calibration and its figures' uncertainties took.
+    """Results of a campaign, and the seconds taken by its calibration and by the uncertainties of its figures.
 
-    ``pulls`` (K,) are the errors of the calibration's parameters, made independent and of variance one by its
-    covariance.
+    ``pulls`` (K,) are the errors of the calibration's parameters, whitened with its covariance.
     """
 
     measured: list[Measured]
@@ -157,7 +156,7 @@ def run_campaign(campaign: Campaign, send: Any = None) -> Outcome:
 
 
 def parameter_pulls(calibration: Calibration, real: Reality, described: Sensor) -> np.ndarray:
-    """Errors of the parameters whose truth is a number of the reality's, whitened by their stated covariance (K,)."""
+    """Return errors (K,) of the parameters with a known true value, whitened by their stated covariance."""
     camera = real.sensor.camera
     window, (column, row) = camera.window, camera.principal_point()
     slope_x, slope_y = (window.normal()[:2] / window.normal()[2]).tolist()
@@ -195,7 +194,7 @@ def parameter_pulls(calibration: Calibration, real: Reality, described: Sensor) 
 def _scan(
     real: Reality, sensor: Sensor, calibration: Calibration, campaign: Campaign, how: str = ""
 ) -> tuple[list[Measured], float]:
-    """Figures of a scan whose stage and water differ as the sensor says, and the seconds for their uncertainties."""
+    """Return figures of a scan, with stage and water varied as stated, and the seconds for their uncertainties."""
     known, medium = sensor.uncertainty, "water" if campaign.wet else "air"
     place = list(PLACES_MM)[campaign.seed % len(PLACES_MM)]
     positions = np.arange(-18.0, 18.5, campaign.step_mm)
@@ -228,7 +227,7 @@ def _scan(
 
 
 def _empty_capture(folder: Path, sensor: Sensor, medium: str, positions: np.ndarray) -> Capture:
-    """A capture that tells sensor, medium and stage; what its images would show is given."""
+    """Return a capture with sensor, medium and stage, but without images; their contents are given elsewhere."""
     header = CaptureHeader(
         name="spheres",
         sensor=sensor,
@@ -245,7 +244,7 @@ def _empty_capture(folder: Path, sensor: Sensor, medium: str, positions: np.ndar
 
 
 def judged(outcomes: Sequence[Outcome]) -> dict[tuple[str, str], list[Measured]]:
-    """All that was measured, by scan and by quantity."""
+    """Return all measured figures by scan and quantity."""
     found: dict[tuple[str, str], list[Measured]] = {}
     for measured in (m for outcome in outcomes for m in outcome.measured):
         quantity = "spacing" if measured.figure == SPACING else "diameter"
@@ -254,12 +253,12 @@ def judged(outcomes: Sequence[Outcome]) -> dict[tuple[str, str], list[Measured]]
 
 
 def within(measured: Sequence[Measured]) -> float:
-    """Share of the errors that the stated 95 % interval holds."""
+    """Return the fraction of errors within the stated 95 % interval."""
     return float(np.mean([abs(m.error_mm) <= NORMAL_95 * m.std_mm for m in measured]))
 
 
 def attempt(campaign: Campaign, send: Any = None) -> Outcome | None:
-    """The outcome of a campaign; None where the calibration refuses its evidence as contradictory."""
+    """Return the outcome of a campaign; None if the calibration rejects its evidence as contradictory."""
     try:
         return run_campaign(campaign)
     except CalibrationError:
@@ -267,7 +266,7 @@ def attempt(campaign: Campaign, send: Any = None) -> Outcome | None:
 
 
 def varied_campaigns(count: int) -> int:
-    """Run so many campaigns of each variation and print, for each, how often the truth is where it is said to be."""
+    """Run ``count`` campaigns of each variation and print the coverage of their stated intervals."""
     table = Table(
         "campaigns in water",
         "refused",
@@ -304,7 +303,7 @@ def varied_campaigns(count: int) -> int:
 
 
 def main(campaigns: int = CAMPAIGNS, *, varied: Annotated[bool, Parameter(negative="")] = False) -> int:
-    """Run all campaigns and print how often the truth is where it is said to be."""
+    """Run all campaigns and print the coverage of the stated intervals."""
     if varied:
         return varied_campaigns(campaigns)
     jobs = [Campaign(seed, wet) for seed in range(campaigns) for wet in (True, False)]

@@ -19,7 +19,7 @@ def rate_hz(*, workers: int) -> float:
 
 
 def _made(folder: Path, scenes: int, workers: int) -> tuple[float, int]:
-    """Seconds that so many scenes take, and their frames."""
+    """Record ``scenes`` scenes; return the seconds taken and the number of frames."""
     start = time.perf_counter()
     twin.dataset("stripe-clean", out=folder, scenes=scenes, workers=workers)
     return time.perf_counter() - start, len(twin.load_dataset(folder))

@@ -1,8 +1,8 @@
-"""Figures of the renderer on a CUDA device: ``python -m tests.bench.gpu``; without one it says so and measures nothing.
+"""Speed of the renderer on a CUDA device: ``python -m tests.bench.gpu``; without a device, only prints a message.
 
-Frames of two spheres in clear and in coastal water, with all effects: the light's time for one frame after the other
-with parts of several sizes, and frames/s of one and of several processes that share the device. The statistical tests
-run there with ``TWIN_TEST_VARIANT=cuda_ad_mono make test-full``.
+Frames show two spheres in clear and in coastal water, with all effects. Measures the time to render single frames in
+parts of several sizes, and frames/s of one and of several processes that share the device. The statistical tests run on
+the device with ``TWIN_TEST_VARIANT=cuda_ad_mono make test-full``.
 """
 
 import statistics
@@ -24,7 +24,7 @@ PROCESSES = (1, 2, 4, 8)
 
 
 def frame_seconds(water: str, samples_at_once: int) -> float:
-    """Median seconds of the light of one frame, rendered in parts of at most so many samples."""
+    """Return the median seconds to render the light of one frame in parts of at most ``samples_at_once`` samples."""
     use_variant(GPU)
     from tests.bench.light import in_named_water
     from twin.light import renderer as module
@@ -42,14 +42,14 @@ def frame_seconds(water: str, samples_at_once: int) -> float:
 
 
 def frames_per_second(water: str, processes: int) -> float:
-    """Frames/s of several processes, from the first frame after each one's warm-up to the last frame of all."""
+    """Return frames/s of several processes, from the first frame after their warm-up to the last frame."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         spans = list(pool.map(_rendered, [water] * processes))
     return processes * FRAMES / (max(end for _, end in spans) - min(start for start, _ in spans))
 
 
 def _rendered(water: str) -> tuple[float, float]:
-    """Begin and end of `FRAMES` frames."""
+    """Return the start and end times of `FRAMES` frames."""
     use_variant(GPU)
     from tests.bench.light import in_named_water
     from twin.light.renderer import Renderer
@@ -67,7 +67,7 @@ def _rendered(water: str) -> tuple[float, float]:
 
 
 def main() -> int:
-    """Measure and print; exit code 0 without a device, too, as nothing was asked of it."""
+    """Measure and print the results; exit code 0, also without a device."""
     try:
         use_variant(GPU)
     except SetupError as error:

@@ -1,7 +1,7 @@
-"""How cost grows with frames, image size, samples, points and evidence images: ``python -m tests.bench.growth``.
+"""Growth of cost with frames, image size, samples, points and evidence images: ``python -m tests.bench.growth``.
 
-Processor time over two decades of each, the exponents fitted, drawn into ``docs/pictures/growth.svg``. Short ones
-are measured several times, of which the fastest counts.
+Measures processor time over two decades of each, fits the exponents, and draws ``docs/pictures/growth.svg``. For short
+runs, the fastest of several repetitions is used.
 """
 
 import tempfile
@@ -44,13 +44,13 @@ class Growth:
     seconds: list[float]
 
     def exponent(self, last: int = 0) -> float:
-        """Slope of the logarithms, of the ``last`` sizes alone if given."""
+        """Return the slope of the logarithms, optionally of the ``last`` sizes only."""
         chosen = slice(-last, None) if last else slice(None)
         return float(np.polyfit(np.log(self.sizes[chosen]), np.log(self.seconds[chosen]), 1)[0])
 
 
 def cost(action: Callable[[], object]) -> float:
-    """Least processor time in s of an action, run until it has taken long enough to be measured."""
+    """Return the least processor time in s of an action, repeated until the total time can be measured."""
     seconds: list[float] = []
     while len(seconds) < _MOST_RUNS and sum(seconds) < _AT_LEAST_S:
         began = time.process_time()

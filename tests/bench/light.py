@@ -1,4 +1,4 @@
-"""Speed of the rendered light: frames with everything on, stock Mitsuba at equal noise, and a whole campaign."""
+"""Rendering speed: frames with all effects, stock Mitsuba at equal noise, and a whole campaign."""
 
 import itertools
 import resource
@@ -24,11 +24,11 @@ SPP = Options().spp
 STOCK_SPP = 64
 SEEDS = 12
 STRIPE_SHARE = 0.05
-"""Pixels brighter than this share of the peak count as the stripe's."""
+"""Pixels brighter than this fraction of the peak belong to the stripe."""
 
 
 def stripe_noise(images: np.ndarray, truth: np.ndarray) -> float:
-    """Rms error of the stripe's pixels of runs (K, H, W) as a share of the stripe's peak, from the truth (H, W)."""
+    """Return the rms error of the stripe's pixels in runs (K, H, W) from the truth (H, W), divided by its peak."""
     stripe = truth > STRIPE_SHARE * truth.max()
     return float(np.sqrt(np.mean((images - truth)[:, stripe] ** 2)) / truth.max())
 
@@ -58,9 +58,9 @@ def in_named_water(water: str) -> Sensor:
 
 
 def rendered_light(water: str) -> tuple[float, float]:
-    """Median seconds to render the light of a frame of two spheres, and its noise as a share of the peak.
+    """Return the median seconds to render the light of a frame of two spheres, and its noise divided by the peak.
 
-    The truth is the mean of all frames, so the error is a little understated and then corrected for it.
+    The truth is the mean of all frames, which lowers the error slightly; the result is corrected for this.
     """
     sensor = in_named_water(water)
     renderer = Renderer(sensor, sensor.media["water"], load_scene("spheres"))
@@ -75,15 +75,15 @@ def rendered_light(water: str) -> tuple[float, float]:
 
 
 def equal_noise_advantage() -> tuple[float, str]:
-    """How many times longer stock `volpath` takes to the same noise on the same scene, and how that was found.
+    """Return the ratio of the times of stock `volpath` and the twin for equal noise on the same scene, and a summary.
 
-    The scene is one that stock can render: no windows, a fog with coastal water's coefficients, a plate, and a
-    projector that throws the sheet, 0.15 mm wide at the stand-off. Noise is the rms error of the stripe's pixels; what
-    stock would need is extrapolated by its own 1 / sqrt(N), and the twin is held against a mean of many more samples.
+    Stock Mitsuba can render the scene: no windows, a fog with coastal water's coefficients, a plate, and a projector
+    of the sheet, 0.15 mm wide at the stand-off. Noise is the rms error of the stripe's pixels. The time of stock
+    Mitsuba is extrapolated with 1 / sqrt(N). The twin is compared with a mean of many more samples.
     """
     bare = {"window": {"mounted": False}}
     sensor = altered(load_sensor("thesis"), {"camera": bare, "laser": bare})
-    # A projector's light opens from a point: as wide at the stand-off as the sheet, whose waist is there.
+    # A projector's light starts from a point. At the stand-off, it is as wide as the sheet at its waist.
     sigma = 0.5 * sensor.laser.waist_radius_mm / sensor.laser.waist_distance_mm
     waist = 1e-6 * sensor.laser.wavelength_nm / (2 * np.pi * sigma)
     thrown = altered(sensor, {"laser": {"waist_radius_mm": waist, "beam_quality_m2": 1.0}})
@@ -119,7 +119,7 @@ def equal_noise_advantage() -> tuple[float, str]:
 
 
 def stripe_spread(images: np.ndarray, truth: np.ndarray) -> float:
-    """Rms scatter of the stripe's pixels among runs (K, H, W), as a share of the stripe's peak."""
+    """Return the rms scatter of the stripe's pixels between runs (K, H, W), divided by the stripe's peak."""
     stripe = truth > STRIPE_SHARE * truth.max()
     return float(np.sqrt(images.var(axis=0, ddof=1)[stripe].mean()) / truth.max())
 
@@ -147,7 +147,7 @@ def campaign(folder: Path) -> tuple[int, float, float, float]:
         )
     seconds = time.perf_counter() - start
     steps = np.diff(moments)
-    # The spheres in water are the last half of the campaign; both thirds hold near, stand-off and far.
+    # The spheres in water are the last half of the campaign; both thirds contain near, stand-off and far.
     late, early = (np.median(part) for part in (steps[-38:], steps[-6 * 38 : -5 * 38]))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return len(moments), seconds, peak, float(late / early)

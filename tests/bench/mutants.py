@@ -1,10 +1,10 @@
-"""Mutation testing, the share of small faults that the tests find: ``python -m tests.bench.mutants [package ...]``.
+"""Mutation testing, the fraction of small faults that tests detect: ``python -m tests.bench.mutants [package ...]``.
 
-From each package mutants are drawn at random by Cosmic Ray's operators: another arithmetic operator, comparison, sign,
-number, truth value, a loop that is left out. Annotations are not changed. Each is tried in a copy of the checkout on
-the tests that run the changed line, shortest first, then on the others of their files; slow ones are left out, but with
-``--again FILE``, which tries the survivors of earlier results on all. A mutant that no test notices survives; whether
-it changes a result at all is for the reader to judge. Needs ``pip install -e '.[mutants]'``.
+Mutants of each package are drawn at random with Cosmic Ray's operators: another arithmetic operator, comparison, sign,
+number or truth value, or a loop left out. Annotations are not changed. Each mutant is tested in a copy of the checkout:
+first with the tests that run the changed line, shortest first, then with the other tests of their files. Slow tests
+are left out. ``--again FILE`` runs all tests on the survivors of earlier results. A mutant survives if no test fails;
+the reader decides if it changes a result at all. Needs ``pip install -e '.[mutants]'``.
 """
 
 import argparse
@@ -37,7 +37,7 @@ TESTS = {
     "twin/sensor": ["tests/twin/sensor", "tests/twin/light"],
 }
 """Packages, and folders of the tests that run them."""
-# These change no result, or end every test at once, as bitwise operators between floating-point numbers do.
+# These change no result, or make every test fail, such as bitwise operators between floating-point numbers.
 _LEFT_OUT = {"NoOp", "RemoveDecorator", "ExceptionReplacer", "VariableReplacer", "VariableInserter"}
 _BITWISE = {"BitAnd", "BitOr", "BitXor", "LShift", "RShift"}
 _LONGEST_S = 240.0  # of the tests for one mutant
@@ -64,7 +64,7 @@ class Mutant:
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a mutant: ``killed``, ``survived`` or ``not run`` by any test; the line before and after."""
+    """Fate of a mutant: ``killed``, ``survived`` or ``not run`` by any test; the line before and after the change."""
 
     mutant: Mutant
     outcome: str
@@ -83,7 +83,7 @@ def annotated_lines(source: str) -> set[tuple[int, int]]:
 
 
 def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
-    """So many mutants of a package, from any place in it at most one."""
+    """Draw ``number`` mutants of a package, at most one from each place."""
     from cosmic_ray.ast import ast_nodes, get_ast
     from cosmic_ray.plugins import get_operator, operator_names
 
@@ -108,7 +108,7 @@ def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
 
 
 def copied(folder: Path) -> Path:
-    """The checkout's files, as they are now, without what Git ignores."""
+    """Copy the current files of the checkout, without those ignored by Git."""
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -125,7 +125,7 @@ def copied(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Tests:
-    """What tests ran: ``of_line``, those that ran a line of a file; ``seconds`` each took."""
+    """Tests by the lines and files that they run, and their durations in ``seconds``."""
 
     of_line: dict[tuple[str, int], set[str]]
     of_file: dict[str, set[str]]
@@ -157,14 +157,14 @@ class Tests:
             for line, contexts in data.contexts_by_lineno(path).items():
                 for context in filter(None, contexts):
                     test, phase = context.rsplit("|", 1)
-                    # What a fixture runs may serve any test of the file.
+                    # A fixture may be used by any test of the file.
                     tests = {test} if phase == "run" else {t for t in seconds if t.startswith(test.split("::")[0])}
                     of_line.setdefault((file, line), set()).update(tests)
                     of_file.setdefault(file, set()).update(tests)
         return cls(of_line, of_file, seconds)
 
     def chosen(self, mutant: Mutant, lines: Sequence[int]) -> Iterator[str]:
-        """Tests for a mutant: of its statement's lines, or of its file where no test but the import runs them."""
+        """Yield tests for a mutant: of its statement's lines, or of its file if only the import runs them."""
         first: set[str] = set().union(*(self.of_line.get((mutant.file, line), set()) for line in lines))
         first = first or self.of_file.get(mutant.file, set())
         files = {test.split("::")[0] for test in first}
@@ -179,7 +179,7 @@ class Tests:
 
 
 def statement_lines(source: str, line: int) -> range:
-    """Lines of the smallest statement that holds a line, without the body of what it heads."""
+    """Return the lines of the smallest statement that contains a line, without the body of a compound statement."""
     best = range(line, line + 1)
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or line):
@@ -237,7 +237,7 @@ def of_package(package: str, mutants: list[Mutant], *, slow: bool, workers: int,
 
 
 def read(path: Path) -> list[Result]:
-    """Results as `main` keeps them."""
+    """Read results stored by `main`."""
     return [Result(**each | {"mutant": Mutant(**each["mutant"])}) for each in json.loads(path.read_text())]
 
 

@@ -1,4 +1,4 @@
-"""From a camera to the disk: a thousand full frames at 60 per second, none lost, and followed live meanwhile."""
+"""Recording from a camera to disk: a thousand full frames at 60 per second without losses, and followed live."""
 
 import itertools
 import multiprocessing
@@ -31,12 +31,12 @@ SERVED = 300
 
 @dataclass(frozen=True)
 class Recorded:
-    """Frames per second that reached the disk, by a straight line through their moments, and how many were lost.
+    """Frames per second written to disk, by a straight line through their times, and the number of lost frames.
 
-    From the first to the last alone, a first frame that is stored 10 ms late would raise 60 frames per second by 0.1.
+    With the first and the last frame only, a first frame stored 10 ms late would raise 60 frames per second by 0.1.
 
-    ``followed`` of them were read from the growing file, their stripe found and turned into points, by a second
-    process, at ``followed_hz`` from the first to the last; it was done ``behind_s`` after the recording.
+    A second process read ``followed`` frames from the growing file and reconstructed them, at ``followed_hz`` from the
+    first to the last. It finished ``behind_s`` after the recording.
     """
 
     rate_hz: float
@@ -47,9 +47,9 @@ class Recorded:
 
 
 def recording(*, live: bool = False) -> Recorded:
-    """A camera that gives 60 frames per second: it repeats a capture of frames with a stripe and noise.
+    """Record from a camera with 60 frames per second, which repeats a capture of frames with a stripe and noise.
 
-    What nobody fetches in time is lost, as with a real one.
+    Frames that are not fetched in time are lost, as with a real camera.
     """
     sensor = load_sensor("thesis")
     with tempfile.TemporaryDirectory() as folder:
@@ -64,9 +64,9 @@ def recording(*, live: bool = False) -> Recorded:
 
 
 def gige_recording() -> Recorded:
-    """A GigE Vision camera on the loopback interface, its images sent at the speed of a 1 Gbit/s cable.
+    """Record from a GigE Vision camera on the loopback interface that sends images at the speed of a 1 Gbit/s cable.
 
-    It exposes at its frame rate, and images wait in its memory for the cable, as in a real one.
+    It exposes at its frame rate, and images wait in its memory for the cable, as in a real camera.
     """
     sensor = load_sensor("thesis")
     images = itertools.cycle(_images(sensor))
@@ -150,7 +150,7 @@ def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multipr
 
 
 def following_rate() -> float:
-    """Frames per second that a follower shows, with stripe and points, where nothing has to be read."""
+    """Return frames per second that a follower shows, with stripe and points, without reading of files."""
     sensor = load_sensor("thesis")
     view = RecordingView(Board("bench"), _header(sensor), nominal_calibration(sensor, sensor.medium("air")))
     frames = [Frame(image, float(k), True, 1.0, float(k)) for k, image in enumerate(_images(sensor))]

@@ -1,4 +1,4 @@
-"""Speed of design studies: designs judged by formulas, what the engine costs, and one design verified by rendering."""
+"""Speed of design studies: evaluation by formulas, cost of the engine, and verification of a design by rendering."""
 
 import os
 import subprocess
@@ -26,17 +26,17 @@ if __name__ == "__main__":
 
 
 def timed(batch: Batch) -> tuple[float, bytes]:
-    """Seconds of a processor that judging a batch takes, and the part."""
+    """Return the processor time in s to evaluate a batch, and the part."""
     start = time.process_time()
     content = evaluate_batch(batch)
     return time.process_time() - start, content
 
 
 def screening() -> tuple[float, float]:
-    """Designs per second of the thesis's baseline and angle, by two workers, and the engine's share of their time.
+    """Return designs per second (thesis's baseline and angle, two workers) and the engine's fraction of the time.
 
-    The engine is all that is not judging: handing out work, taking results back, writing the parts. Starting the
-    workers is left out.
+    The engine is everything except the evaluation of designs: distributing work, collecting results and writing the
+    parts. The start of the workers is left out.
     """
     study = load_study("baseline-angle")
     sampling = {"kind": "sobol", "designs": BATCHES * BATCH, "batch": BATCH}
@@ -54,7 +54,7 @@ def screening() -> tuple[float, float]:
 
 
 def verification() -> float:
-    """Seconds to verify the thesis's sensor by rendering, with the start of Python."""
+    """Return the seconds to verify the thesis's sensor by rendering, including the start of Python."""
     with tempfile.TemporaryDirectory() as folder:
         # A file, since the processes that render begin by reading it.
         script = Path(folder) / "alone.py"

@@ -1,7 +1,7 @@
-"""Runs readers on many changed files: ``python -m tests.fuzz --cases 20000 capture``; all readers unless named.
+"""Run readers on many mutated files: ``python -m tests.fuzz --cases 20000 capture``; by default, all readers.
 
-A file that a reader neither reads nor refuses as it should is kept in ``tests/fuzz/corpus`` as READER--NUMBER and its
-ending, where the tests find it. The exit code is 1 if there was one.
+A file that a reader neither reads nor rejects properly is stored in ``tests/fuzz/corpus`` as READER--NUMBER with its
+suffix. The tests run all files of this folder. The exit code is 1 if there was such a file.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Changes of valid files: of single bytes, and of what the files of a form hold."""
+"""Mutations of valid files: of single bytes, and of the contents of each format."""
 
 import contextlib
 import json
@@ -74,7 +74,7 @@ ODD_NUMBERS = (np.nan, np.inf, -1.0, 1e305, 1e-320, 0.0, 1e18)
 
 
 def changed(content: bytes, form: str, rng: Random, folder: Path) -> bytes:
-    """The content with some change; ``folder`` is for what is changed in place."""
+    """Return the content with a random change; ``folder`` is for files that are changed in place."""
     if rng.random() < 0.4:
         return _bytes(content, rng)
     forms = {"json": _json, "toml": _toml, "lines": _words, "image": _image, "bytes": _bytes}
@@ -109,7 +109,7 @@ _HOLE = "\ue000"
 
 
 def _json(content: bytes, rng: Random) -> bytes:
-    """One value or more replaced, taken away or said twice."""
+    """Replace, remove or repeat one or more values."""
     table, odd = json.loads(content), []
     for _ in range(rng.choice((1, 1, 1, 3))):
         place, key = table, None
@@ -135,7 +135,7 @@ def _json(content: bytes, rng: Random) -> bytes:
 
 
 def _toml(content: bytes, rng: Random) -> bytes:
-    """The value of one key or more replaced, or a line taken away, said twice or put elsewhere."""
+    """Replace the values of one or more keys, or remove, repeat or move a line."""
     lines = content.decode().splitlines()
     for _ in range(rng.choice((1, 1, 2, 4))):
         place = rng.randrange(len(lines))
@@ -148,7 +148,7 @@ def _toml(content: bytes, rng: Random) -> bytes:
 
 
 def _words(content: bytes, rng: Random) -> bytes:
-    """A word or more of the text replaced; of binary PLY only of its header."""
+    """Replace one or more words of the text; in binary PLY, only words of the header."""
     head, end, tail = content.partition(b"end_header\n") if content.startswith(b"ply") else (content, b"", b"")
     if b"ascii" in head:
         head, end, tail = content, b"", b""
@@ -160,12 +160,12 @@ def _words(content: bytes, rng: Random) -> bytes:
 
 
 def _between(head: bytes, words: list[bytes]) -> bytes:
-    """What parts the words of a text."""
+    """Return the separator between the words of a text."""
     return next(mark for mark in (b" ", b",", b"\n") if head.count(mark) == len(words) - 1 or mark == b"\n")
 
 
 def _image(content: bytes, rng: Random) -> bytes:
-    """Sizes in the header changed; a PNG's checksum is made to fit."""
+    """Change sizes in the header; the checksum of a PNG is updated."""
     data = bytearray(content)
     if data.startswith(b"\x89PNG"):
         size = [rng.choice((0, 1, 16, 20000, 2**31 - 1, rng.randrange(2**32))) for _ in range(2)]
@@ -180,7 +180,7 @@ def _image(content: bytes, rng: Random) -> bytes:
 
 
 def _hdf5(content: bytes, rng: Random, path: Path) -> bytes:
-    """Values, shapes, types, links or the label changed by the library itself."""
+    """Change values, shapes, types, links or the label with the HDF5 library."""
     path.write_bytes(content)
     odd = AttributeError, OSError, RuntimeError, ValueError, TypeError, KeyError, ArithmeticError
     with contextlib.suppress(*odd), h5py.File(path, "r+") as file:
@@ -201,7 +201,7 @@ def _hdf5(content: bytes, rng: Random, path: Path) -> bytes:
 
 
 def _replaced(file: h5py.File, name: str, values: np.ndarray, rng: Random) -> None:
-    """Another thing in place of a dataset."""
+    """Replace a dataset by another object."""
     del file[name]
     huge = (rng.choice((10**6, 10**9, 2**40)), *values.shape[1:])
     match rng.randrange(9):

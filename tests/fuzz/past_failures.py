@@ -1,4 +1,4 @@
-"""Inputs that once made a reader fail, hang, or take gigabytes, each built anew."""
+"""Inputs that once made a reader fail, hang or use gigabytes, each built by a function."""
 
 import json
 import os
@@ -15,7 +15,7 @@ Build = Callable[[Path], None]
 
 
 def _with_dataset(change: Callable[[h5py.File], None], reader: str) -> Build:
-    """The reader's valid file, changed by HDF5 itself."""
+    """Return a function that changes the reader's valid file with the HDF5 library."""
 
     def build(path: Path) -> None:
         path.write_bytes(seed_of(READERS[reader], path.parent))
@@ -80,7 +80,7 @@ def _edited(reader: str, edit: Callable[[dict], None]) -> Build:
 
 
 def _png(width: int, height: int) -> Build:
-    """A header with a checksum that fits, and no pixels."""
+    """Return a function for a PNG header with a valid checksum, without pixels."""
 
     def build(path: Path) -> None:
         pieces = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)), (b"IDAT", b"x"), (b"IEND", b"")]
@@ -184,7 +184,7 @@ PAST: dict[str, tuple[str, Build]] = {
         for each in ("sensor", "image-png", "joint", "table", "mesh")
     },
 }
-"""The reader and how its input is made, by what it is. All of them are to be refused."""
+"""Description of an input: its reader and the function that builds it. All inputs must be rejected."""
 
 
 def _bad_checksum(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Everything that reads files from outside, each with a small valid file made by the program itself."""
+"""All readers of external files, each with a small valid file made by the program itself."""
 
 import json
 import tempfile
@@ -52,7 +52,7 @@ from uwlts.thesis.results import CampaignResults, LineProfile, Measurement, Spac
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader, the ending of its files, how a valid one is made, and the form by which it is changed."""
+    """Reader, suffix of its files, function that makes a valid file, and format for mutations."""
 
     name: str
     suffix: str
@@ -62,7 +62,7 @@ class Reader:
 
 
 def seed_of(reader: Reader, folder: Path) -> bytes:
-    """Content of the reader's valid file."""
+    """Return the content of the reader's valid file."""
     path = folder / f"seed{reader.suffix}"
     if not path.exists():
         reader.make(path)
@@ -87,7 +87,7 @@ def _nominal(path: Path) -> None:
 
 
 def _certified(path: Path) -> Path:
-    """The joint calibration that belongs to a certificate, beside it."""
+    """Write the joint calibration of a certificate beside it."""
     beside = path.with_name("certified.json")
     if not beside.exists():
         _joint(beside)
@@ -149,7 +149,7 @@ def _sensor_with(path: Path) -> None:
 
 
 def _exported(path: Path) -> None:
-    """Read a cloud and write it in the formats of others."""
+    """Read a cloud and export it to other formats."""
     cloud = read_cloud(path)
     for suffix in (".xyz", ".laz", ".e57"):
         write_cloud(path.with_name(f"exported{suffix}"), cloud, overwrite=True)

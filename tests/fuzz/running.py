@@ -1,7 +1,7 @@
-"""Readers run on changed files in a process of their own, whose time, memory and exceptions are watched.
+"""Run readers on mutated files in a separate process, and monitor its time, memory and exceptions.
 
-A case is a reader's name and a number: the same number makes the same file. Accepted is a file that is read, or refused
-by one of the project's errors, within `MOST_S` and `MOST_MIB`.
+A case is a reader's name and a number: the same number makes the same file. A case passes if the file is read, or
+rejected by one of the project's errors, within `MOST_S` and `MOST_MIB`.
 """
 
 import json
@@ -22,14 +22,14 @@ from random import Random
 
 MOST_S, MOST_MIB = 5.0, 200.0
 _SPACE = 2**30
-"""Bytes of addresses beyond those that the libraries take: far more than may be used, and less than the machine has."""
+"""Address space in bytes beyond that of the libraries: far above the limit, and below the memory of the machine."""
 _READY = b"ready\n"
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One case: its reader, its number or path, what went wrong or "", the error that refused it, and what it took."""
+    """Result of a case: reader, number or path, failure or "", the error that rejected it, and time and memory used."""
 
     reader: str
     case: str
@@ -40,10 +40,10 @@ class Outcome:
 
 
 def watched(folder: Path, work: Iterable[tuple[str, str]], *, seed: int = 0) -> list[Outcome]:
-    """Outcomes of cases: pairs of a reader's name and a case's number, or the path of a file.
+    """Run cases, pairs of a reader's name and a case's number or the path of a file, and return their outcomes.
 
-    A file on which a reader crashes or hangs ends the process; the next one goes on behind it. ``folder`` keeps the
-    last file of each.
+    If a reader crashes or hangs, the process ends, and a new one continues with the next case. ``folder`` contains the
+    last file of each reader.
     """
     waiting, outcomes = list(work), []
     while waiting:
@@ -58,7 +58,7 @@ def watched(folder: Path, work: Iterable[tuple[str, str]], *, seed: int = 0) -> 
 
 
 def _by_child(folder: Path, waiting: list[tuple[str, str]], seed: int) -> Iterator[Outcome]:
-    """Outcomes up to the end or to the first case that ends the process."""
+    """Yield outcomes until all cases are done or a case ends the process."""
     command = [sys.executable, "-m", "tests.fuzz.running", str(folder), str(seed)]
     known = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "BLOSC_NTHREADS"), "1")
     environment = os.environ | known | {"PYTHONPATH": str(ROOT)}
@@ -89,19 +89,19 @@ def _by_child(folder: Path, waiting: list[tuple[str, str]], seed: int) -> Iterat
 
 
 def kept_file(folder: Path, reader: str, case: str) -> Path:
-    """Where the file of a case stays that went wrong."""
+    """Return the path of the stored file of a failed case."""
     return folder / f"{reader}--{case}"
 
 
 def _keep(folder: Path, reader: str, case: str) -> None:
-    """Put the file of a numbered case aside."""
+    """Store the file of a numbered case."""
     found = next((folder / reader).glob("case.*"), None)
     if case.isdecimal() and found is not None:
         shutil.copyfile(found, kept_file(folder, reader, case))
 
 
 def _peak_mib() -> tuple[float, float]:
-    """Memory in use now and at its peak since the peak was last forgotten, MiB."""
+    """Return the memory in use and its peak since the last reset, MiB."""
     known = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
     now, peak = (int(known[name].split()[0]) / 1024 for name in ("VmRSS", "VmHWM"))
     return now, peak
@@ -130,7 +130,7 @@ def _child(folder: Path, seed: int) -> None:
     answers.flush()
     used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (used + _SPACE, used + _SPACE))
-    # The processor's time: other work on the machine is no fault of a reader.
+    # Processor time, so that other programs on the machine do not count.
     signal.signal(signal.SIGPROF, _too_slow)
     for name, case in work:
         reader, path = READERS[name], Path(case)

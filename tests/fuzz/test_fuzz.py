@@ -1,4 +1,4 @@
-"""Input that cannot hurt: readers refuse what is wrong by the project's errors, in limited time and memory."""
+"""Robust readers: wrong files are rejected by the project's errors, in limited time and memory."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ def test_past_failures_are_refused(tmp_path: Path):
         files[words] = reader, str(path)
     outcomes = dict(zip(files, watched(tmp_path, files.values()), strict=True))
     assert {words: each.fault for words, each in outcomes.items() if each.fault} == {}
-    # A certificate that is not as issued is not refused, but reported as such.
+    # An altered certificate is reported, not rejected.
     assert [words for words, each in outcomes.items() if not each.refusal] == []
     assert max(each.seconds for each in outcomes.values()) < MOST_S
     assert max(each.mib for each in outcomes.values()) < MOST_MIB
@@ -57,7 +57,7 @@ def outcomes_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
 def test_changed_files_are_read_or_refused(outcomes_of: dict[str, list[Outcome]], reader: str):
     outcomes = outcomes_of[reader]
     assert [each for each in outcomes if each.fault] == []
-    # The changes reach something: not all files are still read.
+    # The mutations have an effect: not all files are still read.
     assert len(outcomes) == CASES and sum(bool(each.refusal) for each in outcomes) > 0.1 * CASES
 
 

@@ -1,1 +1,1 @@
-"""Independent references in float64, NumPy only: they import neither the twin nor the sensor's software."""
+"""Independent reference implementations in float64 with NumPy; they do not import the twin or the sensor software."""

@@ -1,7 +1,7 @@
-"""A laser fan behind an untilted flat window, in closed form: where its rays run and what power they carry.
+"""Laser fan behind an untilted flat window, in closed form: paths and power of its rays.
 
-The fan's origin is the origin, x runs across the sheet, y along the fan and z along the laser's axis, all in mm. Every
-fan ray stays in x = 0 because the window's normal lies in that plane.
+The fan starts at the origin; x runs across the sheet, y along the fan and z along the laser's axis, all in mm. Every
+ray stays in x = 0 because this plane contains the window's normal.
 """
 
 import math
@@ -14,7 +14,7 @@ from tests.oracles.optics import fresnel_transmittance
 
 @dataclass(frozen=True, kw_only=True)
 class Fan:
-    """A fan that spreads its power evenly over its angle. Extinction and absorption in 1/mm, lengths mm, angles rad."""
+    """Fan with uniform power over its angle. Extinction and absorption are in 1/mm, lengths in mm, angles in rad."""
 
     power_w: float
     full_angle: float
@@ -61,14 +61,14 @@ class Fan:
         return (z - self.outer_face) * np.hypot(1, self.slopes(angle)[2])
 
     def transmittance(self, angle: np.ndarray) -> np.ndarray:
-        """Share of the power that leaves the window: both faces, and the glass between them."""
+        """Return the fraction of the power that leaves the window, after both faces and the glass."""
         cosines = [1 / np.hypot(1, slope) for slope in self.slopes(angle)]
         first = fresnel_transmittance(cosines[0], n1=1.0, n2=self.glass_index)
         second = fresnel_transmittance(cosines[1], n1=self.glass_index, n2=self.medium_index)
         return first * second * np.exp(-self.glass_absorption * self.window_thickness / cosines[1])
 
     def power_per_angle(self, angle: np.ndarray) -> np.ndarray:
-        """Power in W per rad of the fan behind the window; none beyond its edges."""
+        """Return the power in W per rad of the fan behind the window; zero beyond its edges."""
         inside = np.abs(angle) <= self.full_angle / 2
         return np.where(inside, self.power_w / self.full_angle * self.transmittance(angle), 0.0)
 

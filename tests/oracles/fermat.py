@@ -1,7 +1,7 @@
-"""Rays through flat faces by Fermat's principle: of all paths, light takes the one of least optical length.
+"""Rays through flat faces by Fermat's principle: light takes the path of least optical length.
 
-No law of refraction is used. A path from A to B runs straight between faces; its optical length, the sum of
-``index * length``, is a convex function of where it crosses them, so Newton's method finds the only minimum.
+No law of refraction is used. A path from A to B is straight between faces. Its optical length, the sum of
+``index * length``, is a convex function of the crossings, so Newton's method finds the only minimum.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ def plate(*, distance: float, thickness: float, normal: np.ndarray) -> list[Face
 
 
 def least_time_crossings(start: np.ndarray, ends: np.ndarray, faces: list[Face], indices: list[float]) -> np.ndarray:
-    """Where light from ``start`` (3,) to each of ``ends`` (N, 3) crosses the K faces: (N, K, 3).
+    """Return the crossings (N, K, 3) of K faces by light from ``start`` (3,) to each of ``ends`` (N, 3).
 
     ``indices`` are the K + 1 refractive indices along the path. The straight line is the first guess.
     """
@@ -53,7 +53,7 @@ def least_time_crossings(start: np.ndarray, ends: np.ndarray, faces: list[Face],
 
 
 def directions_seen(ends: np.ndarray, faces: list[Face], indices: list[float]) -> np.ndarray:
-    """Unit directions (N, 3) in which a pupil at the origin sees the points (N, 3)."""
+    """Return the unit directions (N, 3) at a pupil at the origin of light from the points (N, 3)."""
     first = least_time_crossings(np.zeros(3), ends, faces, indices)[:, 0]
     return first / np.linalg.norm(first, axis=1, keepdims=True)
 
@@ -61,10 +61,10 @@ def directions_seen(ends: np.ndarray, faces: list[Face], indices: list[float]) -
 def points_seen_on_plane(
     directions: np.ndarray, plane: Face, first_guess: np.ndarray, faces: list[Face], indices: list[float]
 ) -> np.ndarray:
-    """Points (N, 3) of a plane which a pupil at the origin sees in the given directions (N, 3).
+    """Return the points (N, 3) of a plane that a pupil at the origin sees in the given directions (N, 3).
 
-    Found by search: the point is moved in the plane until the path of least time leaves the pupil in the direction
-    wanted. ``first_guess`` (N, 3) are points of the plane beyond the last face.
+    A search moves each point in the plane until the path of least time leaves the pupil in the given direction.
+    ``first_guess`` (N, 3) are points of the plane beyond the last face.
     """
     basis, reach = plane.basis(), 1e-3
     across = _two_across(directions)
@@ -123,7 +123,7 @@ def _derivatives(
 def _useful_share(
     start: np.ndarray, ends: np.ndarray, crossings: np.ndarray, move: np.ndarray, indices: list[float]
 ) -> np.ndarray:
-    """Largest of 1, 1/2, 1/4 ... (N,) of the move that does not lengthen the path, rounding aside."""
+    """Return the largest of the factors 1, 1/2, 1/4 ... (N,) of the step that does not lengthen the path (rounded)."""
 
     def optical_length(share: np.ndarray) -> np.ndarray:
         return _legs(start, ends, crossings + share[:, None, None] * move)[1] @ np.asarray(indices)

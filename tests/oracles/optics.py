@@ -8,7 +8,7 @@ import numpy as np
 
 
 def fresnel_powers(cosine_in: np.ndarray, *, n1: float, n2: float) -> tuple[np.ndarray, np.ndarray]:
-    """Reflected and transmitted share of the power, both (..., 2) for s and p polarisation.
+    """Return reflected and transmitted fractions of the power, both (..., 2), for s and p polarisation.
 
     ``cosine_in`` is the cosine of the angle in medium 1. Under total reflection the field behind the interface decays
     (an imaginary cosine) and carries no power away.
@@ -16,8 +16,8 @@ def fresnel_powers(cosine_in: np.ndarray, *, n1: float, n2: float) -> tuple[np.n
     cosine_in = np.asarray(cosine_in, dtype=complex)
     cosine_out = np.sqrt(1 - (n1 / n2) ** 2 * (1 - cosine_in**2))
     one = np.ones_like(cosine_in)
-    # s: E lies across the plane of incidence; its continuity reads 1 + r = t, that of H: n1 c1 (1 - r) = n2 c2 t.
-    # p: H lies across it; in amplitudes of E, n1 (1 + r) = n2 t and c1 (1 - r) = c2 t.
+    # s: E is across the plane of incidence. Continuity of E: 1 + r = t; of H: n1 c1 (1 - r) = n2 c2 t.
+    # p: H is across it. In amplitudes of E: n1 (1 + r) = n2 t and c1 (1 - r) = c2 t.
     systems = {
         "s": ([[-one, one], [n1 * cosine_in, n2 * cosine_out]], [one, n1 * cosine_in]),
         "p": ([[-n1 * one, n2 * one], [cosine_in, cosine_out]], [n1 * one, cosine_in]),
@@ -33,5 +33,5 @@ def fresnel_powers(cosine_in: np.ndarray, *, n1: float, n2: float) -> tuple[np.n
 
 
 def fresnel_transmittance(cosine_in: np.ndarray, *, n1: float, n2: float) -> np.ndarray:
-    """Share of the power of unpolarised light that passes from medium 1 into medium 2, like ``cosine_in``."""
+    """Return the transmitted fraction of the power of unpolarised light from medium 1 into 2, like ``cosine_in``."""
     return fresnel_powers(cosine_in, n1=n1, n2=n2)[1].mean(axis=-1)

@@ -1,6 +1,6 @@
-"""Scans of pipes with pits and bumps of known place and depth, made with NumPy alone.
+"""Scans of pipes with pits and bumps of known position and depth, with NumPy only.
 
-The pipe is drawn about its own axis, then turned and moved as a whole: a drawing has the same findings along any axis.
+The pipe is generated about its own axis, then turned and moved as a whole, so findings do not depend on the axis.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ class Bump:
     height_mm: float
 
     def heights(self, along_mm: np.ndarray, angle: np.ndarray, radius_mm: float) -> np.ndarray:
-        """Heights (N,) over the plain pipe at places along and around."""
+        """Return heights (N,) above the plain pipe at positions along and around it."""
         around = radius_mm * (np.mod(angle - self.angle + np.pi, 2 * np.pi) - np.pi)
         away = np.hypot(along_mm - self.along_mm, around) / (0.5 * self.diameter_mm)
         return np.where(away < 1, 0.5 * self.height_mm * (1 + np.cos(np.pi * np.minimum(away, 1))), 0.0)
@@ -40,7 +40,7 @@ class ScannedPipe:
     radius_mm: float
 
     def own_places(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places along (mm) and angles around (rad) of points (M, 3)."""
+        """Return positions along (mm) and angles around (rad) the pipe of points (M, 3)."""
         own = (np.atleast_2d(points_mm) - self.shift_mm) @ self.turn
         return own[:, 2], np.arctan2(own[:, 1], own[:, 0])
 
@@ -52,7 +52,7 @@ class ScannedPipe:
 
 
 def turn_towards(axis: Sequence[float], roll: float) -> np.ndarray:
-    """A rotation (3, 3) that takes Z to an axis, after a turn about Z by ``roll``, rad."""
+    """Return a rotation (3, 3) that maps Z to an axis, after a rotation about Z by ``roll``, rad."""
     third = np.asarray(axis, float) / np.linalg.norm(axis)
     # Householder reflections of Z to the axis and of X to -X: both together are a rotation.
     across = third - [0.0, 0.0, 1.0]
@@ -79,16 +79,16 @@ def scan_pipe(
 ) -> ScannedPipe:
     """Scan a pipe along an axis, with a random roll and place.
 
-    ``arc`` is the part of the circumference that is seen, from angle 0, ``noise_mm`` the standard deviation along the
+    ``arc`` is the visible part of the circumference, from angle 0. ``noise_mm`` is the standard deviation along the
     normals, half of it in common with the next line. ``holes`` are discs (mm along, rad around, mm diameter) without
-    points, ``lost`` the share of points that are lost by chance.
+    points, and ``lost`` is the fraction of points that are lost at random.
     """
     count = max(8, round(arc * radius_mm / spacing_mm))
     angles = arc * (np.arange(count) + 0.5) / count
     places = np.arange(-0.5 * length_mm, 0.5 * length_mm, spacing_mm)
     along, angle = np.meshgrid(places, angles, indexing="ij")
     frame, line = np.indices(along.shape)
-    # Stripes are not laid out evenly: each has a phase of its own.
+    # Points are not aligned between stripes: each stripe has its own phase.
     angle = angle + (rng.uniform(-0.5, 0.5, len(places)) * spacing_mm / radius_mm)[:, None]
     drawn = rng.standard_normal((len(places), count + 1))
     noise = noise_mm * (drawn[:, 1:] + drawn[:, :-1]) / np.sqrt(2)

@@ -1,4 +1,4 @@
-"""Run the blocks of a documentation page in its order, with smaller descriptions of what the commands name."""
+"""Run the blocks of a documentation page in order, with smaller versions of the descriptions that commands name."""
 
 import glob
 import os
@@ -25,11 +25,11 @@ from uwlts.cli import app as uwlts_app
 from uwlts.model.library import library_folder
 
 _SIZE_PX = {"width_px": 640, "height_px": 512, "pixel_size_um": 10.6}
-"""Half of the thesis's pixels along each side, with the same view: the smallest for which its targets are found."""
+"""Half of the thesis's pixels along each side, with the same view: the smallest size with which targets are found."""
 _PRINCIPAL_POINT_PX = [323.1, 252.95]
 """Half of that of `thesis-as-built`."""
 _MOST_PLACES = {"target": 5, "target-through-window": 5, "step": 3}
-"""Places of the stage in a calibration; of all other scans `_PLACES`."""
+"""Number of stage positions in a calibration; all other scans have `_PLACES`."""
 _PLACES = 12
 _SAMPLES = "2"
 """Samples per lit pixel: stripes and circles are found with as few."""
@@ -37,16 +37,16 @@ _SAMPLES = "2"
 
 @dataclass(frozen=True)
 class Page:
-    """How to run a page: required files, and differences from the page."""
+    """Instructions to run a page: required files, and differences from the page."""
 
     given: dict[str, str] = field(default_factory=dict)
     """File in the page's folder: file of the shared campaign."""
     texts: dict[str, str] = field(default_factory=dict)
     """Text of a file in the page's folder."""
     small_python: bool = False
-    """Whether Python blocks take the smaller descriptions too; tutorials are fast enough, and check their figures."""
+    """True if Python blocks also use the smaller descriptions; tutorials are fast enough, and check their figures."""
     before: str = ""
-    """Command lines that make the other required files."""
+    """Command lines that create the other required files."""
     instead: dict[str, str] = field(default_factory=dict)
     """Words of the page: their replacements, shorter or existing ones, with the same options."""
     not_run: dict[str, str] = field(default_factory=dict)
@@ -145,7 +145,7 @@ class Runner:
         return found or [word]
 
     def _smaller(self, words: list[str]) -> list[str]:
-        """The same with the smaller descriptions and few samples."""
+        """Return the same words with the smaller descriptions and few samples."""
         small = {path.stem: str(path) for path in self.small.glob("*.toml")}
         match words:
             case ["twin", "simulate" | "serve" as command, scene, *rest]:
@@ -217,7 +217,7 @@ def run_page(page: Path, how: Page, *, shared: Path | None, folder: Path, small:
 
 
 def _instead(text: str, instead: dict[str, str], unused: set[str]) -> str:
-    """The text with other words in place of the listed ones, which are no longer unused then."""
+    """Replace the listed words of the text, and remove them from ``unused``."""
     for word, other in instead.items():
         unused -= {word} if word in text else set()
         text = text.replace(word, other)
@@ -234,7 +234,7 @@ def _running(folder: Path, small: Path, separate: bool) -> Iterator[Runner]:
 
 
 def _called(words: list[str]) -> list[str]:
-    """Words that call a program of this environment."""
+    """Return words that call a program of this environment."""
     match words:
         case [("uwlts" | "twin") as program, *rest]:
             return [sys.executable, "-m", program, *rest]

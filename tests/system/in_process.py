@@ -1,4 +1,4 @@
-"""The command line run inside the test's process, as its entry point runs it: without the second that imports take."""
+"""Run the command line inside the test's process, through its entry point; this saves a second of imports."""
 
 import subprocess
 import sys
@@ -33,7 +33,7 @@ def run_program(app: App, program: str, *arguments: object) -> subprocess.Comple
 
 @contextmanager
 def shared_workers() -> Iterator[Workers]:
-    """Let all sweeps of this process use the same working processes, unless they are told how many or where."""
+    """Let all sweeps of this process share workers, unless they state the number or address of their own."""
     with open_workers() as pool, pytest.MonkeyPatch.context() as patch:
 
         def opened(*, workers: int | None = None, scheduler: str | None = None) -> AbstractContextManager[Workers]:

@@ -97,7 +97,7 @@ def test_webgl_draws_a_triangle(page: "Page"):
 
 
 def test_text_is_drawn_in_letters(page: "Page"):
-    """Letters differ in width and blackness; without a font there is nothing, or the same box for each."""
+    """Letters differ in width and blackness; without a font they are missing, or all are the same box."""
     picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE)
     assert picture is not None
     ink = []

@@ -137,7 +137,7 @@ def wait_for(part: Path, count: int) -> None:
 
 
 def check_camera(path: Path, sensor: Sensor) -> None:
-    """Compare with the description from which the twin was built."""
+    """Compare with the description of the simulated sensor."""
     calibration = read_calibration(path)
     figures = calibration.residuals["camera"]
     # Circles are found to some 0.05 px in small images with noise.

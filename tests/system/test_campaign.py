@@ -1,9 +1,9 @@
-"""The main job in small: render, calibrate from rendered images only, reconstruct, and judge against truth.
+"""Small version of the main workflow: render, calibrate from rendered images only, reconstruct, and compare with truth.
 
-Two gates stand here. With perfect images and true parameters nothing but the stripe's centre and the chain's arithmetic
-is left, so errors of micrometres show. With speckle, blur and noise, and a calibration from such images of a sensor
-that differs from its drawings, the gates are a few times the errors that the full campaign shows; the thesis's own
-spacing error is 0.11 mm, its standard deviation 0.10 to 0.14 mm.
+There are two sets of limits. With perfect images and true parameters, only the stripe's centre and the arithmetic cause
+errors, and micrometres are detected. The other images have speckle, blur and noise, and are calibrated from such images
+of a sensor that differs from its drawings. These limits are a few times the errors of the full campaign. The thesis's
+own spacing error is 0.11 mm, and its standard deviation 0.10 to 0.14 mm.
 """
 
 from pathlib import Path
@@ -59,7 +59,7 @@ def test_perfect_images_and_true_parameters_give_micrometres(tmp_path: Path, pla
     assert truth.share_within_tolerance >= 0.99
     assert truth.tolerance_mm == pytest.approx(0.010)
     assert abs(evaluation.sphere_spacing.error_mm) <= 0.005
-    # Rows of a stripe that ends in a point are lost or doubtful, never more than a tenth of them.
+    # At the pointed end of a stripe, rows are lost or uncertain, but never more than a tenth.
     assert truth.missed + truth.false_points < 0.1 * matched
 
 

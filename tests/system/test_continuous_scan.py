@@ -83,7 +83,7 @@ def true_places(capture: Capture, hill: Hill) -> np.ndarray:
     """
     times = np.array([state.time_s for state in hill.states])
     places = np.array([state.position_mm for state in hill.states])
-    # The capture counts time from its beginning on the host's clock, with which the camera's was compared.
+    # Times of the capture start at its beginning, on the host's clock. The camera's clock was compared with it.
     offsets = times[:, None] - capture.time_s
     candidates = np.sort(offsets.ravel())
     off = np.array([np.abs(offsets - by).min(axis=0).max() for by in candidates])

@@ -1,6 +1,6 @@
 """The operator's page in a real browser, with the twin as the hardware: all steps, faults, viewers.
 
-Screenshots of the first way through are kept in the folder that UWLTS_SCREENSHOTS names.
+Screenshots of the first run are stored in the folder named by UWLTS_SCREENSHOTS.
 """
 
 import os
@@ -506,7 +506,7 @@ def test_keys_alone_are_enough(desk, page):
 
 @pytest.mark.slow
 def test_who_looks_closer_sees_all_points_there(desk, page):
-    """Of a COPC file with twice as many points as are shown."""
+    """The COPC file has twice as many points as are shown."""
     rng = np.random.default_rng(3)
     points = np.column_stack([*rng.uniform(-100, 100, (2, 600_000)), rng.normal(400, 0.1, 600_000)])
     none = np.full(len(points), -1)

@@ -162,7 +162,7 @@ def test_truncated_images(says, scan_images, tmp_path: Path, suffix: str):
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg"])
 def test_images_with_a_hole(says, scan_images, tmp_path: Path, suffix: str):
-    """Pixels that a decoder substitutes for missing bytes are not an image; BMP has no means to detect that."""
+    """Pixels that a decoder substitutes for missing bytes are not accepted; in BMP they cannot be detected."""
     folder = folder_of(tmp_path / "images", scan_images[:3], suffix)
     victim = folder / f"laser1{suffix}"
     content = bytearray(victim.read_bytes())

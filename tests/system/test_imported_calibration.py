@@ -41,7 +41,7 @@ def printed(target) -> tuple[np.ndarray, np.ndarray]:
 
 
 def poses(target) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Rotation and translation of the board in the camera frame, its middle near where the sheet crosses the axis."""
+    """Return rotations and translations of the board in the camera frame, near the crossing of sheet and axis."""
     extent = 15.0 * np.array([target.columns, target.rows])
     middle = np.r_[(extent / 2 if isinstance(target, CharucoTarget) else (extent - 15.0) / 2), 0.0]
     at = camera_from_object(SENSOR)[:3, 3]

@@ -97,7 +97,7 @@ class Operated(Place):
         return status
 
     def dark_after_s(self) -> float | None:
-        """Time in s until the light is off; None where it stays on for longer than `OFF_S`."""
+        """Return the time in s until the light is off; None if it stays on for longer than `OFF_S`."""
         began = time.monotonic()
         return time.monotonic() - began if within(OFF_S, lambda: not self.controller.state().laser_on) else None
 
@@ -287,7 +287,7 @@ def test_half_requests_end_and_lock_nobody_out(operated, half_requests):
         browser.click(browser.buttons()["Laser off"])
         assert operated.dark_after_s() is not None
         assert sum(map(closed, held)) >= 2 * (HALF - 256)
-    # A request that is sent slowly has no more time than one that stops.
+    # A request that is sent slowly has the same time limit as one that stops.
     for _ in range(50):
         with suppress(OSError):
             held[-1].sendall(b"X: y\r\n")

@@ -58,7 +58,7 @@ class FaultyCamera(DrawnCamera):
 
 
 class Lit:
-    """A program that switches the laser of a controller, and how it and its guard are sent signals."""
+    """Program that switches the laser of a controller; signals can be sent to it and to its guard."""
 
     def __init__(self, controller: GrblController, *words: object):
         self.controller, self._sent = controller, []
@@ -117,7 +117,7 @@ def longest_light_s(controller: GrblController) -> float:
 
 
 def watched(running: Scan) -> float:
-    """Wait until the scan has ended, or does nothing any more; the longest of its lights in s."""
+    """Wait until the scan has ended or hangs; return the duration of its longest light in s."""
     assert within(PATIENCE_S, lambda: running.camera.number >= FAULTY_LIGHT)
     # Dark for good: also between two tries.
     within(LONGEST_S, lambda: running.program.poll() is not None)

@@ -100,7 +100,7 @@ def asked(page: Place, path: str = "/", *, method: str = "GET", **headers: str) 
 
 
 def opened(page: Place, *, client: str = "", **headers: str) -> AbstractContextManager[ClientConnection]:
-    """Connection, as a context, by which a browser's page sends its clicks, or that of a ``client`` if given."""
+    """Open the connection of a browser's page for its clicks, or that of a ``client``, as a context."""
     place, origin = urlsplit(page.address), headers.pop("Origin", None)
     query = {"EIO": 4, "transport": "websocket"}
     if client:
@@ -150,7 +150,7 @@ class Browser:
         return found
 
     def open(self) -> str:
-        """Connect; the server's answer, which begins with 40 where it knows the page."""
+        """Connect; return the server's answer, which begins with 40 if it knows the page."""
         place = self.place
         self._closing.close()
         connecting = opened(place, client=self.client, Origin=place.address, **self._headers)

@@ -121,16 +121,16 @@ def test_either_of_two_lines_on_the_board_is_straight(tmp_path: Path, peak: Peak
     assert len(points) > 0.97 * len(on_board)
     along, across, row, middle = cv2.fitLine(points.astype(np.float32), cv2.DIST_HUBER, 0, 0.01, 0.001).ravel()
     straight = np.abs(points[:, 1] - middle - (points[:, 0] - row) * across / along)
-    # The camera's own processing left few grey levels, in steps; a line 4 px wide lies to a fraction of that all the
-    # same: half a pixel at the median, 1.5 px but for one row in twenty.
+    # The camera's processing left few grey levels. A line 4 px wide is nevertheless found to a fraction of its width:
+    # half a pixel at the median, and 1.5 px in all but one of twenty rows.
     assert np.median(straight) < 0.5
     assert np.mean(straight < 1.5) > 0.95
 
 
 @pytest.mark.parametrize(
     ("number", "points", "columns_rows", "residual_px"),
-    # In 01 two hundred dots of the outer rows lie where the light ends, which moves them by 0.1 px: left out. 02 was
-    # printed in whole dots of the printer, which moves rows and columns by half a pixel.
+    # In 01, two hundred dots of the outer rows are at the edge of the light, which moves them by 0.1 px: left out. 02
+    # was printed in whole dots of the printer, which moves rows and columns by half a pixel.
     [("01", 6200, {98, 67}, 0.05), ("02", 1300, {41, 35}, 0.8), ("05", 4300, {85, 52}, 0.05)],
 )
 def test_dots_under_strong_distortion_are_numbered(number, points, columns_rows, residual_px):
@@ -151,8 +151,8 @@ def test_a_board_beside_a_saturated_stripe_is_found(frame: str):
     image = cv2.imread(str(DATA / "etna" / f"{frame}.jpg"), cv2.IMREAD_GRAYSCALE)
     view = ChessboardTarget(columns=7, rows=6, square_mm=10.0).detect(image)
     assert len(view.pixels) == 42
-    # The lens's distortion leaves less than half a pixel of a flat board's homography; a corner that is not one lies a
-    # good part of a square (80 to 110 px) away.
+    # Lens distortion changes the homography of a flat board by less than half a pixel. A false corner is a large part
+    # of a square (80 to 110 px) away.
     flat = cv2.findHomography(view.points_mm[:, :2], view.pixels)[0]
     away = cv2.perspectiveTransform(view.points_mm[:, None, :2], flat)[:, 0] - view.pixels
     assert np.sqrt(np.mean(away**2)) < 1.0 and np.linalg.norm(away, axis=1).max() < 3.0

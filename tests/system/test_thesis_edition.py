@@ -1,8 +1,8 @@
 """A small edition of the thesis's reproduction, whose gates catch a lost 0.02 mm.
 
-The as-built sensor, full physics and the whole chain of calibrations, without the campaign's random imperfections: what
-is left is what speckle, noise and the methods do. Images depend on the seeds alone, so that the gates stand close about
-what was measured; the injected errors show that 0.02 mm more or less does not pass.
+Uses the as-built sensor, full physics and the whole chain of calibrations, but no random imperfections. Errors are due
+to speckle, noise and the methods only. Images depend on the seeds only, so limits are close to the measured values.
+Tests with injected errors show that a change of 0.02 mm does not pass.
 """
 
 import json
@@ -37,7 +37,7 @@ GATES_MM = {
     (*PLANE, "two refractions", "ours", "STD"): (0.020, 0.029),
     (*PLANE, "two refractions", "ours", "RE"): (0.10, 0.18),
 }
-"""Least and greatest value of a figure with its sign, about what was measured with the noise of this seed.
+"""Smallest and largest allowed value of a figure, with sign, around the value measured with this seed.
 
 Nine poses leave a spacing error by refractions of +0.008 to +0.047 mm in eleven other draws of the noise.
 """
@@ -159,9 +159,9 @@ JOINT = "joint_with_scans"
 def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect: CampaignFolder):
     """Imperfections follow from the seed alone; only the images' noise depends on the processor that draws it.
 
-    Measured on a processor with AVX2: all nine figures (three spacings, six diameters) of scans that no calibration has
-    used have a root mean square error of 0.010 mm jointly with other scans, 0.024 mm with the target in water, 0.074 mm
-    with one refraction and 0.082 mm with two; 0.020 mm are stated, as the water could have drifted between scans.
+    Root mean square errors on a processor with AVX2, for all nine figures (three spacings, six diameters) of scans that
+    no calibration has used: 0.010 mm jointly with other scans, 0.024 mm with the target in water, 0.074 mm with one
+    refraction and 0.082 mm with two. The stated uncertainty is 0.020 mm, as the water could have drifted between scans.
     """
     (result,) = compare_campaigns([imperfect])
     names = ("SSE", "diameter error sphere 1", "diameter error sphere 2")
@@ -186,9 +186,9 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
     assert 0.0204 / 1.3 < root_mean_square(stated) < 0.0204 * 1.3
 
     # Factors of 7.7 and 8.7 are expected, and 3 is required: a joint estimate whose errors are 2.6 times larger fails.
-    # By the noise of a scan a diameter moves by 0.007 mm, independently from scan to scan, and by that of the
-    # calibration all spacings by about 0.005 mm together. For 0.025 mm all spacings would have to move by 0.028 mm,
-    # over five of their standard deviations (1e-7), or each of six diameters by 0.015 mm, over two of theirs (1e-9).
+    # Standard deviations: 0.007 mm of a diameter by noise of its scan, independent between scans, and about 0.005 mm of
+    # all spacings together by noise of the calibration. To reach 0.025 mm, all spacings would have to move by 0.028 mm,
+    # over five standard deviations (1e-7), or each of six diameters by 0.015 mm, over two standard deviations (1e-9).
     for way in ("one_refraction", "two_refractions"):
         assert root_mean_square(errors[JOINT]) < root_mean_square(errors[way]) / 3, way
 

@@ -1,4 +1,4 @@
-"""A sensor's views for the calibration tests, made without the sensor's software: NumPy, Fermat's principle."""
+"""Views of a sensor for calibration tests, by NumPy and Fermat's principle, independent of the sensor software."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ WATER = 1.3312
 
 @dataclass(frozen=True)
 class Lens:
-    """Pinhole with the distortion that a description may have."""
+    """Pinhole camera with the distortion model of descriptions."""
 
     fx: float
     fy: float
@@ -42,7 +42,7 @@ class Lens:
 
 
 def built_sensor() -> Sensor:
-    """The thesis's sensor with the deviations from its drawings that real ones have."""
+    """Return the thesis's sensor with realistic deviations from its drawings."""
     return Sensor.model_validate(read_table(find_description("thesis-as-built", "sensors"), "sensors"))
 
 
@@ -52,12 +52,12 @@ def lens_of(sensor: Sensor) -> Lens:
 
 
 def inside(pixels, sensor: Sensor):
-    """Pixels (N, 2) in the image: (N,) bool."""
+    """Return the mask (N,) of pixels (N, 2) in the image."""
     return ((pixels >= 0) & (pixels <= [sensor.camera.width_px - 1, sensor.camera.height_px - 1])).all(axis=1)
 
 
 def lattice(columns=25, rows=25):
-    """The thesis's circle centres (N, 3) in mm, target frame, origin in the middle."""
+    """Return the thesis's circle centres (N, 3) in mm, target frame, with the origin in the middle."""
     x, y = np.meshgrid(np.arange(columns) - columns // 2, np.arange(rows) - rows // 2)
     return np.column_stack([9.375 * x.ravel(), 9.372 * y.ravel(), np.zeros(x.size)])
 
@@ -73,10 +73,10 @@ def turn(x=0.0, y=0.0, z=0.0):
 def stage_images(
     sensor, *, positions=np.arange(31) * 10.0, stage_tilt=(0.0, 0.0), noise_px=0.0, rng=None, points=None, spin=0.02
 ):
-    """The thesis's target images in air and the true ``T_camera_target`` of each.
+    """Return the thesis's target images in air, and the true ``T_camera_target`` of each.
 
-    The target faces the laser, spun a little; the stage carries the sensor along the target's normal, tilted by
-    ``stage_tilt`` in the target's frame, towards the target.
+    The target faces the laser, with a small rotation in its plane. The stage moves the sensor towards the target along
+    its normal, tilted by ``stage_tilt`` in the target's frame.
     """
     lens, points = lens_of(sensor), lattice() if points is None else points
     rotation = camera_from_object(sensor)[:3, :3] @ turn(0.004, -0.007, np.pi / 2 + spin)
@@ -97,7 +97,7 @@ def stage_images(
 
 
 def stripes_on_target(sensor, poses, *, count=1280, noise_px=0.0, rng=None):
-    """Stripe pixels of each image: the sheet's line on the target, as far as the fan and the image reach."""
+    """Return stripe pixels of each image: the sheet's line on the target, within the fan and the image."""
     lens, laser = lens_of(sensor), laser_pose(sensor)
     stripes = []
     for pose in poses:
@@ -114,7 +114,7 @@ def stripes_on_target(sensor, poses, *, count=1280, noise_px=0.0, rng=None):
 
 
 def step_profile(depth_mm, *, shift_mm=0.0, tilt=0.0, height_mm=STEP_MM, count=1280):
-    """Points (N, 3) in the OCS of base, block, base at a depth, the block nearer by the height, tilted about X."""
+    """Return points (N, 3) in the OCS of base, block, base at a depth, tilted about X; the block is nearer."""
     along = np.linspace(-75, 75, count)
     up = np.where(np.abs(along - shift_mm) < 30, -height_mm, 0.0)
     y, z = np.cos(tilt) * along - np.sin(tilt) * up, np.sin(tilt) * along + np.cos(tilt) * up
@@ -131,7 +131,7 @@ def nine_steps(*, count=1280, tilts=(0.01, -0.02, 0.03)):
 
 
 def through_window(sensor, points_object, *, index=WATER, refractions=2, noise_px=0.0, rng=None):
-    """Pixels of points in the OCS seen through the sensor's window, by least optical length."""
+    """Return pixels of points in the OCS through the sensor's window, by least optical length."""
     window, frame = sensor.camera.window, camera_from_object(sensor)
     faces = plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=window.normal())
     indices = [1.0, window.index(sensor.laser.wavelength_nm), index]

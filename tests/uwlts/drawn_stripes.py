@@ -1,4 +1,4 @@
-"""Captures of drawn stripes on things in water, seen through the window by Fermat's principle: NumPy, no renderer."""
+"""Captures of drawn stripes on objects in water, through the window by Fermat's principle: NumPy, no renderer."""
 
 import math
 
@@ -16,7 +16,7 @@ SIGMA_PX, AMPLITUDE, DARK = 1.4, 180.0, 8.0
 
 
 def coarse_sensor(*, window_mounted):
-    """The thesis's sensor with a quarter of the pixels, a lens without distortion and a window square to its axis."""
+    """Return the thesis's sensor with a quarter of the pixels, no distortion and a window square to its axis."""
     sensor = built_sensor()
     window = sensor.camera.window.model_copy(update={"mounted": window_mounted})
     camera = sensor.camera.model_copy(
@@ -37,7 +37,7 @@ SHAPE = (SENSOR.camera.height_px, SENSOR.camera.width_px)
 
 
 def stripe_image(pieces, rng):
-    """A Gaussian line through the pixels (N, 2) of each piece; where pieces share a column, the last is in front."""
+    """Draw a Gaussian line through the pixels (N, 2) of each piece; in common columns, the last piece is in front."""
     centre, columns = np.full(SHAPE[1], -100.0), np.arange(SHAPE[1])
     for pixels in pieces:
         here = (columns >= pixels[:, 0].min()) & (columns <= pixels[:, 0].max())
@@ -59,7 +59,7 @@ def step_image(depth_mm, *, tilt=0.0, shift_mm=0.0, **step):
 
 
 def sphere_profiles(depth_mm):
-    """Pixels of the stripe on two spheres side by side: for each stage position those on one and on the other."""
+    """Return stripe pixels on two spheres side by side: for each stage position, one array per sphere."""
     around, profiles = np.linspace(-1.1, 1.1, 121), []
     for x in STAGE_MM:
         circle = math.sqrt(RADIUS_MM**2 - x**2)
@@ -76,7 +76,7 @@ def sphere_profiles(depth_mm):
 
 
 def write(path, images, *, stage_mm=None, sensor=SENSOR, medium=None, **header):
-    """A capture of images with the laser on."""
+    """Write a capture of images with the laser on."""
     header = CaptureHeader(
         name=path.stem,
         sensor=sensor,

@@ -23,7 +23,7 @@ def target_pose(*, tilt_deg=(0.0, 0.0), middle_mm=(0.0, 0.0, 378.0)):
 
 
 def drawn_lamp(sensor: Sensor, target: CircleTarget, pose, *, blur_px=0.6, gain=1.0, noise_dn=1.0, seed=0):
-    """Image (H, W) of uint8 of the target at a pose."""
+    """Draw an image (H, W) of uint8 of the target at a pose."""
     width, height = sensor.camera.width_px, sensor.camera.height_px
     picture = np.full((height * FINER, width * FINER), GROUND, np.uint8)
     columns, rows = np.meshgrid(np.arange(target.columns), np.arange(target.rows))
@@ -39,7 +39,7 @@ def drawn_lamp(sensor: Sensor, target: CircleTarget, pose, *, blur_px=0.6, gain=
 
 
 def drawn_laser(sensor: Sensor, pose, *, gain=1.0, noise_dn=1.0, seed=0, half_mm=1000.0):
-    """Image (H, W) of uint8 of the laser line on the target's plane, as far as ``half_mm`` from the target's origin."""
+    """Draw an image (H, W) of uint8 of the laser line on the target's plane, up to ``half_mm`` from its origin."""
     laser, normal, origin = laser_pose(sensor), pose[:3, 2], pose[:3, 3]
     angle = np.linspace(-1, 1, 4000) * np.radians(sensor.laser.fan_angle_deg / 2)
     rays = np.cos(angle)[:, None] * laser.axis + np.sin(angle)[:, None] * laser.fan

@@ -1,4 +1,4 @@
-"""Windows of any tilt and thickness for property tests, and the same windows as the oracle of least time takes them."""
+"""Windows of any tilt and thickness for property tests, also as faces for the oracle of least time."""
 
 import math
 
@@ -14,7 +14,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def tilted(x_deg: float, y_deg: float) -> np.ndarray:
-    """The axis (0, 0, 1) turned about x, then about y."""
+    """Return the axis (0, 0, 1) rotated about x, then about y."""
     x, y = math.radians(x_deg), math.radians(y_deg)
     about_x = np.array([[1, 0, 0], [0, math.cos(x), -math.sin(x)], [0, math.sin(x), math.cos(x)]])
     about_y = np.array([[math.cos(y), 0, math.sin(y)], [0, 1, 0], [-math.sin(y), 0, math.cos(y)]])
@@ -39,7 +39,7 @@ windows = st.builds(
 
 
 def faces_and_indices(window: WindowModel, medium_index: float) -> tuple[list[fermat.Face], list[float]]:
-    """The window as the oracle takes it."""
+    """Return the window's faces and refractive indices for the oracle."""
     both = fermat.plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=np.array(window.normal))
     if window.refractions == 1:
         return both[:1], [1.0, medium_index]

@@ -1,4 +1,4 @@
-"""Evidence for the joint calibration, in air and in a medium, made by Fermat's principle, not the sensor's software."""
+"""Evidence for the joint calibration, in air and in a medium, by Fermat's principle, without the sensor software."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ TARGET = parse_target(
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of what the views are spoilt by, and the generator."""
+    """Standard deviations of the errors of views, and the random generator."""
 
     circles_px: float = 0.0
     stripe_px: float = 0.0
@@ -36,7 +36,7 @@ class Noise:
 
 
 def seen(sensor: Sensor, points, *, index, window):
-    """Pixels (N, 2) of points (N, 3) in the camera frame."""
+    """Return pixels (N, 2) of points (N, 3) in the camera frame."""
     if not window:
         return lens_of(sensor).pixels(points)
     plate_of = sensor.camera.window
@@ -46,7 +46,7 @@ def seen(sensor: Sensor, points, *, index, window):
 
 
 def lit_points(sensor: Sensor, *, normal, point, index, bow=0.0, count=200):
-    """Where the fan, through the laser's window, lights a plane: (count, 3), camera frame."""
+    """Return the points (count, 3) of a plane lit by the fan through the laser's window, camera frame."""
     pose, window = laser_pose(sensor), sensor.laser.window
     module = np.stack([pose.normal, pose.fan, pose.axis])
     angle = np.linspace(-1, 1, count) * np.radians(sensor.laser.fan_angle_deg / 2)
@@ -60,7 +60,7 @@ def lit_points(sensor: Sensor, *, normal, point, index, bow=0.0, count=200):
 
 
 def target_series(sensor, *, medium=None, window=True, positions, bow=0.0, noise=Noise(), tilts=None, columns=25):
-    """A series of the target on the stage, or with ``tilts`` (F, 2) in rad by hand, with the stripes on it."""
+    """Return a series of the target with stripes: on the stage, or in free poses with ``tilts`` (F, 2) in rad."""
     index = 1.0 if medium is None else WATER
     frame = camera_from_object(sensor)
     direction = frame[:3, :3] @ np.array([0.002, -0.001, 1.0])
@@ -85,7 +85,7 @@ def target_series(sensor, *, medium=None, window=True, positions, bow=0.0, noise
 
 
 def step_views(sensor: Sensor, *, noise=Noise(), tilts=(0.01, -0.02, 0.03)):
-    """Nine images of the step standard on the sheet as described, without what the laser's window does to it."""
+    """Return nine images of the step standard on the described sheet, without the effect of the laser's window."""
     standard = StepStandard(height_mm=STEP_MM)
     found = []
     for profile in nine_steps(count=400, tilts=tilts):
@@ -95,14 +95,14 @@ def step_views(sensor: Sensor, *, noise=Noise(), tilts=(0.01, -0.02, 0.03)):
 
 
 def gathered(sensor: Sensor, series, steps=()) -> Gathered:
-    """What captures with these views would give; ``sensor`` is what the drawings say."""
+    """Return the evidence of captures with these views; ``sensor`` is the description by the drawings."""
     return Gathered(sensor, {"water": MEDIUM}, list(series), list(steps), [], {}, [])
 
 
 def assert_derivatives(evidence, parameters, global_values, local, *, within):
-    """Derivatives of the evidence's residuals are those by central differences, ``within`` the largest of each.
+    """Compare derivatives of residuals with central differences, to ``within`` times the largest of each column.
 
-    Where residuals vanish, their scale does not matter.
+    If residuals vanish, the derivatives of their scale do not matter.
     """
     vector, count = np.concatenate([global_values, local]), len(global_values)
     found = evidence.residuals(parameters, global_values, local)

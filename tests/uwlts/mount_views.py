@@ -1,6 +1,6 @@
-"""Profiles of a sphere before a plane, a plane, a step or a ring by a profiler on a robot: rays met with the surfaces.
+"""Profiles of a sphere before a plane, a plane, a step or a ring, by a profiler on a robot.
 
-Independent of the code under test: every ray of the fan is intersected in the base frame with the surfaces as they are.
+Independent of the code under test: every ray of the fan is intersected with the surfaces in the base frame.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ MOUNT_STD = np.array([0.05, 0.08, 0.03, 4e-4, 2e-4, 3e-4])
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
-    """Profiles (N, 2) with NaN where a ray met nothing, and the poses (P, 4, 4) that the robot reports, mm."""
+    """Profiles (N, 2), NaN for rays that miss all surfaces, and the poses (P, 4, 4) reported by the robot, mm."""
 
     profiles: list[np.ndarray]
     poses: np.ndarray
@@ -45,17 +45,17 @@ def sphere_campaign(
     smooth_mm: float = 0.0,
     rays: int = RAYS,
 ) -> Campaign:
-    """A campaign: the sensor looks down from all sides, the sphere anywhere in the middle of its field of view.
+    """Simulate a campaign: the sensor looks down from all sides, with the sphere near the middle of its field of view.
 
-    The robot reports other positions than it has, by ``robot_mm`` in each coordinate, and lengths too short by
-    ``scale``. The plane lies 1.1 radius below the sphere's centre, square to z of the base. The profiler errs along
-    each profile by ``smooth_mm`` (rms) as well, alike within some 8 mm.
+    The positions reported by the robot have errors of ``robot_mm`` in each coordinate and are too short by the factor
+    ``scale``. The plane is 1.1 radii below the sphere's centre, square to z of the base. The profiler has an additional
+    error of ``smooth_mm`` (rms), correlated over about 8 mm of a profile.
     """
     profiles, reported = [], []
     for _ in range(poses):
         turn = rng.uniform(-1, 1, 3) * np.radians(tilt_deg)
         looking_down = Rotation.from_euler("x", np.pi) * Rotation.from_rotvec(turn)
-        # Where the sphere's centre lies in the sensor's frame.
+        # The sphere's centre in the sensor's frame.
         place = np.array([rng.uniform(-35, 35), rng.uniform(-0.7, 0.7) * RADIUS_MM, STANDOFF_MM + rng.uniform(-30, 30)])
         base_sensor = np.eye(4)
         base_sensor[:3, :3] = looking_down.as_matrix()
@@ -89,7 +89,7 @@ def profile_of(
     sphere: bool = True,
     count: int = RAYS,
 ) -> np.ndarray:
-    """What the fan of a sensor at ``T_base_sensor`` sees: x and z (N, 2), with noise along z and gaps, mm."""
+    """Return the profile of a sensor at ``T_base_sensor``: x and z (N, 2) in mm, with noise along z and gaps."""
     angles = np.radians(np.linspace(-18, 18, count))
     rays = np.column_stack([np.sin(angles), np.zeros(count), np.cos(angles)])
     directions, origin = rays @ base_sensor[:3, :3].T, base_sensor[:3, 3]
@@ -104,7 +104,7 @@ def profile_of(
             length = np.where(under > 0, np.minimum(length, -half - np.sqrt(under)), length)
     seen = np.where(np.isfinite(length), length, np.nan)
     profile = np.column_stack([rays[:, 0] * seen, rays[:, 2] * seen + noise_mm * rng.standard_normal(count)])
-    # A gap somewhere, and single points without an echo.
+    # A gap at a random position, and single missing points.
     gap = int(rng.integers(count - 25))
     profile[gap : gap + 25] = np.nan
     profile[rng.random(count) < 0.03] = np.nan
@@ -120,9 +120,9 @@ def errors_of(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def step_campaign(
     rng: np.random.Generator, *, height_mm: float, poses: int = 20, noise_mm: float = 0.03, tilt_deg: float = 25.0
 ) -> Campaign:
-    """A block with its edge along y of the base, through the place of the sphere, seen by an ideal robot.
+    """Simulate a campaign on a block with its edge along y of the base, at the sphere's position, by an ideal robot.
 
-    Its top lies ``height_mm`` above the table, and reaches to x = 55 mm before that place; beyond lies the table again.
+    The top of the block is ``height_mm`` above the table and extends 55 mm from the edge towards -x.
     """
     profiles, reported = [], []
     for _ in range(poses):
@@ -150,7 +150,7 @@ def _step_profile(
     at_top, at_table = origin[0] + top * directions[:, 0], origin[0] + table * directions[:, 0]
     with np.errstate(divide="ignore"):
         side = (SPHERE_MM[0] - origin[0]) / directions[:, 0]
-    # A ray that leaves the space above the block below its top meets the side that faces it, or misses the block.
+    # A ray that is not on the top but reaches the table's level below it meets the side of the block.
     length = np.where(on_top(at_top), top, np.where(on_top(at_table), side, table))
     profile = np.column_stack([rays[:, 0] * length, rays[:, 2] * length + noise_mm * rng.standard_normal(RAYS)])
     profile[rng.random(RAYS) < 0.03] = np.nan
@@ -169,9 +169,10 @@ def ring_campaign(
     tilt_deg: float = 30.0,
     towards_sensor: bool = False,
 ) -> Campaign:
-    """A ring gauge (`RING_MM`) whose face looks along `RING_AXIS`, on a table; the sheet meets its bore or its outside.
+    """Simulate a campaign on a ring gauge (`RING_MM`) on a table, with its face normal along `RING_AXIS`.
 
-    With ``towards_sensor`` the profiler's z grows towards the sensor, and x the other way.
+    The sheet meets its bore or its outer wall. With ``towards_sensor``, the profiler's z grows towards the sensor, and
+    its x is reversed.
     """
     axes = _ring_axes()
     profiles, reported = [], []
@@ -203,7 +204,7 @@ def _ring_axes() -> np.ndarray:
 def _ring_profile(
     base_sensor: np.ndarray, axes: np.ndarray, rng: np.random.Generator, *, noise_mm: float, table: bool
 ) -> np.ndarray:
-    """The nearest of what each ray meets: face, both walls, and the table on which the ring stands."""
+    """Return the nearest intersection of each ray with the ring's face, its walls, or the table under it."""
     angles = np.radians(np.linspace(-18, 18, RAYS))
     rays = np.column_stack([np.sin(angles), np.zeros(RAYS), np.cos(angles)])
     # In the ring's frame, with the middle of its face as origin.
@@ -232,7 +233,7 @@ def _ring_profile(
 
 
 def known_mount(transform: np.ndarray, **changed: Any) -> Mount:
-    """A mount as a calibration finds it, with the standard uncertainties `MOUNT_STD` (mm, rad)."""
+    """Return a mount as from a calibration, with the standard uncertainties `MOUNT_STD` (mm, rad)."""
     fields: dict[str, Any] = {
         "T_platform_sensor": tuple(map(tuple, transform.tolist())),
         "covariance": tuple(map(tuple, np.diag(MOUNT_STD**2).tolist())),

@@ -1,6 +1,6 @@
-"""A scanning vehicle over a sea bed with stones, crossing its own path: rays met with the height of the bed.
+"""Scan by a vehicle over a sea bed with stones that crosses its own path: rays intersected with the bed.
 
-The navigation drifts smoothly; what it reports is all that the code under test gets besides the points.
+The navigation has a smooth drift. The code under test gets only the points and the reported path.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ NOISE_MM = 0.05
 
 @cache
 def bed(size_mm: float = 4000.0, seed: int = 7) -> RectBivariateSpline:
-    """Height over x and y: waves of sand, and stones of 20 to 80 mm."""
+    """Return the height over x and y: waves of sand, and stones of 20 to 80 mm."""
     rng = np.random.default_rng(seed)
     axis = np.arange(-500.0, size_mm, 5.0)
     x, y = np.meshgrid(axis, axis, indexing="ij")
@@ -35,7 +35,7 @@ def bed(size_mm: float = 4000.0, seed: int = 7) -> RectBivariateSpline:
 
 
 def route(corners: np.ndarray, *, radius_mm: float = 250.0) -> np.ndarray:
-    """Places (N, 2) each `STEP_MM` along lines between corners (C, 2), rounded by a moving mean."""
+    """Return positions (N, 2) every `STEP_MM` along lines between corners (C, 2), rounded by a moving mean."""
     lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)))
     way = np.arange(0, lengths[-1], STEP_MM)
     places = np.stack([np.interp(way, lengths, column) for column in corners.T], axis=1)
@@ -49,7 +49,7 @@ def route(corners: np.ndarray, *, radius_mm: float = 250.0) -> np.ndarray:
 def scan(
     rng: np.random.Generator, poses: np.ndarray, height: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frame, line (N,) and points (N, 3) in the sensor's frame by its poses (F, 4, 4), Z to the bed of a height."""
+    """Return frame, line (N,) and points (N, 3) in the sensor frame, from its poses (F, 4, 4) and the bed height."""
     fan = np.radians(np.linspace(-FAN_DEG / 2, FAN_DEG / 2, RAYS))
     rays = np.column_stack([np.zeros(RAYS), np.sin(fan), np.cos(fan)])
     frame, line = (each.ravel() for each in np.meshgrid(np.arange(len(poses)), np.arange(RAYS), indexing="ij"))
@@ -72,11 +72,11 @@ def ride(
     ground: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     navigation: Callable[[Trajectory], tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> tuple[PointCloud, Trajectory, Trajectory]:
-    """Cloud by the reported path, the reported path, and the true one.
+    """Return the cloud along the reported path, the reported path, and the true path.
 
-    The drift at the end is of the stated size along each axis: a steady rate with a slow wave of a fifth, and besides a
-    random walk of ``walk`` times that. Or a ``navigation`` gives errors (N, 6) and their covariances (N, 6, 6) along
-    the true path. The height over x and y is that of `bed` unless ``ground`` gives it.
+    The drift at the end has the stated size along each axis. It is a steady rate with a slow wave of a fifth of it,
+    plus a random walk of ``walk`` times that size. Alternatively, ``navigation`` gives errors (N, 6) and their
+    covariances (N, 6, 6) along the true path. ``ground`` is the height over x and y; by default, that of `bed`.
     """
     places = route(corners)
     heading = np.unwrap(np.arctan2(*np.gradient(places, axis=0).T[::-1]))

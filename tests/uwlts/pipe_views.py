@@ -1,6 +1,6 @@
-"""Scans of a pipe from several sides: rays of a laser fan met with the surface as it is, by Newton's method.
+"""Scans of a pipe from several sides: rays of a laser fan intersected with the surface by Newton's method.
 
-Independent of the code under test, which gets points, their stated uncertainty, and poses that are wrong.
+Independent of the code under test, which gets points, their stated uncertainty, and wrong poses.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def oval(angle: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 @cache
 def _pits() -> RectBivariateSpline:
-    """Height over angle and length of pits and bumps of 8 to 16 mm, as a smooth function."""
+    """Return the height by angle and length of pits and bumps of 8 to 16 mm, as a smooth function."""
     rng = np.random.default_rng(99)
     angle, along = np.linspace(-np.pi, np.pi, 945), np.linspace(-80, 80, 161)
     height = np.zeros((len(angle), len(along)))
@@ -66,11 +66,11 @@ def scan_from(
     systematic: float = 0.0,
     amounts: np.ndarray | None = None,
 ) -> PointCloud:
-    """What a sensor at a pose sees while it goes along its X: a fan in its YZ plane, noise along the rays.
+    """Simulate the scan of a sensor that moves along its X: a fan in its YZ plane, noise along the rays.
 
-    ``systematic`` scales errors that all points share: a scale along Y, a bow of the sheet and a tilt, each of standard
-    deviation one in units that are stated as patterns. ``amounts`` (3,) are those of a calibration that scans have in
-    common; else they are drawn.
+    ``systematic`` scales errors that all points share: a scale along Y, a bow of the sheet, and a tilt. Their amounts
+    have a standard deviation of one in units of the stated patterns. ``amounts`` (3,) are amounts common to several
+    scans; by default, they are drawn.
     """
     fan = np.radians(np.linspace(-FAN_DEG / 2, FAN_DEG / 2, RAYS))
     rays = np.column_stack([np.zeros(RAYS), np.sin(fan), np.cos(fan)])
@@ -79,7 +79,7 @@ def scan_from(
     origin = pose[:3, 3] + stage[frame, None] * pose[:3, 0]
     ray = rays[line] @ pose[:3, :3].T
     across, towards = origin[:, 1:], ray[:, 1:]
-    # Where the rays meet a circle round the axis, then the surface itself.
+    # Intersections of the rays with a circle round the axis, then with the surface itself.
     square, half = np.sum(towards**2, 1), np.sum(across * towards, 1)
     with np.errstate(invalid="ignore"):
         length = (-half - np.sqrt(half**2 - square * (np.sum(across**2, 1) - RADIUS_MM**2))) / square
@@ -128,9 +128,9 @@ def views(
     one_sensor: bool = False,
     **how: object,
 ) -> tuple[list[PointCloud], np.ndarray, np.ndarray]:
-    """Scans from ``count`` sides, their true poses (N, 4, 4) in the frame of the first, and wrong poses.
+    """Return scans from ``count`` sides, their true poses (N, 4, 4) in the frame of the first, and wrong poses.
 
-    ``one_sensor``: all are by one calibration, else each by its own.
+    With ``one_sensor``, all scans have the same calibration errors, otherwise each has its own.
     """
     true = np.array([side_pose(angle) for angle in 2 * np.pi * np.arange(count) / count])
     if one_sensor:
@@ -147,7 +147,7 @@ def views(
 
 
 def pose_errors(found: np.ndarray, true: np.ndarray, middles_mm: np.ndarray) -> np.ndarray:
-    """Shift (mm) at the scan's middle and turn (rad), (N, 6), by which poses are wrong, in the frame of the first."""
+    """Return pose errors (N, 6) in the frame of the first: shift (mm) at the scan's middle and rotation (rad)."""
     back = true @ np.linalg.inv(found)
     turn = Rotation.from_matrix(back[:, :3, :3]).as_rotvec()
     shift = np.einsum("nij,nj->ni", back[:, :3, :3], middles_mm) + back[:, :3, 3] - middles_mm

@@ -1,4 +1,4 @@
-"""Scans of bodies that stand still in water: cut by the sheet geometrically, seen by Fermat's principle."""
+"""Scans of stationary bodies in water: geometric intersection with the sheet, images by Fermat's principle."""
 
 from dataclasses import dataclass
 
@@ -14,35 +14,35 @@ from uwlts.optics.brightness import estimate_blur_shift_px
 
 VIEW = ViewMedium(True, 0)
 SLOPE = np.array([0.004, -0.003])
-"""How far the stage really leans from the OCS's X, towards Y and Z."""
+"""True slopes of the stage's direction against the OCS's X, towards Y and Z."""
 NONE = Noise()
 
 _FACING = np.cos(np.radians(75))
 
 
 def square_sensor() -> Sensor:
-    """The sensor as built, but its laser's window square to the sheet, which so stays a plane in the water."""
+    """Return the sensor as built, with the laser's window square to the sheet, which is then a plane in water."""
     laser = built_sensor().laser
     window = laser.window.model_copy(update={"tilt_y_deg": 0.0})
     return built_sensor().model_copy(update={"laser": laser.model_copy(update={"window": window})})
 
 
 def stage_direction(sensor: Sensor) -> np.ndarray:
-    """Where the stage really moves the sensor (3,), camera frame."""
+    """Return the true unit direction (3,) of the sensor's motion on the stage, camera frame."""
     turned = camera_from_object(sensor)[:3, :3] @ np.array([1.0, *SLOPE])
     return turned / np.linalg.norm(turned)
 
 
 @dataclass(frozen=True)
 class Body:
-    """A sphere; with ``axis`` a cylinder through the point; without ``radius`` a plane with that normal. OCS, mm."""
+    """Sphere; with ``axis``, a cylinder through the point; without ``radius``, a plane with that normal (OCS, mm)."""
 
     point: tuple[float, float, float]
     radius: float | None = None
     axis: tuple[float, float, float] | None = None
 
     def lit(self, origin, rays):
-        """Where rays (N, 3) from a point first meet it, and the unit normals out of it there; NaN where they do not."""
+        """Return the first intersections of rays (N, 3) from a point, and outward unit normals; NaN for a miss."""
         away = np.array(self.point) - origin
         axis = np.zeros(3) if self.axis is None else np.array(self.axis) / np.linalg.norm(self.axis)
         if self.radius is None:
@@ -61,9 +61,9 @@ class Body:
 
 
 def scan_of(sensor: Sensor, bodies, artefact, *, stage_mm, count=200, noise=NONE, source="scan"):
-    """Stripes on bodies while the stage stands at positions (F,), and which body each lies on: (N,).
+    """Return the stripes on bodies at stage positions (F,), and the number of the body for each point (N,).
 
-    The stripes are sharp; how far blur may have moved them is what it may do on a matt surface.
+    The stripes are sharp. Their stated shift by blur is that of a matt surface.
     """
     frame, pose = camera_from_object(sensor), laser_pose(sensor)
     rotation = frame[:3, :3]

@@ -1,7 +1,7 @@
-"""Profiles of a sphere by a sensor whose calibration is wrong by a draw from its own covariance, on a robot.
+"""Profiles of a sphere by a sensor on a robot, with calibration errors drawn from the calibration's covariance.
 
-The true sensor has parameters of its own: stripe centres are where its rays meet its sheet on the sphere. What is
-measured of them is by the calibration.
+Stripe centres are calculated with the true parameters, from rays that meet the sheet on the sphere. Profiles are
+calculated from them with the calibration.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ LINES = np.arange(120, 1160, 8)
 
 
 def joint_estimate(thesis: Sensor) -> StoredEstimate:
-    """A joint estimate from a target in water, whose sheet is known to some tenths of a millimetre."""
+    """Return a joint estimate from a target in water; its sheet is known to some tenths of a millimetre."""
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
     series = target_series(built_sensor(), medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise)
     options = CalibrationOptions(poses="stage", correct_circles=False)
@@ -31,13 +31,13 @@ def joint_estimate(thesis: Sensor) -> StoredEstimate:
 
 
 def largest_parts(known, by, count=3):
-    """Independent parts (count, P) of the parameters' errors that move a mount most."""
+    """Return the independent parts (count, P) of parameter errors with the largest effect on a mount."""
     root = covariance_root(known.covariance)
     return root[:, np.argsort(-np.linalg.norm(by @ root[: by.shape[1]] * 1e3, axis=0))[:count]].T
 
 
 def half_way(first, second):
-    """Half of the way from one mount to another (6,): shift, mm, and turn, rad."""
+    """Return half of the difference between two mounts (6,): shift, mm, and rotation, rad."""
     turn = Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec()
     return np.append(first[:3, 3] - second[:3, 3], turn) / 2
 
@@ -45,7 +45,7 @@ def half_way(first, second):
 def captured_by(
     known: StoredEstimate, values: np.ndarray, rng: np.random.Generator, *, poses: int = 15, noise_px: float = 0.1
 ) -> CapturedProfiles:
-    """Profiles by the calibration of what a sensor of other parameters ``values`` (P,) sees, from an ideal robot."""
+    """Return profiles by the calibration from images of a sensor with parameters ``values`` (P,), on an ideal robot."""
     stripes, platforms = [], []
     for number in range(poses):
         turned = Rotation.from_euler("x", np.pi) * Rotation.from_rotvec(rng.uniform(-1, 1, 3) * np.radians(25))
@@ -62,7 +62,7 @@ def captured_by(
 
 
 def stripe_of_sphere(known: StoredEstimate, values: np.ndarray, centre_mm: np.ndarray) -> np.ndarray:
-    """Lines and stripe centres (n, 2) on a sphere with its centre in the OCS of the sensor with these parameters."""
+    """Return lines and stripe centres (n, 2) on a sphere, seen by the sensor with these parameters (centre in OCS)."""
     parameters = known.parameters
     frame = object_frame(parameters.sheet_model(values), laser_axis=parameters.sheet.axis)
     reach = np.arange(150.0, 900.0, 15.0)
@@ -79,7 +79,7 @@ def stripe_of_sphere(known: StoredEstimate, values: np.ndarray, centre_mm: np.nd
     depth = seen[:, 2].reshape(len(LINES), -1)
     changes = np.signbit(off[:, 1:]) != np.signbit(off[:, :-1])
     hit = np.flatnonzero(changes.any(axis=1))
-    # Of the two sides of the sphere that nearer to the sensor.
+    # The side of the sphere towards the sensor.
     first = np.array([min(np.flatnonzero(changes[row]), key=lambda k, row=row: depth[row, k]) for row in hit])
     low, high = reach[first], reach[first + 1]
     sign = np.signbit(off[hit, first])

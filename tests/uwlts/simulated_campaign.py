@@ -1,4 +1,4 @@
-"""Whole campaigns by Fermat's principle: all that the sensor's description states an uncertainty for is drawn anew."""
+"""Whole campaigns by Fermat's principle: all quantities with an uncertainty in the sensor's description are drawn."""
 
 from dataclasses import dataclass, replace
 
@@ -18,23 +18,23 @@ from uwlts.model.sensor import Medium, Sensor
 SPHERES = SphereStandard(kind="spheres", diameters_mm=(50.12, 50.14), spacings_mm=(99.18,))
 PLACES_MM = {"near": -40.0, "standoff": 15.0, "far": 85.0}
 FORMULA = 1.5e-5
-"""Error that Quan and Fry state for their formula of the index of water."""
-# A finder of stripes gives up where a surface leans away further: the cosine of the angle of incidence.
+"""Error of the formula of Quan and Fry for the index of water, as they state."""
+# No stripe is found on surfaces with a smaller cosine of the angle of incidence.
 _LEAST_COSINE = 0.4
 _FEWEST_LIT = 50
 _LENGTHENED = 12.93 / 12.5
-"""Of the focal length, as of the sensor as built against its drawings."""
+"""Ratio of the true focal length to that of the drawings, as for the sensor as built."""
 _TRACED = 60
 
 
 @dataclass(frozen=True)
 class ModelErrors:
-    """Errors that the joint calibration has no parameters for and the description does not mention.
+    """Errors that the joint calibration does not model and the description does not mention.
 
-    ``distortion`` are coefficients added to the lens's. The target is a saddle, ``saddle_mm`` high at its edges'
-    middles, and printed wider along x by the share ``stretch``. Its gloss moves the stripe on it by ``gloss_px``.
-    Waist and aperture make circles and stripe ``noise`` times as noisy as usual in the focus, and 100 mm before and
-    behind it by the share ``blur`` of that more.
+    ``distortion`` contains coefficients added to those of the lens. The target is a saddle, ``saddle_mm`` high at the
+    middles of its edges, and stretched along x by the fraction ``stretch``. Its gloss moves the stripe by ``gloss_px``.
+    In the focus, the noise of circles and stripe is ``noise`` times the usual one. At 100 mm from the focus, it is
+    larger by the fraction ``blur``.
     """
 
     distortion: tuple[tuple[str, float], ...] = ()
@@ -47,12 +47,13 @@ class ModelErrors:
 
 @dataclass(frozen=True, eq=False)
 class Reality:
-    """What a sensor, its stage and its standards really are where drawings and certificates say something else.
+    """True properties of a sensor, its stage and its standards, which differ from drawings and certificates.
 
-    ``lean`` (2,) are the slopes of the stage's direction against the target's normal, ``warmer_k`` by how much the
-    water is warmer than its thermometer says. ``target_saddle_mm`` is twice the height of the middles of the target's
-    sides across x, ``stretch`` (2,) that of its columns and rows, ``gloss_px`` by how much it moves the stripe on it.
-    ``circles_px`` and ``stripe_px`` are their noise in the focus, which grows by ``blur`` of it within 100 mm.
+    ``lean`` (2,) are the slopes of the stage's direction against the target's normal. ``warmer_k`` is the error of the
+    thermometer: true minus measured temperature of the water. ``target_saddle_mm`` is twice the height of the middles
+    of the target's sides across x. ``stretch`` (2,) is the relative stretch of its columns and rows. The target's gloss
+    moves the stripe by ``gloss_px``. ``circles_px`` and ``stripe_px`` are the noise in the focus, which grows by the
+    fraction ``blur`` within 100 mm.
     """
 
     sensor: Sensor
@@ -73,11 +74,11 @@ class Reality:
     blur: float
 
     def noisier(self, z_mm: float) -> float:
-        """Noise at a depth of the OCS as a multiple of that in the focus."""
+        """Return the noise at a depth of the OCS, divided by that in the focus."""
         return 1 + self.blur * abs(z_mm) / 100
 
     def index(self, medium: Medium, drift_k: float = 0.0) -> float:
-        """Index of a medium; that of water is of the second order in the temperature, also beyond 30 degC."""
+        """Return the index of a medium; for water, quadratic in the temperature, also beyond 30 degC."""
         if medium.kind == "air":
             return 1.0
         wavelength, at = self.sensor.laser.wavelength_nm, np.array([10.0, 20.0, 30.0])
@@ -90,9 +91,10 @@ class Reality:
 def drawn_reality(
     described: Sensor, rng: np.random.Generator, *, spread: float = 1.0, errors: ModelErrors = ModelErrors()
 ) -> Reality:
-    """A sensor built from drawings; what they state no uncertainty for differs as in the sensor as built.
+    """Draw a sensor built from drawings.
 
-    All that they state an uncertainty for differs by ``spread`` times as much as they say.
+    Quantities with a stated uncertainty are drawn with ``spread`` times this uncertainty. All others differ as in the
+    sensor as built.
     """
     stated = described.uncertainty
     known = stated.model_copy(
@@ -163,9 +165,9 @@ class FanRays:
 
     @classmethod
     def of(cls, real: Reality, index: float, count: int) -> "FanRays":
-        """Through where they light two planes; behind the window light runs straight.
+        """Construct rays from the points lit on two planes; behind the window, light runs straight.
 
-        A spline through so many rays is right to 1e-5 mm between them: they are smooth over the fan.
+        Rays are smooth over the fan: a spline through `_TRACED` rays has errors of 1e-5 mm between them.
         """
         frame = camera_from_object(real.sensor)
         between, wanted = np.linspace(-1, 1, _TRACED), np.linspace(-1, 1, count)
@@ -186,11 +188,11 @@ class FanRays:
         return cls(near, far - near)
 
     def on_plane(self, normal: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
-        """Where they meet a plane (N, 3); its distance along the normal may differ from ray to ray."""
+        """Return the intersections (N, 3) with a plane; its distance along the normal may differ from ray to ray."""
         return self.points + ((offset - self.points @ normal) / (self.steps @ normal))[:, None] * self.steps
 
     def on_sphere(self, centre: np.ndarray, radius: float) -> np.ndarray:
-        """Where those that meet a sphere do so first (M, 3)."""
+        """Return the first intersections (M, 3) of the rays that meet a sphere."""
         from_centre, length = self.points - centre, np.linalg.norm(self.steps, axis=1, keepdims=True)
         along = self.steps / length
         half = np.sum(from_centre * along, axis=1)
@@ -200,7 +202,7 @@ class FanRays:
 
 
 def stripe_noise(real: Reality, pixels: np.ndarray, z_mm: float) -> np.ndarray:
-    """Pixels (N, 2) of a stripe along the width at a depth of the OCS, with its noise across."""
+    """Add noise across the stripe to its pixels (N, 2) at a depth of the OCS."""
     noise = real.rng.normal(0, real.stripe_px * real.noisier(z_mm), len(pixels))
     return pixels + np.column_stack([np.zeros(len(pixels)), noise])
 
@@ -208,7 +210,7 @@ def stripe_noise(real: Reality, pixels: np.ndarray, z_mm: float) -> np.ndarray:
 def target_series(
     real: Reality, *, view: ViewMedium, index: float, positions: np.ndarray, spacings: int, rays: int
 ) -> Series:
-    """The bent target on the stage with the stripe on it; every so many circles of it, for speed."""
+    """Simulate the bent target on the stage with the stripe on it; uses only circles every ``spacings``, for speed."""
     sensor = real.sensor
     frame = camera_from_object(sensor)
     placed = turn(*real.rng.normal(0, 0.005, 2), np.pi / 2 + real.rng.normal(0, 0.01))
@@ -246,7 +248,7 @@ def target_series(
 
 
 def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -> list[tuple[StepEvidence, ViewMedium]]:
-    """The stripe over a block on a plate, one image at each depth of the OCS."""
+    """Simulate the stripe over a block on a plate, one image at each depth of the OCS."""
     frame, fan = camera_from_object(real.sensor), FanRays.of(real, index, rays)
     found = []
     for depth in depths:
@@ -257,7 +259,7 @@ def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -
         shift = real.rng.uniform(-12.0, 12.0)
         on_top = np.abs((top - middle) @ rotation[:, 1] - shift) < 30.0
         lit = np.where(on_top[:, None], top, base)
-        # The block's side and its shadow, and the plate's ends.
+        # Excludes the block's side and its shadow, and the plate's ends.
         along = np.abs((lit - middle) @ rotation[:, 1] - shift)
         lit = lit[on_top | ((along > 34.0) & (along < 75.0))]
         pixels = seen(real.sensor, lit, index=index, window=True)
@@ -271,7 +273,7 @@ def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -
 def evidence(
     real: Reality, described: Sensor, *, wet: bool, images: int = 6, spacings: int = 2, rays: int = 150
 ) -> Gathered:
-    """Target images without and with the camera's window, in air or in water, and for the latter some of a step."""
+    """Simulate target images without and with the camera's window, in air or in water, and images of a step."""
     water = described.media["water"]
     index = real.index(water) if wet else 1.0
     size = {"spacings": spacings, "rays": rays}
@@ -291,7 +293,7 @@ def evidence(
 
 @dataclass(frozen=True, eq=False)
 class ScanStripes:
-    """Stripe centres of a scan: image, column and row (N,) of each, and what the stage says (F,) in mm."""
+    """Stripe centres of a scan: image, column and row (N,) of each, and reported stage positions (F,) in mm."""
 
     frame: np.ndarray
     line: np.ndarray
@@ -302,9 +304,9 @@ class ScanStripes:
 def scan_of_spheres(
     real: Reality, *, index: float, place: str, positions: np.ndarray, lean: np.ndarray, rays: int = 800
 ) -> ScanStripes:
-    """Stripes on the sphere standard, the sensor moved across it along the sheet's normal but for a lean (2,)."""
+    """Simulate stripes on the sphere standard; the sensor moves along the sheet's normal, except for a lean (2,)."""
     frame, fan = camera_from_object(real.sensor), FanRays.of(real, index, rays)
-    # A beam tilted into the line optics turns the sheet's normal as a whole.
+    # A beam with a tilt at the line optics rotates the sheet's normal.
     frame[:3, :3] = frame[:3, :3] @ turn(0.0, real.bow, 0.0)
     direction = frame[:3, :3] @ [1.0, *lean]
     direction /= np.linalg.norm(direction)

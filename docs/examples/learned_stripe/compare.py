@@ -1,11 +1,11 @@
-"""Compare a trained network with the project's own methods on the test scenes of data sets, and on real images.
+"""Compare a trained network with the project's own methods, on the test scenes of data sets and on real images.
 
     python compare.py stripe.onnx runs/clean runs/turbid runs/shiny --real FOLDER
 
-Lines count whose stripe is visible and could be known to a pixel by its Cramer-Rao bound. A line is found where a
-method gives a centre within `NEAR_PX` of the true one, and false where it gives one farther away or where no stripe is.
-Errors are those of the found lines; the bound is that of detector noise without speckle. On real images, whose truth
-nobody knows, the scatter of the centres about a smooth stripe is given instead.
+Only lines with a visible stripe and a Cramer-Rao bound below one pixel are evaluated. A line is found if the method's
+centre is within `NEAR_PX` of the true one. A centre farther away, or on a line without a stripe, is false. Errors are
+those of the found lines. The bound is for detector noise without speckle. The truth of real images is unknown: for
+them, the table shows the scatter of the centres about a smooth stripe.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SMOOTH_LINES = 31
 
 @dataclass
 class Tally:
-    """What a method gives on the lines of a data set: errors of the found ones in px, their bounds, and counts."""
+    """Results of a method on a data set: errors of found lines and their bounds, in px, and counts of lines."""
 
     errors: list[np.ndarray] = field(default_factory=list)
     bounds: list[np.ndarray] = field(default_factory=list)
@@ -59,13 +59,13 @@ class Tally:
 
 
 def methods(model: Path) -> dict[str, StripeOptions]:
-    """Options of all methods and of the network, all of which keep the lines beside ends of the stripe."""
+    """Return the options of all methods and of the network; all keep the lines beside ends of the stripe."""
     known = {name: StripeOptions(method=name, end_lines=0) for name in method_names()}
     return known | {"learned": StripeOptions(method="learned", model=str(model), end_lines=0)}
 
 
 def judge(folder: Path, options: dict[str, StripeOptions]) -> dict[str, Tally]:
-    """Tallies of all methods on the test scenes of a data set."""
+    """Return the tallies of all methods on the test scenes of a data set."""
     tallies = {name: Tally() for name in options}
     for sample in twin.load_dataset(folder, split="test", names=("image", "centre_px", "status", "bound_px")):
         for name, how in options.items():
@@ -75,7 +75,7 @@ def judge(folder: Path, options: dict[str, StripeOptions]) -> dict[str, Tally]:
 
 
 def smooth_scatter(images: Sequence[np.ndarray], along: str, how: StripeOptions) -> tuple[float, float]:
-    """Share of the lines with a centre, and the centres' scatter in px about a parabola over `SMOOTH_LINES` lines."""
+    """Return the fraction of lines with a centre, and the centres' scatter in px about parabolas of `SMOOTH_LINES`."""
     found, lines, left = 0, 0, []
     for image in images:
         centre = extract_stripe(image, stripe_along=along, options=how).centre_px
@@ -83,7 +83,7 @@ def smooth_scatter(images: Sequence[np.ndarray], along: str, how: StripeOptions)
         for start in range(0, len(centre) - SMOOTH_LINES, SMOOTH_LINES):
             part = centre[start : start + SMOOTH_LINES]
             good = np.isfinite(part)
-            # A stripe that is whole and has no edge there.
+            # A stripe without gaps and edges.
             if good.all() and np.abs(np.diff(part)).max() < NEAR_PX:
                 place = np.arange(SMOOTH_LINES) - SMOOTH_LINES // 2
                 left.append(part - np.polyval(np.polyfit(place, part, 2), place))

@@ -1,7 +1,7 @@
-"""A small U-Net across the stripe: one profile line in, a map of where the stripe's centre is out.
+"""Small U-Net across the stripe: its input is a profile line, its output a probability map of the stripe's centre.
 
 Layers are those of Ronneberger et al. (MICCAI 2015) in one dimension. The map is a softmax over the line's pixels and
-"no stripe" as one class more; the centre is the map's mean about its highest pixel, which makes it finer than a pixel.
+the class "no stripe". The centre is the mean of the map about its highest pixel, with subpixel resolution.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 CHANNELS = 12, 20, 32, 48
-"""Of the levels, each of half the pixels of the one before."""
+"""Channels of the levels; each level has half the pixels of the previous one."""
 KERNEL = 5
 NEAR_PX = 4
-"""Pixels on either side of the map's highest one whose mean is the centre."""
+"""Pixels on either side of the map's highest pixel that are averaged for the centre."""
 
 Weights = list[tuple[jax.Array, jax.Array]]
 
 
 def layers() -> list[tuple[int, int, int]]:
-    """Kernel and channels, in and out, of all convolutions in their order: down, up, map, and "no stripe"."""
+    """Return kernel, input and output channels of all convolutions in order: down, up, map, and "no stripe"."""
     sizes, last = [], 2
     for channels in CHANNELS:
         sizes += [(KERNEL, last, channels), (KERNEL, channels, channels)]
@@ -49,9 +49,9 @@ def _convolved(x: jax.Array, layer: tuple[jax.Array, jax.Array]) -> jax.Array:
 
 
 def logits(weights: Weights, lines: jax.Array) -> jax.Array:
-    """Logits (B, P + 1) of the pixels and of "no stripe", of lines (B, P) in shares of the full scale."""
+    """Return logits (B, P + 1) of the pixels and of "no stripe", for lines (B, P) scaled to a full scale of 1."""
     given = iter(weights)
-    # The root evens out the shot noise; the share of the line's highest pixel shows faint stripes.
+    # The square root makes shot noise uniform; division by the line's maximum shows faint stripes.
     lines = jnp.maximum(lines, 0.0)
     x = jnp.stack([jnp.sqrt(lines), lines / (lines.max(axis=1, keepdims=True) + 1e-3)], axis=-1)
     passed = []
@@ -72,7 +72,7 @@ def logits(weights: Weights, lines: jax.Array) -> jax.Array:
 
 
 def centres(found: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Centre (B,) px and the probability (B,) that it is there, from logits (B, P + 1)."""
+    """Return centres (B,) in px and the probabilities (B,) of a stripe, from logits (B, P + 1)."""
     chance = jax.nn.softmax(found, axis=1)[:, :-1]
     place = jnp.arange(chance.shape[1], dtype=jnp.float32)
     near = chance * (jnp.abs(place - chance.argmax(axis=1)[:, None]) <= NEAR_PX)

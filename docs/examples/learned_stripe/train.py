@@ -22,17 +22,17 @@ from twin.datasets.data_set import LineStatus
 
 CROP_PX, BATCH = 256, 256
 SPREAD_PX = 0.8
-"""Standard deviation of the map that is asked for about the true centre."""
+"""Standard deviation of the target map about the true centre."""
 CENTRE_WEIGHT = 1.0
-"""Of the centre's error in px beside the map's cross entropy."""
+"""Weight of the centre's error in px relative to the map's cross entropy."""
 RATE = 3e-3
 NO_STRIPE = -1.0
 
 
 def read_lines(folders: list[Path], split: str) -> tuple[np.ndarray, np.ndarray]:
-    """Lines (N, P) of uint8 and the true centre (N,) on each, `NO_STRIPE` where none is.
+    """Return lines (N, P) of uint8 and the true centre (N,) on each, `NO_STRIPE` on lines without a stripe.
 
-    Left out are faint stripes, and those whose centre cannot be known to a pixel, as under saturated daylight.
+    Faint stripes are left out, and stripes whose centre cannot be known to a pixel, as under saturated daylight.
     """
     images, truths = [], []
     for folder in folders:
@@ -47,12 +47,12 @@ def read_lines(folders: list[Path], split: str) -> tuple[np.ndarray, np.ndarray]
 
 
 def batches(lines: np.ndarray, truth: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Random parts of random lines, half of them turned about; a part that misses its stripe has none."""
+    """Yield random crops of random lines, half of them reversed; a crop beside the stripe is labelled `NO_STRIPE`."""
     longest = lines.shape[1] - CROP_PX
     while True:
         chosen = rng.integers(0, len(lines), BATCH)
         centre = truth[chosen]
-        # Most parts show the stripe, and near their border it has no whole profile.
+        # Most crops contain the stripe; near their border its profile is cut off.
         first = np.where(centre >= 0, centre - rng.uniform(0, CROP_PX, BATCH), rng.uniform(0, longest, BATCH))
         first = np.clip(first, 0, longest).astype(int)
         part = lines[chosen[:, None], first[:, None] + np.arange(CROP_PX)].astype(np.float32) / 255.0
@@ -79,7 +79,7 @@ def loss(weights: Weights, lines: jax.Array, centre: jax.Array) -> jax.Array:
 
 
 def trained(lines: np.ndarray, truth: np.ndarray, *, minutes: float, seed: int) -> Weights:
-    """Weights after so many minutes; the learning rate falls to zero over them."""
+    """Train for ``minutes`` and return the weights; the learning rate decreases to zero over this time."""
     weights = new_weights(seed)
     optimiser = optax.inject_hyperparams(optax.adam)(learning_rate=RATE)
     state = optimiser.init(weights)
@@ -106,7 +106,7 @@ def trained(lines: np.ndarray, truth: np.ndarray, *, minutes: float, seed: int) 
 
 
 def main() -> None:
-    """Train, judge on the validation scenes, write the model."""
+    """Train, evaluate on the validation scenes, and write the model."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path, help="data sets of twin dataset with the label centre")
     parser.add_argument("--out", type=Path, required=True, help="ONNX model to write")

@@ -29,7 +29,7 @@ SHOT = Shot(stage_mm=0.0, travelled_mm=0.0, light="laser")
 
 
 def gaussian(centre: float, sigma: float, count: int, electrons: float) -> np.ndarray:
-    """A Gaussian of so many electrons at its peak, integrated over pixels."""
+    """Return a Gaussian with a peak of ``electrons``, integrated over pixels."""
     edge = (np.arange(count + 1) - 0.5 - centre) / (np.sqrt(2) * sigma)
     return electrons * np.sqrt(np.pi / 2) * sigma * np.diff(erf(edge))
 
@@ -147,7 +147,7 @@ def test_the_light_of_all_ways_makes_the_image(thesis):
     np.testing.assert_allclose(taken.image, grey, rtol=4 * 2**-11, atol=0.51)
     assert [part.max() > 0 for part in light] == [True, True, True, False, True]
     assert light[4].max() < 1.5 * light[4][light[4] > 0].min(), "daylight on an even plate"
-    # Haze lies in the water before the plate, on the laser's side of the stripe.
+    # Haze is in the water before the plate, on the laser's side of the stripe.
     assert light[1].sum() > 0 and light[0].argmax() != light[1].argmax()
 
 

@@ -174,7 +174,7 @@ def test_values_and_choices_reach_the_sensor(study):
     sensor = make_sensor(study, design)
     assert (sensor.laser.baseline_mm, sensor.camera.window.glass) == (333.0, "N-BK7")
     assert (sensor.camera.width_px, sensor.camera.height_px) == (640, 512)
-    # What is not free stays, and the base itself is not touched.
+    # Fixed parameters keep the values of the base, and the base itself does not change.
     assert sensor.detector == load_sensor("thesis").detector
     assert study.sensor.laser.baseline_mm == 265.0
 
@@ -219,10 +219,10 @@ def test_a_base_that_cannot_work_says_why(study):
 def test_many_designs_are_judged_as_each_by_itself(name):
     study = load_study(name)
     designs = sample_designs(sampled(study, kind="sobol", designs=1200), 0, 1200)
-    # Few at a time are judged without compiled formulas, and checked one by one where they differ in words.
+    # Small batches are evaluated without compiled formulas.
     places = [*range(30), *range(220, 250), *range(1170, 1200)]
     parts = [evaluate_designs(study, [designs[place] for place in places[k : k + 3]]) for k in range(0, len(places), 3)]
-    # What was compiled for some number of designs holds for fewer and for more.
+    # Formulas compiled for one number of designs are valid for fewer and for more.
     for count in (250, 1200, 250):
         for column, values in evaluate_designs(study, designs[:count]).items():
             found = values[[place for place in places if place < count]]

@@ -1,4 +1,4 @@
-"""What the formulas say of designs, held against known answers of triangulation, optics and laser safety."""
+"""Compare the design formulas with known results of triangulation, optics and laser safety."""
 
 import math
 
@@ -126,7 +126,8 @@ def test_speckle_alone_makes_the_scatter_independent_of_the_light(thesis):
 
 
 def test_photons_alone_make_the_scatter_fall_with_the_root_of_the_light(thesis):
-    # Light of a great line width on a rough surface has no speckle; few electrons leave the profile's form unimportant.
+    # Light of large line width on a rough surface gives no speckle; with few electrons, the form of the profile does
+    # not matter.
     white = altered(thesis, {"detector": QUIET, "laser": {"linewidth_nm": 2000.0}})
     exposures = [judged(altered(white, {"exposure": {"laser_ms": ms}})) for ms in (1e-4, 4e-4)]
     ratio = exposures[0].sigma_z_rms_mm.item() / exposures[1].sigma_z_rms_mm.item()

@@ -1,4 +1,4 @@
-"""Where designs see their sheet, by formulas: held against least time, the design equations and finite differences."""
+"""Compare the formulas for the view of the sheet with least time, the design equations and finite differences."""
 
 import math
 
@@ -118,7 +118,7 @@ def test_figures_agree_with_the_design_equations(thesis, medium):
     assert found.depth_per_px_mm.item() == pytest.approx(per_pixel * leaning, rel=1e-9)
     for name, depth in (("line_near_mm", 250.0), ("line_mm", 325.0), ("line_far_mm", 400.0)):
         expected = float(line_length_mm(setup, depth + setup.window.outer_mm, side_px=1280))
-        # The edge lies half a pixel outside the last pixel's centre for both.
+        # For both, the edge is half a pixel outside the centre of the last pixel.
         assert getattr(found, name).item() == pytest.approx(expected, rel=1e-6)
     assert found.standoff_mm.item() == pytest.approx(view_of_sheet(sensor, sensor.media[medium]).standoff_mm, rel=1e-9)
 

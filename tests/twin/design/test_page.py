@@ -184,7 +184,7 @@ def test_drawn_volume_has_the_description_s_ends_and_lies_on_the_sheet(name):
     outer = window.distance_mm + window.thickness_mm / math.cos(math.radians(window.tilt_x_deg))
     depths = outer + np.array([sensor.volume.near_mm, sensor.volume.far_mm])
     assert side.volume[:, 1] == pytest.approx(depths, abs=1e-9)
-    # Laser, crossing, volume and its part in view lie on one line, at the angle that is written at it.
+    # Laser, crossing, volume and its visible part are on one line, at the angle in its label.
     points = np.vstack([side.laser.origin, side.crossing, side.volume, side.in_view])
     direction = np.array([math.sin(side.angle_rad), -math.cos(side.angle_rad)])
     aside = (points - side.crossing) @ np.array([direction[1], -direction[0]])
@@ -205,9 +205,9 @@ def test_drawn_lines_are_as_long_as_the_figures_say_and_end_at_the_drawn_borders
     lengths = np.array([figures.line_near_mm[0], figures.line_mm[0], figures.line_far_mm[0]])
     # The figures leave out 1e-9 of the line at both ends, as the drawing does; the rest is rounding.
     assert np.ptp(front.lines[:, :, 0], axis=1) == pytest.approx(lengths, rel=1e-8)
-    # Lines end on the image's border, found by tracing rays forward, or on the fan's edge. The border has 40 pieces per
-    # side: between their ends it lies off by less than 0.1 mm even where distortion bends it. In the image's corners,
-    # at near and far end, the line may end a little beyond the border's, as it is bent and the volume's end is not.
+    # Lines end on the image's border, found by tracing rays forward, or on the fan's edge. The border has 40 segments
+    # per side, with an error below 0.1 mm even if distortion bends the border. In the image's corners, at the near and
+    # the far end, the line may end slightly outside the border: the line is bent and the volume's end is straight.
     for line, allowed in zip(front.lines, (2.5, 0.1, 2.5), strict=True):
         for end in line:
             assert min(distance_to(end, border) for border in (*front.borders, *front.fan)) < allowed
@@ -262,7 +262,7 @@ def test_the_front_of_many_designs():
     values = np.random.default_rng(1).random((100_000, 2))
     front = find_pareto_front(values)
     found = values[front][np.argsort(values[front, 0])]
-    # Along the front one value rises while the other falls, and nothing lies below it.
+    # Along the front one value rises while the other falls, and no value is below it.
     assert len(found) > 5 and (np.diff(found[:, 1]) < 0).all()
     below = np.searchsorted(found[:, 0], values[:, 0], side="right") - 1
     assert (values[below >= 0, 1] >= found[below[below >= 0], 1]).all()
@@ -411,7 +411,7 @@ def test_one_variable_gives_curves_and_none_gives_bars():
 
 
 class Page(HTMLParser):
-    """What a page holds: text, attributes that load something, and the figures' JSON."""
+    """Contents of a page: text, attributes that load files, and the figures' JSON."""
 
     VOID = {"meta", "br", "link", "img", "rect", "path", "line", "circle"}
 

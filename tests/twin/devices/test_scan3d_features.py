@@ -1,7 +1,7 @@
-"""The served 3D camera's features and chunk data by GenApi, the standard's reference implementation.
+"""Read the served 3D camera's features and chunk data with GenApi, the standard's reference implementation.
 
-harvesters reads cameras through it. No GenTL producer that reaches GigE Vision cameras can be had freely, so that its
-last part, the transport of frames by a producer, is tried with images only (`tests/uwlts/hardware/test_cameras.py`).
+`harvesters` reads cameras through GenApi. No free GenTL producer supports GigE Vision cameras. Therefore the transport
+of frames by a producer is tested with images only (`tests/uwlts/hardware/test_cameras.py`).
 """
 
 import struct

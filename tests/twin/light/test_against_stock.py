@@ -119,7 +119,8 @@ def in_stripe(direct: np.ndarray) -> np.ndarray:
 def off_stripe(direct: np.ndarray) -> np.ndarray:
     """Return the mask of blocks (H, W) that, like their neighbours, receive no light of the stripe.
 
-    The twin renders the stripe up to 4.5 standard deviations; the stock renderer has no limit: 4e-5 of the peak remain.
+    The twin renders the stripe up to 4.5 standard deviations; the stock renderer does not cut it off. The difference is
+    4e-5 of the peak.
     """
     lit = direct > 1e-9 * direct.max()
     lit[1:] |= lit[:-1].copy()

@@ -70,8 +70,9 @@ def test_the_stripe_on_a_plate_is_where_the_formulas_say(thesis, medium_name, al
         # The distance between the centres of the outermost lines is one line less than the side.
         assert abs(np.ptp(y) - line_length_mm(setup, depth, side_px=camera.lines() - 1)) < 2 * end_mm
 
-        # Two plates 2 mm apart. The quotient departs from the slope by h^2 / Z^2 of it, h = 1 mm and Z at least 337 mm:
-        # 1e-5. The errors of two centres at least 5.8 px from each other give 4e-4, those of their means 1e-4.
+        # Two plates at a distance of 2 mm. The quotient differs from the slope by h^2 / Z^2 (relative), with h = 1 mm
+        # and Z at least 337 mm: 1e-5. Errors of two centres at least 5.8 px from each other give 4e-4, those of their
+        # means 1e-4.
         ahead, behind = stripe(z + 1.0)[0], stripe(z - 1.0)[0]
         assert np.abs(ahead - behind).min() > 5.8
         excess = 2 * COSINE / (ahead - behind) / per_pixel - 1

@@ -294,8 +294,9 @@ def test_no_walk_outshines_the_stripe(tiny, name):
     assert images.min() >= 0
     peak, mean = frames[0].stripe.max(), images.mean(axis=0)
     assert mean.max() < 0.2 * peak
-    # Weighted by the balance heuristic, a walk that finds a lit surface adds at most its radiance over the share 0.7 of
-    # directions drawn from the vertex's own scattering; a cell takes the mean of 4 walks or more, of which two may.
+    # Weighted by the balance heuristic, a walk that finds a lit surface adds at most its radiance divided by 0.7, the
+    # fraction of directions drawn from the vertex's own scattering. A cell takes the mean of at least 4 walks; at most
+    # two of them may find a lit surface.
     assert images.max() < 0.2 * peak + 2 / 0.7 / 4 * peak
     # Halves of the seeds agree in the light altogether: a sum dominated by rare bright samples would not.
     totals = images.sum(axis=(1, 2))
@@ -347,7 +348,7 @@ def test_images_hold_what_the_walks_find(tiny):
 
 @pytest.mark.slow
 def test_light_on_longer_ways_moves_with_the_sensor(coarse):
-    """Sensor and scene moved together show the same image: nothing may depend on where the scene's origin lies."""
+    """Sensor and scene moved together give the same image: no result depends on the scene's origin."""
     shift = np.array([7.0, -5.0, 60.0])
     groove = [wall(-45.0, (60.0, 0.0), 0.8), wall(45.0, (-60.0, 0.0), 0.8)]
     images = []

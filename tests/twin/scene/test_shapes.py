@@ -188,7 +188,7 @@ def test_a_pitted_pipe_has_the_diameters_and_pits_that_were_asked_for():
     axial = np.stack([mesh.triangles_center[:, 0], *np.zeros((2, len(mesh.faces)))], axis=1)
     outwards = np.sum((mesh.triangles_center - axial) * mesh.face_normals, axis=1)
     assert outwards.min() > 0
-    # The back has no pits: the smallest diameter is across, the largest along z.
+    # Without pits, at the back, the smallest diameter is across, the largest along z.
     end = mesh.vertices[np.isclose(mesh.vertices[:, 0], -60.0)]
     assert 2 * end[:, 2].max() == pytest.approx(102.0, abs=0.02)
     assert np.ptp(end[:, 1]) == pytest.approx(98.0, abs=0.02)

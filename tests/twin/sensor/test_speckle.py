@@ -1,7 +1,7 @@
 """Speckle against the statistics of Gaussian fields: distribution, grain, averaging over pixels, and change in motion.
 
-The number of independent values in a region of many grains is its area divided by the correlation area A_c = (4 / pi)
-(lambda N (1 + m))^2, the integral of |2 J1(z) / z|^2 over the plane.
+The number of independent values in a region of many grains is its area divided by the correlation area A_c. This is the
+integral of |2 J1(z) / z|^2 over the plane, A_c = (4 / pi) (lambda N (1 + m))^2.
 """
 
 import math

@@ -34,7 +34,7 @@ def true_points(cloud: PointCloud, reported: Trajectory, true: Trajectory) -> np
 
 
 def apart(cloud: PointCloud, true_points: np.ndarray, crossed: tuple[float, float]) -> np.ndarray:
-    """By how much two passes place the same squares of 30 mm apart, (K, 3) mm, in an overlap about a place."""
+    """Return the displacements (K, 3) in mm between two passes on squares of 30 mm around a crossing."""
     assert cloud.time_s is not None
     inside = np.all(np.abs(true_points[:, :2] - crossed) < 90, axis=1)
     errors, late = (cloud.points_mm - true_points)[inside], cloud.time_s[inside] > np.median(cloud.time_s)
@@ -80,7 +80,7 @@ def test_a_loop_is_closed(loop, closed):
     points = true_points(cloud, reported, true)
     before, after = (apart(each, points, (450, 0)) for each in (cloud, found.cloud))
     assert len(after) >= 30 and np.linalg.norm(before, axis=1).min() > 10
-    # The goal for lengths within a crossing; along the normal the surface tells more than across it.
+    # The goal for lengths within a crossing; the surface determines shifts along its normal best.
     assert (np.sqrt(np.mean(after**2, axis=0)) < [1.0, 1.0, 0.2]).all()
     assert position_errors(found.trajectory, true) < position_errors(reported, true) / 3
     for time in best.times_s:
@@ -88,7 +88,7 @@ def test_a_loop_is_closed(loop, closed):
         k = int(np.argmin(np.abs(true.times_s - time)))
         error = (found.trajectory.poses - true.poses)[k, :3, 3]
         assert (np.abs(error) < 5 * np.sqrt(np.diag(found.trajectory.covariance[k])[:3])).all()
-    # The start is the frame's, and what a crossing tells lowers the uncertainty of what came before it.
+    # The start defines the frame, and a crossing reduces the uncertainty of earlier positions.
     std = np.sqrt(np.einsum("nii->ni", found.trajectory.covariance))
     assert std[0, :3].max() < 0.1 and (std[:, :3] < 60).all()
 
@@ -120,14 +120,14 @@ def test_a_random_walk_is_followed_within_a_crossing():
     points = true_points(cloud, reported, true)
     found = uwlts.align_trajectory(cloud, reported)
     before, after = (apart(each, points, (450, 0)) for each in (cloud, found.cloud))
-    # The walk goes 60 mm x 0.1 x sqrt(1.5 s / 20 s) = 1.6 mm while a pass is over the crossing. About its mean it
-    # scatters by that over sqrt(6), and by 0.9 mm for two passes.
+    # The random walk reaches 60 mm x 0.1 x sqrt(1.5 s / 20 s) = 1.6 mm while a pass is over the crossing. Its standard
+    # deviation about its mean is 1.6 mm / sqrt(6), or 0.9 mm for two passes.
     assert len(after) >= 30 and (before.std(axis=0) > 0.5).all()
-    # The goal for lengths within a crossing; along the normal the surface tells more than across it.
+    # The goal for lengths within a crossing; the surface determines shifts along its normal best.
     assert (np.sqrt(np.mean(after**2, axis=0)) < [1.0, 1.0, 0.2]).all()
     stated = [np.sqrt(np.einsum("nii->ni", each.covariance)[1:, :3]) for each in (reported, found.trajectory)]
     assert np.sqrt(np.mean(stated[1] ** 2)) < np.sqrt(np.mean(stated[0] ** 2)) / 3
-    # Errors along the path are alike: few independent numbers of standard deviation one, so that three is one in 300.
+    # Errors along the path are correlated: few independent numbers of standard deviation one exceed 3 once in 300.
     off = (found.trajectory.poses - true.poses)[1:, :3, 3] / stated[1]
     assert np.sqrt(np.mean(off**2)) < 3
 
@@ -157,7 +157,7 @@ def test_along_a_ridge_the_navigation_is_all_that_is_known():
     cloud, reported, true = ride(np.random.default_rng(SEED), RACE_MM, ground=ground, **drift)
     found = uwlts.align_trajectory(cloud, reported, **drift).trajectory
     std = np.sqrt(np.einsum("ii->i", found.covariance[-1]))
-    # Over the start again: along the ridge the navigation's 4 mm stay, less what the kind of drift tells.
+    # Over the start again: along the ridge the navigation's 4 mm remain, slightly reduced by the drift model.
     assert std[0] > 3.0 and (std[1:3] < 0.5).all()
     error = (found.poses - true.poses)[-1, :3, 3]
     assert (np.abs(error) < 5 * std[:3]).all()

@@ -44,7 +44,7 @@ def test_rates_walks_and_dead_reckoning_are_found_from_the_covariance(by_heading
     assert found.stated
     assert found.dead_reckoned == by_heading
     size, walk = found.std**2, found.std**2 * found.walk
-    # What is measured all along walks within the bounds of twice its variance.
+    # Continuously measured quantities are modelled as random walks with twice their variance, an upper bound.
     np.testing.assert_allclose(size[2:5], 2 * np.array([DEPTH_MM, TILT, TILT]) ** 2)
     np.testing.assert_allclose(found.walk[2:5], 1.0)
     # The part that the heading causes is taken off; its random walk leaves some of it.

@@ -77,7 +77,7 @@ def test_closer_nodes_keep_the_correction_and_are_no_more_than_wanted():
 def test_a_heading_error_adds_to_a_dead_reckoned_position():
     at = np.array([SECONDS])
     with_, without = (covariance(prior_of(dead_reckoned=each), at)[:, 0, :, 0] for each in (True, False))
-    # A heading that grows steadily to e shifts the end by e / 2 of the way, to the side, and a walk by e / sqrt(3).
+    # A heading error that grows linearly to e shifts the end sideways by e / 2 of the way, and a walk by e / sqrt(3).
     way = SPEED_MM_S * SECONDS
     aside = STD[5] ** 2 * way**2 * ((1 - WALK[5]) / 4 + WALK[5] / 3)
     np.testing.assert_allclose(with_[1, 1] - without[1, 1], aside, rtol=0.01)

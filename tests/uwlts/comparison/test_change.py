@@ -68,7 +68,7 @@ def test_nothing_is_claimed_where_nothing_changed():
         change = uwlts.compare_clouds(scanned(rng), scanned(rng))
         assert change.compared.mean() > 0.95
         shares.append(change.significant[change.compared].mean())
-    # What is common to all points makes the shares of single pairs scatter widely about 5 %.
+    # Errors common to all points make the fractions of single pairs scatter widely about 5 %.
     assert np.mean(shares) < 0.12
     quiet = [uwlts.compare_clouds(scanned(rng, common=False), scanned(rng, common=False)) for _ in range(3)]
     claimed = np.mean([share(each) for each in quiet])
@@ -117,7 +117,7 @@ def shallow(x, y):
 
 
 def share(change):
-    """Share of the area in which a change is claimed."""
+    """Return the fraction of the area with a significant change."""
     return np.average(change.significant[change.compared], weights=change.area_mm2[change.compared])
 
 
@@ -128,9 +128,9 @@ def test_a_registration_takes_up_what_looks_like_a_movement():
     pairs = [(scanned(rng), scanned(rng)) for _ in range(4)]
     found = [uwlts.compare_clouds(*pair, register=True) for pair in pairs]
     plain = uwlts.compare_clouds(*pairs[0])
-    # Noise and images alone have 0.03 mm, shift and tilt of both clouds another 0.1 mm.
+    # Noise and images have 0.03 mm, shift and tilt of both clouds 0.1 mm more.
     assert np.median(found[0].level_mm) < 0.5 * np.median(plain.level_mm)
-    # Neighbouring places share their images, so that the share of one pair has a standard deviation of 2 %.
+    # Neighbouring places share their images; therefore the fraction of one pair has a standard deviation of 2 %.
     assert np.mean([share(each) for each in found]) < 0.05 + 3 * 0.02 / np.sqrt(4)
 
 
@@ -163,11 +163,11 @@ def test_a_given_shape_is_taken_as_it_is(ball, tmp_path):
     given = uwlts.compare_clouds(cloud, tmp_path / "ball.toml")
     far = given.compared & (given.points_mm[:, 2] < -15) & (np.hypot(*given.points_mm[:, :2].T) > 6)
     z = given.points_mm[far, 2] / 25.0
-    # The cloud's centre lies 0.02 mm before the sphere's, its radius is 0.05 mm larger; means of 30 points of 0.02 mm.
+    # The cloud's centre is 0.02 mm before the sphere's, its radius is 0.05 mm larger; means of 30 points of 0.02 mm.
     assert np.mean(given.distance_mm[far] - (0.05 - 0.02 * z)) == pytest.approx(0, abs=0.003)
     (tmp_path / "ball.toml").write_text('kind = "sphere"\ndiameter_mm = 50.0\npoint_mm = [0, 0, 0.2]\n')
     moved = uwlts.compare_clouds(cloud, tmp_path / "ball.toml", register=True)
-    # Turns about the sphere's centre are open; 10,000 points of 0.02 mm, the bump has no weight.
+    # Rotations about the sphere's centre are undetermined; 10,000 points of 0.02 mm, the bump gets zero weight.
     centre = moved.registration.transform[:3] @ [0, 0, 0, 1]
     np.testing.assert_allclose(centre, [0, 0, 0.2], atol=0.005)
     for text in ('kind = "sphere"\npoint_mm = [0, 0, 0]\n', 'kind = "cone"\n', "kind = \n"):
@@ -239,7 +239,7 @@ def test_what_a_shape_does_not_tell_is_left_as_it_was(surface, open_words):
 
 
 def profiles(rng, ends):
-    """A curved surface in dense profiles 1 mm apart, whose noise three neighbours share."""
+    """Return a curved surface in dense profiles every 1 mm, with noise shared by three neighbours."""
     x, y = np.meshgrid(np.arange(*ends, 1.0), np.arange(-15, 15, 0.15), indexing="ij")
     drawn = rng.standard_normal((x.shape[0], x.shape[1] + 2))
     noise = NOISE_MM * (drawn[:, :-2] + drawn[:, 1:-1] + drawn[:, 2:]) / np.sqrt(3)
@@ -248,12 +248,12 @@ def profiles(rng, ends):
 
 
 def test_nothing_is_claimed_beyond_the_reference_or_of_shared_noise():
-    """Beside the border of the reference its nearest points lie on a line, which has no normal."""
+    """Beside the border of the reference, its nearest points are on a line and do not define a normal."""
     rng = np.random.default_rng(8)
     change = uwlts.compare_clouds(profiles(rng, (-40, 40)), profiles(rng, (-20, 20)))
     assert np.abs(change.points_mm[change.compared, 0]).max() < 24
     assert np.abs(change.distance_mm[change.compared]).max() < 0.2
-    # Some 1,500 places, ten neighbours of which share their points: 5 % scatter by 2 %; without the factor it is 25 %.
+    # About 1,500 places, where ten neighbours share their points: 5 % scatter by 2 %; without the factor it is 25 %.
     assert change.significant[change.compared].mean() < 0.12
 
 
@@ -341,7 +341,7 @@ def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
 
 
 def test_all_regions_are_listed_whatever_the_size_of_the_cloud(monkeypatch, tmp_path):
-    """25 losses of one size on a cloud of which every fourth place alone can be looked at."""
+    """25 losses of one size on a cloud so large that only every fourth place is examined."""
     rng = np.random.default_rng(31)
     x, y = np.meshgrid(np.arange(200.0), np.arange(200.0), indexing="ij")
     frame, line = np.indices(x.shape)

@@ -65,8 +65,8 @@ def test_two_spheres_before_a_wall_with_outliers(wall_z):
     shuffled = rng.permutation(len(points))
     result = evaluate_cloud(cloud_of(points[shuffled]), DUMBBELL)
     for number, sphere in enumerate(result.spheres):
-        # Where the wall cuts the sphere some points of the wall lie within the noise and count, some of the sphere do
-        # not. The limits are the means over forty draws and five standard deviations.
+        # At the intersection with the wall, some points of the wall are within the noise and count, and some of the
+        # sphere do not. The limits are the means over forty draws and five standard deviations.
         true = np.linalg.norm(spheres[6000 * number : 6000 * (number + 1)] - CENTRES[number], axis=1)
         assert sphere.points_used == pytest.approx(6000, abs=40)
         assert sphere.points_rejected <= 48
@@ -127,7 +127,7 @@ def test_the_cap_leaves_the_limb_out():
     points = dumbbell(np.random.default_rng(5))
     narrow = DUMBBELL.model_copy(update={"cap_angle_deg": 45.0})
     result = evaluate_cloud(cloud_of(points), narrow)
-    # Evenly spread over the cap: the share of the points within 45 of 75 deg, +- 4 sqrt(6000 p q).
+    # Evenly spread over the cap: the fraction of points within 45 of 75 deg, +- 4 sqrt(6000 p q).
     expected = 6000 * (1 - np.cos(np.radians(45))) / (1 - np.cos(np.radians(75)))
     assert result.spheres[0].points_used == pytest.approx(expected, abs=160)
     with pytest.raises(EvaluationError, match="Increase cap_angle_deg"):
@@ -272,7 +272,7 @@ def test_profiles_are_labelled_and_measured(shape):
     assert outliers <= 7
     # Edges and outliers blank 1 mm to each side: at most 12 x 2 of 176 mm.
     assert kept > 24 * 900 * (1 - 24 / 176 - 0.02)
-    # The root mean square of 24 values of unit variance lies within these limits but for 2e-5 of all draws.
+    # The root mean square of 24 values of unit variance is outside these limits in 2e-5 of all draws.
     assert 0.45 < np.sqrt(np.mean(np.square(scaled))) < 1.66
 
 
@@ -358,7 +358,7 @@ def test_a_whole_scan_of_a_step(reference):
     assert abs(result.height_error_mm) < 4.5 * result.height_std_mm < 0.01
     assert abs(result.profile_height_error_mm) < 0.01
     assert result.profiles == 40
-    # 40 profiles of 900 points, of which 12 mixed; blanked strips take up to 12 of 176 mm.
+    # 40 profiles of 900 points, with 12 mixed points each; blanked strips take up to 12 of 176 mm.
     assert result.points_used > 0.88 * 40 * 900
     assert result.lower_std_mm == pytest.approx(0.05, rel=0.05)
     assert result.parallelism_deg < 0.02
@@ -372,8 +372,8 @@ def test_a_whole_scan_of_a_step(reference):
 
 
 def test_a_turned_step_is_measured_along_its_normal():
-    # The treads are drawn HEIGHT / cos 25 / cos 5 apart along Z; along their normal that is less by the length of
-    # (slope in X, slope in Y, 1), here from an ordinary regression of Z.
+    # The distance of the treads along Z is HEIGHT / cos 25 / cos 5. The distance along their normal is this divided by
+    # the length of (slope in X, slope in Y, 1), here from an ordinary regression of Z.
     cloud = step_scan(25)
     labels = label_step_faces(cloud.points_mm, height_mm=HEIGHT)
     base = cloud.points_mm[labels == StepFace.LOWER]

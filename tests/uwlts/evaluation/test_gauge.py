@@ -59,7 +59,7 @@ def test_intervals_hold_the_truth(interaction):
         rows = [(str(p), str(o), values[p, o, k]) for p in range(8) for o in range(6) for k in range(2)]
         study = uwlts.gauge_study(rows)
         held.append([study.components[name].low <= std <= study.components[name].high for name, std in truth.items()])
-    # Four standard deviations of a share of 120 are 8 %; pooling by a test costs some more.
+    # Four standard deviations of a fraction of 120 are 8 %; pooling after a test reduces the coverage a little more.
     assert (np.mean(held, axis=0) > 0.85).all()
 
 

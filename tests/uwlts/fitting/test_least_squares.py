@@ -28,7 +28,7 @@ def test_normal_noise_costs_five_percent():
     rng, draws, count = np.random.default_rng(SEED), 1000, 200
     design, counted = np.ones((count, 1)), np.ones(count, bool)
     found = np.array([(fit_biweight(design, row, counted)[0] @ row)[0] for row in rng.standard_normal((draws, count))])
-    # The variance of a variance of so many draws is 2 / draws: five standard errors.
+    # A variance estimated from n draws has the relative variance 2 / n: five standard errors.
     assert abs(count * found.var() * 0.95 - 1) < 5 * np.sqrt(2 / draws)
 
 

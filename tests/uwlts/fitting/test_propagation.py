@@ -20,7 +20,7 @@ def test_draws_and_patterns_give_the_covariance_of_sums():
     expected, common = errors.covariances(weights, np.zeros(count), image)
     assert systematic is not None and common is not None
     np.testing.assert_allclose(systematic, np.sqrt(np.diag(common)))
-    # Five standard errors of a standard deviation of so many draws.
+    # Five standard errors of a standard deviation from `DRAWS` draws.
     np.testing.assert_allclose(random, np.sqrt(np.diag(expected)), rtol=5 / np.sqrt(2 * DRAWS))
 
 

@@ -305,7 +305,7 @@ def test_planted_outliers_and_only_they_are_rejected(fit, draw):
     points[outliers, 2] += rng.uniform(2, 15, 40)  # at least 20 standard deviations up
     robust = fit_robustly(fit, points)
     clean = fit(np.delete(points, outliers, axis=0))
-    # Of 3960 normal residuals 0.002 lie beyond 5 standard deviations.
+    # Of 3960 normal residuals, 0.002 are expected beyond 5 standard deviations.
     np.testing.assert_array_equal(np.flatnonzero(~robust.inliers), np.sort(outliers))
     assert (robust.rejected, robust.rejected_share) == (40, 0.01)
     np.testing.assert_allclose(robust.fit.residuals_mm, clean.residuals_mm, atol=1e-8)
@@ -325,5 +325,5 @@ def test_clean_points_are_all_kept_noisy_or_exact():
 def test_the_limit_follows_k():
     rng = np.random.default_rng(10)
     points = flat(rng, 20000) + rng.normal(0, SIGMA, (20000, 3))
-    # 0.27 % of a normal distribution lie beyond 3 standard deviations: 54 +- 7.3; rounds shift the limit by 1 %.
+    # 0.27 % of a normal distribution are beyond 3 standard deviations: 54 +- 7.3; iterations shift the limit by 1 %.
     assert fit_robustly(fit_plane, points, k=3.0).rejected == pytest.approx(54, abs=35)

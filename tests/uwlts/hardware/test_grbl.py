@@ -695,7 +695,7 @@ def test_a_laser_that_is_lit_at_rest_goes_off_by_hand(controller, stage, at_most
 def test_darkness_by_hand_is_met_at_the_next_exchange(controller, stage, exchange):
     stage.darken()
     time.sleep(0.1)
-    # A second press has no further effect.
+    # A second press does not change anything.
     stage.darken()
     # The laser is off, so nothing is exchanged.
     stage.keep_lit()

@@ -18,9 +18,9 @@ SHAPES = {
 def test_the_largest_of_noisy_values_is_not_too_large(shape):
     """The uncorrected maximum of equal values is 0.07 too large, two standard deviations of a mean.
 
-    Fewer than 31 of 40 intervals of 95 % contain the truth once in 80,000 times. The limit of the mean error of 40 is
-    four standard deviations, 0.05 / sqrt(40) each, plus the bias of the extrapolation, a quarter of a mean's standard
-    deviation.
+    Fewer than 31 of 40 intervals of 95 % contain the truth once in 80,000 times. The limit for the mean error of 40 is
+    four standard deviations of 0.05 / sqrt(40), plus the bias of the extrapolation. The bias is a quarter of the
+    standard deviation of a mean.
     """
     rng, truth = np.random.default_rng(7), SHAPES[shape]
     largest = np.convolve(truth, np.full(TOGETHER, 1 / TOGETHER), "valid").max()

@@ -15,7 +15,7 @@ DRAWS = 3000
 FALSE_ALARM = 5e-6
 """Of one comparison. There are 16: with other seeds one of them fails by chance with a probability below 1e-4."""
 NOT_LINEAR = 1.02
-"""The variance of what is moved may differ by so much from that of its linear change."""
+"""Allowed ratio of the variance of a quantity at moved points to the variance of its linear approximation."""
 
 
 def cloud_of(

@@ -1,4 +1,4 @@
-"""Descriptions by name or path: bases, cycles, and messages that tell what to change."""
+"""Descriptions by name or path: bases, cycles, and messages that say what to change."""
 
 from pathlib import Path
 
@@ -218,7 +218,7 @@ def test_merging_keeps_every_change_and_touches_nothing_else(base: dict, changes
     assert repr((base, changes)) == before
     after, wanted = leaves(result), leaves(changes)
     assert wanted.items() <= after.items()
-    # What is not from the changes is from the base, at a place that no change replaced as a whole.
+    # All other values are from the base, in tables that no change replaced as a whole.
     for way, value in after.items():
         if way not in wanted:
             assert leaves(base)[way] == value

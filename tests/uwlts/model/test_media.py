@@ -38,7 +38,7 @@ def test_water_index_agrees_with_an_independent_fit():
     assert index * 1.000277 == pytest.approx(1.33205, abs=3e-5)
 
 
-# Refractive indices relative to air with the accuracy to which their source prints them.
+# Refractive indices relative to air, with the rounding of their printed values.
 GLASS = [
     ("N-BK7", 587.5618, 1.51680, 0.51e-5),  # Schott data sheet, n_d
     ("N-BK7", 656.2725, 1.51432, 0.51e-5),  # Schott data sheet, n_C

@@ -43,7 +43,7 @@ def test_stations_are_as_petzold_measured_them(water, a, b):
     assert per_metre(sea(water=water), 530.0) == pytest.approx((a, b), rel=1e-12)
 
 
-# What exponents from 0.3 to 1.7 and slopes from 0.011 to 0.018 / nm make of the stations at 635 nm, from 514 or 530 nm.
+# Ranges at 635 nm from stations at 514 or 530 nm, for exponents from 0.3 to 1.7 and slopes from 0.011 to 0.018 / nm.
 @pytest.mark.parametrize(
     ("water", "a", "b"),
     [
@@ -276,22 +276,22 @@ def test_names_and_turbidities_are_checked_where_they_are_used():
             FournierForand.of_backscatter(share)
 
 
-# Ocean Optics Web Book, page on the function of Fournier and Forand: index, slope and share scattered backwards.
+# Ocean Optics Web Book, page on the Fournier-Forand function: index, slope and backscatter fraction.
 @pytest.mark.parametrize(
     ("index", "slope", "share"),
     [(1.021, 3.0742, 1e-4), (1.04, 3.201, 1e-3), (1.08, 3.483, 0.01), (1.10, 3.5835, 0.0183), (1.175, 4.065, 0.1)],
 )
 def test_particles_follow_from_the_share_scattered_backwards(index, slope, share):
     found = FournierForand.of_backscatter(share)
-    # The published pairs are printed to two or three decimals of the index, which the line meets to 0.003; the slope is
-    # held by the share, with 0.1542 for one of the index.
+    # The published indices have two or three decimals; the linear relation differs from them by at most 0.003. Index
+    # errors are slope errors times 0.1542.
     assert found.index == pytest.approx(index, abs=0.003)
     assert found.slope == pytest.approx(slope, abs=0.003 / 0.1542)
 
 
 @dataclass(frozen=True)
 class Even(PhaseFunction):
-    """Scatters the same in all directions, with a share of it left out."""
+    """Isotropic scattering, optionally with a part of it left out."""
 
     name = "even"
     sentence = "the same in all directions"

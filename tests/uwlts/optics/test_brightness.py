@@ -86,7 +86,7 @@ def test_a_point_is_the_mean_of_the_footprint(blur_px):
 
 
 def test_points_lie_where_the_light_comes_from(thesis, tmp_path):
-    """Left as they are they lie 9 um beside, seen along the camera's rays; the sheet's curved image costs 0.3 um."""
+    """Uncorrected points have errors of 9 um along the camera's rays; the sheet's curved image causes 0.3 um."""
     header = CaptureHeader(
         name="scan",
         sensor=thesis,
@@ -135,7 +135,7 @@ def test_the_sheet_is_no_thicker_than_the_stripes_are_wide(thesis):
 
 
 def test_many_centres_see_the_sheet_as_few_do(thesis):
-    """By a table that errs by 1e-7 mm of points and 1e-6 of all else; ten times as much between its nodes."""
+    """The table has errors of 1e-7 mm for points and 1e-6 for other values; ten times as much between its nodes."""
     calibration = nominal_calibration(thesis, thesis.media["water"])
     rng = np.random.default_rng(9)
     line, centre = rng.integers(100, 1180, 6000), rng.uniform(300.0, 700.0, 6000)
@@ -172,7 +172,7 @@ def ridge(lean, bend, fading, blur):
     [(0.6, 0.0, 0.02), (-0.6, 0.0, 0.02), (0.0, 0.008, 0.0), (0.4, 0.004, -0.02), (0.0, 0.0, 0.02)],
 )
 def test_blur_moves_centres_of_leaning_and_bent_stripes(lean, bend, fading):
-    """To second order; a fifth is left to what follows. The images hold 8 bits, the centre errs by 0.005 px."""
+    """To second order; a fifth is allowed for higher orders. With images of 8 bits, centres have errors of 0.005 px."""
     blur = 1.6
     image, rows = ridge(lean, bend, fading, blur)
     stripe = extract_stripe(np.round(image).astype(np.uint8), stripe_along="width", saturation=255)

@@ -183,7 +183,7 @@ def test_the_thesis_line_is_longer_than_its_drawings_give():
     # By hand, in test_design_checks.py: 80.226 mm to each side in water.
     assert line_length_mm(WATER, STANDOFF, side_px=1280) == pytest.approx(160.45, abs=0.01)
     assert line_length_mm(AIR, STANDOFF, side_px=1280) == pytest.approx(STANDOFF * 6.784 / 12.5)
-    # The published 184 mm lie between water and air at the stand-off, and 60 mm behind it in water.
+    # The published 184 mm are between the values for water and air at the stand-off. In water, they occur 60 mm behind.
     assert line_length_mm(WATER, STANDOFF + 59.9, side_px=1280) == pytest.approx(184.0, abs=0.05)
     # The thesis's own recipe has cos 35 deg too much: 168 mm in air.
     assert 1280 * 0.0053 * 265 * math.cos(ANGLE) / (12.5 * math.tan(ANGLE)) == pytest.approx(168.25, abs=0.005)
@@ -214,8 +214,8 @@ def test_the_thesis_scheimpflug_angle():
 
 
 def test_object_plane_lens_plane_and_image_plane_meet_in_one_line():
-    # Scheimpflug's own condition. Points of the sheet through a thin lens at the origin: z is the distance before it,
-    # x across; their images lie at -x m and z m behind it, m = f / (z - f).
+    # Scheimpflug's condition. Points of the sheet through a thin lens at the origin: z is the distance before it, x the
+    # coordinate across. Their images are at -x m, and z m behind it, with m = f / (z - f).
     f, z = 12.5, np.array([300.0, STANDOFF, 500.0])
     x = z * math.tan(ANGLE) - 265
     m = f / (z - f)
@@ -345,8 +345,8 @@ def test_a_laser_placed_by_its_axis_has_the_same_design(thesis):
 
 
 def test_z_of_a_laser_beside_the_camera_runs_along_its_own_axis(thesis):
-    # The sheet holds the laser's axis, which leans sideways too; on the image's middle line, where the sheet is crossed
-    # by x = 0, Z grows by the way along the laser's axis.
+    # The sheet contains the laser's axis, which also leans sideways. On the image's middle line, where x = 0 crosses
+    # the sheet, Z grows with the distance along the laser's axis.
     laser = PLACED | {"origin_mm": (-150.0, -265.0, 0.0), "axis": (150.0, 265.0, 378.5)}
     sensor = altered(thesis, {"laser": laser})
     setup, leaning = nominal_setup(sensor, sensor.media["air"])

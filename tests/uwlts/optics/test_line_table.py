@@ -1,4 +1,4 @@
-"""Tables of smooth functions: they give what the function gives, or there is none."""
+"""Tables of smooth functions: their values equal those of the function; other functions get no table."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_terms_are_left_out_up_to_an_error():
 
 
 def test_a_table_is_kept_for_the_next_places_of_the_same_function():
-    """Those that lie within the same multiples of 64, whichever came first; another function has another one."""
+    """A table is reused for places within the same multiples of 64, in any order; other functions have their own."""
     calls = []
 
     def counted(line, place):

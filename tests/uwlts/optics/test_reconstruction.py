@@ -68,7 +68,7 @@ def test_directions_come_back_to_their_pixels_through_opencv(distortion, seed):
 
 
 def test_strong_barrel_distortion_is_inverted_up_to_its_edge_and_flagged_beyond():
-    # x (1 - 0.3 x^2) rises up to x = 1.0541, where it is 0.70273: no image lies farther out.
+    # x (1 - 0.3 x^2) rises up to x = 1.0541, where it is 0.70273: no image is farther out.
     model = camera(distortion=Distortion(k1=-0.3), focal_px=1000.0)
     edge = math.sqrt(1 / 0.9) * (1 - 0.3 / 0.9)
     around = np.linspace(0, 2 * math.pi, 400)
@@ -142,9 +142,9 @@ def test_projection_through_the_window_is_the_path_of_least_time(window, medium_
 
 
 def points_beyond(face: fermat.Face, *, seed: int, count: int, steepest_deg: float) -> np.ndarray:
-    """Points (count, 3) 1 to 500 mm beyond a face, seen straight from the pupil at up to an angle to its normal.
+    """Return points (count, 3) 1 to 500 mm beyond a face, up to an angle from its normal through the pupil.
 
-    The first lies on the normal through the pupil.
+    The first point is on this normal.
     """
     random = np.random.default_rng(seed)
     height = (face.point @ face.normal + random.uniform(1.0, 500.0, count))[:, None]
@@ -288,7 +288,7 @@ def test_the_axial_ray_meets_the_sheet_or_says_why_not(offset_mm, normal, expect
 def test_failures_of_lens_and_window_keep_their_status_among_good_points():
     calibration = nominal("width", distortion=Distortion(k1=-4.0))
     centre, corner = [639.5, 511.5], [0.0, 0.0]
-    # x (1 - 4 x^2) ends at 0.192, the corner lies at 0.347.
+    # x (1 - 4 x^2) ends at 0.192; the corner is at 0.347.
     found = points_on_sheet(calibration, np.array([centre, corner, centre]), medium_index=WATER)
     assert found.status.tolist() == [RayStatus.OK, RayStatus.NO_DIRECTION, RayStatus.OK]
     assert np.isnan(found.points_mm[1]).all() and np.isfinite(found.points_mm[[0, 2]]).all()
@@ -350,7 +350,7 @@ def test_a_profiles_lines_are_columns_or_rows(stripe_along):
     expected = reconstruct_pixels(calibration, pixels, **common)
     assert (profile.status == RayStatus.OK).all()
     np.testing.assert_array_equal(profile.points_mm, expected.points_mm)
-    # The stripe runs along y of the object frame: neighbouring lines lie apart in y, by far more than in depth.
+    # The stripe runs along y of the object frame: neighbouring lines differ in y by far more than in depth.
     assert (np.abs(np.diff(profile.points_mm[:, 1])) > 3.0).all()
 
 

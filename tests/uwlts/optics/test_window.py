@@ -53,7 +53,7 @@ def test_refraction_obeys_snell(x_deg, y_deg, n1, n2, seed):
 def test_refraction_is_reversible(x_deg, y_deg, n1, n2, seed):
     normal, incident = tilted(x_deg, y_deg), cone(seed)
     forth, reflected = refract(incident, normal, ratio=n1 / n2)
-    # Away from grazing: behind the interface the cosine then exceeds 0.1, by which roundings of 1e-16 are divided.
+    # Without grazing rays: rounding errors of 1e-16 are divided by the cosine behind the interface, here above 0.1.
     kept = ~reflected
     kept[kept] = forth[kept] @ normal > 0.1
     back, _ = refract(-forth[kept], normal, ratio=n2 / n1)
@@ -99,8 +99,8 @@ def test_traced_rays_are_the_paths_of_least_time(window, medium_index, seed):
     depth = np.random.default_rng(seed).uniform(10.0, 500.0, len(seen))
     points = rays.origins + depth[:, None] * rays.directions
     faces, path = faces_and_indices(window, medium_index)
-    # Lengths up to 1e3 mm with roundings of 1e-16 give 1e-13 mm, and divided by the cosine squared of 60 deg 1e-12 mm;
-    # the oracle stops at moves of 1e-11 mm, of which the square is left. The tolerance leaves a thousandfold.
+    # Rounding errors of 1e-16 for lengths up to 1e3 mm are 1e-13 mm, divided by the squared cosine of 60 deg 1e-12 mm.
+    # The oracle stops at steps of 1e-11 mm and converges quadratically. The tolerance is a thousand times larger.
     crossings = fermat.least_time_crossings(np.zeros(3), points, faces, path)
     np.testing.assert_allclose(rays.origins, crossings[:, -1], rtol=0, atol=1e-9)
     # The first leg is 5 mm or longer: 1e-12 mm over 5 mm.
@@ -135,7 +135,7 @@ def test_a_plate_without_thickness_or_without_glass_is_one_refraction(window, me
     for plate_like, interface in ((thin, single), (airy, behind)):
         two = trace_window(seen, plate_like, medium_index=medium_index)
         one = trace_window(seen, interface, medium_index=medium_index)
-        # Roundings of lengths up to 1e3 mm and of unit vectors, a few operations apart; 1 / cos 60 deg doubles them.
+        # Rounding errors of a few operations on lengths up to 1e3 mm and unit vectors; 1 / cos 60 deg doubles them.
         np.testing.assert_allclose(two.origins, one.origins, rtol=0, atol=1e-11)
         np.testing.assert_allclose(two.directions, one.directions, rtol=0, atol=1e-14)
 

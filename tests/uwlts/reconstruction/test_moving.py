@@ -171,10 +171,10 @@ def test_errors_of_each_pose_move_its_image_s_points_together():
 
 @pytest.mark.parametrize("kind", ["random walk", "common", "Gauss-Markov"])
 def test_errors_along_a_path_are_as_alike_as_its_covariances_say(kind):
-    """The length between the first and the last images, against 4000 draws of errors along the path.
+    """Compare the length between the first and the last images with 4000 draws of errors along the path.
 
-    A random walk is what variances that grow with time mean. Shapes in time hold 99 % of its variance, and what is left
-    counts as independent, which changes the distance of two images' points by 1 % at most.
+    Variances that grow with time mean a random walk. Shapes in time contain 99 % of its variance; the rest counts as
+    independent. This changes the uncertainty of a distance between points of two images by 1 % at most.
     """
     rng = np.random.default_rng(3)
     count, seen, std = 40, np.array([[10.0, 0.0, 200.0]]), np.array([0.5, 0.7, 0.3, 1e-4, 2e-4, 3e-4])

@@ -7,7 +7,7 @@ from uwlts.storage.cloud import PointUncertainty
 
 
 def test_points_have_the_covariance_of_the_path_and_of_their_sensor():
-    """Single points exactly (float32); between images the share of 1 % that is left to single images is missing."""
+    """Single points are exact (float32); covariances between images omit the 1 % assigned to single images."""
     rng = np.random.default_rng(2)
     images, coefficients, count = 60, 8, 1200
     at = np.linspace(0, 1, images)[:, None]
@@ -48,6 +48,6 @@ def test_points_have_the_covariance_of_the_path_and_of_their_sensor():
     )
     scale = size[:40, :, None, None] * size[None, None, 40:80]
     assert np.sqrt(np.mean(((stated - between) / scale) ** 2)) < 0.03
-    # What the sensor does can still be told from all else.
+    # The contribution of the sensor remains separate from all others.
     again = np.tensordot(found.shared["sensor"].T, found.patterns_mm, axes=1)
     np.testing.assert_allclose(again, sensor, atol=1e-4)

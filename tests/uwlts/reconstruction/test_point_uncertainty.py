@@ -1,4 +1,4 @@
-"""What clouds say of their points' uncertainty, against Monte Carlo through the reconstruction itself."""
+"""Compare the stated uncertainty of cloud points with Monte Carlo draws through the reconstruction."""
 
 from dataclasses import replace
 

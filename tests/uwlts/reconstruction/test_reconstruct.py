@@ -1,4 +1,4 @@
-"""Stripes found once and reconstructed by any calibration; which calibration may be used in which medium."""
+"""Reconstruction of the same stripes with any calibration; media allowed for each calibration."""
 
 from dataclasses import replace
 

@@ -6,9 +6,9 @@ from uwlts.reconstruction.verify import find_undetectable_errors
 
 
 def test_a_reversed_stage_that_sizes_cannot_show_is_named():
-    """Moved square to the sheet, a reversed stage turns the cloud into its mirror image, in which lengths are the same.
+    """A reversed stage that moves square to the sheet mirrors the cloud, which does not change lengths.
 
-    Moved 30 deg beside that, it shears it by 2 tan 30 deg.
+    At 30 deg from this direction, it shears the cloud by 2 tan 30 deg.
     """
     positions = np.arange(5.0)
     for direction in ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)):

@@ -1,4 +1,4 @@
-"""Registration of several scans: against true poses, with what a shape does not tell left as it was."""
+"""Registration of several scans against true poses; coordinates that a shape does not determine are not changed."""
 
 import json
 from dataclasses import replace
@@ -30,9 +30,9 @@ def pits():
 
 
 def test_patches_follow_a_curved_surface():
-    """Their places lie on the cylinder, where the mean of a disc lies inside, and scatter as their covariance says.
+    """Patch centres are on the cylinder, unlike the mean of a disc, and scatter according to their covariance.
 
-    Averages over a third of the radius lie inside by 1.2 um, a quarter of the standard deviation.
+    Averages over a third of the radius are 1.2 um inside, a quarter of the standard deviation.
     """
     scan = scan_from(side_pose(0.0), np.random.default_rng(SEED), radius=plain)
     patches = surface_patches(scan.points_mm)
@@ -95,7 +95,7 @@ def test_the_covariance_is_that_of_the_errors():
         scans, true, wrong = views(np.random.default_rng([SEED, seed]), radius=pitted, systematic=0.5)
         found = uwlts.register(scans, poses=wrong)
         errors = pose_errors(found.poses, true, found.middles_mm)[1:].ravel()
-        # Turns in units of the shift of the usual point; what is open has no variance.
+        # Rotations in units of the shift of a typical point; undetermined coordinates have zero variance.
         units = np.tile(np.repeat([1.0, 80.0], 3), 4)
         values, ways = np.linalg.eigh(found.covariance[6:, 6:] * np.outer(units, units))
         known = values > 1e-9 * values[-1]
@@ -185,7 +185,7 @@ def test_no_start_is_invented_on_a_plain_pipe():
 
 
 def with_spheres(rng, scans, poses, diameter):
-    """The scans with four spheres beside the pipe, of which each scan sees the side towards it."""
+    """Add four spheres beside the pipe to the scans; each scan sees the side towards it."""
     centres = np.array([[-50.0, 190.0, 60.0], [50.0, 190.0, -40.0], [0.0, 200.0, 120.0], [30.0, 185.0, 20.0]])
     result = []
     for scan, pose in zip(scans, poses, strict=True):

@@ -87,10 +87,11 @@ def rms(errors):
     return math.sqrt(np.mean(errors**2))
 
 
-# The band in which pixels count by their share reaches 5.3 px to either side of the ellipse, for an edge that is a ramp
-# over the whole short reach. It holds a blur of 4 px: what is left is rounding to grey levels, 0.29 / 160 over the root
-# of some hundred pixels of the edge, and the sampling of the levels beside it. Of a blur of 6 px it cuts off the last
-# 0.7 px, unevenly with the pixels' phase: measured 0.02 px for the large circles, 0.06 px for the small ones.
+# The band of pixels with fractional weights reaches 5.3 px to either side of the ellipse, for an edge that is a ramp
+# over the whole short reach. It contains a blur of 4 px. The remaining errors are rounding to grey levels, 0.29 / 160
+# divided by the root of about a hundred edge pixels, and the sampling of the levels beside the edge. For a blur of 6 px
+# it cuts off the last 0.7 px, depending on the pixels' phase: measured 0.02 px for the large circles, 0.06 px for the
+# small ones.
 @pytest.mark.parametrize("bright", [True, False])
 @pytest.mark.parametrize(("blur", "limit"), [(4.0, 0.003), (6.0, 0.07)])
 @pytest.mark.parametrize("radius", [12.5, 17.0, 25.0])
@@ -113,9 +114,9 @@ def test_shading_does_not_pull_circles_whose_blur_grows_across_the_plate(shading
 def test_noise_moves_blurred_circles_by_its_share_of_the_contrast():
     noise = 2.0
     errors = errors_px(find_circles(photograph(blurred(25.0, 4.0), samples=3, noise=noise)))
-    # A band of half width B around a circle of radius r holds 4 pi r B pixels at the distance r, each of which pulls
-    # the centroid by noise / contrast / (pi r^2) of its distance: sqrt(2 B / (pi r)) noise / contrast a coordinate. The
-    # levels inside and outside, read from 48 pixels each, add about as much again, twice; B is 5.3 px.
+    # A band of half width B around a circle of radius r contains 4 pi r B pixels at the distance r. Each moves the
+    # centroid by noise / contrast / (pi r^2) of its distance: sqrt(2 B / (pi r)) noise / contrast per coordinate. The
+    # levels inside and outside, each measured on 48 pixels, add about the same amount each. B is 5.3 px.
     alone = math.sqrt(2) * math.sqrt(2 * 5.3 / (math.pi * 25.0)) * noise / (BRIGHT - DARK)
     assert 0.5 * alone < rms(errors) < 4 * alone
 

@@ -1,4 +1,4 @@
-"""Points of the sheet that many stripe pixels show, by a table, against those of each pixel by itself."""
+"""Compare points of the sheet calculated with a table for many stripe pixels with those of each single pixel."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from uwlts.calibration.joint.residuals import SeenSheet
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 
 FEWEST = 5000
-"""Number of pixels from which a table is used."""
+"""Smallest number of pixels for the use of a table."""
 
 
 @pytest.fixture(scope="module")

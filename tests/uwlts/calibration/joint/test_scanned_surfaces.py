@@ -225,9 +225,9 @@ def test_a_pipe_of_known_diameter_gives_the_water(kind):
         scan = evidence_of(kind, artefact=pipe, sizes_known=known, noise=noise())
         errors, told[known], _ = asked([scan], **dict.fromkeys(SLOPE_NAMES, 0.01), index_of_water=5e-3)
         assert all(abs(errors[name]) < 4 * told[known][name] for name in errors)
-    # Along the stage every profile is the known circle, and the pipe slides on itself whatever way it moves. Across it
-    # the stage measures the width, so that the form tells the water nearly as well, and is round only for the stage's
-    # true direction.
+    # Along the stage every profile is the known circle, and no motion of the stage along the pipe's axis changes it.
+    # Across the pipe the stage measures the width. Then the form determines the water nearly as well, and the pipe is
+    # round only for the stage's true direction.
     better = told[True]["index of water"] / told[False]["index of water"]
     towards_z = told[True][SLOPE_NAMES[1]] / 0.01
     assert (better < 0.4 and towards_z > 0.5) if kind == "pipe along" else (better < 0.9 and towards_z < 0.1)
@@ -329,9 +329,9 @@ def solved(thesis, target, *scans):
 def test_a_size_described_a_millimetre_wrong_is_refused_by_its_name(
     thesis, target_in_water, kind, wrong, name, true_mm
 ):
-    """Certified to 0.02 mm; the scans measure these sizes with standard uncertainties of 0.07 mm at most.
+    """Sizes are certified to 0.02 mm; the scans measure them with standard uncertainties of 0.07 mm at most.
 
-    Taken for right, the window's distance errs by two of its stated uncertainties more, with a doubt about the model.
+    If the wrong size were accepted, the error of the window's distance would grow by two of its stated uncertainties.
     """
     right = scanned("spheres", **CERTIFIED["spheres"])
     with pytest.raises(CalibrationError, match="most likely it is described wrongly") as caught:
@@ -443,10 +443,10 @@ def test_captures_that_are_no_scan_of_a_known_surface(tmp_path, artefact, pose, 
 
 
 def test_what_blur_and_the_sheets_thickness_leave_is_common_to_all_points():
-    """Of the blur any share, uniformly; of light beside the sheet twice what its thickness is uncertain by.
+    """The blur contributes a uniformly distributed fraction, light beside the sheet twice its thickness uncertainty.
 
-    On a plane square to the laser's axis a shift of the sheet by d moves the points as a pixel does by d over the size
-    of a pixel there: the camera's rays cross the sheet where it was or the plane.
+    On a plane square to the laser's axis, a shift of the sheet by d moves the points as a pixel shift does. This shift
+    is d divided by the size of a pixel there, because the camera's rays cross the old sheet or the plane.
     """
     square = Body((0.0, 0.0, 40.0), None, (0.0, 0.0, 1.0))
     stripes, _ = scan_of(SENSOR, (square,), PlaneStandard(), stage_mm=STAGE, count=300)

@@ -69,7 +69,7 @@ def test_labels_keep_to_their_treads():
         )
         block = points[step.labels == StepFace.UPPER]
         distances = np.linalg.norm(block[:, None] - profile[None, ::4, 1:], axis=2).min(axis=1)
-        # Neighbouring points of the profile are 0.12 mm apart; every fourth is compared.
+        # The distance between neighbouring points of the profile is 0.12 mm; every fourth is compared.
         assert distances.max() < 0.3
 
 
