@@ -124,7 +124,7 @@ def light() -> list[Row]:
 
 
 def campaign() -> list[Row]:
-    """Record a campaign of the thesis, calibrate jointly from it, and measure with the calibration on one core."""
+    """Speed of a campaign of the thesis: record it, calibrate jointly from it, and measure with it on one core."""
     from tests.bench.calibration import joint_calibration, measuring_rate
     from tests.bench.light import campaign as recorded
 

@@ -222,7 +222,7 @@ def _surface(thing: Mesh | FreeForm | CirclePlate | TargetPlate) -> tuple[np.nda
 def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Read vertices (V, 3), faces (F, 3) and, if every part has them, texture coordinates (V, 2) of a mesh file.
 
-    Parts are concatenated here: trimesh would copy their materials, for which it needs an imaging library.
+    Parts are concatenated here: trimesh would also copy their materials, which requires an imaging library.
     """
     path = thing.path
     require_regular_file(path, most_bytes=_MOST_MESH_BYTES, error=DescriptionError, called="mesh")

@@ -104,7 +104,7 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
 
 
 def add_glare(light: np.ndarray, share: float) -> np.ndarray:
-    """Return light (H, W), the fraction ``share`` of which is spread as veiling glare.
+    """Spread the fraction ``share`` of light (H, W) as veiling glare.
 
     The kernel is exp(-r / w) / (2 pi w^2) with w = `GLARE_REACH` image widths. Light is lost only beyond the image
     borders.

@@ -42,7 +42,7 @@ def poisson_numbers(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     number selects one of 4096 equal cells of the unit interval, and nearly all cells belong to a single count. In the
     other cells, which include the tail, another uniform number and the distribution function determine the count.
 
-    The number for r is a Poisson process of density h over all pixels, from which each event is kept with the
+    The number for r comes from a Poisson process of density h over all pixels. Each of its events is kept with the
     probability r / h (L. Devroye, Non-Uniform Random Variate Generation, 1986, sections III.2.4 and VI.1.3). A sum of
     Poisson numbers is a Poisson number, so the result is exact to double precision.
     """

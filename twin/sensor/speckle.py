@@ -161,9 +161,9 @@ def coherence(
 ) -> np.ndarray:
     """Return the speckle contrast, above 0 up to 1, of a rough surface in laser light of a spectral width.
 
-    A height h delays the light by n (cos i + cos o) h = g h. For normally distributed heights with the standard
-    deviation s, patterns of wavenumbers that differ by q have an amplitude correlation of exp(-(q g s)^2 / 2), and an
-    intensity correlation of exp(-(q g s)^2). Over a Gaussian line of standard deviation d, q has the variance 2 d^2.
+    A height h delays the light by n (cos i + cos o) h = g h. Let heights be normally distributed with the standard
+    deviation s. Patterns of wavenumbers that differ by q then have an amplitude correlation of exp(-(q g s)^2 / 2), and
+    an intensity correlation of exp(-(q g s)^2). Over a Gaussian line of standard deviation d, q has the variance 2 d^2.
     The mean intensity correlation is C^2 = (1 + 4 (d g s)^2)^(-1/2) (Parry in Dainty, Laser Speckle and Related
     Phenomena, 1975; Goodman, Speckle Phenomena in Optics, Ch. 5).
 

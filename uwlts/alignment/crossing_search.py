@@ -112,7 +112,7 @@ def _search_range(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:
 
 
 def _find_hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[Hypothesis]:
-    """Find poses in which the later piece coincides with the earlier one, within the search range (3,).
+    """Find poses that make the later piece coincide with the earlier one, within the search range (3,).
 
     The height maps of both, including their neighbours on the path, are correlated for all shifts.
     """

@@ -33,7 +33,7 @@ class AlignmentOptions:
         Number of pieces after which a hypothesis is decided: a crossing and its alternatives appear within this number
         of swath widths.
     rival_share : float
-        Number of patches of another position, relative to the best one, from which a consistent rival makes a crossing
+        Least number of patches of a consistent rival position, relative to the best one, that makes a crossing
         ambiguous.
     least_gain : float
         Least ratio of the navigation's position uncertainty at a crossing to that after the alignment; with less, the
@@ -45,7 +45,7 @@ class AlignmentOptions:
         ``agreeing_sigmas``. Wrong positions reach 0.8 of all patches, since the path adapts, but few held-out ones.
         Chosen on rendered passes.
     fewest_held_out : int
-        Least number of held-out patches for which their fraction is tested.
+        Least number of held-out patches for a test of their fraction.
     agreeing_sigmas : float
         Largest distance of an agreeing patch in standard deviations of the noise of the points.
     held_out_every : int
@@ -57,8 +57,8 @@ class AlignmentOptions:
     most_nodes : int
         Largest number of nodes in crossings: normal matrices of 3000 unknowns take 72 MB.
     node_spacing : float
-        Spacing of nodes in crossings (unit: patch radius), at which the walk between nodes stays below the scatter of
-        patches. Chosen on simulated passes with a walk of 30 mm.
+        Spacing of nodes in crossings (unit: patch radius): the walk between nodes stays below the scatter of patches.
+        Chosen on simulated passes with a walk of 30 mm.
     rounds : int
         Largest number of least-squares rounds.
     still : float

@@ -15,7 +15,7 @@ from uwlts.storage.cloud import PointUncertainty, project_variance
 TWO_SIDED = 1.96
 """Standard normal quantile of 97.5 %."""
 _NEARLY_NORMAL = 200
-"""Number of points from which Student's quantile is within 1 % of the normal one."""
+"""Least number of points with Student's quantile within 1 % of the normal one."""
 _PAIRS_AT_A_TIME = 2_000_000
 
 

@@ -19,10 +19,10 @@ class ComparisonOptions:
     fewest_points : int
         Least number of points in a disc: with fewer, the roughness is unknown.
     quiet_share : float
-        Fraction of the places, those of the lowest scatter, from which the noise correlation within an image is
-        estimated. The others may hold edges.
+        Fraction of the places, those of the lowest scatter, used to estimate the noise correlation within an image. The
+        others may contain edges.
     area_neighbours : int
-        Number of neighbours from whose distance the area of a place is estimated.
+        Number of neighbours used to estimate the area of a place.
     fewest_of_region : int
         Least number of places of a reported region. Discs of neighbours overlap, so chance also produces pairs.
     other_unit_ratio : float

@@ -109,7 +109,7 @@ class Instrument:
 
     @property
     def laser_in_use(self) -> bool:
-        """Whether the laser is on, or may be switched on by the current task."""
+        """True if the laser is on, or may be switched on by the current task."""
         return self._board.laser in ("on", "flashing") or self.state in (InstrumentState.SCANNING, InstrumentState.BUSY)
 
     def pause(self) -> None:

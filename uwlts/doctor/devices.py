@@ -1,7 +1,7 @@
 """Findings about cameras, driver libraries and serial ports, including trials of a camera and a stage.
 
-The stage is not moved and the laser stays off: the trial only sends queries, and Ctrl-X at the end, at which Grbl
-switches the laser's pin off.
+The stage is not moved and the laser stays off. The trial only sends queries, and Ctrl-X at the end, which switches the
+laser's pin off.
 """
 
 import os

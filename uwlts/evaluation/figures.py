@@ -65,7 +65,7 @@ class FigureKey:
 
     @property
     def is_detail(self) -> bool:
-        """Whether another figure of the same evaluation summarises or supersedes this one."""
+        """True if another figure of the same evaluation summarises or supersedes this one."""
         if self.quantity in (Quantity.PROBING_ERROR, Quantity.STD):
             return bool(self.spheres)
         return self.quantity in (Quantity.SPACING_ERROR_KNOWN_RADIUS, Quantity.PROFILE_HEIGHT_ERROR)
@@ -169,7 +169,7 @@ class ArtefactEvaluation(ABC):
 
     @property
     def within_vdi_outliers(self) -> bool:
-        """Whether the rejected fraction is at most 0.3 %, the limit of VDI/VDE 2634."""
+        """True if the rejected fraction is at most 0.3 %, the limit of VDI/VDE 2634."""
         return self.rejected_share <= VDI_OUTLIER_SHARE
 
     @abstractmethod

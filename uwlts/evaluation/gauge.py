@@ -22,7 +22,7 @@ _MOST_BYTES = 64 * 2**20
 _POOLED_ABOVE = 0.25
 """p-value of the interaction above which it is pooled with the repeatability (AIAG)."""
 _DRAWS = 20_000
-"""Number of draws of the mean squares, of which 500 exceed each end of a 95 % interval."""
+"""Number of draws of the mean squares; 500 of them exceed each end of a 95 % interval."""
 _SEED = 7
 """Seed of the draws, so that a study always has the same intervals."""
 _SIGMAS = 6.0

@@ -110,7 +110,7 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
 
 
 _STEADY = 1e-6
-"""Largest change of a weight at which the reweighting ends."""
+"""Largest change of a weight in the last round of reweighting."""
 _MOST_REWEIGHTED = 50
 """Largest number of reweighted fits; each usually reduces the changes by a factor of three to ten."""
 _DEPENDENT = 1e-12

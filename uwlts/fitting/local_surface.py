@@ -39,7 +39,7 @@ class PointGrid:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points to which patches are fitted, with their uncertainty along the normals.
+    """Points for the fit of patches, with their uncertainty along the normals.
 
     Attributes
     ----------

@@ -19,7 +19,7 @@ from uwlts.errors import EvaluationError
 from uwlts.storage.cloud import PointUncertainty, project_variance
 
 _CELLS_PER_RADIUS = 3.0
-"""Cubes per disc radius, in which points are averaged: a disc holds 28 averages for 6 coefficients."""
+"""Averaging cubes per disc radius: a disc contains 28 averages for 6 coefficients."""
 _NEIGHBOURS = 40
 _FEWEST = 10
 """Least number of averages in a disc; a second-order surface has 6 coefficients."""
@@ -32,7 +32,7 @@ _ROUGH = 5.0
 _MOST = 15_000
 """Number of patches above which they are thinned."""
 _SAMPLE = 400
-"""Number of discs from which the radius is found."""
+"""Number of discs used to find the radius."""
 _SAME_WAY = 0.8
 """Least cosine (37 deg) between the normals of corresponding patches."""
 _FACING = 0.15

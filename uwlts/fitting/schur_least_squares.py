@@ -12,9 +12,9 @@ _ROUNDS = 60
 _SMALLEST_STEP = 1e-11
 """Step, in the unit of residuals, that rounding of sums over all residuals produces."""
 _HARDLY_DAMPED = 1e-8
-"""Damping, relative to columns of unit length, up to which a step is practically a full Gauss-Newton step."""
+"""Largest damping, relative to columns of unit length, of practically full Gauss-Newton steps."""
 _SAFE = 1e-7
-"""Largest relative gain at which the linear model may replace an evaluation of all residuals."""
+"""Largest relative gain for the linear model to replace an evaluation of all residuals."""
 _SINGULAR = 1e-13
 """Eigenvalue of the normal matrix of the scaled global parameters, below which it is rounding noise."""
 

@@ -256,7 +256,7 @@ class CameraDevice(ABC):
 
     @property
     def running(self) -> bool:
-        """Whether the camera is acquiring; False after an error that means that the camera is gone."""
+        """True if the camera is acquiring; False after an error that means that the camera is gone."""
         return self._started
 
     def open(self) -> None:
@@ -435,7 +435,7 @@ class CameraDevice(ABC):
     def _profiles(self, numbers: np.ndarray, frame: Delivered, chunk: Callable[[str, int], int | None]) -> Delivered:
         """Return the frame of a 3D camera with one centre line for each row of its values (N, W).
 
-        ``chunk(feature, row)`` returns a row's chunk value, or None. Raises HardwareError if coordinates lie outside
+        ``chunk(feature, row)`` returns a row's chunk value, or None. Raises HardwareError if coordinates are outside
         the profile lines, or the time of a row is unknown.
         """
         meant, rows = self.info.coordinates or Coordinates(), range(len(numbers))

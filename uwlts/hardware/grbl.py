@@ -122,12 +122,12 @@ class GrblStage:
 
     @property
     def position_known(self) -> bool:
-        """Whether the stage may move: it was homed or unlocked, and no fault occurred since."""
+        """True if the stage may move: it was homed or unlocked, and no fault occurred since."""
         return self._position_known and self._line.fault is None
 
     @property
     def faulty(self) -> bool:
-        """Whether a fault has stopped all movements and switched the laser off, until `home` or `unlock`."""
+        """True if a fault has stopped all movements and switched the laser off, until `home` or `unlock`."""
         return self._line.fault is not None
 
     @property
@@ -510,9 +510,9 @@ class GrblStage:
     def stop(self, *, reset: bool = False) -> float:
         """Brake to rest by a feed hold and return the position in mm.
 
-        Without ``reset`` the controller is held until `unlock` or `home`, and the laser keeps its state unless $32=1,
-        with which Grbl switches it off. With ``reset`` the laser goes off and the stage can move again; the position is
-        kept because nothing moves during the reset.
+        Without ``reset`` the controller is held until `unlock` or `home`. The laser keeps its state, except with $32=1:
+        then Grbl switches it off. With ``reset`` the laser goes off and the stage can move again; the position is kept
+        because nothing moves during the reset.
         """
         self._line.realtime(FEED_HOLD)
         braking_s = self.settings.max_feed_mm_per_min / 60 / self.settings.acceleration_mm_per_s2
@@ -536,7 +536,7 @@ class GrblStage:
 
     @property
     def laser_unreachable(self) -> bool:
-        """Whether the last command to switch the laser off could not be sent."""
+        """True if the last command to switch the laser off could not be sent."""
         return self._line.unreachable
 
     def darken(self) -> bool:

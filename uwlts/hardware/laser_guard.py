@@ -2,8 +2,8 @@
 
 `uwlts.hardware.heartbeat` starts it with the open port. The program writes beats to the guard's standard input: the
 time until which the laser may stay on without a further beat. The guard answers each on its standard output. If a beat
-is late because the program is suspended or hangs, the guard sends Ctrl-X, on which Grbl switches its spindle pin off at
-once. It does the same when its standard input ends, which happens however the program ends, and when it is asked to end
+is late because the program is suspended or hangs, the guard sends Ctrl-X. Grbl then switches its spindle pin off at
+once. The guard does the same when its standard input ends, as at any end of the program, and when it is asked to end
 itself. It runs as a plain script with only the standard library, so that it starts within milliseconds.
 """
 

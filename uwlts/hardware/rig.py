@@ -75,12 +75,12 @@ class Brightness:
 
     @property
     def dark(self) -> bool:
-        """Whether too few lines count to derive an exposure."""
+        """True if too few lines count to derive an exposure."""
         return not are_enough(self.counted, self.lines)
 
     @property
     def overexposed(self) -> bool:
-        """Whether more lines are saturated than a reflection explains."""
+        """True if more lines are saturated than a reflection explains."""
         return self.saturated > _MANY_SHARE * self.counted and are_enough(self.saturated, self.lines)
 
 

@@ -11,7 +11,7 @@ from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.window import trace_window
 
-# Rays across the fan to which the plane is fitted.
+# Number of rays across the fan for the fit of the plane.
 _RAYS = 65
 # Depths along each ray.
 _DEPTHS = 9

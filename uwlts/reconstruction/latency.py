@@ -25,7 +25,7 @@ _GRAIN = 2.0
 _LEAST_RELIEF = 0.5
 """Least relief common to both passes, relative to its maximum over all shifts, for a shift to be compared."""
 _FAR_PX = 20.0
-"""Distance at which the cost of a mismatch saturates."""
+"""Largest distance of a mismatch; above it, the cost is constant."""
 _ROUNDS = 8
 """Largest number of rounds of outlier rejection."""
 _OUTLIER = 4.0

@@ -32,7 +32,7 @@ _LEFT = 0.01
 _LEFT_OF_SHAPES = 1e-3
 """Largest fraction of the variance of all pose components outside the retained patterns."""
 _MOST_MOMENTS = 400
-"""Number of times from which the modes are computed; they vary slowly."""
+"""Number of times used to compute the modes; they vary slowly."""
 _LEAST = 1e-6
 """Lower bound of a variance relative to the largest one, for a path with an exact start."""
 

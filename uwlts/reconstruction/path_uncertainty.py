@@ -13,7 +13,7 @@ _MOST_SHAPES = 12
 _LEFT = 0.01
 """Largest fraction of the variance in this remainder."""
 _SAMPLE = 1500
-"""Number of points from which the modes are chosen."""
+"""Number of points used to choose the modes."""
 _BLOCK = 50_000
 
 

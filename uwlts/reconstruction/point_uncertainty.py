@@ -33,7 +33,7 @@ _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
 """Least number of centres with two neighbours for the noise, whose relative standard error is then one third."""
 _SAMPLED = 500
-"""Number of points from which patterns are chosen: their rms agrees with that of all within some percent."""
+"""Number of points used to choose patterns: their rms agrees with that of all within some percent."""
 _TABLE_TOLERANCE_MM = 1e-6
 """Error of tabulated shifts, far below any relevant shift."""
 _LEFT_OUT_MM = 1e-9

@@ -74,7 +74,7 @@ class Verification:
 
     @property
     def passed(self) -> bool:
-        """Whether all quantities passed."""
+        """True if all quantities passed."""
         return all(verdict.passed for verdict in self.verdicts)
 
     @property

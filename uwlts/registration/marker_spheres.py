@@ -50,7 +50,7 @@ def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
 
 
 def group_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> list[dict[int, MarkerSphere]]:
-    """Group spheres of different scans that lie within ``reach_mm`` of each other in the common frame.
+    """Group spheres of different scans that are within ``reach_mm`` of each other in the common frame.
 
     Each group maps scan numbers to spheres. Spheres seen in one scan only are omitted.
     """

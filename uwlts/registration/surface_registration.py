@@ -182,7 +182,7 @@ def register_to_surface(
     Raises
     ------
     EvaluationError
-        Fewer than 50 points lie near the surface and within the datums.
+        Fewer than 50 points are near the surface and within the datums.
     """
     counted = (
         np.arange(len(points_mm)) if datums is None else np.flatnonzero(_select_within(points_mm, datums, reach_mm))

@@ -1,4 +1,4 @@
-"""Descriptions of data sets: distributions, paths, splits, and what is refused."""
+"""Descriptions of data sets: distributions, paths, splits, and rejected descriptions."""
 
 import math
 from itertools import pairwise
@@ -87,7 +87,7 @@ def test_splits_are_by_scene_and_keep_their_members_as_scenes_are_added():
         assert choose_split(few, scene) == choose_split(many, scene)
     members = [choose_split(many, scene) for scene in range(2000)]
     for split, share in zip(SPLITS, (0.8, 0.1, 0.1), strict=True):
-        # Multiples of the golden section fill every interval evenly but for a few.
+        # Multiples of the golden section fill every interval nearly evenly.
         assert members.count(split) == pytest.approx(2000 * share, abs=5)
     assert {choose_split(described(splits={"train": 0, "validation": 0, "test": 1}), k) for k in range(50)} == {"test"}
 

@@ -85,7 +85,7 @@ def test_frames_are_those_of_the_twin(folder):
     assert info["exposure_ms"] == again.exposure_ms[0] == 2.0
     assert info["as_built"]["laser"]["power_mw"] == info["drawn"]["sensor.laser.power_mw"]
     assert info["medium"]["water"] == info["drawn"]["scene.water"]
-    # The pose leads from the sensor to the scene, as everywhere.
+    # The pose maps from the sensor to the scene, as everywhere.
     assert info["T_scene_object"][0][3] == info["stage_mm"] == (-4.0, 4.0)[info["frame"]]
 
 
@@ -282,7 +282,7 @@ def test_shards_that_another_run_holds_are_left_to_it_and_then_waited_for(folder
     out, made = tmp_path / "shared", hashes(folder)
     out.mkdir()
     held = sorted(made)[-1]
-    # Another machine's run that takes a shard, and dies before it is written.
+    # A run on another machine claims a shard and ends before it is written.
     program = (
         "import sys, time, pathlib\nfrom uwlts.files.writing import lock_output\n"
         "with lock_output(pathlib.Path(sys.argv[1])):\n"

@@ -51,7 +51,7 @@ def test_width_noise_and_bound_of_a_gaussian_stripe(sigma):
         (gaussian(c + step, sigma, count, 5e3) - gaussian(c - step, sigma, count, 5e3)) / (2 * step) for c in centres
     ]
     bound = 1 / np.sqrt((np.square(np.stack(slopes, axis=1)) / np.square(noise)).sum(axis=0))
-    # Five points know the slope of a Gaussian of 1 px to some percent.
+    # Five points determine the slope of a Gaussian of 1 px to some percent.
     np.testing.assert_allclose(found.bound_px, bound, rtol=0.06 if sigma < 1.5 else 0.01)
     assert not found.clipped.any()
 
@@ -70,7 +70,7 @@ def test_least_squares_reach_the_bound():
             return (gaussian(place[0], sigma, count, 3000.0) - seen) / noise[:, 0]
 
         found.append(least_squares(missing, [20.0]).x[0])
-    # A standard deviation of 600 values is known to 2.9 %: the gate is 4.5 of these, once in 150,000 runs.
+    # A standard deviation of 600 values is known to 2.9 %. The limit is 4.5 times that: exceeded once in 150,000 runs.
     assert np.std(found) == pytest.approx(bound, rel=0.13)
 
 
@@ -82,7 +82,7 @@ def test_stripes_cut_by_the_image_and_lines_without_one_have_no_width():
     assert np.isnan(found.width_px).tolist() == [True, False, True]
     assert np.isnan(found.snr).tolist() == [False, False, True]
     assert found.clipped.tolist() == [True, True, False]
-    # Clipped pixels say nothing: here they are the flat top, and the bound grows.
+    # Clipped pixels contain no information: here they are the flat top, and the bound grows.
     less = stripe_quality(signal, noise, np.array([0.5, 20.3, np.nan]), informative=~clipped, clipped=clipped)
     assert less.bound_px[1] > found.bound_px[1]
 

@@ -1,4 +1,4 @@
-"""Studies as they are described, and the designs that they stand for."""
+"""Descriptions of studies, and their designs."""
 
 import math
 from pathlib import Path

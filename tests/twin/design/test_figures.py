@@ -92,7 +92,7 @@ def test_coverage_is_the_share_of_the_depth_in_view(thesis):
     view = view_of_sheet(thesis, thesis.media["water"])
     expected = (min(view.farthest_mm, 420.0) - max(view.nearest_mm, 200.0)) / 220.0
     assert 0.5 < expected < 0.95
-    # The view is looked for in steps of 0.15 mm.
+    # The view is searched in steps of 0.15 mm.
     assert judged(thesis).coverage.item() == pytest.approx(expected, abs=0.3 / 220)
     whole = altered(thesis, {"volume": {"near_mm": view.nearest_mm + 1, "far_mm": view.farthest_mm - 1}})
     assert judged(whole).coverage.item() == 1.0
@@ -111,7 +111,7 @@ def test_a_smaller_aperture_coarsens_speckle_and_sharpens_what_is_out_of_focus(t
     best = int(np.argmin(scatter))
     assert 0 < best < len(numbers) - 1
     assert scatter[-1] > 2.0 * scatter[best]
-    # Defocus alone goes with 1 / N, and Dorsch's limit with N.
+    # Defocus is proportional to 1 / N, and Dorsch's limit to N.
     fast, slow = with_number(2.0), with_number(4.0)
     assert fast.blur_px.item() / slow.blur_px.item() == pytest.approx(2.0, rel=0.02)  # diffraction apart
     assert slow.speckle_limit_mm.item() / fast.speckle_limit_mm.item() == pytest.approx(2.0, rel=1e-9)
@@ -153,7 +153,7 @@ def test_speckle_contrast_in_a_pixel_is_below_that_of_two_polarisations(thesis):
 
 
 def test_green_light_wins_over_red_beyond_some_range(thesis):
-    # Without speckle, whose grains are finer in green, and in the middle of the image only, to reckon by hand.
+    # For a calculation by hand: without speckle, whose grains are finer in green, and only in the middle of the image.
     slim = {"camera": {"width_px": 16}, "volume": {"near_mm": 309.0, "far_mm": 309.2}, "exposure": {"longest_ms": 1e9}}
 
     def exposure(wavelength_nm: float, baseline_mm: float) -> float:
@@ -163,7 +163,7 @@ def test_green_light_wins_over_red_beyond_some_range(thesis):
     ratio = np.array([exposure(635.0, b) / exposure(520.0, b) for b in (150.0, 265.0, 400.0, 700.0)])
     assert (np.diff(ratio) > 0).all() and ratio[0] < 1 < ratio[-1]
     crossing = brentq(lambda b: exposure(635.0, b) - exposure(520.0, b), 150.0, 700.0, xtol=1e-3)
-    # Red brings 635 / 520 times the photons per watt, and loses exp(-(c_red - c_green) way) on its way.
+    # Red has 635 / 520 times the photons per watt, and loses the factor exp(-(c_red - c_green) length) in the water.
     red, green = (
         water_absorption_per_m(wavelength_nm=nm) + water_scattering_per_m(wavelength_nm=nm, salinity_g_kg=0.0)
         for nm in (635.0, 520.0)
@@ -172,7 +172,7 @@ def test_green_light_wins_over_red_beyond_some_range(thesis):
     way_m = 1e-3 * (standoff - 68.73 + math.hypot(standoff, crossing) - 35.93)
     # Diffraction, 1 % of a stripe's width, and the indices of water, by 0.3 %, favour one of them by as little.
     assert way_m == pytest.approx(math.log(635.0 / 520.0) / (red - green), rel=0.06)
-    # So green wins where the sheet crosses the camera's axis farther than some 0.4 m from the camera.
+    # So green is better if the sheet crosses the camera's axis more than about 0.4 m from the camera.
     assert 0.35 < 1e-3 * standoff < 0.5
 
 
@@ -181,7 +181,7 @@ def test_absorption_costs_what_beer_and_lambert_say(thesis):
     dark = altered(thesis, {"media": {"water": {"absorption_per_m": 1.0, "scattering_per_m": 0.0}}})
     thin = {"volume": {"near_mm": 309.0, "far_mm": 310.4}, "camera": {"width_px": 16}}
     lost = judged(altered(dark, thin)).required_ms.item() / judged(altered(clear, thin)).required_ms.item()
-    # Way to the stand-off less the laser's window (30 mm in air and 5.93 mm of glass), and back to the camera's.
+    # Path to the stand-off without the laser's window (30 mm in air and 5.93 mm of glass), and back to the camera's.
     way_m = 1e-3 * (math.hypot(378.46, 265.0) - 35.93 + 309.73)
     assert lost == pytest.approx(math.exp(way_m), rel=2e-3)
 
@@ -201,7 +201,7 @@ def test_absorption_costs_what_beer_and_lambert_say(thesis):
     ],
 )
 def test_laser_classes(thesis, power_mw, fan_deg, expected):
-    # An eye's 7 mm at 100 mm are 4.0 deg, 8.9 % of 45 deg; 0.5 deg pass whole.
+    # A pupil of 7 mm at 100 mm subtends 4.0 deg, 8.9 % of 45 deg; a fan of 0.5 deg enters completely.
     sensor = altered(thesis, {"laser": {"power_mw": power_mw, "fan_angle_deg": fan_deg}})
     p = extract_parameters([sensor], [sensor.media["water"]])
     found, _ = compute_figures(p, reflectance=0.5, water_depth_m=100.0)

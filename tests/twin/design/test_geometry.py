@@ -101,7 +101,7 @@ def test_the_line_of_pixels_that_are_not_square(thesis, along, shorter):
         compute_figures(numbers(s), reflectance=0.5, water_depth_m=100.0)[0].line_mm.item() for s in (square, oblong)
     ]
     views = [view_of_sheet(s, s.media["water"]).line_length_mm for s in (square, oblong)]
-    # Snell's law makes angles out of slopes, which are 0.3 at most.
+    # Snell's law converts slopes, at most 0.3, to angles.
     assert lengths[0] / lengths[1] == pytest.approx(shorter, rel=5e-3)
     assert views[0] / views[1] == pytest.approx(shorter, rel=5e-3)
 

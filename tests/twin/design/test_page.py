@@ -1,4 +1,4 @@
-"""The page of a design study: its drawing obeys optics, its charts hold the designs, and no input breaks it."""
+"""Page of a design study: its drawing obeys optics, its charts contain the designs, and no input breaks it."""
 
 import json
 import math
@@ -149,7 +149,7 @@ SENSORS = {
 
 
 def angle_to(normal: np.ndarray, ray: np.ndarray) -> float:
-    """Angle of a ray to a normal in the plane, another way than the drawing's vectors."""
+    """Return the angle between a ray and a normal in the plane, without the drawing's vector functions."""
     return math.remainder(math.atan2(ray[1], ray[0]) - math.atan2(normal[1], normal[0]), math.tau)
 
 
@@ -492,7 +492,7 @@ def test_the_page_says_what_an_engineer_needs(swept, tmp_path):
     assert "Formulas and rendering disagree by a factor 2.5 (limit 1.5), most at Z = 0 mm" in text
     assert "20 µm predicted, 50 µm rendered" in text
     assert "the measuring volume would begin … mm behind the window's outer face" in text
-    # Nothing is asked of the network: links lead within the page, and the policy forbids the rest.
+    # The page loads nothing from the network: links stay within the page, and the policy forbids the rest.
     assert page.loads and all(link.startswith(("#", "data:image/png")) for link in page.loads)
     styles = raw.split("<script")[0]
     assert "default-src 'none'" in styles and "@import" not in styles and not re.findall(r"url\((?!#)", styles)

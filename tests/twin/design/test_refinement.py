@@ -1,4 +1,4 @@
-"""Derivatives of figures by the numbers of a design, held against differences, and designs that they improve."""
+"""Derivatives of figures by the parameters of a design, compared with differences, and improved designs."""
 
 import numpy as np
 import pytest
@@ -74,7 +74,7 @@ def test_a_design_follows_the_gradient_to_the_best_of_its_range():
     end = refine_design(study, start, better)
     assert end is not None
     after = evaluate_designs(study, [end])["sigma_z_rms_mm"].item()
-    # A fine grid about the end finds nothing better that keeps all constraints and as much in view.
+    # A fine grid about the result contains no better design that meets all constraints and has the same view.
     around = [
         Design(0, {"laser.baseline_mm": b, "laser.triangulation_angle_deg": a})
         for b in np.linspace(185.5, 344.5, 41)

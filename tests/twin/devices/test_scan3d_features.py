@@ -44,7 +44,7 @@ class Registers(genapi.AbstractPort):
 
 @pytest.fixture
 def camera() -> GenicamCamera:
-    """`GenicamCamera` on the nodes of the twin's description, in place of those that a producer reads from a camera."""
+    """Return a `GenicamCamera` on the nodes of the twin's description, instead of nodes read by a producer."""
     finder = PeakFinder(load_sensor("thesis").camera, 255, 16)
     served = GigeCamera(lambda exposure_ms: np.zeros((1024, 1280), np.uint8), scan3d=finder, encoder=lambda: 0)
     registers, nodes = Registers(), genapi.NodeMap()

@@ -59,7 +59,7 @@ def test_a_window_passes_what_the_fields_continuity_allows(mode, glass, absorpti
     transport = {"camera": mi.TransportMode.Radiance, "laser": mi.TransportMode.Importance}[mode]
     path = faces.trace(mi.Point3f(0.0, 0.0, 0.0), direction, mode=transport)
     assert (path.weight.numpy() > 0).all()
-    # The twin's own coefficient: given, or 14.5 / m for Rubin's clear soda lime at 635 nm, or none.
+    # The twin's own coefficient: given, 14.5 / m for Rubin's clear soda lime at 635 nm, or zero.
     absorption = 1e-3 * {1.52: 0.0, 1.9: 40.0, "soda-lime": 14.5}[glass]
     expected = window_transmittance(np.cos(angle), window, index, absorption_per_mm=absorption)
     if mode == "camera":
@@ -208,7 +208,7 @@ def test_water_dims_the_stripe_over_the_laser_s_and_the_cameras_way(thesis, abso
         laser_way = oracle_fan(sensor, media[0]).way_in_medium(0.0, z - laser_origin(sensor)[2])
         camera_way = oracle_paths(sensor, media[0], np.array([[0.0, 0.0, z]]))[2][0]
         expected = math.exp(-extinction(media[1]) * (laser_way + camera_way))
-        # Same samples in both images: the way's spread across the stripe, 0.2 mm, times 6.5 / m enters squared.
+        # Same samples in both images: the spread of path lengths across the stripe, 0.2 mm * 6.5 / m, enters squared.
         assert found == pytest.approx(expected, rel=2e-4)
         assert 0.003 < expected < 0.4
 
@@ -230,7 +230,7 @@ def test_a_plate_under_the_lamp_shows_reflectance_times_irradiance_over_pi(thesi
 
 @pytest.mark.parametrize("light", ["day", "lamp"])
 def test_turbid_water_veils_what_day_and_lamp_light(thesis, light):
-    """Duntley's equation; of the lamp's light, Henyey and Greenstein's share that returns."""
+    """Duntley's equation, with the backscattered fraction of the lamp's light by Henyey and Greenstein."""
     lamps = {"irradiance_w_per_m2": 3.0, "ambient_w_per_m2": 2.0}
     sensor = altered(thesis, {"lamp": lamps, "camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2}})
     g, z, reflectance = 0.7, 30.0, 0.45

@@ -1,7 +1,7 @@
-"""The twin against Mitsuba's own integrators, in absolute units: the same scenes, rendered here and now by both.
+"""The twin compared with Mitsuba's own integrators, in absolute units, on the same scenes.
 
-Every image is rendered in several independent runs, so that blocks of pixels have a mean and a standard error; their
-differences are tested one by one and together. One run is enough where the twin takes no random numbers.
+Every image is rendered in several independent runs, so that blocks of pixels have a mean and a standard error. Their
+differences are tested one by one and together. One run is enough if the twin uses no random numbers.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SIGMA_DEG, FAN_DEG = 0.5, 35.0
 CLEAR = fog(absorption_per_m=0.0, scattering_per_m=0.0)
 SINGLY = ("multiple-scattering", "secondary-light")
 SMALLEST_P = 1e-4
-"""Agreement is refused where chance alone would part two equal images further only once in 10^4 times."""
+"""Smallest p-value of agreement: two equal images differ more by chance only once in 10^4 times."""
 LARGEST_Z = -stats.norm.ppf(SMALLEST_P / 2)
 SECOND_ORDER = math.radians(SIGMA_DEG) ** 2
 """Relative error due to the different light directions across the sheet.
@@ -50,7 +50,7 @@ def broad(thesis) -> Sensor:
 
 
 def turbid(asymmetry: float) -> Medium:
-    """Fog through which the light's way from laser to camera is 1.7 optical depths long."""
+    """Return a fog with a light path from laser to camera of 1.7 optical depths."""
     return fog(absorption_per_m=0.5, scattering_per_m=1.5, phase="henyey-greenstein", asymmetry=asymmetry)
 
 
@@ -67,8 +67,8 @@ def twin_irradiance(
 class Comparison:
     """Twin against stock over a part of the image.
 
-    ``z`` (N,) holds the blocks' differences in standard errors, ``ratio`` is the twin's sum over stock's, ``resolved``
-    its standard error.
+    ``z`` (N,) contains the blocks' differences in standard errors. ``ratio`` is the twin's sum divided by that of
+    stock Mitsuba, and ``resolved`` its standard error.
     """
 
     z: np.ndarray

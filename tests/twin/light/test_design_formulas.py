@@ -1,6 +1,6 @@
-"""The design formulas against the rendered sensor: where the stripe on a plate appears, how it moves, how long it is.
+"""Design formulas compared with the rendered sensor: position, motion and length of the stripe on a plate.
 
-The twin bends rays at the real faces of both windows; the formulas are closed and know the camera's window only.
+The twin refracts rays at the faces of both windows; the closed formulas include the camera's window only.
 """
 
 import math
@@ -23,7 +23,7 @@ from uwlts.optics.design import (
 from uwlts.storage.truth import TruthStatus
 
 PIXEL = 1e-3
-"""Of one line: a coordinate of 1000 px is rounded to 6e-5 px, and 1e-4 mm of a ray in 32 bits are 5e-4 px."""
+"""Tolerance in px of a line: a coordinate of 1000 px is rounded to 6e-5 px, and 1e-4 mm of a 32-bit ray are 5e-4 px."""
 MEAN_PIXEL = 2.5e-4
 """Tolerance in px of the mean over all lines: half of the systematic error that the lines have in common."""
 COSINE = math.cos(math.radians(35))
@@ -43,7 +43,7 @@ def test_the_stripe_on_a_plate_is_where_the_formulas_say(thesis, medium_name, al
     v = np.arange(camera.lines()) - centre
 
     def stripe(z: float) -> tuple[np.ndarray, np.ndarray]:
-        """Image coordinate u and place Y along the stripe of every line, on a plate at Z in the object's frame."""
+        """Return u and the position Y along the stripe of every line, on a plate at Z in the object's frame."""
         truth = find_true_stripe(renderer, sensor_at(-z))
         assert (truth.status == TruthStatus.VISIBLE).all()
         return away * (truth.centre_px - middle), truth.point_mm[:, 1]

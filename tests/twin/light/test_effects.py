@@ -75,8 +75,8 @@ def test_multiply_scattered_light_has_no_fireflies(sensor):
     frames = [renderer.laser_frame(sensor_at(), spp=16, seed=seed) for seed in range(10)]
     scattered = np.stack([frame.scattered for frame in frames])
     stripe = np.quantile(frames[0].stripe, 0.99)
-    # A walk brings back at most what the stripe sends out, some 30 times over where it was drawn seldom (the floors of
-    # 0.3 of its choices), in the mean of 35 walks of a cell: one alone never outshines the stripe's pixels.
+    # A walk returns at most the radiance of the stripe, times about 30 if its directions had a low probability (limits
+    # of 0.3 for each choice). In the mean of 35 walks of a cell, a single walk is never brighter than the stripe.
     assert scattered.max() < stripe
     spread = scattered.std(axis=0).mean() / scattered.mean()
     assert 0 < spread < 1.5

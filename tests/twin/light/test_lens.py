@@ -1,4 +1,4 @@
-"""The finite pupil: blur against depth is what geometric optics says, and no light is lost or gained."""
+"""Finite pupil: blur by depth agrees with geometric optics, and no light is lost or gained."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Mirrors: the stripe's second image stands where the mirrored geometry says, as bright as the mirror's share."""
+"""Mirrors: position and brightness of the stripe's second image follow from geometry and the mirror's reflectance."""
 
 import math
 from dataclasses import replace
@@ -66,7 +66,7 @@ def test_light_by_way_of_a_mirror_twice_goes_with_its_share_squared(thesis):
 
 @pytest.mark.slow
 def test_while_the_sensor_travels_the_light_by_way_of_a_mirror_travels_as_well(thesis):
-    """The exposure is the mean of still ones at places along the way, the outermost with half the weight."""
+    """The exposure is the mean of still images at positions along the path, the outermost with half the weight."""
     renderer = Renderer(thesis, clear(), hidden(SHARE), effects=replace(EFFECTS, motion=True))
     way = Travel(velocity_mm_s=np.array([100.0, 0.0, 0.0]), exposure_s=0.04)
     moving = renderer.irradiance("laser", sensor_at(), spp=64, travel=way).astype(float)

@@ -1,4 +1,4 @@
-"""A sensor that travels while it exposes: blur, rolling shutter, and what the truth says of them."""
+"""Sensor that moves during exposure: blur, rolling shutter, and their ground truth."""
 
 from dataclasses import replace
 
@@ -53,7 +53,7 @@ def test_a_rolling_shutter_shifts_each_row_by_its_delay(renderer):
     pose, delay = sensor_at(), 0.005
     centre = find_true_stripe(renderer, pose).centre_px
     rolled = find_true_stripe(renderer, pose, travel=travel(row_mm=delay))
-    # Every line is exposed where its stripe then is: the still frame at the travel of that row shows the same.
+    # Every line shows the stripe at its own exposure time, like the still frame at the travel of that row.
     for line in (4, 24, 43):
         at = rolled.centre_px[line] * delay
         assert find_true_stripe(renderer, sensor_at(x=at)).centre_px[line] == pytest.approx(

@@ -1,4 +1,4 @@
-"""Grains and bubbles in the sheet: how much light they send, where they are seen, and how large."""
+"""Grains and bubbles in the sheet: their scattered light, image positions and sizes."""
 
 import math
 from dataclasses import replace

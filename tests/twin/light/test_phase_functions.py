@@ -1,4 +1,4 @@
-"""Phase functions against other authors' figures, and directions drawn from them against the functions themselves."""
+"""Phase functions compared with published values, and sampled directions compared with the functions."""
 
 import math
 
@@ -46,7 +46,7 @@ def one_minus_cosine(place: np.ndarray) -> np.ndarray:
 
 
 def shares(medium: Medium, edges: np.ndarray) -> np.ndarray:
-    """Share (bins,) of the light that is scattered between places, by the midpoint rule over what `phase` gives."""
+    """Return the fraction (bins,) of light scattered between angles, by the midpoint rule over values of `phase`."""
     fine = 400
     steps = np.diff(edges)[:, None] / fine
     middle = one_minus_cosine(edges[:-1, None] + steps * (np.arange(fine) + 0.5))
@@ -55,7 +55,7 @@ def shares(medium: Medium, edges: np.ndarray) -> np.ndarray:
 
 
 def within(table_of: PhaseFunction, degrees: float) -> float:
-    """Share scattered by less than an angle."""
+    """Return the fraction scattered by less than an angle."""
     table = tabulate_phase_function((Scatterer(1.0, table_of),))
     return float(np.interp(math.log(math.radians(degrees)), np.log(node_angles()), table.cumulative))
 
@@ -243,7 +243,7 @@ def test_ends_and_nonsense_stay_within_the_table():
     assert (values > 0).all()
     assert values[0] == values[1] > 1e5
     assert values[2] == values[3] < 0.004
-    # A ray that met nothing may ask for anything; the answer is of no use but must not read beyond the table.
+    # A ray without a hit may have any argument; its result is not used, but must not read beyond the table.
     scattering.phase(mi.Float([math.nan, math.inf, -math.inf, -1.0])).numpy()
 
 

@@ -1,4 +1,4 @@
-"""The lattice of samples in a pixel: even along every axis, in pairs about the middle, so that nothing is shifted."""
+"""Lattice of samples in a pixel: even along every axis, and in pairs about the centre, so that nothing is shifted."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def test_the_pupils_shifts_are_spread_over_a_block_of_pixels():
 
 @pytest.mark.parametrize("along", ["width", "height"])
 def test_few_samples_leave_a_blurred_stripe_where_it_is(thesis, along: str):
-    """The middle of mass of every profile line, against that of many samples; water puts the stand-off out of focus."""
+    """Compare the centroid of every profile line with that of many samples; in water, the stand-off is out of focus."""
     camera = {"stripe_along": along, "width_px": 96, "height_px": 96, "f_number": 2.0}
     sensor = altered(thesis, {"camera": camera})
     blurred, sharp = (Renderer(sensor, clear(0.3), scene_of(plate()), effects=effects) for effects in (BLURRED, NONE))

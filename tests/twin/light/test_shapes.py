@@ -1,4 +1,4 @@
-"""The twin's procedural shapes before its rays: hits where the smooth functions say, gaps where the nose hides."""
+"""Ray intersections with procedural shapes: hits agree with the smooth functions, and the nose hides a gap."""
 
 from itertools import pairwise
 
@@ -80,7 +80,7 @@ def test_no_ray_slips_through_the_seams_of_a_mesh():
 
 
 def hidden_places(sensor: Sensor, medium: Medium, x: float) -> np.ndarray:
-    """Places y (N,) in steps of 0.2 mm across the face where the head hides the sheet at ``x`` from the camera.
+    """Return positions y (N,) across the face, in steps of 0.2 mm, where the head hides the sheet at ``x``.
 
     From there, the straight line to the window, along which light takes least time, runs below the height function.
     """

@@ -1,4 +1,4 @@
-"""The sheet with a profile, a bow and a bent surface: where its light is, how much, and rays drawn from it."""
+"""Sheet with a profile, a bow and a bent surface: position and power of its light, and sampled rays."""
 
 import math
 from typing import Any
@@ -41,7 +41,7 @@ WATER = clear()
 
 
 def shape_of(laser: Laser, angle: np.ndarray) -> np.ndarray:
-    """Power per angle over its mean over the fan: written from the description's words, normalised numerically."""
+    """Return power per angle divided by its mean over the fan, from the description and normalised numerically."""
 
     def relative(a: np.ndarray) -> np.ndarray:
         if laser.fan_profile == "flat":
@@ -82,7 +82,7 @@ def middle(sheet: Sheet, y: np.ndarray, z: float) -> np.ndarray:
 
 
 def power_per_mm(sheet: Sheet, y: np.ndarray, z: float) -> np.ndarray:
-    """Power in W/mm through the plane Z = ``z`` per length along Y, the Gaussian summed across X."""
+    """Return the power in W/mm through the plane Z = ``z`` per length along Y, integrated across X."""
     centre = middle(sheet, y, z)
     sigma = light_at(sheet, centre)["sigma_mm"]
     places = np.linspace(-8, 8, 65)  # the trapezoidal rule with four places per sigma is exact to 1e-12

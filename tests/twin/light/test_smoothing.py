@@ -1,4 +1,4 @@
-"""The noise of random walks is removed, their light is not: synthetic walks with rare bright ones, rendered frames."""
+"""Smoothing removes the noise of random walks and keeps their light: synthetic walks with outliers, rendered frames."""
 
 import math
 from pathlib import Path
@@ -31,7 +31,7 @@ def features() -> np.ndarray:
 
 
 def walks_of(light: np.ndarray, walks: int, *, rng: np.random.Generator) -> FoundLight:
-    """Walks (rows, columns, ``walks``) of a mean light: log-normal, so that one in a thousand finds 100 times more."""
+    """Return log-normal walks (rows, columns, ``walks``) of a mean light; one in a thousand is 100 times brighter."""
     spread = 1.5
     each = light[..., None] * rng.lognormal(-0.5 * spread**2, spread, (*light.shape, walks))
     findings = FoundLight(*light.shape)
@@ -56,7 +56,7 @@ def test_rare_bright_walks_leave_no_spots_and_all_light_is_kept():
 
 def test_what_enough_walks_found_is_kept_whatever_the_features_say():
     rng = np.random.default_rng(1)
-    # A bright square that no feature knows. 4,000 walks scatter by 4.6 %, below the share that is left as it is.
+    # A bright square that no feature describes. 4,000 walks scatter by 4.6 %, below the threshold for smoothing.
     light = halo() + 5 * ((np.abs(ROWS - 36) < 4) & (np.abs(COLUMNS - 40) < 4))
     walks = 4000
     findings = walks_of(light, walks, rng=rng)

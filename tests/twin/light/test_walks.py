@@ -82,8 +82,8 @@ def assert_agrees(found: np.ndarray, error: np.ndarray, expected: np.ndarray, *,
 
 @pytest.mark.parametrize("reflectance", [0.3, 0.8])
 def test_an_integrating_sphere_is_filled_with_the_geometric_series(coarse, tmp_path, reflectance):
-    # Inside a diffuse sphere every point lights all points evenly, so that P r of the light's power P that the first
-    # reflection leaves makes an irradiance P r (1 + r + ...) / area on all of it. The sensor sits inside.
+    # Inside a diffuse sphere of reflectance r, every point illuminates all points evenly. The power P r after the first
+    # reflection gives the irradiance P r (1 + r + ...) / area everywhere. The sensor is inside the sphere.
     radius = 900.0
     trimesh.creation.icosphere(subdivisions=6, radius=radius).export(tmp_path / "sphere.ply")
     surface = {"kind": "mesh", "path": str(tmp_path / "sphere.ply"), "reflectance": reflectance}
@@ -120,7 +120,7 @@ def wall(turn: float, centre: tuple[float, float], reflectance: float) -> dict[s
 
 
 def line_on_wall(sensor: Sensor, medium: Medium, s: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Power per length (N,) that the sheet lays along the line Y, Z = s * ``along`` from the origin of the OCS."""
+    """Return the power per length (N,) of the sheet along the line Y, Z = s * ``along`` from the origin of the OCS."""
     fan, origin = oracle_fan(sensor, medium), laser_origin(sensor)
     step = 1e-3
 
@@ -136,7 +136,7 @@ def line_on_wall(sensor: Sensor, medium: Medium, s: np.ndarray, along: np.ndarra
 def from_line(
     points: np.ndarray, normal: np.ndarray, line: np.ndarray, line_normal: np.ndarray, c: float
 ) -> np.ndarray:
-    """Irradiance (N, M) at points (N, 3) per power (M,) that diffuse spots (M, 3) send out, in 1/mm2."""
+    """Return the irradiance (N, M) at points (N, 3) per power (M,) emitted by diffuse spots (M, 3), in 1/mm2."""
     apart = line[None] - points[:, None]
     r = np.linalg.norm(apart, axis=-1)
     there, here = -(apart @ line_normal) / r, (apart @ normal) / r
@@ -173,7 +173,7 @@ def test_a_corner_lights_itself_as_one_bounce_by_quadrature(coarse, absorption):
 def sheet_upon(
     sensor: Sensor, medium: Medium, points: np.ndarray, normal: np.ndarray, phase, low: float, high: float
 ) -> np.ndarray:
-    """Irradiance (N,) that the sheet between Z = ``low`` and ``high``, scattering once, throws on points (N, 3).
+    """Return the irradiance (N,) at points (N, 3) by light scattered once from the sheet between ``low`` and ``high``.
 
     The sheet is a plane: its width of 0.15 mm is far below the distance to the points.
     """
@@ -255,7 +255,7 @@ def test_thin_water_spreads_the_stripe_along_camera_rays_as_quadrature(coarse):
 
 
 def line_on_plane(sensor: Sensor, medium: Medium, y: np.ndarray, z: float) -> np.ndarray:
-    """Power per length (N,) that the sheet lays along Y on the plane Z = ``z``."""
+    """Return the power per length (N,) of the sheet along Y on the plane Z = ``z``."""
     fan, depth = oracle_fan(sensor, medium), z - laser_origin(sensor)[2]
     angle = fan.angle_through(y, np.full_like(y, depth))
     way = fan.way_in_medium(angle, depth)
@@ -298,7 +298,7 @@ def test_no_walk_outshines_the_stripe(tiny, name):
     # fraction of directions drawn from the vertex's own scattering. A cell takes the mean of at least 4 walks; at most
     # two of them may find a lit surface.
     assert images.max() < 0.2 * peak + 2 / 0.7 / 4 * peak
-    # Halves of the seeds agree in the light altogether: a sum dominated by rare bright samples would not.
+    # Both halves of the seeds agree in total light: a sum dominated by rare bright samples would not.
     totals = images.sum(axis=(1, 2))
     spread = totals.std(ddof=1)
     assert spread < 0.5 * totals.mean()
@@ -361,6 +361,6 @@ def test_light_on_longer_ways_moves_with_the_sensor(coarse):
     lit = images[0] > 0.05 * images[0].max()
     assert lit.sum() > 500
     assert images[0][lit].mean() > 1e-11, "haze alone is a thousand times weaker"
-    # Equal walks but for rounding, which sends one in some thousands another way.
+    # Walks are equal except for rounding, which changes the path of one in some thousands.
     assert images[1][lit].mean() == pytest.approx(images[0][lit].mean(), rel=0.01)
     assert np.median(np.abs(images[1][lit] / images[0][lit] - 1)) < 0.01

@@ -1,4 +1,4 @@
-"""The plan of a folder of recordings: kept to, refused, or replaced."""
+"""Plan of a folder of recordings: followed, rejected, or replaced."""
 
 import json
 

@@ -71,7 +71,7 @@ def lattice_mm(scene: Scene) -> np.ndarray:
 
 
 def found_px(image: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Circles (rows, columns, 2) of an image, each the one nearest to where it is expected."""
+    """Return the circles (rows, columns, 2) of an image nearest to their expected positions."""
     circles = find_circles(image).centres
     assert len(circles) == ROWS * COLUMNS
     distance = np.linalg.norm(expected[:, :, None] - circles, axis=-1)
@@ -146,8 +146,8 @@ def test_detection_errors_have_their_size_in_the_image(small, medium):
         distance = np.linalg.norm(still[:, None] - circles, axis=-1)
         offsets.append(circles[distance.argmin(axis=1)] - still)
     offsets = np.array(offsets)
-    # The plate leans by 35 deg against the camera, about the image's u axis; in what the image shows of it, refraction
-    # does not matter near the axis. The scale is that of the plate's origin, 3 % from that of the lattice at most.
+    # The plate leans by 35 deg against the camera, about the image's u axis; near the axis, refraction does not matter.
+    # The scale is that of the plate's origin, at most 3 % from that of the lattice.
     u, v = offsets.reshape(-1, 2).std(axis=0)
     tolerance = 4.5 / math.sqrt(2 * IMAGES * len(still)) + 0.03
     assert u == pytest.approx(0.6, rel=tolerance)
@@ -248,7 +248,7 @@ def test_position_errors_move_the_stripe_and_not_what_is_recorded(small, tmp_pat
     shift = np.mean(truth_off.centre_px[:, lines] - truth.centre_px[:, lines], axis=1)
     assert abs(shift[0]) > 0.15
     assert shift[2] == pytest.approx(-shift[0] / 2, rel=0.05)
-    # It is the image that a stage gives that is sent there.
+    # The image is that of a stage with a commanded position.
     _, _, sent = scan(small, tmp_path / "sent.h5", start_mm=-3.5, count=1)
     np.testing.assert_array_equal(sent.centre_px[0], truth_off.centre_px[0])
 

@@ -1,4 +1,4 @@
-"""Flaws of real recordings in whole images: each alone, in the light it belongs to, in the truth, in the capture."""
+"""Flaws of real recordings in whole images: each alone, in its own light, in the truth and in the capture."""
 
 from dataclasses import fields, replace
 

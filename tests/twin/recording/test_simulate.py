@@ -1,4 +1,4 @@
-"""Virtual recordings: repeatable, resumable after an interruption, never overwriting unasked, nominal outside."""
+"""Simulated recordings: repeatable, resumable after an interruption, never overwritten by default, nominal headers."""
 
 import subprocess
 import sys

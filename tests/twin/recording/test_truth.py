@@ -1,4 +1,4 @@
-"""The twin's ground truth: stripe centres by least time, points on their surfaces, shadows where geometry puts them."""
+"""Ground truth of the twin: stripe centres by least time, points on surfaces, and shadows by geometry."""
 
 import numpy as np
 import pytest
@@ -262,7 +262,7 @@ def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
     np.testing.assert_array_equal(status[clear_cut], expected[clear_cut])
     image = renderer.irradiance("laser", sensor_at(), spp=4)
     bright = image[:, 30:290:2].max(axis=0) > 0.05 * image.max()
-    # A pixel at the shadow's rim is partly lit, and the stripe's lit half shows at a hidden one's.
+    # A pixel at the edge of the shadow is partly lit, and the lit half of the stripe is visible beside a hidden point.
     inner = np.convolve(blocked > 0, np.ones(3), "same")
     assert not bright[inner == 3].any()
     assert bright[inner == 0].all()

@@ -1,4 +1,4 @@
-"""Campaigns: what is drawn for each seed, deviations of real hardware from descriptions, and refusals."""
+"""Campaigns: values drawn for each seed, deviations of real hardware from descriptions, and rejected plans."""
 
 import math
 from pathlib import Path
@@ -57,7 +57,7 @@ def drawn(seed: int = 0, *, every: int = 1, **sizes: float) -> dict[str, Take]:
 
 
 def over_seeds(name: str, wanted: list[int]) -> list[dict[str, Take]]:
-    """Takes of the recordings of some numbers for many seeds, with one imperfection alone."""
+    """Return the takes of numbered recordings for many seeds, with a single imperfection."""
     chosen = campaign([RECORDINGS[number] for number in wanted], **{name: SIZES[name]})
     return [{take.name: take for take in list_takes(chosen, seed=seed)} for seed in range(SEEDS)]
 
@@ -98,7 +98,7 @@ def plate(take: Take):
 
 
 def deflection_deg(take: Take) -> np.ndarray:
-    """By what angles (3,) the stage's true direction leaves the recorded one along X, Y and Z."""
+    """Return the components (3,) of the angle between the stage's true direction and the recorded one."""
     return np.degrees(take.scene.motion.unit_direction() - take.scene.motion.recorded_direction())
 
 

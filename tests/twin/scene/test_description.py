@@ -1,4 +1,4 @@
-"""Sensor and scene descriptions: all that ship are sound, and every mistake in one is refused by name."""
+"""Sensor and scene descriptions: all shipped ones are valid, and every mistake is rejected with its name."""
 
 import numpy as np
 import pytest

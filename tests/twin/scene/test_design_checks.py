@@ -1,4 +1,4 @@
-"""Sensors and scenes that cannot work are refused with the numbers that say why; those that just work pass."""
+"""Sensors and scenes that cannot work are rejected with the numbers that explain it; those that just work pass."""
 
 import math
 

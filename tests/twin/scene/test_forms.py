@@ -1,4 +1,4 @@
-"""Flange, cable, rope, marine growth and sea floor: their sizes, closed or open, and facets on the functions."""
+"""Flange, cable, rope, marine growth and sea floor: sizes, topology, and deviation of facets from the functions."""
 
 import math
 

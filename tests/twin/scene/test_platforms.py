@@ -1,4 +1,4 @@
-"""Platforms that carry the sensor: where they truly are, and what they report."""
+"""Platforms that carry the sensor: true and reported poses."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def test_the_same_path_is_described_again():
 
 
 def test_the_clock_of_the_platform_is_ahead():
-    """By the platform's clock the pose at a time is that of the camera's time less the offset."""
+    """The pose at a time of the platform's clock is that at the camera's time minus the offset."""
     path = IdealPath(kind="path", waypoints=ALONG, speed_mm_per_s=100.0, frame_rate_hz=20.0, clock_offset_s=0.02)
     course = path.course()
     times = np.array([shot.time_s for shot in course.shots])

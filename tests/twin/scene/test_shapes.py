@@ -1,4 +1,4 @@
-"""The procedural shapes: closed or open as they should be, facing the sensor, of the sizes that were asked for."""
+"""Procedural shapes: topology, orientation towards the sensor, and requested sizes."""
 
 import numpy as np
 import pytest

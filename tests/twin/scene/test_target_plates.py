@@ -1,4 +1,4 @@
-"""Targets drawn by the twin from the descriptions used for detection: every kind, exact to its edges."""
+"""Targets drawn by the twin from the descriptions used for detection: every kind, with exact edges."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Blooming: charge runs along its column, none is lost unless drained, and what fits stays where it is."""
+"""Blooming: excess charge flows along its column, and none is lost unless drained; charge up to the full well stays."""
 
 import numpy as np
 import pytest

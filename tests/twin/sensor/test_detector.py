@@ -1,4 +1,4 @@
-"""Light to grey values: the photon-transfer curve of EMVA 1288 finds the parameters that were put in."""
+"""Light to grey values: the photon-transfer curve of EMVA 1288 recovers the simulated parameters."""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -29,7 +29,7 @@ def detector(**changes: object) -> Detector:
 
 
 def flat(electrons: float, sensor: Detector, *, exposure_ms: float = 1.0, seed: int | None = 0) -> np.ndarray:
-    """Image of an even irradiance, ``electrons`` per pixel over the whole exposure; without noise if seed is None."""
+    """Return an image of uniform irradiance, ``electrons`` per pixel and exposure; without noise if seed is None."""
     rng = None if seed is None else np.random.default_rng(seed)
     light, pattern = np.full((SIDE, SIDE), electrons, np.float32), fixed_pattern(sensor, height=SIDE, width=SIDE)
     return grey_values(light, sensor, exposure_ms=exposure_ms, rng=rng, pattern=pattern)
@@ -73,7 +73,7 @@ def test_the_photon_transfer_curve_gives_gain_and_read_noise(bits, full_well, pa
     np.testing.assert_allclose(means, true_gain * levels, rtol=5e-3, atol=5 * np.sqrt(variances.max() / (2 * PIXELS)))
     scatter = np.sqrt(2 / PIXELS) * np.hypot(variances + dark_variance, dark_variance)
     assert (np.abs(variances - true_gain * means) < 5 * scatter).all()
-    # A spread that grows with the signal instead of with its root would be noticed.
+    # A spread proportional to the signal instead of its root would be detected.
     assert (np.abs(variances[-1] * (means / means[-1]) ** 2 - true_gain * means) > 5 * scatter).sum() > 8
 
 

@@ -1,4 +1,4 @@
-"""The fixed pattern: EMVA 1288's spatial analysis finds the non-uniformity that was put in, and hot pixels are hot."""
+"""Fixed pattern: EMVA 1288's spatial analysis recovers the simulated non-uniformity and hot pixels."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def stack(electrons: float, chip: Detector, *, exposure_ms: float = 1.0) -> np.n
 
 
 def spatial_variance(images: np.ndarray) -> float:
-    """EMVA 1288's: variance of the mean image less what the temporal noise leaves in it, in grey values squared."""
+    """Return EMVA 1288's spatial variance of the mean image, corrected for temporal noise, in squared grey values."""
     return images.mean(axis=0).var(ddof=1) - images.var(axis=0, ddof=1).mean() / len(images)
 
 

@@ -1,4 +1,4 @@
-"""Flaws of real recordings as functions of arrays: glare, vignetting, colour filters, compression, the sensor built."""
+"""Flaws of real recordings as functions of arrays: glare, vignetting, colour filters, compression, true sensors."""
 
 import io
 

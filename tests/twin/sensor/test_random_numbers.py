@@ -1,4 +1,4 @@
-"""Random numbers for images: every mean gets its own Poisson distribution, read noise is normal to its tail."""
+"""Random numbers for images: a Poisson distribution for every mean, and normal read noise up to its tails."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def p_value(numbers: np.ndarray, mean: float) -> float:
 
 @pytest.mark.parametrize("mean", MEANS)
 def test_every_mean_has_poissons_distribution(drawn, mean):
-    # 16 tests at 1e-4 each: a right generator fails the lot once in 600 seeds, and this seed is fixed.
+    # 16 tests at 1e-4 each: a correct generator fails any of them once in 600 seeds, and this seed is fixed.
     assert p_value(drawn[mean], float(np.float32(mean))) > 1e-4
 
 

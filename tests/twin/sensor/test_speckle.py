@@ -60,7 +60,7 @@ Pattern = Callable[..., np.ndarray]
 
 @pytest.fixture(scope="module")
 def lens(thesis: Sensor) -> Lens:
-    """Makes the thesis's camera with another f-number, or anything else."""
+    """Return the thesis's camera with another f-number or other changes."""
 
     def make(f_number: float, **changes: object) -> Camera:
         return altered(thesis, {"camera": {"f_number": f_number, **changes}}).camera
@@ -288,7 +288,7 @@ def test_a_frame_depends_on_seed_and_travel_only(lens):
         np.testing.assert_array_equal(frame(again, travel, everything), expected)
     shuffled = rng.permutation(5000)[:700]
     np.testing.assert_array_equal(frame(again, 0.01, shuffled), forward[1][shuffled])
-    # Fully coherent and polarised pixels get the same alone and in company.
+    # Fully coherent and polarised pixels have the same factors alone and together with others.
     pure = np.arange(300)
     polarised[pure], coherent[pure] = 1.0, 1.0
     np.testing.assert_array_equal(frame(once, 5.0, pure), frame(once, 5.0, everything)[pure])

@@ -15,10 +15,10 @@ from uwlts.storage.cloud import PointCloud
 
 SEED = 5
 LOOP_MM = np.array([[0, 0], [1100, 0], [1100, 700], [450, 700], [450, -500]], float)
-"""Of 4 m, with one crossing at (450, 0)."""
+"""Path of 4 m, with one crossing at (450, 0)."""
 
 RACE_MM = np.array([[-200, 0], [700, 0], [700, 600], [-200, 600], [-200, 0], [500, 0]], float)
-"""Ends where it began, in the same direction."""
+"""Path that ends at its start, in the same direction."""
 
 
 def position_errors(found: Trajectory, true: Trajectory) -> float:
@@ -27,7 +27,7 @@ def position_errors(found: Trajectory, true: Trajectory) -> float:
 
 
 def true_points(cloud: PointCloud, reported: Trajectory, true: Trajectory) -> np.ndarray:
-    """Points (N, 3) of a cloud along the reported path where they truly are."""
+    """Return the true positions (N, 3) of the points of a cloud along the reported path."""
     assert cloud.time_s is not None
     moved = true.poses_at(cloud.time_s) @ np.linalg.inv(reported.poses_at(cloud.time_s))
     return np.einsum("nij,nj->ni", moved, np.c_[cloud.points_mm, np.ones(len(cloud))])[:, :3]

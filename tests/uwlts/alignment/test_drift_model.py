@@ -14,7 +14,7 @@ DEPTH_MM, TILT = 3.0, 2e-3
 
 
 def navigated(*, by_heading: bool) -> Trajectory:
-    """Along X, then along Y, from 2 s after the navigation's start on.
+    """Return a trajectory along X, then along Y, that starts 2 s after the navigation.
 
     The state is the error of x, y and heading, and their biases.
     """
@@ -47,10 +47,10 @@ def test_rates_walks_and_dead_reckoning_are_found_from_the_covariance(by_heading
     # Continuously measured quantities are modelled as random walks with twice their variance, an upper bound.
     np.testing.assert_allclose(size[2:5], 2 * np.array([DEPTH_MM, TILT, TILT]) ** 2)
     np.testing.assert_allclose(found.walk[2:5], 1.0)
-    # The part that the heading causes is taken off; its random walk leaves some of it.
+    # The part caused by the heading is subtracted; its random walk leaves a small remainder.
     rates = np.sqrt((size - walk)[[0, 1, 5]])
     np.testing.assert_allclose(rates, np.array([BIAS_MM_S, BIAS_MM_S, GYRO]) * SECONDS, rtol=0.05)
-    # The rate has drifted for 2 s before: v(t) - v(0) is no square alone.
+    # The rate has drifted for 2 s before: v(t) - v(0) is not only quadratic.
     np.testing.assert_allclose(walk[:2], NOISE**2 * SECONDS, rtol=0.5)
     np.testing.assert_allclose(walk[5], HEADING_NOISE**2 * SECONDS, rtol=0.1)
 

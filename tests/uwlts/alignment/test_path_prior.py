@@ -1,4 +1,4 @@
-"""Prior of the correction of a path, against drifts that are drawn step by step."""
+"""Prior of a path correction, compared with drifts simulated step by step."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def prior_of(*, correlation: float = np.inf, dead_reckoned: bool = False) -> Pat
 
 
 def covariance(prior: PathPrior, times_s: np.ndarray) -> np.ndarray:
-    """Of the drift at times (N,), (6, N, 6, N)."""
+    """Return the covariance (6, N, 6, N) of the drift at times (N,)."""
     root = prior.times_root(np.eye(6 * prior.count)).reshape(6, prior.count, -1)
     at = np.einsum("nc,ick->ink", prior.basis(times_s), root)
     return np.einsum("ink,jmk->injm", at, at)

@@ -1,4 +1,4 @@
-"""The stripe on a flat target, among what else is bright in the image."""
+"""Detection of the stripe on a flat target among other bright parts of the image."""
 
 import cv2
 import numpy as np

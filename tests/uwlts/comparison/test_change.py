@@ -1,4 +1,4 @@
-"""Change between clouds: what is claimed where nothing changed, what is found, and what a registration leaves open."""
+"""Change between clouds: false positives, detected changes, and coordinates that a registration does not determine."""
 
 import json
 from dataclasses import replace
@@ -22,7 +22,7 @@ SIDE_MM, STEP_MM = 60.0, 0.5
 
 
 def height(x, y):
-    """A surface that no movement leaves as it is."""
+    """Return the height of a surface without symmetry: every motion changes it."""
     return 2.0 * np.sin(x / 9.0) + 1.5 * np.cos(y / 7.0) + 0.01 * x * y / 5
 
 
@@ -31,7 +31,7 @@ def dent(x, y):
 
 
 def scanned(rng, *, change=None, common=True, surface=height, calibration=None):
-    """A cloud taken in lines by a stage, whose errors are those that it states.
+    """Return a cloud scanned in lines by a stage, with errors as stated.
 
     ``calibration`` are the errors (3,) of water, shift and tilt by one calibration, in standard deviations.
     """
@@ -123,7 +123,7 @@ def share(change):
 
 @pytest.mark.slow
 def test_a_registration_takes_up_what_looks_like_a_movement():
-    """Shift and tilt that all points share no longer count, and what is claimed stays at most the level's 5 %."""
+    """Common shift and tilt no longer count, and the claimed fraction is at most the 5 % of the level."""
     rng = np.random.default_rng(12)
     pairs = [(scanned(rng), scanned(rng)) for _ in range(4)]
     found = [uwlts.compare_clouds(*pair, register=True) for pair in pairs]

@@ -1,6 +1,6 @@
-"""Artefacts are found among other surfaces and measured as they were made; wrong content is refused.
+"""Artefacts are found among other surfaces and measured correctly; wrong contents are rejected.
 
-Clouds are drawn from ideal shapes with known noise. The true figures are those of the noise that was drawn.
+Clouds are drawn from ideal shapes with known noise. The true figures are those of the drawn noise.
 """
 
 import json

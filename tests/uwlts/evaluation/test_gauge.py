@@ -1,4 +1,4 @@
-"""Gauge studies: AIAG's example, coverage of the intervals, and tables that are refused."""
+"""Gauge studies: AIAG's example, coverage of the intervals, and rejected tables."""
 
 import json
 

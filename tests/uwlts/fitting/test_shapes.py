@@ -1,6 +1,6 @@
-"""Fits against exact shapes, against their own scatter over many noisy repeats, and at their limits.
+"""Fits of exact shapes, their scatter over many noisy repeats, and their limits.
 
-The references are the shapes that the points were drawn from; no test repeats a formula of the fits.
+The references are the shapes of the drawn points; no test repeats a formula of the fits.
 """
 
 from functools import partial

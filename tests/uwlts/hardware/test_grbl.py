@@ -44,7 +44,7 @@ def controller() -> Iterator[GrblController]:
 
 @pytest.fixture
 def stage(controller: GrblController) -> Iterator[GrblStage]:
-    """A homed stage. Faults are left to the test; in the end the laser is off."""
+    """Yield a homed stage. Tests may cause faults; at the end the laser is off."""
     with GrblStage(controller.port) as opened:
         opened.home()
         yield opened

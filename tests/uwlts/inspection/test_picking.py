@@ -13,7 +13,7 @@ from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 CENTRE = np.array([30.0, -12.0, 350.0])
 DRAWS = 3000
 FALSE_ALARM = 5e-6
-"""Of one comparison. There are 16: with other seeds one of them fails by chance with a probability below 1e-4."""
+"""Probability of a false alarm in one of 16 comparisons; with other seeds, any of them fails with less than 1e-4."""
 NOT_LINEAR = 1.02
 """Allowed ratio of the variance of a quantity at moved points to the variance of its linear approximation."""
 

@@ -1,4 +1,4 @@
-"""Calibrations whose joint estimate is damaged are refused in one line when they are read."""
+"""Calibrations with a damaged joint estimate are rejected with one line when they are read."""
 
 import json
 
@@ -37,7 +37,7 @@ def written(thesis, tmp_path_factory):
 
 
 def damage(**changes):
-    """Entries of the joint estimate replaced by what is given for them, or taken out by None."""
+    """Replace entries of the joint estimate by the given values, or remove them by None."""
 
     def damaged(joint):
         joint.update(changes)

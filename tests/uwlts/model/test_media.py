@@ -1,4 +1,4 @@
-"""Indices, absorption and scattering against published numbers, and refusals outside the ranges of their sources."""
+"""Indices, absorption and scattering compared with published numbers, and refusals outside the ranges of sources."""
 
 import math
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Named waters and turbidity against the numbers of their sources, and what a description may ask for."""
+"""Named waters and turbidity compared with their sources, and permitted descriptions."""
 
 import math
 from dataclasses import dataclass

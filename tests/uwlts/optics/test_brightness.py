@@ -17,7 +17,7 @@ from uwlts.stripe import CaptureStripes, extract_stripe
 STAGE = 3.0 + np.arange(7.0)
 LINES = np.arange(600, 641)
 LEAN, FADING = 0.3, 0.4
-"""Of the surface, mm of Z per mm of X, and of its brightness, per mm."""
+"""Slope of the surface, mm of Z per mm of X, and relative decrease of its brightness per mm."""
 
 
 def surface_z(x):

@@ -1,4 +1,4 @@
-"""Derivatives of the camera, the window and the sheet against differences of what they are derivatives of."""
+"""Derivatives of camera, window and sheet compared with finite differences."""
 
 import cv2
 import numpy as np

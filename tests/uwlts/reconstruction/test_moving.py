@@ -1,4 +1,4 @@
-"""Reconstruction of scans by a platform: by its poses, a mount and a trajectory."""
+"""Reconstruction of scans on a moving platform, from its poses, a mount and a trajectory."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ STEP_MM = 2.0
 
 
 def platform_at(stage_mm):
-    """The platform's pose where the sensor went by ``stage_mm`` along its x axis from the start."""
+    """Return the platform's pose after a motion of the sensor by ``stage_mm`` along its x axis."""
     moved = np.eye(4)
     moved[0, 3] = stage_mm
     return START @ moved @ np.linalg.inv(MOUNT)
@@ -119,7 +119,7 @@ def test_images_outside_the_trajectory_are_refused(tmp_path):
 
 
 def test_the_mount_s_uncertainty_moves_points_as_other_mounts_do():
-    """Against points that were calculated with 4000 mounts drawn by the covariance."""
+    """Compare with points calculated with 4000 mounts drawn from the covariance."""
     rng = np.random.default_rng(1)
     seen = rng.uniform([-40, -1, 150], [40, 1, 300], size=(30, 3))
     poses = np.array([platform_at(stage) for stage in rng.uniform(0, 500, 30)])
@@ -149,7 +149,7 @@ def drawn_points(seen, poses, errors):
 
 
 def test_errors_of_each_pose_move_its_image_s_points_together():
-    """Against 4000 draws of the poses' errors, each image's on its own; means over images average them."""
+    """Compare with 4000 draws of pose errors, independent between images; means over images average them."""
     rng = np.random.default_rng(2)
     seen, images = rng.uniform([-40, -1, 150], [40, 1, 300], size=(5, 3)), 6
     poses = np.array([platform_at(20.0 * number) for number in range(images)])
@@ -207,7 +207,7 @@ def test_errors_along_a_path_are_as_alike_as_its_covariances_say(kind):
 
 
 def test_many_images_have_the_uncertainty_of_few():
-    """Of a random walk at 1200 images, by 400 moments, against a tenth of them."""
+    """Compare a random walk at 1200 images, with modes from 400 times, with a tenth of the images."""
     count, seen = 1200, np.array([[10.0, 0.0, 200.0]])
     poses = np.array([platform_at(0.5 * number) for number in range(count)])
     points = drawn_points(seen, poses, np.zeros((count, 6)))[:, 0]

@@ -147,7 +147,7 @@ def test_many_points_by_a_table_have_the_covariance_of_few_by_themselves(calibra
         many = point_uncertainty(capture, calibration, frame, line, centre)
         few = point_uncertainty(capture, calibration, frame[whole], line[whole], centre[whole])
     assert len(line) >= 5000 > len(whole)
-    # Left out of either is what moves points by 5e-5 mm (root mean square), at most three times that at one of them.
+    # Both omit patterns that move points by 5e-5 mm (root mean square), at most three times that at a single point.
     found, expected = many.systematic_mm2()[whole], few.systematic_mm2()
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2 * (1.5e-4) ** 2)
     np.testing.assert_allclose(many.random_mm2[whole], few.random_mm2, rtol=1e-5)
@@ -229,7 +229,7 @@ def test_figures_have_the_uncertainty_of_monte_carlo(calibration, stripes, thesi
         moved = moved + np.einsum("m,mni->ni", rng.standard_normal(len(patterns)), patterns)
         spread.append(evaluate_cloud(replace(cloud, points_mm=moved), artefact).figures_mm["STD"])
     total = np.hypot(found["STD"].random_mm, found["STD"].systematic_mm)
-    # STD adds squares, so that it is not linear in the patterns: the same size is what can be asked.
+    # STD adds squares, so it is not linear in the patterns: only its size is compared.
     assert 0.3 * np.std(spread) < total < 3 * np.std(spread)
 
 

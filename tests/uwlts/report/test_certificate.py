@@ -1,4 +1,4 @@
-"""Certificates: their seal, what they say of lengths and form, and their page."""
+"""Certificates: seal, statements on lengths and form, and page."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Report of an inspection: what stands on the page, in the JSON and in the PDF, and what is refused."""
+"""Report of an inspection: contents of page, JSON and PDF, and rejected inputs."""
 
 import json
 from types import SimpleNamespace

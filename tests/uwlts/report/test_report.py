@@ -1,4 +1,4 @@
-"""The report of a campaign: numbers against ones worked out by hand, the page against what a browser would fetch."""
+"""Report of a campaign: numbers compared with calculations by hand, and a page that loads nothing."""
 
 import io
 import json
@@ -416,7 +416,7 @@ def test_a_reference_of_the_wrong_form_is_refused(tmp_path, text, says):
 
 
 class Tags(HTMLParser):
-    """Every start tag with its attributes, the text of styles and scripts, and all other text."""
+    """Collect every start tag with its attributes, the text of styles and scripts, and all other text."""
 
     def __init__(self, page: str):
         super().__init__()

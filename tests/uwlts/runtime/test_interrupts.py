@@ -11,7 +11,7 @@ from uwlts.runtime.interrupts import preserve_interrupts
 
 
 def test_an_interrupt_within_a_callback_is_not_lost(capsys: pytest.CaptureFixture):
-    """Python reports and drops exceptions of a weak reference's callback; Ctrl-C may come in one at any time."""
+    """Python only reports exceptions in callbacks of weak references; Ctrl-C may arrive in such a callback."""
 
     def callback(_: object) -> None:
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""The laser's own stripe among reflections, in drawn images. Rendered ones: `docs/studies/stripe_reflections.py`."""
+"""Direct stripe of the laser among reflections, in drawn images (rendered: `docs/studies/stripe_reflections.py`)."""
 
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""The thesis's stripe centre: LabVIEW's low-pass filter, and the vertex of a parabola through the peak."""
+"""Stripe centre of the thesis: LabVIEW's low-pass filter, and the vertex of a parabola through the peak."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ LINES, LENGTH = 40, 64
 
 
 def by_definition(image, *, tolerance):
-    """IMAQ LowPass as its manual words it, pixel by pixel; away from the border. Also the relative deviations."""
+    """Return IMAQ LowPass by its manual, pixel by pixel, except at the border, and the relative deviations."""
     grey = image.astype(float)
     out, deviation = grey.copy(), np.full(image.shape, np.nan)
     for row in range(2, len(grey) - 2):
@@ -61,7 +61,7 @@ def test_black_stays_black():
 
 
 def capture(path, images, *, stripe_along):
-    """A capture of images whose stripe runs along their width, turned if it shall run along the height."""
+    """Write a capture of images with a stripe along the width, rotated for a stripe along the height."""
     images = images if stripe_along == "width" else [np.ascontiguousarray(image.T) for image in images]
     sensor = load_sensor("thesis")
     size = {"height_px": images[0].shape[0], "width_px": images[0].shape[1], "stripe_along": stripe_along}
@@ -147,7 +147,7 @@ def test_noise_within_the_tolerance_is_not_smoothed(tmp_path):
 
 
 def test_unless_set_the_tolerance_is_labviews(tmp_path):
-    """40 %: a pixel 30 % above its neighbours stays, and draws the vertex to it."""
+    """Limit of 40 %: a pixel 30 % above its neighbours remains, and shifts the vertex towards it."""
     image = parabolas(np.full(LINES, 30.0))
     image[31] = (1.3 * image[31]).astype(np.uint16) // 2
     known = found(np.full((1, LINES), 30.0))
@@ -187,5 +187,5 @@ def test_stripes_at_the_border_of_the_image_have_a_finite_centre(tmp_path):
     vertices = np.concatenate([np.full(LINES // 2, 0.25), np.full(LINES // 2, LENGTH - 1.25)])
     with capture(tmp_path / "stripe.h5", [parabolas(vertices)], stripe_along="width") as opened:
         centre = thesis_stripes(opened, found(vertices[None])).centre_px
-    # Pixels beyond the border are repeated, which draws the vertex to it by less than the fit's half width.
+    # Pixels beyond the border are repeated, which shifts the vertex towards it by less than the fit's half width.
     assert (np.abs(centre - vertices) < 2).all()

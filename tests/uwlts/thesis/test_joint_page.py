@@ -1,4 +1,4 @@
-"""The joint comparison's summary and page, from results made up."""
+"""Summary and page of the joint comparison, from synthetic results."""
 
 import json
 import re

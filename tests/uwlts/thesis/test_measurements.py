@@ -1,4 +1,4 @@
-"""Drawn scans of spheres measured as the thesis's campaigns are: stripes by sphere, figures, failures reported."""
+"""Drawn scans of spheres measured as in the thesis's campaigns: stripes by sphere, figures, reported failures."""
 
 import math
 from dataclasses import replace

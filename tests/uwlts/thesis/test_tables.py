@@ -1,4 +1,4 @@
-"""The thesis's tables: published values retyped, rows from results made up here, and the files for the reader."""
+"""Tables of the thesis: published values, rows from synthetic results, and the files for the reader."""
 
 import csv
 import io
@@ -138,7 +138,7 @@ def measured(thing, placement, medium, method, processing="thesis", **figures):
 
 
 def campaign(factor=1.0):
-    """Results of a campaign whose every value is the published one times a factor."""
+    """Return results of a campaign with all published values times a factor."""
     measurements = []
     for (method, medium), n in zip(COLUMNS, range(4), strict=True):
         for number, (of_spheres, of_plane) in enumerate(zip(typed(SPHERES), typed(PLANES), strict=True)):
@@ -186,7 +186,7 @@ def test_rows_of_the_published_values_themselves():
     checked = 0
     for row in rows.values():
         if row.ours and row.published and not row.table.startswith(("Our", "Experiment")) and row.table != "Table 5":
-            # Table 8 is worked out from values of two digits.
+            # Table 8 is calculated from values of two digits.
             tolerance = 0.35 if row.table == "Table 8" else 1e-9
             assert row.ratio == pytest.approx(1.05, rel=tolerance), row
             assert row.mean == pytest.approx(np.mean(row.ours))
@@ -206,7 +206,7 @@ def test_rows_of_the_published_values_themselves():
         "ours_max": pytest.approx(1.2 * 0.66),
     }
     mean = rows["Table 2", "spheres, mean, air", "SSE"]
-    # Worked out by hand: 0.17 + 0.33 + 0.28 + 0.32 + 0.20 + 0.39 = 1.69; errors count without their sign.
+    # By hand: 0.17 + 0.33 + 0.28 + 0.32 + 0.20 + 0.39 = 1.69; errors count without their sign.
     assert mean.published == pytest.approx(1.69 / 6)
     assert mean.ours == pytest.approx((0.9 * 1.69 / 6, 1.2 * 1.69 / 6))
     # The largest error in water by the proposed method is 0.23 mm, of 220 mm.
@@ -242,7 +242,7 @@ def test_a_position_that_was_not_measured():
     row = alone["Table 6", "spheres, far, water", "PE"]
     assert (row.published, row.ours, row.mean, row.ratio) == (0.46, (), None, None)
     assert {row.as_dict()[name] for name in ("ours_mean", "ours_min", "ours_max")} == {None}
-    # The mean is over the positions that are there, of the published values too.
+    # The mean is over the available positions, also for the published values.
     mean = alone["Table 6", "spheres, mean, water", "PE"]
     assert mean.ours == pytest.approx(((0.69 + 0.66 + 0.51 + 0.51 + 0.48) / 5,))
     assert mean.ratio == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Uncertainty budgets against two that were published: the thesis's Table 9 and the GUM's end gauge (H.1)."""
+"""Uncertainty budgets compared with two published ones: the thesis's Table 9 and the GUM's end gauge (H.1)."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The window's distance by the step images used, and what it does to spheres, on drawn stripes whose truth is known."""
+"""Window distance by the step images used, and its effect on spheres, on drawn stripes with known truth."""
 
 import numpy as np
 import pytest
@@ -17,13 +17,13 @@ PLACES = {"near": -40.0, "standoff": 10.0, "far": 60.0}
 
 
 def described(distance_mm):
-    """The sensor as its captures describe it, with the window at another distance."""
+    """Return the sensor described by its captures, with the window at another distance."""
     window = SENSOR.camera.window.model_copy(update={"distance_mm": distance_mm})
     return SENSOR.model_copy(update={"camera": SENSOR.camera.model_copy(update={"window": window})})
 
 
 def campaign(folder, poses, *, odd_mm=None):
-    """A campaign's folder with images of the step in some poses at every place; at the far one with another height."""
+    """Write a campaign folder with step images in some poses at every position; the far step has another height."""
     for place, depth in PLACES.items():
         height = odd_mm if odd_mm is not None and place == "far" else STEP_MM
         images = [step_image(depth, tilt=tilt, shift_mm=shift, height_mm=height) for tilt, shift in poses]

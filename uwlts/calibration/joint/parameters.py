@@ -16,7 +16,7 @@ from uwlts.optics.window import RayDerivatives, tilt_direction, trace_derivative
 LENS = tuple(key for key in LensParameter if key is not LensParameter.F)
 WINDOW = tuple(WindowParameter)
 COLUMNS = ("u", "v", *LENS, *WINDOW, "medium_index")
-"""Variables by which rays are differentiated."""
+"""Variables of the derivatives of rays."""
 SHEET = tuple(SheetParameter)
 """Rotations of the normal towards the axis and the fan's direction, rad; shift, mm; parameters of `FanModel`."""
 
@@ -92,7 +92,7 @@ class EarlierEstimate:
 
 @dataclass(frozen=True, eq=False)
 class DescribedSheet:
-    """Described sheet, for which all parameters are zero, camera frame, mm: vectors (3,) as in `NominalSheet`."""
+    """Described sheet, camera frame, mm: vectors (3,) as in `NominalSheet`; all its parameters are zero."""
 
     normal: np.ndarray
     axis: np.ndarray

@@ -124,8 +124,8 @@ class Spheres(Surface):
 class Plane(Surface):
     """Plane near the one through ``point_mm`` (3,) with the unit ``normal`` (3,).
 
-    Local parameters: two slopes of its normal towards the unit vectors ``across`` (2, 3), perpendicular to ``normal``
-    and each other, and its distance in mm from the point.
+    Local parameters: two slopes of its normal towards the unit vectors ``across`` (2, 3), and its distance in mm from
+    the point. The unit vectors are perpendicular to ``normal`` and each other.
     """
 
     kind: ClassVar[str] = "stripe on the plane"
@@ -149,8 +149,8 @@ class Cylinder(Surface):
     """Cylinder near the one with the unit ``axis`` (3,) through ``point_mm`` (3,), seen from outside or inside.
 
     Local parameters: two shifts of its axis in mm at the point and two slopes, along the unit vectors ``across`` (2,
-    3), perpendicular to ``axis`` and each other, and the deviation from ``diameter_mm``. The standard uncertainty of
-    the diameter is infinite if unknown.
+    3), and the deviation from ``diameter_mm``. The unit vectors are perpendicular to ``axis`` and each other. The
+    standard uncertainty of the diameter is infinite if unknown.
     """
 
     kind: ClassVar[str] = "stripe on the pipe"

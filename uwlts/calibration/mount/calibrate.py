@@ -181,7 +181,7 @@ def _advice(evidence: MountEvidence) -> str:
 
 
 class _Calibration:
-    """Steps of one calibration, in the order in which `make_result` needs them."""
+    """Steps of one calibration, in the order needed by `make_result`."""
 
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence

@@ -26,7 +26,7 @@ _BINS = 32
 _LEAST_SPAN = 1e-6
 """Fraction of the largest effect of a pose error on its profile below which an effect is ignored."""
 _LEAST_SHARE = 1e-3
-"""Smallest factor by which a plane reduces the noise: it is tilted by less than 0.06 deg from the sheet."""
+"""Least factor on the noise of a plane's points, reached at a tilt of 0.06 deg from the sheet."""
 
 
 @dataclass(frozen=True, eq=False)

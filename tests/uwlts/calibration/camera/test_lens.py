@@ -1,4 +1,4 @@
-"""A lens from images of a target: the model that predicts best, images and points left out, honest uncertainties."""
+"""Lens from images of a target: choice of the best model, rejected images and points, realistic uncertainties."""
 
 from dataclasses import replace
 
@@ -113,7 +113,7 @@ def test_an_image_of_another_board_is_left_out_and_named():
 
 @pytest.mark.slow
 def test_an_image_that_alone_decides_is_left_out_and_named():
-    """The only image of a tilted board, and that board 0.6 % wider: in ten of ten draws it was left out."""
+    """The board is 0.6 % wider in its only tilted image: this image was left out in ten of ten draws."""
     reasons = []
     for seed in range(20, 26):
         images = views(seed, count=19, tilt=0.1) + views(seed + 50, count=1, tilt=0.6)
@@ -151,7 +151,7 @@ def test_misplaced_points_are_left_out():
 
 @pytest.mark.slow
 def test_stated_uncertainties_hold_where_the_misses_of_an_image_go_together():
-    """Boards with a different bow in every image: point errors are correlated, which single points do not show."""
+    """Boards have a different bow in every image, so the errors of their points are correlated."""
     errors, stated, independent = [], [], []
     for seed in range(30):
         found = lens(views(100 + seed, count=12, bent=0.15), distortion=("k1", "k2"), pixels="square")

@@ -1,4 +1,4 @@
-"""Guided calibration: images are judged rightly, and following what the guide asks for leads to a good camera soon."""
+"""Guided calibration: images are assessed correctly, and the requested poses lead to a good camera quickly."""
 
 from dataclasses import replace
 
@@ -210,7 +210,7 @@ def test_tilts_are_those_of_the_poses():
 
 
 def led(setting: Setting, wanted: CompletionLimits, rng: np.random.Generator, *, most: int) -> State:
-    """Follow the wishes as a hand does: to some 3 deg and 5 mm."""
+    """Follow the requests as by hand: to about 3 deg and 5 mm."""
     poses: list[np.ndarray] = []
     state = solve_state([], setting, wanted)
     while describe_missing(state) and len(poses) < most:
@@ -281,7 +281,7 @@ def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
     first, second, last, again = (best_pose(state, skipped=skipped) for skipped in (0, 1, count - 1, count))
     assert first.gain >= second.gain >= last.gain and first.gain > last.gain
     assert len({wish.candidate.pose.tobytes() for wish in (first, second, last)}) == 3
-    # Who skips them all begins again.
+    # After all requests were skipped, they start again.
     np.testing.assert_array_equal(again.candidate.pose, first.candidate.pose)
 
 

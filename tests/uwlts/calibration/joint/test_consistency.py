@@ -1,4 +1,4 @@
-"""Evidence that contradicts itself or its description: refused, with the images and figures to blame by their names."""
+"""Evidence that contradicts itself or its description is rejected with the names of the images and figures."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
 
 @pytest.fixture(scope="module")
 def thesis(thesis):
-    """The drawings, with what is usually known of such."""
+    """Return the sensor of the drawings with typical uncertainties."""
     return thesis.model_copy(update={"uncertainty": Uncertainty()})
 
 
@@ -39,33 +39,33 @@ def views():
 
 
 def edited(series, edit):
-    """The series with ``edit(number, image)`` in place of each image."""
+    """Return the series with each image replaced by ``edit(number, image)``."""
     images = [edit(number, image) for number, image in enumerate(series.found.images)]
     return replace(series, found=replace(series.found, images=images))
 
 
 def stripes_edited(series, edit):
-    """The series with ``edit(number, pixels)`` in place of each stripe."""
+    """Return the series with each stripe replaced by ``edit(number, pixels)``."""
     stripes = [edit(number, pixels.copy()) for number, pixels in enumerate(series.found.stripes)]
     return replace(series, found=replace(series.found, stripes=stripes))
 
 
 def refusal(evidence, *, strict=False):
-    """Why evidence is refused, even where any lens may be tried and images may be left out."""
+    """Return the reason for rejected evidence, with all lens models and rejection of images allowed."""
     with pytest.raises(CalibrationError) as error:
         solve_jointly(evidence, options=replace(OPTIONS, lens=LensChoice(), strict=strict))
     return str(error.value)
 
 
 def lens_pulls(result, sensor):
-    """Errors of the lens's parameters over their stated uncertainties."""
+    """Return the errors of the lens parameters divided by their stated uncertainties."""
     known = CameraModel.from_description(sensor.camera).parameters()
     found = zip(result.estimate.parameters.keys, result.estimate.values, result.estimate.std().values(), strict=True)
     return np.array([abs(value - known[k.text]) / std for k, value, std in found if isinstance(k, LensParameter)])
 
 
 def pulls(result):
-    """Errors of lens and window distance over their stated uncertainties."""
+    """Return the errors of lens and window distance divided by their stated uncertainties."""
     lens = CameraModel.from_description(BUILT.camera).parameters()
     names = (LensParameter.F, LensParameter.CX, LensParameter.CY, LensParameter.K1, LensParameter.K2)
     true = {name: lens[name.text] for name in names} | {WindowParameter.DISTANCE: BUILT.camera.window.distance_mm}
@@ -119,7 +119,7 @@ def test_images_are_left_out_as_long_as_enough_agree(views, thesis):
 
 
 def curled(strength_px):
-    """Distortion that no lens of the model has: a cubic across the image, ``strength_px`` at its sides."""
+    """Add a distortion outside the lens model: a cubic across the image, ``strength_px`` at its sides."""
 
     def edit(_, image):
         x = (image.pixels[:, 0] - 640.0) / 640.0
@@ -129,7 +129,7 @@ def curled(strength_px):
 
 
 def test_what_the_model_lacks_makes_uncertainties_larger(views, thesis):
-    """Some parameters are off by many of the uncertainties that scatter alone would state."""
+    """The errors of some parameters are many times the uncertainty due to scatter."""
     wrong = gathered(thesis, [edited(part, curled(6.0)) for part in views])
     assert "the target has systematic deviations across the image" in refusal(wrong, strict=True)
     result = solve_jointly(wrong, options=OPTIONS)

@@ -1,4 +1,4 @@
-"""Stated uncertainties of the joint calibration hold the truth as often as they say, over whole simulated campaigns.
+"""Coverage of stated uncertainties of the joint calibration, in whole simulated campaigns.
 
 200 campaigns of each kind are measured by ``python -m tests.bench.coverage``.
 """
@@ -24,7 +24,7 @@ def outcomes():
 
 @pytest.fixture(scope="module")
 def measured(outcomes):
-    """Errors over stated standard uncertainties, and shares within 95 %, of all scans together, by quantity."""
+    """Return errors divided by standard uncertainties, and fractions within 95 %, of all scans, by quantity."""
     found = judged(outcomes)
     return {
         quantity: [m for (_, other), some in found.items() if other == quantity for m in some]

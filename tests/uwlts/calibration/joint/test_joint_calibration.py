@@ -1,4 +1,4 @@
-"""The joint calibration on views made by Fermat's principle: derivatives, what it finds, how well it says it does."""
+"""Joint calibration on views by Fermat's principle: derivatives, results and stated uncertainties."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def std_by_text(result):
 
 
 def pulls(result):
-    """Errors of the parameters over their stated uncertainties."""
+    """Return the errors of the parameters divided by their stated uncertainties."""
     estimate, std = result.estimate, std_by_text(result)
     values = {key.text: value for key, value in zip(estimate.parameters.keys, estimate.values, strict=True)}
     return {name: (values[name] - true) / std[name] for name, true in truth().items() if name in values}

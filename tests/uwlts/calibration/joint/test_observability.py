@@ -53,7 +53,7 @@ def from_steps(thesis, *, height_mm):
     known = thesis.uncertainty.model_copy(update={"step_height_mm": height_mm, "window_tilt_deg": 0.01})
     described = thesis.model_copy(update={"uncertainty": known})
     air = target_series(sensor, window=False, positions=np.arange(6) * 46.0 - 200.0, noise=noise(2), columns=15)
-    # Standards that face the laser, whose heights are as certain as stated.
+    # The standards face the laser, so that the uncertainty of their heights is the stated one.
     steps = step_views(sensor, noise=noise(3), tilts=(0.0, 0.0, 0.0))
     return solve_jointly(gathered(described, [air], steps), options=OPTIONS).calibration
 
@@ -89,7 +89,7 @@ def test_two_that_cannot_be_distinguished_are_named_together():
 
 
 def test_what_cancels_in_every_length_is_not_named():
-    """Two parameters known to 1 each trade places without any length changing."""
+    """Two parameters, each known to 1, can compensate each other without an effect on lengths."""
     covariance = np.array([[1.0, -0.9999999, 0.0], [-0.9999999, 1.0, 0.0], [0.0, 0.0, 1.0]])
     found = find_weaknesses(lengths([[0.01, 0.01, 0.002]]), keys("window_distance", "f", "glass_index"), covariance)
     assert [each.parameters for each in found] == [(WindowParameter.GLASS_INDEX,)]
@@ -133,7 +133,7 @@ def test_a_direction_of_less_than_a_tenth_of_the_variance_is_not_named(smaller_m
 
 
 def without(known, key):
-    """The covariance where a parameter is known."""
+    """Return the covariance for a known parameter."""
     place = known.parameters.keys.index(key)
     column = known.covariance[:, place]
     return known.covariance - np.outer(column, column) / column[place]
@@ -219,7 +219,7 @@ def test_targets_points_are_those_that_are_found():
 
 
 def shot(sensor, pose, view, spoilt):
-    """The image of the target and the stripe that a shot at ``T_camera_target`` really gives."""
+    """Return the true image of the target and the stripe for a pose ``T_camera_target``."""
     index = 1.0 if view.medium is None else 1.3312
     points = lattice()
     pixels = seen(sensor, points @ pose[:3, :3].T + pose[:3, 3], index=index, window=view.window)

@@ -1,4 +1,4 @@
-"""A joint calibration carried over to new water by steps: views by Fermat's principle, captures of drawn stripes."""
+"""Adaptation of a joint calibration to new water by steps: views by Fermat's principle, captures of drawn stripes."""
 
 import json
 import re
@@ -180,7 +180,7 @@ def test_a_covariance_that_is_none_is_refused(covariance):
 
 
 def test_evidence_without_information_leaves_everything_as_it_was(earlier, thesis):
-    """Two pixels are a line, and a third a height that nobody knows."""
+    """Two pixels determine a line, and a third an unknown height."""
     known = read_original_estimate(earlier, WARM)
     frame = camera_from_object(BUILT)
     priors = known.parameters.priors | {StepHeight(20.0): Prior(20.0, 1e4)}
@@ -233,7 +233,7 @@ def test_what_was_held_is_as_the_calibration_says(earlier):
         return reconstruct_pixels(by, pixels, medium_index=index, stage_mm=0.0, stage_direction=along).points_mm
 
     assert frame[:3, :3].T @ (found - frame[:3, 3:]) == pytest.approx(expected(calibration).T, abs=1e-6)
-    # A tenth of a millimetre is at stake.
+    # The effect is a tenth of a millimetre.
     assert np.abs(expected(calibration) - expected(earlier)).max() > 0.1
 
 
@@ -299,7 +299,7 @@ def test_a_sensor_that_has_changed_is_noticed(earlier, thesis):
     evidence = steps(thesis, depths_mm=(-45.0, 15.0, 85.0))
     with pytest.raises(CalibrationError, match=r"contradicts itself: height of the 23.17 mm step found 23\.[2-4]"):
         refreshed(moved_since(earlier, "sheet_offset", 0.45), evidence, index_std=0.02)
-    # Five standard uncertainties, give or take one: a doubt up to six, then a contradiction.
+    # Five standard uncertainties, with a scatter of one: a warning up to six, then a contradiction.
     try:
         said = refreshed(moved_since(earlier, "f", 9.0), evidence, index_std=0.02).warnings
     except CalibrationError as error:

@@ -1,4 +1,4 @@
-"""Scans of spheres, planes and pipes as evidence: derivatives, and what form and size give away."""
+"""Scans of spheres, planes and pipes as evidence: derivatives, and information from form and size."""
 
 import re
 from dataclasses import replace
@@ -47,7 +47,7 @@ SIZE_FOUND = re.compile(r"found ([\d.]+), described as .* \(([-+.\d]+) mm or ([\
 
 
 def parameters(**std):
-    """Everything as built and known, but for what ``std`` gives a standard uncertainty."""
+    """Return parameters as built and known, except those with a standard uncertainty in ``std``."""
     nominal, pose = nominal_calibration(SENSOR), laser_pose(SENSOR)
     window = nominal.window
     normal = np.array(window.normal) / window.normal[2]
@@ -144,7 +144,7 @@ def test_known_sizes_are_off_by_their_standard_uncertainties():
 
 
 class _Held:
-    """Evidence that holds the lens where it is, so that a scan can be asked alone."""
+    """Return evidence that fixes the lens, so that a scan can be evaluated alone."""
 
     def __init__(self, lens):
         self._lens = lens

@@ -1,4 +1,4 @@
-"""Texts for estimates written by hand: when doubts and contradictions appear, which figures and advice they hold."""
+"""Texts for synthetic estimates: conditions of warnings and contradictions, their figures and advice."""
 
 import re
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The choice of a model by images held out, on views made by Fermat's principle, tilted and bowed or not."""
+"""Choice of a model by held-out images, on views by Fermat's principle, with and without tilts and bow."""
 
 import json
 from dataclasses import replace
@@ -60,7 +60,7 @@ def problem_of(thesis, sensor, *, bow: float, seed: int):
 
 @pytest.fixture(scope="module")
 def plain(thesis):
-    """A window square to the axis, a flat sheet, a laser window square to it: as the description says."""
+    """Return the described sensor: a window square to the axis, a flat sheet, and a laser window square to it."""
     return problem_of(thesis, sensor_with(window_tilt_deg=0.0, laser_tilt_deg=0.0), bow=0.0, seed=0)
 
 
@@ -86,7 +86,7 @@ def test_where_nothing_is_tilted_or_bowed_the_simplest_model_is_chosen(plain_cho
     assert not (simplest.window_tilt or simplest.bow or simplest.window_turn)
     assert simplest.distortion == ("k1", "k2")
     said = " ".join(verdicts(plain_choice))
-    # Two images in water are held out: too few to speak of windows by.
+    # Two images in water are held out: too few for a statement about windows.
     assert "whether the tilt of the window is needed is not shown" in said
     assert "the bow of the sheet is not needed" in said
     assert "the turn of the laser's window is not needed" in said

@@ -82,7 +82,7 @@ def test_wrong_poses_and_empty_profiles_are_left_out(rng):
 
 
 def least_scatter_mm(campaign: Campaign) -> float:
-    """Root mean square distance from the sphere where SciPy's plain least squares ends, from the true values."""
+    """Return the rms distance from the sphere after SciPy's plain least squares, started at the true values."""
     seen = [np.isfinite(profile).all(axis=1) for profile in campaign.profiles]
     flat = np.vstack([profile[own] for profile, own in zip(campaign.profiles, seen, strict=True)])
     points = np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
@@ -135,7 +135,7 @@ def test_a_plane_gives_the_mount(rng):
 
 
 def test_a_plane_and_a_robot_that_scatters_give_the_mount():
-    """Steps whose first ones reverse, as the scatter changes, and that are not to be damped ever after."""
+    """The first steps reverse because the scatter changes; later steps must not remain damped."""
     campaign = sphere_campaign(np.random.default_rng([1, 3]), poses=24, plane_only=True, robot_mm=0.03)
     within(mount_of(campaign, artefact="plane"))
 

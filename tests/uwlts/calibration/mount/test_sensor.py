@@ -71,7 +71,7 @@ def test_intervals_hold_for_sensors_that_differ_from_their_calibration(known):
 
 
 def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
-    """Points along a path follow another calibration, and the mount that goes with it, as their patterns say."""
+    """The patterns predict the change of points along a path for another calibration and its mount."""
     number, by = 0, np.array(mount.sensor.by_parameters)
     line, centre = np.tile(np.arange(300, 900), 2), np.repeat([450.0, 620.0], 600)
     header = CaptureHeader(

@@ -175,7 +175,7 @@ def test_origin_is_where_the_described_sensor_has_it(sensor, result):
     ("along", "towards", "spin"), [("width", -1.0, 1.6), ("height", 1.0, -1.5), ("height", -1.0, 3.1)]
 )
 def test_signs(along, towards, spin):
-    """Y, Z keep their senses whichever way the stage counts, the stripe runs and the plate is turned."""
+    """The directions of Y and Z do not depend on those of stage, stripe and plate."""
     sensor = sensor_along(along)
     header = header_of(sensor, direction=(0.0, 0.0, towards))
     found = fit_polynomials(evidence_of(sensor, towards=towards, spin=spin), header, degree=6)
@@ -188,7 +188,7 @@ def test_stage_against_the_header(sensor, evidence):
 
 
 def test_missing_lines_borrow(sensor):
-    """Lines hidden at all depths come out as if they were seen; a hole wider than a tenth of the lines stays one."""
+    """Lines hidden at all depths are interpolated; a gap wider than a tenth of the lines remains."""
     hidden, hole = np.arange(300, 360), np.arange(700, 900)
     found = fit_polynomials(evidence_of(sensor, without=np.r_[hidden, hole]), header_of(sensor), degree=6).calibration
     lines, centres, true = stripe_at(sensor, 12.0)
@@ -273,7 +273,7 @@ def test_domains_bridge_short_gaps_only():
 
 
 def test_offset_of_the_position_changes_nothing(evidence):
-    """A shift by 1000 px changes x by roundings of 1e-13; a Vandermonde matrix in px would lose 18 digits of 16."""
+    """A shift by 1000 px changes x by rounding of 1e-13; a Vandermonde matrix in px would lose all digits."""
     lines = np.concatenate([s[:, 0] for s in evidence.stripes]).astype(int)
     centres = np.concatenate([s[:, 1] for s in evidence.stripes])
     depths = np.repeat(DEPTHS, [len(s) for s in evidence.stripes])

@@ -1,4 +1,4 @@
-"""The sequential calibration that chooses its lens and doubts its images, from views without drawn pixels."""
+"""Sequential calibration with choice of the lens and rejection of images, from views without drawn pixels."""
 
 import re
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The whole calibration from capture files with drawn images: circles, stripes on the plate, stripes on a step."""
+"""Complete calibration from captures of drawn images: circles, stripes on the plate, and stripes on a step."""
 
 import json
 

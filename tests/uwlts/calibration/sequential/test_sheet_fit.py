@@ -1,4 +1,4 @@
-"""The laser sheet from stripes on the target: exact recovery, honest scatter, strays, the plate's extent, refusals."""
+"""Laser sheet from stripes on the target: exact recovery, correct scatter, outliers, extent of the plate, refusals."""
 
 import numpy as np
 import pytest

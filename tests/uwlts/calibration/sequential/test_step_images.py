@@ -1,4 +1,4 @@
-"""Step standards that do not face the laser: the turn that images along the stage show, one profile not."""
+"""Step standards that do not face the laser: images along the stage show their rotation, a single profile does not."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The window's distance from step images: exact against Fermat's principle, honest scatter, refusals."""
+"""Window distance from step images: exact by Fermat's principle, correct scatter, refusals."""
 
 from dataclasses import replace
 from functools import cache
