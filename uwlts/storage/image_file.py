@@ -90,5 +90,5 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
                 f"{path} is a TIFF file of {declared.bits_per_pixel} bit in which zero is white; save it with zero as "
                 "black (photometric interpretation BlackIsZero)"
             )
-        image = ~image
+        image = np.subtract(np.uint16(np.iinfo(np.uint16).max), image)
     return image
