@@ -27,8 +27,9 @@ _MODELS = ("distortionmodel", "distortiontype", "projectionmodel", "lensmodel")
 _MAYBE_MODELS = ("cameramodel", "cameratype", "model", "modeltype", "type", "projection", "lens", "lenstype")
 """Names that may state something else, such as the product, so that only values in `_FOREIGN` are foreign models."""
 _FOREIGN = re.compile(
-    "fisheye|fishlens|equi|kannala|kb[0-9]*$|omni|mei$|mei[^a-z]|scaramuzza|ocam|fov$|ftheta|doublesphere|ds$|eucm|ucm|"
-    "unified|division|spherical|panoram|cylind|stereographic|orthographic|thinprism|inversebrown|modifiedbrown|telecentric|radialfish"
+    "fisheye|equi|kannala|kb[0-9]*$|omni|mei$|scaramuzza|ocam|fov$|ftheta|doublesphere|ds$|eucm|ucm|"
+    "unified|division|spherical|panoram|cylind|stereographic|orthographic|thinprism|inversebrown|modifiedbrown|"
+    "telecentric"
 )
 _NO = ("", "0", "0.0", "false", "no", "off", "none")
 
