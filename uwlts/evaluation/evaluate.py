@@ -232,7 +232,7 @@ def _read_matching_truth(path: str | Path, cloud: PointCloud) -> Truth:
 
 
 def _name_other_scene(header: TruthHeader, path: Path, metadata: Table) -> str | None:
-    """Return the difference between a truth's scene and that of a cloud; None if there is none or it is unknown."""
+    """Return the difference between the scenes of a truth and a cloud, or None if no difference is known."""
     capture = metadata.get("capture")
     if (digest := metadata.get("scene")) is not None:
         found = scene_digest(header.scene)
@@ -282,8 +282,8 @@ def evaluate(
     Raises
     ------
     EvaluationError
-        There is neither an artefact nor a truth, an artefact's description is not valid, the cloud does not show the
-        artefact, or the truth is that of another capture.
+        There is neither an artefact nor a truth, or an artefact's description is not valid. The cloud does not show
+        the artefact. The truth is that of another capture.
     CaptureError, DescriptionError
         A file cannot be read.
     """

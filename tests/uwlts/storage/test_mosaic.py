@@ -62,11 +62,11 @@ def test_other_images_are_no_mosaic():
 def test_demosaicing_returns_each_colour(pattern: str, dtype: type):
     light = np.full((16, 16), 100.0)
     raw = raw_image(light, pattern, (1.0, 0.5, 0.25), noise=0.0).astype(dtype)
-    found = demosaic(raw, pattern, name="a.png")  # pyright: ignore[reportArgumentType]
+    found = demosaic(raw, pattern, name="a.png")
     assert found.dtype == dtype
     assert found[4:-4, 4:-4].reshape(-1, 3).tolist() == [[33, 58, 108]] * 64
     with pytest.raises(ImageError, match="a colour image, which has no Bayer pattern: leave bayer out"):
-        demosaic(found, pattern, name="a.png")  # pyright: ignore[reportArgumentType]
+        demosaic(found, pattern, name="a.png")
 
 
 def test_an_import_of_raw_images(tmp_path: Path):

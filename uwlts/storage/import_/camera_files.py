@@ -19,15 +19,17 @@ from uwlts.model.sensor import Distortion, Sensor
 # Alternative names, compared without case and underscores.
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "m1")
 _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoef", "d", "d1")
-_BROWN_CONRADY = ("", "plumbbob", "rationalpolynomial", "radtan", "radialtangential", "brownconrady", "opencv")
+_BROWN_CONRADY = ("", "plumbbob", "rationalpolynomial", "radtan", "radialtangential", "brownconrady")
+_BROWN_CONRADY += ("opencv", "fullopencv")
 _PINHOLES = ("pinhole", "perspective", "none")
 _MODELS = ("distortionmodel", "distortiontype", "projectionmodel", "lensmodel")
 """Names that state nothing but the lens model, so that an unknown value is a foreign model."""
 _MAYBE_MODELS = ("cameramodel", "cameratype", "model", "modeltype", "type", "projection", "lens", "lenstype")
 """Names that may state something else, such as the product, so that only values in `_FOREIGN` are foreign models."""
 _FOREIGN = re.compile(
-    "fisheye|fishlens|equi|kannala|kb[0-9]*$|omni|mei$|mei[^a-z]|scaramuzza|ocam|fov$|ftheta|doublesphere|ds$|eucm|ucm|"
-    "unified|division|spherical|panoram|cylind|stereographic|orthographic|thinprism|inversebrown|telecentric|radialfish"
+    "fisheye|equi|kannala|kb[0-9]*$|omni|mei$|scaramuzza|ocam|fov$|ftheta|doublesphere|ds$|eucm|ucm|"
+    "unified|division|spherical|panoram|cylind|stereographic|orthographic|thinprism|inversebrown|modifiedbrown|"
+    "telecentric"
 )
 _NO = ("", "0", "0.0", "false", "no", "off", "none")
 
