@@ -105,7 +105,7 @@ def shorten(text: str, most: int = 300) -> str:
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
 
 
-def log_warnings(path: str | Path, warnings: Iterable[str]) -> None:
+def log_warnings(path: str | os.PathLike[str], warnings: Iterable[str]) -> None:
     """Log warnings about the content of a file; without further settings, Python prints them on standard error."""
     for warning in warnings:
         _LOG.warning("warning: %s: %s", path, warning)

@@ -261,7 +261,8 @@ def omit_points(points_mm: np.ndarray, omitted: Mapping[str, np.ndarray]) -> tup
     Programs mark unmeasured points by NaN, infinity, or the place 0 0 0. Points at 0 0 0 are omitted if there are more
     than a few, and many more than at any other place.
     """
-    finite, zero = np.isfinite(points_mm).all(axis=1), (points_mm == 0).all(axis=1)
+    x, y, z = points_mm.T
+    finite, zero = np.isfinite(x) & np.isfinite(y) & np.isfinite(z), (x == 0) & (y == 0) & (z == 0)
     reasons = {"without finite coordinates": ~finite, **omitted}
     if (count := np.count_nonzero(zero)) > FEW_ZEROS:
         others = points_mm[finite & ~zero]

@@ -378,8 +378,9 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
             raise CaptureError(f"{np.count_nonzero(wrong)} values of {name} are no whole numbers")
         return values.astype(np.int32)
 
-    chosen, warnings = omit_points(np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]), {})
-    vertices = vertices[chosen]
+    points = np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"])
+    chosen, warnings = omit_points(points, {})
+    points, vertices = points[chosen], vertices[chosen]
     uncertainty, count = None, sum(f"pattern{m}_x" in known for m in range(len(known)))
     wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
     if count and known.keys() >= set(wanted):
@@ -393,7 +394,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     deviation = column("deviation", np.nan)
     metadata, uncertainty = _without_shared(_metadata(ply.comments), uncertainty)
     cloud = PointCloud(
-        points_mm=np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]),
+        points_mm=points,
         intensity=column("intensity", np.nan),
         frame=indices("frame"),
         line=indices("line"),

@@ -43,7 +43,7 @@ _TIME_NAMES = ("time", "t", "timestamp", "stamp", "time_s")
 _IN_BRACKETS = re.compile(r"(.*?)[\s_]*[\[(<](.*)[\])>]")
 _AT_END = re.compile(r"(.+?)[\s_/.\-]+([^\s_/.\-]+)|([xyz])(mm|cm|um|m)")
 _POSITION = re.compile(
-    r"(?:(?:.*[._ /])?(?:p|t|pos|position|trans|translation|coord|coordinate|point)(?:[._ ](?:.*[._ ])?)?)?([xyz])"
+    r"(?:(?:p|t|(?:.*[._ /])?(?:pos|position|trans|translation|coord|coordinate|point))(?:[._ ](?:.*[._ ])?)?)?([xyz])"
     r"(?:[._ ]?(?:pos|position|coord|coordinate))?"
 )
 _QUATERNION = re.compile(
@@ -106,62 +106,61 @@ def read_number_table(path: Path, digests: dict[str, str], *, named: bool = True
     """
     content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
     digests[path.name] = hash_file(path)
-    lines = [line.strip(b" ") for line in _decode_wide(content, path).splitlines() if line.strip()]
+    content = _decode_wide(content, path)
+    lines = [stripped for line in content.splitlines() if (stripped := line.strip(b" ")) and not stripped.isspace()]
     comments = [*takewhile(lambda line: line.startswith(_COMMENTS), lines)]
-    lines = [line for line in lines if not line.startswith(_COMMENTS)]
+    if any(mark in content for mark in _COMMENTS):
+        lines = [line for line in lines if not line.startswith(_COMMENTS)]
     if not lines:
         raise DescriptionError(f"{path} is empty: expected a table of numbers")
     lines, counted = _without_count(lines)
-    sample = lines[1] if len(lines) > 1 and not _is_row(lines[0]) else lines[0]
-    delimiter, comma = _separators(sample)
     header = None
     if not _is_row(lines[0]):
         header, *lines = lines
         if not lines:
             raise DescriptionError(f"{path} has no rows after the names of its columns")
-    else:
-        count = len(_cells(sample, delimiter))
-        candidates = [each for each in comments if len(_name_cells(each, delimiter, count)) == count]
-        header = next((each for each in reversed(candidates) if _names_columns(each, delimiter, count)), None)
     if counted not in (None, len(lines)):
         raise DescriptionError(
             f"{path} states {counted} rows in its first line and has {len(lines)}: it is incomplete or has several "
             "parts"
         )
-    if delimiter == b" ":
-        lines = [b" ".join(line.split()) for line in lines]
-    notes: list[str] = []
-    comma = comma or (delimiter != b"," and any(b"," in line for line in lines))
-    if comma and delimiter == b" ":
-        notes.append("commas between digits were read as decimal commas, blanks as separators")
-    if (
-        header is None
-        and delimiter == b","
-        and any(re.match(rb"-?0\d", cell) for line in lines[:50] for cell in line.split(b","))
-    ):
+    delimiter, comma = _separators(lines[0])
+    count = len(_cells(lines[0], delimiter))
+    if header is None:
+        header = next((each for each in reversed(comments) if _names_columns(each, delimiter, count)), None)
+    cells = [] if header is None else _name_cells(header, delimiter, count)
+    body = b"\n".join(lines) + b"\n"
+    if delimiter == b" " and b"  " in body:
+        body = re.sub(rb" {2,}", b" ", body)
+    comma = comma or (delimiter != b"," and b"," in body)
+    if header is None and delimiter == b"," and any(re.search(rb"(^|,) *-?0\d", line) for line in lines[:50]):
         raise DescriptionError(
             f"{path} has cells such as '00' between commas: commas seem to be both decimal and separators. "
             "Export it with another separator"
         )
-    count = len(_cells(lines[0], delimiter))
-    cells = [] if header is None else _name_cells(header, delimiter, count)
-    units: dict[str, str] = {}
-    said = [_text(each) for each in comments[:1000] if _UNIT_IN_COMMENT.search(_text(each).lower())]
-    if header is not None:
-        names = []
-        for number, cell in enumerate(cells):
-            name, unit = _name_and_unit(cell, path)
-            names.append(name or f"column {number + 1}")
-            units |= {names[-1]: unit} if unit else {}
-        if "qw" in names:
-            names = [f"q{name[1]}" if name in ("rx", "ry", "rz") else name for name in names]
-    else:
+    names, units = _names_and_units(cells, path)
+    if not names:
         names = ["x", "z"] if named and count == 2 else [str(number) for number in range(count)]
     if len(set(names)) < len(names):
         raise DescriptionError(f"{path} has the columns {', '.join(names)}: expected each name once")
+    columns = _parse(body, names, delimiter, comma, path)
+    if lines[0].endswith(delimiter) and not (cells and cells[-1]) and np.isnan(columns[names[-1]]).all():
+        del columns[names[-1]]
+    if "time_s" in columns:
+        columns["time_s"] = columns["time_s"] * _TIMES[units.get("time_s", "s")]
+    notes: list[str] = []
+    if comma and delimiter == b" ":
+        notes.append("commas between digits were read as decimal commas, blanks as separators")
+    said = [text for text in map(_text, comments[:1000]) if _UNIT_IN_COMMENT.search(text.lower())]
+    if said and not units.keys() & set("xyz"):
+        notes.append(f"a comment may state another unit than that of the coordinates: {shorten(said[0], 100)}")
+    return NumberTable(path, columns, units, notes)
+
+
+def _parse(body: bytes, names: list[str], delimiter: bytes, comma: bool, path: Path) -> dict[str, np.ndarray]:
     try:
         table = csv.read_csv(
-            BytesIO(b"\n".join(lines) + b"\n"),
+            BytesIO(body),
             read_options=csv.ReadOptions(column_names=names, use_threads=False),
             parse_options=csv.ParseOptions(delimiter=delimiter.decode()),
             convert_options=csv.ConvertOptions(
@@ -172,14 +171,24 @@ def read_number_table(path: Path, digests: dict[str, str], *, named: bool = True
         )
     except (pa.ArrowInvalid, pa.ArrowException) as error:
         raise DescriptionError(f"{path} is no table of numbers: {str(error).splitlines()[0]}") from error
-    columns = {name: table[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in names}
-    if lines[0].endswith(delimiter) and (header is None or not cells[-1]) and np.isnan(columns[names[-1]]).all():
-        del columns[names[-1]]
-    if "time_s" in columns:
-        columns["time_s"] = columns["time_s"] * _TIMES[units.get("time_s", "s")]
-    if said and not units.keys() & set("xyz"):
-        notes.append(f"a comment may state another unit than that of the coordinates: {shorten(said[0], 100)}")
-    return NumberTable(path, columns, units, notes)
+    return {name: table[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in names}
+
+
+def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str, str]]:
+    """Return the usual names of columns, and the units that they state; raises DescriptionError for unknown ones."""
+    names: list[str] = []
+    units: dict[str, str] = {}
+    for number, cell in enumerate(cells, start=1):
+        name, unit = _split_unit(cell)
+        if unit is not None and unit not in (known := _UNITS_OF.get(name, {unit: 1.0})):
+            raise DescriptionError(
+                f"{path} has a column {shorten(repr(cell))} with an unknown unit; expected one of {', '.join(known)}"
+            )
+        names.append(name or f"column {number}")
+        units |= {names[-1]: unit} if unit else {}
+    if "qw" in names:
+        names = [f"q{name[1]}" if name in ("rx", "ry", "rz") else name for name in names]
+    return names, units
 
 
 def _decode_wide(content: bytes, path: Path) -> bytes:
@@ -207,7 +216,7 @@ def _without_count(lines: list[bytes]) -> tuple[list[bytes], int | None]:
 def _separators(line: bytes) -> tuple[bytes, bool]:
     """Return the separator of a line, and whether commas are decimal although blanks separate the numbers."""
     for mark in (b";", b"\t"):
-        if mark in line:
+        if mark in line.strip():
             return mark, False
     words = line.split()
     if len(words) > 1 and b"," in line and all(map(_DECIMAL_COMMA.fullmatch, words)):
@@ -251,8 +260,9 @@ def _text(line: bytes) -> str:
 
 def _names_columns(line: bytes, delimiter: bytes, count: int) -> bool:
     """Return whether a comment names columns: x and z, or an angle."""
-    names = {_split_unit(cell)[0] for cell in _name_cells(line, delimiter, count)}
-    return {"x", "z"} <= names or "angle" in names
+    cells = _name_cells(line, delimiter, count)
+    names = {_split_unit(cell)[0] for cell in cells}
+    return len(cells) == count and ({"x", "z"} <= names or "angle" in names)
 
 
 def _split_unit(cell: str) -> tuple[str, str | None]:
@@ -284,13 +294,3 @@ def _usual_name(name: str) -> str:
         return match[1]
     match = _ROTATION.fullmatch(name)
     return f"r{match[1]}" if match else name
-
-
-def _name_and_unit(cell: str, path: Path) -> tuple[str, str | None]:
-    """Return name and unit of a column; raises DescriptionError if the unit is none of such a column."""
-    name, unit = _split_unit(cell)
-    if unit is not None and unit not in (known := _UNITS_OF.get(name, {unit: 1.0})):
-        raise DescriptionError(
-            f"{path} has a column {shorten(repr(cell))} with an unknown unit; expected one of {', '.join(known)}"
-        )
-    return name, unit

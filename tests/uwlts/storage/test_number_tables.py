@@ -33,6 +33,7 @@ def text_of(header: str, separator: str, scale: float, comma: bool = False) -> s
         ("X (millimetres),Y (millimetres),Z (millimetres)", ",", 1.0),
         ("# scanned in Basel, twice\n", ",", 1.0),
         ("3", " ", 1.0),
+        ("# x y z in the frame of the camera", " ", 1.0),
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
@@ -69,6 +70,8 @@ def test_columns_are_taken_by_name_and_the_others_left(tmp_path: Path):
         ("5\n1 2 3\n4 5 6\n", "states 5 rows"),
         ("1,25,2,05,3,50\n4,25,5,05,6,50\n", "both decimal and separators"),
         ("x,y,z\n1,2\n", "no table of numbers"),
+        ("x_px,y_px,z_px\n1,2,3\n", "columns x_px, y_px, z_px; expected x, y and z"),
+        ("x,y,z,label\n1,2,3,a\n", "no table of numbers"),
         ("x,p_x,y,z\n1,2,3,4\n", "each name once"),
     ],
 )
