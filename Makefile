@@ -45,8 +45,8 @@ test test-full: style
 	@# Beside the tests, in time that those leave: many wait for simulated hardware and for pages.
 	@folder=$$(mktemp -d); jobs=; \
 	trap 'kill $$jobs 2>/dev/null; rm -rf $$folder' EXIT; trap 'exit 130' INT TERM; \
-	nice $(VENV)/bin/basedpyright >$$folder/types 2>&1 & jobs="$$jobs $$!"; \
-	for name in $(BESIDE); do nice $(BY_ITSELF) $$name >$$folder/$$name 2>&1 & jobs="$$jobs $$!"; done; \
+	nice -n 19 $(VENV)/bin/basedpyright >$$folder/types 2>&1 & jobs="$$jobs $$!"; \
+	for name in $(BESIDE); do nice -n 19 $(BY_ITSELF) $$name >$$folder/$$name 2>&1 & jobs="$$jobs $$!"; done; \
 	$(PYTHON) -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS); failed=$$?; \
 	for job in $$jobs; do wait $$job || failed=$$((failed ? failed : $$?)); done; jobs=; \
 	for name in types $(BESIDE); do echo "$$name:"; cat $$folder/$$name; done; exit $$failed

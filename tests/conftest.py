@@ -88,7 +88,7 @@ SERVING = {
     "test_documented_hardware.py",
 }
 
-NICE = 5
+NICE = 15
 """Niceness of test processes other than the serving one, which checks times."""
 
 

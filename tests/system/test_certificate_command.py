@@ -59,7 +59,7 @@ def test_changes_are_found(folder: Path):
     path.write_text(path.read_text(encoding="utf-8").replace('"thesis"', '"theses"', 1), encoding="utf-8")
     checked = run("certificate", "calibration.json", "--check", "calibration.certificate.json", folder=folder)
     assert checked.returncode == 1
-    assert "is not the calibration that calibration.certificate.json is about" in checked.stdout
+    assert "is not the calibration certified by calibration.certificate.json" in checked.stdout
 
 
 def test_nothing_is_replaced_unasked_nor_the_calibration_at_all(folder: Path):

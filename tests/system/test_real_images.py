@@ -23,6 +23,7 @@ from uwlts.calibration.target_stripes import stripe_on_target
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import PlaneFound
 from uwlts.model.parameter_keys import LensParameter
+from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_ import import_images
 from uwlts.storage.pose_files import read_poses
@@ -247,7 +248,7 @@ def test_a_folder_of_photographs_calibrates_camera_and_sheet(etna: Capture):
 def _mount_agrees_with_the_board(capture: Capture, calibration: Calibration, air: AirEvidence):
     """The stripes on the plate, and nothing else, place the sensor on the robot where the board's corners place it."""
     poses = read_poses(DATA / "etna" / "poses.csv", pose_format="quaternion-xyzw", unit="m")[0]
-    cloud = uwlts.reconstruct(capture, calibration)
+    cloud = reconstruct_stripes(capture, find_stripes(capture), calibration)
     # Without a stage its positions count the poses.
     seen = cloud.points_mm - np.outer(capture.stage_mm[cloud.frame], capture.header.stage_direction)
     mount = uwlts.calibrate_mount([seen[cloud.frame == n] for n in np.unique(cloud.frame)], poses, artefact="plane")

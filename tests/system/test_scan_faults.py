@@ -201,7 +201,9 @@ def test_steps_that_the_motor_loses_show_at_the_end(board, sensor, folder, tmp_p
         ended(done, "the stage has lost steps")
         # The third image, which shows the stripe's motion, was taken before the slip. Noise of 0.2 px on 96 lines with
         # a motion of 3 px/mm is 0.02 mm, including the correlation of neighbouring lines.
-        stood_mm, error_mm = map(float, re.search(r"stood (\S+) mm \(std (\S+) mm\)", done.stderr).groups())
+        stood_mm, error_mm = map(
+            float, re.search(r"displacement of the stage of (\S+) mm \(std (\S+) mm\)", done.stderr).groups()
+        )
         assert stood_mm == pytest.approx(steps * sensor.stage.resolution_mm, abs=0.04) and error_mm < 0.03
         assert dark(served)
         assert not out.exists() and len(positions(part_path(out))) == 6
