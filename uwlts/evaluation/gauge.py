@@ -98,7 +98,7 @@ class RepeatedReference(Brief, RecordFile):
     """Repeated measurements of one part of known size (type-1 study).
 
     ``bias`` is the mean minus the reference; it is significant if its 95 % interval excludes 0. For a tolerance T and a
-    standard deviation s, Cg = 0.2 T / (6 s) and Cgk = (0.1 T - |bias|) / (3 s).
+    standard deviation s, Cg = 0.2 T / (6 s) and Cgk = (0.1 T - abs(bias)) / (3 s).
     """
 
     count: int
