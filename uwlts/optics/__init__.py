@@ -1,1 +1,1 @@
-"""Camera, window, laser sheet and brightness: arrays in, arrays out."""
+"""Camera, window, laser sheet and brightness on arrays; the design formulas; whether a calibration fits a capture."""

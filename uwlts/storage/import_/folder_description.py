@@ -117,7 +117,7 @@ def read_description(path: Path) -> ImportDescription:
     if not is_regular_file(path):
         raise DescriptionError(
             f"no description at {path}: write one with sensor, medium, and the role of each image "
-            "(docs/how-to/import-images.md)"
+            "(docs/reference/import-description.md)"
         )
     return validate_description(ImportDescription, read_table(path), path)
 
