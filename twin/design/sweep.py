@@ -49,7 +49,7 @@ class SweepResult(Brief):
         Folder of report.html, designs.csv, summary.json and winner.toml.
     columns : dict of str to (N,) array
         All N designs: "design", the free values, the figures of merit (units in their names), "violation", "failure".
-    marked : tuple of Marked
+    marked : tuple of HighlightedDesign
         Base sensor if it works, best design, and refined design if it is better; the last one is the winner.
     agreements : tuple of Agreement
         Comparison of formulas and rendering for each rendered design.

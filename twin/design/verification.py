@@ -326,7 +326,7 @@ def verify_candidates(
         The study.
     folder : Path
         Folder of the results.
-    candidates : sequence of Marked
+    candidates : sequence of HighlightedDesign
         Designs to render.
     workers : Workers
         Processes.

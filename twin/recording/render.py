@@ -90,7 +90,7 @@ def render(
     Returns
     -------
     Recording
-        Images (N, height, width) in grey levels, positions in mm, and the truth.
+        Images (F, H, W) in grey levels, their metadata, and the truth.
 
     Raises
     ------

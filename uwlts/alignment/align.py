@@ -162,7 +162,7 @@ def align_trajectory(
     Returns
     -------
     AlignedTrajectory
-        Corrected trajectory with the covariance that remains, the moved cloud, and the crossings that were used.
+        Corrected trajectory with its covariance, the cloud along it, and the crossings.
 
     Raises
     ------

@@ -240,7 +240,7 @@ def compare_clouds(
     Returns
     -------
     SurfaceChange
-        Signed distance in mm, its standard uncertainty and its detection limit at each place of the reference.
+        Distance and level of detection in mm at each compared place of the cloud.
 
     Raises
     ------

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -13,13 +12,14 @@ from scipy.spatial import KDTree
 
 from uwlts.comparison.ideal_shapes import KINDS, IdealShape, read_shape
 from uwlts.comparison.options import OPTIONS
-from uwlts.errors import CaptureError, DescriptionError, EvaluationError, describe_problems
+from uwlts.errors import DescriptionError, EvaluationError, describe_problems
 from uwlts.evaluation.figures import TOWARDS_SENSOR
-from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text, require_regular_file
+from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
 from uwlts.fitting.point_spacing import POINTS_PER_DISC
 from uwlts.model.sensor import Description, Positive, Vector
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.mesh_file import has_faces, load_triangles
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
 
 _SAMPLES_PER_DISC = 60
@@ -96,38 +96,16 @@ def read_reference(reference: Reference, *, unit: Unit, disc_mm: float) -> Refer
         path = Path(reference)
         if path.suffix.lower() == ".toml":
             reference = read_shape(path)
-        elif (mesh := _read_mesh(path)) is not None:
-            return sample_mesh(scale * mesh[0], mesh[1], disc_mm=disc_mm)
-        else:
+        elif path.suffix.lower() == ".h5" or (path.suffix.lower() == ".ply" and not has_faces(path)):
             reference = read_cloud(path)
+        else:
+            mesh = load_triangles(path)
+            return sample_mesh(scale * np.asarray(mesh.vertices, float), np.asarray(mesh.faces), disc_mm=disc_mm)
     if not isinstance(reference, PointCloud):
         return reference
     if scale != 1.0 and reference.uncertainty is not None:
         raise EvaluationError("the unit is m, but clouds with uncertainty are always in mm; omit the unit")
     return ReferencePoints(scale * reference.points_mm, None, reference.uncertainty, reference.frame)
-
-
-def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Read vertices (V, 3) and triangles (F, 3) of a mesh file; None if the file is a cloud."""
-    if path.suffix.lower() == ".h5":
-        return None
-    import trimesh
-
-    require_regular_file(path, error=CaptureError, called="reference")
-    if path.suffix.lower() == ".ply":
-        with path.open("rb") as file:
-            header = file.read(1 << 20).partition(b"end_header")[0]
-        if b"element face" not in header or b"element face 0" in header:
-            return None
-    try:
-        loaded: Any = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:
-        # Trimesh passes on any exception of its parsers.
-        raise CaptureError(f"{path} is neither a mesh (.stl, .obj, .off, .ply) nor a cloud: {error}") from error
-    vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces)
-    if not len(faces) or not np.isfinite(vertices).all():
-        raise CaptureError(f"{path} has no triangles, or has vertices that are not finite")
-    return vertices, faces
 
 
 def sample_mesh(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> ReferencePoints:

@@ -163,7 +163,7 @@ def record_guided(
     Returns
     -------
     GuidedRecording
-        Paths of the capture and the calibration, and the images that were taken.
+        Captures of target and step standard, the kind of poses, and the evidence that is still missing.
 
     Raises
     ------

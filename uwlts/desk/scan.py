@@ -86,7 +86,7 @@ def scan(
     Returns
     -------
     ScanProgress
-        State at the end: images taken, path of the capture, and warnings.
+        Counts of profile lines and of faulty images, and the latest exposures.
 
     Raises
     ------

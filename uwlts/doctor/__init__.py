@@ -42,7 +42,7 @@ def examine(
     Returns
     -------
     list of Finding
-        Subject, state and advice of each check.
+        Subject, status, result and advice of each check.
     """
     parts: list[Callable[[], Sequence[Finding]]] = [
         _examine_libraries,

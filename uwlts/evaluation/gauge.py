@@ -153,7 +153,7 @@ def gauge_study(
     Returns
     -------
     GaugeStudy or RepeatedReference
-        Variance components and their fractions of the tolerance; with `reference`, bias and capability.
+        Components of variance; with ``reference`` the bias and the indices Cg and Cgk.
 
     Raises
     ------

@@ -197,7 +197,7 @@ class IlluminatedPoints:
 def _make_sheet_function(
     calibration: Calibration, laser: Laser, origin_mm: np.ndarray, *, medium_index: float
 ) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return a function from lines and centres (N,) to the values (N, 8) of `LitSheet.evaluate` and the status (N,)."""
+    """Return a function from lines and centres (N,) to the tabulated values (N, 8) and the status (N,)."""
     frame = calibration.object_transform()
 
     def exact(line: np.ndarray, place_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -259,7 +259,7 @@ def fit_brightness_slopes(
 
 
 def footprint_std(uncertainty: Uncertainty) -> float:
-    """Return the relative standard uncertainty of the squares of `LitSheet.footprint_mm`.
+    """Return the relative standard uncertainty of the squares of `IlluminatedPoints.footprint_mm`.
 
     It combines the uncertainties of the sheet's thickness and of the stripe method.
     """

@@ -47,7 +47,7 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
     Returns
     -------
     list of DesignRow
-        Named quantities with value, unit and the equation that they follow.
+        Rows of name, value, unit and source.
 
     Raises
     ------

@@ -103,7 +103,7 @@ def verify(
     Returns
     -------
     Verification
-        Measured and certified sizes in mm, their uncertainties, E_n and conformity.
+        Verdict on each calibrated quantity, and errors that the artefact cannot reveal.
 
     Raises
     ------

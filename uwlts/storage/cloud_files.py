@@ -205,7 +205,9 @@ def read_region(
         raise CaptureError(f"a region goes from x, y, z to larger x, y, z; found {low.tolist()} to {high.tolist()} mm")
     if is_copc(path):
         with _naming(path):
-            return read_copc(path, box_mm=(low, high), at_most=at_most)[0]
+            cloud = read_copc(path, box_mm=(low, high), at_most=at_most)[0]
+            log_warnings(path, cloud.warnings)
+            return cloud
     found = [
         part.select(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
         for part in read_parts(path)

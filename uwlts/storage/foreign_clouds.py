@@ -40,7 +40,7 @@ def read_foreign(path: Path) -> PointCloud:
 
 def _read_text(path: Path) -> PointCloud:
     try:
-        table = read_number_table(path, {}, named=False)
+        table = read_number_table(path, named=False)
         columns, scale = table.columns, table.mm_per_unit()
     except DescriptionError as error:
         raise CaptureError(str(error)) from error

@@ -7,7 +7,7 @@ import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from plyfile import PlyData, PlyElement
@@ -18,6 +18,9 @@ from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.storage.cloud_files import open_ply
+
+if TYPE_CHECKING:
+    import trimesh
 
 MESH_FORMATS = (".stl", ".ply", ".glb")
 READ_FORMATS = (".ply", ".stl", ".obj")
@@ -119,6 +122,26 @@ def has_faces(path: Path) -> bool:
     return header.startswith(b"ply") and found is not None
 
 
+def load_triangles(path: Path) -> trimesh.Trimesh:
+    """Load the triangles of a mesh in any format of trimesh, with vertices (V, 3) and faces (F, 3) as in the file.
+
+    Raises CaptureError if the file is missing, damaged or without triangles, or vertices are not finite.
+    """
+    import trimesh
+
+    require_regular_file(path, called="mesh")
+    ending = path.suffix.lower()
+    source = open_ply(path, called="mesh") if ending == ".ply" else str(path)
+    try:
+        loaded: Any = trimesh.load(source, file_type=ending[1:], force="mesh", process=False)
+    except Exception as error:
+        # trimesh passes on all exceptions of its parsers.
+        raise CaptureError(f"{path} is not a complete mesh (such as .stl, .obj, .off or .ply): {error}") from error
+    if not len(loaded.faces) or not np.isfinite(loaded.vertices).all():
+        raise CaptureError(f"{path} has no triangles, or vertices that are not finite")
+    return loaded
+
+
 def read_mesh(path: str | Path) -> SurfaceMesh:
     """Read a mesh in mm from PLY, STL or OBJ.
 
@@ -130,26 +153,14 @@ def read_mesh(path: str | Path) -> SurfaceMesh:
     CaptureError
         The file is missing, damaged or without triangles, or vertices are not finite.
     """
-    import trimesh
-
     path = Path(path)
+    loaded = load_triangles(path)
+    if path.suffix.lower() == ".stl":
+        # STL repeats each vertex for every triangle.
+        loaded.merge_vertices()
+    vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64)
     is_ply = path.suffix.lower() == ".ply"
-    try:
-        require_regular_file(path, called="mesh")
-        source = open_ply(path, called="mesh") if is_ply else str(path)
-        loaded: Any = trimesh.load(source, file_type=path.suffix[1:].lower(), force="mesh", process=False)
-        if path.suffix.lower() == ".stl":
-            # STL repeats each vertex for every triangle.
-            loaded.merge_vertices()
-        vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64)
-        known = PlyData.read(open_ply(path, called="mesh"))["vertex"].data if is_ply else np.empty(len(vertices), [])
-    except CaptureError:
-        raise
-    except Exception as error:
-        # trimesh passes on all exceptions of its parsers.
-        raise CaptureError(f"{path} is not a complete mesh ({', '.join(READ_FORMATS)}): {error}") from error
-    if not len(faces) or not np.isfinite(vertices).all():
-        raise CaptureError(f"{path} has no triangles, or vertices that are not finite")
+    known = PlyData.read(open_ply(path, called="mesh"))["vertex"].data if is_ply else np.empty(len(vertices), [])
     names = known.dtype.names or ()
     normals = np.asarray(loaded.vertex_normals, float)
     if {"nx", "ny", "nz"} <= set(names):

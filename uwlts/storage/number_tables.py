@@ -23,7 +23,7 @@ ROTATION_NAMES = ("qw", "qx", "qy", "qz", "rx", "ry", "rz", "roll", "pitch", "ya
 
 _MOST_BYTES = 512 * 2**20
 _LENGTHS = {"nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1e3, "km": 1e6}
-_LENGTHS |= {"micron": 1e-3, "in": 25.4, "inch": 25.4, "ft": 304.8, "feet": 304.8, "yd": 914.4}
+_LENGTHS |= {"in": 25.4, "ft": 304.8, "yd": 914.4}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "gon": np.pi / 200}
 _TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 _SAME_UNITS = {"degree": "deg", "°": "deg", "radian": "rad", "grad": "gon", "second": "s", '"': "in", "foot": "ft"}
@@ -88,24 +88,26 @@ class NumberTable:
 
 
 def check_unit(unit: Unit) -> Unit:
+    """Return the unit; raises DescriptionError if it is neither mm nor m."""
     if unit not in get_args(Unit):
         raise DescriptionError(f"the unit is {unit!r}; expected mm or m")
     return unit
 
 
-def read_number_table(path: Path, digests: dict[str, str], *, named: bool = True) -> NumberTable:
+def read_number_table(path: Path, digests: dict[str, str] | None = None, *, named: bool = True) -> NumberTable:
     """Read a table of numbers, separated by commas, semicolons, tabs or blanks.
 
     With separators other than commas, numbers may have decimal commas. Lines that begin with #, //, % or ! are
     comments; the last comment before the numbers names the columns if it contains x and z, or an angle. A first line
     with the number of rows is recognised, as are UTF-8, UTF-16 and Latin-1. Names are in lower case and without unit.
     Usual names for times, positions, quaternions and Euler angles become ``time_s``, ``x``, ``qw``, ``roll`` and so
-    on. Without names, two columns are x and z, and others are numbered.
+    on. Without names, two columns are x and z, and others are numbered. ``digests`` takes the file's SHA-256 by name.
 
     Raises DescriptionError if the file is no such table, rows are missing, or a name states an unknown unit.
     """
     content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
-    digests[path.name] = hash_file(path)
+    if digests is not None:
+        digests[path.name] = hash_file(path)
     content = _decode_wide(content, path)
     lines = [stripped for line in content.splitlines() if (stripped := line.strip(b" ")) and not stripped.isspace()]
     comments = [*takewhile(lambda line: line.startswith(_COMMENTS), lines)]

@@ -52,7 +52,7 @@ def read_poses(
     columns, numbers that are not finite, matrices that are not rigid, quaternions that are not of unit length, and
     angles in rad that look like degrees.
     """
-    table = read_number_table(Path(path), {} if digests is None else digests, named=False)
+    table = read_number_table(Path(path), digests, named=False)
     return _poses(table, pose_format, unit)
 
 
@@ -76,7 +76,7 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
             covariance = covariance * units[:, None] * units
         rows[:, :3] *= 1e3
         return _trajectory(path, times, poses_from_rows(rows, "quaternion-xyzw", path), covariance)
-    table = read_number_table(path, {}, named=False)
+    table = read_number_table(path, named=False)
     if pose_format == "tum":
         if len(table.columns) != 8:
             raise DescriptionError(

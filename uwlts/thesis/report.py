@@ -99,7 +99,7 @@ def evaluate_thesis(
     Returns
     -------
     ThesisReport
-        Tables of all methods beside the published ones, and the paths of the written pages.
+        Paths of the written files, page first, and the headline as text.
 
     Raises
     ------

@@ -42,7 +42,7 @@ def page_text(
         The study.
     columns : Columns
         All evaluated designs; can be empty.
-    marked : sequence of Marked
+    marked : sequence of HighlightedDesign
         Designs to highlight, the chosen one last.
     agreements : sequence of Agreement
         Comparison of formulas and rendering for each rendered design.

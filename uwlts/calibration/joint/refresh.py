@@ -235,7 +235,7 @@ def refresh(
     Returns
     -------
     Refreshed
-        Adapted calibration with its covariance, and the differences from the earlier one.
+        Calibration with the new water in addition to the old, the change for each new water, and warnings.
 
     Raises
     ------

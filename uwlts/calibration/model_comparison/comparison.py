@@ -393,7 +393,7 @@ def compare_models(
     Returns
     -------
     Comparison
-        Prediction error of each model in mm, on held-out images and over nearest and farthest images.
+        Models ranked by their errors in held-out images, the polynomials' errors, and warnings.
 
     Raises
     ------

@@ -107,7 +107,7 @@ def calibrate_mount(
     Returns
     -------
     Mount
-        ``T_platform_sensor`` (4, 4), mm, with its covariance (6, 6), the left-out poses and a proposed next pose.
+        ``T_platform_sensor`` (4, 4), mm, its covariance (6, 6), the poses with reasons for rejection, and a next one.
 
     Raises
     ------

@@ -180,7 +180,7 @@ def import_images(
     Returns
     -------
     Imported
-        Path of the capture, numbers of images by kind, and warnings.
+        Numbers of laser and lamp images, and warnings.
 
     Raises
     ------
