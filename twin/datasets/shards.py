@@ -52,10 +52,10 @@ class ShardWriter(Protocol):
 
 
 @contextmanager
-def open_shard(path: Path, format: Format, *, frames: int) -> Iterator[ShardWriter]:
+def open_shard(path: Path, file_format: Format, *, frames: int) -> Iterator[ShardWriter]:
     """Open a shard with a number of frames; it appears at ``path`` if the body ends without an exception."""
     with write_atomically(path, overwrite=True) as aside:
-        match format:
+        match file_format:
             case "webdataset":
                 with tarfile.open(aside, "w", format=tarfile.USTAR_FORMAT) as archive:
                     yield _TarWriter(archive)
@@ -63,7 +63,7 @@ def open_shard(path: Path, format: Format, *, frames: int) -> Iterator[ShardWrit
                 with h5py.File(aside, "w", libver="latest") as file:
                     yield _Hdf5Writer(file, frames)
             case _:
-                assert_never(format)
+                assert_never(file_format)
 
 
 class _TarWriter:
@@ -127,9 +127,9 @@ class ShardReader:
     Raises CaptureError if the file is missing, damaged, or has another number of frames than ``frames``.
     """
 
-    def __init__(self, path: Path, format: Format, *, frames: int):
+    def __init__(self, path: Path, file_format: Format, *, frames: int):
         self.path, self.frames = path, frames
-        self.format: Format = format
+        self.format: Format = file_format
         self._places: list[tuple[str, dict[str, tuple[int, int]]]] | None = None
 
     def sample(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:

@@ -211,7 +211,7 @@ class Capture(AbstractContextManager["Capture"]):
         except DAMAGE as error:
             raise CaptureError(f"{self.path} is not a capture, or is truncated: {_what_is_wrong(error)}") from error
         try:
-            self.header = read_label(self.file, CaptureHeader, path=self.path, format=FORMAT, version=VERSION)
+            self.header = read_label(self.file, CaptureHeader, path=self.path, file_format=FORMAT, version=VERSION)
             self._read_frames(unfinished=unfinished)
         except DAMAGE as error:
             self.file.close()

@@ -134,7 +134,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         try:
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 self._claim_space()
-                write_label(self._file, format=FORMAT, version=self._version(), header=self.header)
+                write_label(self._file, file_format=FORMAT, version=self._version(), header=self.header)
                 if self._plan is not None:
                     write_plan(self._file, self._plan)
                 # The checksum detects damage that would otherwise be decompressed to another image.

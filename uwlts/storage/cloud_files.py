@@ -458,7 +458,7 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     # Written in memory first: HDF5 does not survive a full disk.
     content = BytesIO()
     with h5py.File(content, "w", libver="latest") as file:
-        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
+        write_label(file, file_format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
         for name, data in arrays.items():
             file.create_dataset(name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True)
     with write_atomically(path, overwrite=overwrite) as aside:
@@ -470,7 +470,7 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     names = _UNCERTAINTY
     try:
         with h5py.File(path, "r") as file:
-            header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
+            header = read_label(file, _CloudHeader, path=path, file_format=FORMAT, version=VERSION)
             points = find_dataset(file, "points_mm", path=path)
             total = 0 if points is None or not points.ndim else len(points)
             chosen = rows(total)

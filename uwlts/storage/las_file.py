@@ -129,9 +129,9 @@ def unwanted_points(found: Any) -> dict[str, np.ndarray]:
     }
 
 
-def load_library(name: Literal["laspy", "lazrs", "copclib", "pye57"], format: str) -> ModuleType:
+def load_library(name: Literal["laspy", "lazrs", "copclib", "pye57"], file_format: str) -> ModuleType:
     """Import a library for clouds; raises SetupError if it is not installed."""
-    return optional_library(name, needed_by=format, extra="clouds", instead=", or write PLY or XYZ")
+    return optional_library(name, needed_by=file_format, extra="clouds", instead=", or write PLY or XYZ")
 
 
 def shorten_error(error: BaseException) -> str:

@@ -248,4 +248,4 @@ def _points_of(table: NumberTable, unit: Unit | None) -> np.ndarray:
 
 def read_mount(path: str | Path) -> Mount:
     """Read a mount; raises CaptureError if the file is missing, foreign, newer or damaged."""
-    return read_model(path, Mount, format=FORMAT, version=VERSION, called="mount")
+    return read_model(path, Mount, file_format=FORMAT, version=VERSION, called="mount")

@@ -561,7 +561,7 @@ def test_things_that_are_no_captures(tmp_path: Path, valid: bytes):
         file["frames"] = np.zeros((2, HEIGHT, WIDTH), np.uint8)
     refused(foreign, "HDF5, but .*no format.*'uwlts-capture'")
     with h5py.File(foreign, "w") as file:
-        write_label(file, format="uwlts-truth", version=1, header=a_header())
+        write_label(file, file_format="uwlts-truth", version=1, header=a_header())
     refused(foreign, "format is 'uwlts-truth', expected 'uwlts-capture'")
 
 
@@ -748,4 +748,4 @@ def test_label_is_read_without_the_rest(tmp_path: Path, valid: bytes):
     path = tmp_path / "a.h5"
     path.write_bytes(valid)
     with h5py.File(path, "r") as file:
-        assert read_label(file, CaptureHeader, path=path, format="uwlts-capture", version=1) == a_header()
+        assert read_label(file, CaptureHeader, path=path, file_format="uwlts-capture", version=1) == a_header()
