@@ -357,7 +357,7 @@ class Figures:
     sigma_z_far_mm: np.ndarray = _figure("σ Z at the far end")
     depth_per_px_mm: np.ndarray = _figure("depth per pixel", "mm/px")
     along_per_px_mm: np.ndarray = _figure("length along the stripe per pixel", "mm/px")
-    coverage: np.ndarray = _figure("share of the volume in reach", "")  # of camera and laser
+    coverage: np.ndarray = _figure("fraction of the volume in reach", "")  # of camera and laser
     standoff_mm: np.ndarray = _figure("stand-off")  # where the sheet crosses the camera's axis
     near_mm: np.ndarray = _figure("near end of the volume")
     far_mm: np.ndarray = _figure("far end of the volume")

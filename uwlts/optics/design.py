@@ -341,8 +341,8 @@ def nominal_setup(sensor: Sensor, medium: Medium) -> tuple[Triangulation, float]
     Raises
     ------
     DesignError
-        The sheet does not cross the camera's axis beyond the window, the stripe runs along the other side of the image,
-        or the medium is not air and the camera's window is not mounted.
+        The sheet does not cross the camera's axis beyond the window, or the stripe runs along the other side of the
+        image. The medium is not air, but the camera's window is not mounted.
     """
     camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
     pose, index = laser_pose(sensor), medium.refractive_index(wavelength)

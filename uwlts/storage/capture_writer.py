@@ -183,8 +183,8 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             The frame has another size or type than the capture, or is an image with the laser on in a capture of centre
             lines.
         CaptureError
-            Stage position, exposure, time or pose is not finite, the exposure is negative, the time is before that of
-            the last frame, or the pose is not a rotation with a shift (4, 4).
+            Stage position, exposure, time or pose is not finite, or the exposure is negative. The time is before that
+            of the last frame. The pose is not a rotation with a shift (4, 4).
         OutputError
             Writing fails; earlier frames are kept.
         """

@@ -394,7 +394,7 @@ def test_killed_recording_keeps_every_announced_frame_and_can_be_resumed(tmp_pat
         process.kill()
         seen = [int(first), *announced(process)]
         assert process.wait() == -signal.SIGKILL
-        assert seen == list(range(done, done + len(seen))), "a resumed run goes on with the next frame"
+        assert seen == list(range(done, done + len(seen))), "a resumed run continues with the next frame"
         process.stdout.close()
         process.stderr.close()
         assert has_writer(part_path(path))
