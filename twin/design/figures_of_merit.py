@@ -261,10 +261,23 @@ def find_depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
 
 
 def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
-    """Evaluate designs at depths from the window's outer face and ``places`` (-1 to 1) along the stripe.
+    """Evaluate designs at depths and places along the stripe.
 
     An error d of the stripe's centre on its profile line causes the error (dY, dZ) = J^-1 (d, 0) of the point. J is the
     Jacobian of the pixel across and along the stripe with respect to Y and Z.
+
+    Parameters
+    ----------
+    xp
+        Array library: NumPy, or Dr.Jit for derivatives.
+    p
+        Parameters of the designs.
+    depth_mm
+        Depths from the window's outer face.
+    places
+        Positions along the stripe, from -1 to 1 between its ends.
+    reflectance
+        Reflectance of the object.
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff = standoff_mm(pose)

@@ -82,11 +82,33 @@ def sample_spots(
     sparkle: bool,
     rng: np.random.Generator,
 ) -> Spots:
-    """Sample bodies in a light's sheet as the camera sees them, ``per_litre`` of them larger than 0.1 mm.
+    """Sample bodies in a light's sheet that the camera sees.
 
-    Only visible bodies are returned: those behind, inside or shadowed by objects are omitted. ``extinction`` is in
-    1/mm; ``defocus`` blurs the spots. ``sparkle`` varies the light of each spot by speckle, with as many independent
-    grains as its disc holds (gamma distribution: Goodman, Speckle Phenomena, Sec. 4.6).
+    Parameters
+    ----------
+    view
+        View of the camera.
+    light
+        Light with the sheet.
+    objects
+        Objects of the scene; bodies behind, inside or shadowed by them are omitted.
+    pose
+        Pose of the sensor.
+    body
+        Kind of the bodies.
+    per_litre
+        Number of bodies larger than 0.1 mm per litre.
+    extinction
+        Extinction coefficient of the medium, 1/mm.
+    wavelength_nm
+        Wavelength of the light.
+    defocus
+        Blur the spots by defocus.
+    sparkle
+        Vary the light of each spot by speckle, with as many independent grains as its disc holds (gamma distribution:
+        Goodman, Speckle Phenomena, Sec. 4.6).
+    rng
+        Source of positions, sizes and speckle.
     """
     camera = view.camera
     width, height = camera.width_px + 2 * _MARGIN_PX, camera.height_px + 2 * _MARGIN_PX

@@ -67,7 +67,18 @@ def find_platform_poses(
     clock_offset_s: float | None,
     clock_drift_ppm: float = 0.0,
 ) -> PlatformPoses:
-    """Return the poses of the platform at all images, from the trajectory or from the capture.
+    """Return the poses of the platform at all images.
+
+    Parameters
+    ----------
+    capture
+        Capture of the moving sensor.
+    trajectory
+        Trajectory of the platform; None: the poses stored in the capture.
+    mount
+        Mount, which may state the scale of a robot's lengths.
+    clock_offset_s, clock_drift_ppm
+        Lead of the platform's clock at the first laser image, by default that of the mount, and its drift.
 
     Raises
     ------
