@@ -40,7 +40,26 @@ def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
 def read_model(
     path: str | Path, model: type[AnyModel], *, file_format: str, version: int, called: str, advice: str = ""
 ) -> AnyModel:
-    """Read a JSON file of the program as a model; raises CaptureError if it is missing, foreign, newer or damaged."""
+    """Read a JSON file of the program as a model.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    model
+        Type of the content.
+    file_format, version
+        Expected values of the keys "format" and "version".
+    called
+        Name of the expected content in messages.
+    advice
+        End of the message about content that is not valid.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, foreign, newer or damaged.
+    """
     content = read_json(path, called=called)
     return model_from_json(content, path, model, file_format=file_format, version=version, called=called, advice=advice)
 
@@ -75,7 +94,24 @@ def validate_content(model: type[AnyModel], content: object, complaint: str, *, 
 
 
 def write_model(path: str | Path, model: BaseModel, *, file_format: str, version: int, overwrite: bool) -> None:
-    """Write a model with format and version as indented JSON, completely or not; raises OutputError if that fails."""
+    """Write a model as indented JSON, completely or not at all.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    model
+        Content.
+    file_format, version
+        Values of the keys "format" and "version".
+    overwrite
+        Replace an existing file.
+
+    Raises
+    ------
+    OutputError
+        The file exists and ``overwrite`` is not set, or cannot be written.
+    """
     content = {"format": file_format, "version": version} | model.model_dump(mode="json")
     with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -151,7 +151,23 @@ _RUN_UP_MM = 1.0
 def add_provenance(
     header: CaptureHeader, plan: RigPlan, camera: CameraDevice, *, source: str, stage: str, **more: JsonValue
 ) -> CaptureHeader:
-    """Return the header of a capture with the provenance of its images."""
+    """Return the header of a capture with the provenance of its images.
+
+    Parameters
+    ----------
+    header
+        Header without provenance.
+    plan
+        Plan of the recording.
+    camera
+        Camera that takes the images.
+    source
+        Kind of the recording, such as "scan".
+    stage
+        Name of the stage's controller.
+    **more
+        Further entries.
+    """
     provenance = {
         "source": source,
         "title": plan.title,

@@ -43,7 +43,26 @@ def write_label(file: h5py.File, *, file_format: str, version: int, header: Desc
 def read_label(
     file: h5py.File, model: type[AnyHeader], *, path: str | Path, file_format: str, version: int
 ) -> AnyHeader:
-    """Return the header of a file; raises CaptureError if the file is foreign, newer or damaged."""
+    """Return the header of a file.
+
+    Parameters
+    ----------
+    file
+        Open file.
+    model
+        Type of the header.
+    path
+        Name of the file in messages.
+    file_format
+        Expected format.
+    version
+        Newest version that can be read.
+
+    Raises
+    ------
+    CaptureError
+        The file is foreign, newer or damaged.
+    """
     found = _text(file, "format")
     if found != file_format:
         called = "it has no format" if found is None else f"its format is {found!r}"
