@@ -167,10 +167,10 @@ def mark_rivals(
     ----------
     profiles : (N, L)
         Grey values of all lines.
-    left : (M, B + 2 MARGIN)
-        Contrasts of the remaining blocks on M lines; spikes are ignored.
+    left : (N, B + 2 MARGIN)
+        Contrasts of the remaining blocks of all lines; spikes are ignored.
     lines : (M,)
-        Profile lines.
+        Profile lines to examine.
     known : (M,)
         Lines that are marked already and not examined.
     rules

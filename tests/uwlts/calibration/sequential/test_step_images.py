@@ -58,7 +58,7 @@ def test_a_turn_about_the_stripe_shows_along_the_stage_and_is_taken_into_account
         assert image.lengthened_std == pytest.approx(np.tan(TURN) * np.radians(0.58), rel=0.1)
     assert said.startswith("step.h5: the standard does not face the laser: it is rotated by ")
     assert float(said.split("rotated by ")[1].split(" ")[0]) == pytest.approx(6.0, abs=0.5)
-    assert "about the stripe and so appears higher by 0.5" in said
+    assert "about the stripe, so that it appears higher by 0.5" in said
     assert said.count("taken into account") == 1
 
 
