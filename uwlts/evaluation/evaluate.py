@@ -236,7 +236,7 @@ def _name_other_scene(header: TruthHeader, path: Path, metadata: Table) -> str |
     capture = metadata.get("capture")
     if (digest := metadata.get("scene")) is not None:
         found = scene_digest(header.scene)
-        return None if found == digest else f"its scene has the digest {found}, that of {capture} {digest}"
+        return None if found == digest else f"its scene has the digest {found}, the scene of {capture} has {digest}"
     own, wanted = _kind_of_artefact(header.scene), _kind_of_artefact(metadata)
     if own is not None and wanted is not None and own != wanted:
         return f"it shows the artefact '{own}', the cloud '{wanted}'"

@@ -169,6 +169,6 @@ def _brief(value: object) -> str:
 
 
 def json_text(content: object, *, indent: int | None = None, only_ascii: bool = True) -> str:
-    """Return JSON text, for a model that of its set fields; raises ValueError for numbers that are not finite."""
+    """Return JSON text, for a model of its set fields only; raises ValueError for numbers that are not finite."""
     plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
     return json.dumps(plain, indent=indent, ensure_ascii=only_ascii, allow_nan=False) + "\n"

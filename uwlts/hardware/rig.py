@@ -44,7 +44,7 @@ _STEPS = 12
 _DOWN = 1 / 16
 """Factor after a saturated image, whose excess is unknown."""
 _UP = 30.0
-"""Largest factor after a dark image, where noise limits the estimate."""
+"""Largest factor after a dark image, because noise limits the estimate."""
 
 
 def get_stripe(seen: Seen, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:

@@ -100,7 +100,7 @@ def least_scatter_mm(campaign: Campaign) -> float:
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 @pytest.mark.parametrize("radius", [RADIUS_MM, None])
 def test_smooth_errors_of_the_profiler_are_weighed(seed, radius):
-    """2,000 points with little noise, and with a larger smooth error of the profiler, as in real ones.
+    """Profiles of 2,000 points have little noise and, as real ones, a larger smooth error of the profiler.
 
     If the points counted as independent, they would outweigh the robot, and the estimate would jump by millimetres.
     """
