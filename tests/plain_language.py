@@ -41,7 +41,7 @@ BEGINNINGS = {
     r"(Those|That|Its|Their) (of|that|which)\b": "the noun",
 }
 """Beginning of a sentence that is no question: what to write instead."""
-MOST_WORDS = 30
+MOST_WORDS = 28
 """Longest sentence in a docstring. Code, and text in brackets, counts as one word."""
 
 _PATTERNS = [

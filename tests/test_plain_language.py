@@ -35,7 +35,11 @@ def test_long_sentences_of_docstrings_are_found(tmp_path, monkeypatch):
     monkeypatch.setattr(plain_language, "ROOT", tmp_path)
     (tmp_path / "twin").mkdir()
     path = tmp_path / "twin" / "module.py"
-    path.write_text(f'"""{"word " * 30}(and brackets with any number of words)."""\n', encoding="utf-8")
+    path.write_text(
+        f'"""{"word " * plain_language.MOST_WORDS}(and brackets with any number of words)."""\n', encoding="utf-8"
+    )
     assert len(list(plain_language.findings(path))) == 1
-    path.write_text(f'"""{"word " * 29}(and brackets with any number of words)."""\n', encoding="utf-8")
+    path.write_text(
+        f'"""{"word " * (plain_language.MOST_WORDS - 1)}(and brackets with any number of words)."""\n', encoding="utf-8"
+    )
     assert not list(plain_language.findings(path))

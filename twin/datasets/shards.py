@@ -1,7 +1,7 @@
 """Files of a data set: tar archives for the webdataset library, or HDF5 files; each frame is a sample.
 
-In a tar archive, the files of a sample are consecutive and share the name up to the first dot, such as ``000123-00``
-for frame 0 of scene 123. ``.png`` is the image, and ``.mask.png`` and ``.object_map.png`` are 8-bit images. ``.json``
+In a tar archive, the files of a sample are consecutive and share the name up to the first dot. Frame 0 of scene 123 is
+``000123-00``. ``.png`` is the image, and ``.mask.png`` and ``.object_map.png`` are 8-bit images. ``.json``
 contains the metadata. Each further array is a ``.npy`` file with its name.
 
 In an HDF5 file, each array is a dataset with the frames along its first axis; further datasets are ``image``, ``json``

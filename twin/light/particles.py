@@ -173,9 +173,9 @@ def sample_spots(
 def diffuse_sphere(cosine: np.ndarray) -> np.ndarray:
     """Return the radiant intensity in 1/sr of a diffuse sphere per irradiance and squared radius.
 
-    2 / 3 rho (sin a + (pi - a) cos a) / pi, where a is the phase angle between the directions to the light and to the
-    viewer (Lambert's sphere: H. N. Russell, Astrophys. J. 43, 173, 1916). ``cosine`` is that of the scattering angle pi
-    - a.
+    It is 2 / 3 rho (sin a + (pi - a) cos a) / pi (Lambert's sphere: H. N. Russell, Astrophys. J. 43, 173, 1916). The
+    phase angle a is that between the directions to the light and to the viewer. ``cosine`` is that of the scattering
+    angle pi - a.
     """
     angle = np.pi - np.arccos(np.clip(cosine, -1, 1))
     return 2 / 3 * _REFLECTANCE * (np.sin(angle) + (np.pi - angle) * np.cos(angle)) / np.pi

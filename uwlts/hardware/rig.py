@@ -214,8 +214,8 @@ LaserStage = GrblStage | HandSwitchedLaser
 class Rig:
     """Camera, stage and laser that take the images of a plan one by one.
 
-    A switched laser is on only while the camera exposes. If a frame is late, the laser is switched off while waiting,
-    and the frame is accepted if its time stamp shows that it was exposed in the light.
+    A switched laser is on only while the camera exposes. If a frame is late, the laser is switched off while waiting.
+    The frame is accepted if its time stamp shows that it was exposed in the light.
 
     ``ahead`` is the direction of motion towards every position, 1 or -1, to eliminate backlash.
     ``repeated`` counts images that were taken again because their frames were lost or damaged.

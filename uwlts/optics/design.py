@@ -6,8 +6,8 @@ away from the laser, and ``v_px`` along it. The triangulation angle is the angle
 axes. The camera's window is normal to the camera's axis. The laser's window does not turn the sheet, because the sheet
 contains the normal of that window.
 
-A ray of slope (p, e) = (u, v) s / f in air has the slope (p, e) / sqrt(n^2 + (n^2 - 1) (p^2 + e^2)) in a medium of
-index n, by Snell's law. With it, the thesis's formulas for air hold exactly behind a window.
+In air a ray has the slope (p, e) = (u, v) s / f. By Snell's law, in a medium of index n the slope is
+(p, e) / sqrt(n^2 + (n^2 - 1) (p^2 + e^2)). With it, the thesis's formulas for air hold exactly behind a window.
 """
 
 import math

@@ -1,8 +1,8 @@
 """Scans from a moving platform: sensor poses from a mount and a trajectory, and their uncertainty.
 
 Pose errors move all points of an image together. They may be independent between images. Navigation errors, however,
-are correlated along the path. The correlation of a filter's errors before and after a time step or an update is the
-square root of the ratio of the smaller to the larger variance. A prediction adds independent noise; for an update,
+are correlated along the path. A filter's errors before and after a time step or an update have a correlation. It is
+the square root of the ratio of the smaller to the larger variance. A prediction adds independent noise; for an update,
 Cov(e+, e-) = P+ (J. A. Farrell, Aided Navigation, 2008, section 5.4). Over many steps the correlation is the product.
 The correlation of any two times therefore follows from the stated covariances.
 """
