@@ -30,7 +30,7 @@ START_MS = 1.0
 """First exposure: in the middle of the usual range, on a logarithmic scale."""
 _FEW_SHARE = 0.01
 _FEWEST_LINES = 3
-"""Fewer lines than this fraction and number are attributed to a reflection or noise."""
+"""Smallest fraction and number of lines with a stripe; fewer are attributed to a reflection or noise."""
 _DIM_SHARE = 0.05
 """Lines below this fraction of the brightest one are dark."""
 _MANY_SHARE = 0.05

@@ -332,7 +332,7 @@ class _Taking:
         unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
         slip_mm, error_mm = relief.measure_slip(select_centres(get_stripe(image, self._sensor, background=unlit)))
         if not np.isfinite(slip_mm):
-            seen = "shows no stripe where it was; or the laser has failed since the last image"
+            seen = "shows no stripe at its earlier place; or the laser has failed since the last image"
         elif relief.is_significant(slip_mm, error_mm):
             seen = f"shows a displacement of the stage of {slip_mm:+.2f} mm (std {error_mm:.2f} mm)"
         else:

@@ -210,7 +210,7 @@ def test_tilts_are_those_of_the_poses():
 
 
 def led(setting: Setting, wanted: CompletionLimits, rng: np.random.Generator, *, most: int) -> State:
-    """Follow the requests as by hand: to about 3 deg and 5 mm."""
+    """Follow the requests like a hand, with errors of about 3 deg and 5 mm."""
     poses: list[np.ndarray] = []
     state = solve_state([], setting, wanted)
     while describe_missing(state) and len(poses) < most:

@@ -325,7 +325,7 @@ def test_stripe_beside_the_plate(sensor, evidence):
 
 
 def test_plate_map_takes_out_the_offsets_of_circles(sensor):
-    """Circles of 5 mm seen through lens and water: centroids by the shoelace formula of Fermat's rims.
+    """Centroids of 5 mm circles through lens and water are those of rims by Fermat's principle (shoelace formula).
 
     The offsets reach 0.1 px, 0.015 mm; the map's own degree leaves 1 to 2 um.
     """

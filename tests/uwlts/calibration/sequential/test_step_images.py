@@ -94,7 +94,7 @@ def test_a_standard_that_faces_the_laser_is_not_doubted():
     ids=["the stage stood", "two images", "the standard was moved"],
 )
 def test_one_profile_shows_the_other_turn_only(steps):
-    """Seen from the slope of the faces; the turn about the stripe is taken to be as large, and doubles nothing else."""
+    """The slope of the faces shows the rotation; the one about the stripe is assumed to be as large."""
     images, (said,) = labelled(turned_step("step.h5", aside=-0.05, **steps))
     assert "rotated by 2.9° about the sheet's normal" in said
     assert "appears higher by 0.13 % or 0.029 mm" in said
