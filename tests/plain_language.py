@@ -41,6 +41,8 @@ BEGINNINGS = {
     r"(Those|That|Its|Their) (of|that|which)\b": "the noun",
 }
 """Beginning of a sentence that is no question: what to write instead."""
+ALLOWED = {"docs/studies/vehicle_pass.py": "doubtful", "docs/results/registration.md": "of which"}
+"""File: idiom that may stay, in the titles and captions of published tables."""
 MOST_WORDS = 28
 """Longest sentence in a docstring. Code, and text in brackets, counts as one word."""
 
@@ -76,9 +78,11 @@ def findings(path: Path) -> Iterator[str]:
     name = str(path.relative_to(ROOT))
     for line, text, is_docstring in texts(path):
         plain = " ".join(_CODE_IN_TEXT.sub("x", text).split())
-        for pattern, instead in _PATTERNS:
+        # Shorter strings are names.
+        for pattern, instead in _PATTERNS if plain.count(" ") > 1 else ():
             for found in pattern.finditer(plain):
-                yield f"{name}:{line}: '{found[0].strip()[:60]}': write {instead}"
+                if found[0] != ALLOWED.get(name):
+                    yield f"{name}:{line}: '{found[0].strip()[:60]}': write {instead}"
         if is_docstring and name.startswith(("uwlts/", "twin/")):
             for sentence in sentences(text):
                 if (words := len(sentence.split())) > MOST_WORDS:

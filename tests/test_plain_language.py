@@ -6,12 +6,12 @@ from tests import plain_language
 
 FOUND = {
     "module.py": ('x = 1\n"""Limit, of which a half is used."""\n', 2),
-    "comment.py": ("x = 1  # hardly used\n", 1),
+    "comment.py": ("x = 1  # it is hardly used\n", 1),
     "message.py": ('raise ValueError("there is nothing to do. What the images show is a plane.")\n', 1),
     "page.md": ("# Title\n\nThis method\nerrs by 1 mm.\n", 3),
 }
 NOT_FOUND = {
-    "module.py": '"""Return ``aside``, and `tells` (N,)."""\naside = write(tells)\n',
+    "module.py": '"""Return ``aside``, and `tells` (N,)."""\naside = write(tells, "aside")\n',
     "page.md": "What is it?\n\n```python\naside = 1\n```\n\n`hardly`\n",
 }
 

@@ -180,7 +180,7 @@ def main() -> None:
         )
     head = ["sensor, pass", "before", "after", "times", "from the start: before", "after", "times"]
     head += ["to the last crossing", "behind it"]
-    head += ["lengths before", "lengths after", "within twice the stated", "uncertain crossings"]
+    head += ["lengths before", "lengths after", "within twice the stated", "doubtful crossings"]
     print(table(head, rows))
     for name in ("path_mm", "own_mm", "lengths_mm"):
         before, after = np.moveaxis(np.array([getattr(each, name) for each in all_figures]), -1, 0)

@@ -239,15 +239,8 @@ def make_foreign_cloud(
 ) -> PointCloud:
     """Make a cloud of another program, without uncertainty; raises CaptureError like `PointCloud`.
 
-    Parameters
-    ----------
-    points_mm : (N, 3)
-        Points.
-    intensity, frame, line, deviation_mm, time_s : (N,), optional
-        Attributes of the points, as in `PointCloud`.
-    omitted
-        Masks (N,) of points that are omitted, by reason; each gives a warning. Unmeasured points are omitted as well
-        (`omit_points`).
+    ``omitted`` maps reasons to masks (N,) of points that are omitted, with a warning. Unmeasured points are omitted as
+    well (`omit_points`).
     """
     chosen, warnings = omit_points(points_mm, omitted or {})
     unknown = np.full(len(points_mm), NO_INDEX)
