@@ -27,7 +27,7 @@ def flat(x, y):
 
 
 def scanned(rng: np.random.Generator, surface, *, common: bool, calibration: np.ndarray | None = None) -> PointCloud:
-    """Return a scanned cloud; errors of its calibration (2,) in standard deviations are drawn unless given."""
+    """Return a scanned cloud; errors of its calibration (2,) in standard deviations are drawn by default."""
     axis = np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM)
     x, y = np.meshgrid(axis, axis)
     image = np.repeat(np.arange(len(axis))[None], len(axis), axis=0).ravel()

@@ -85,7 +85,34 @@ def read_mount_evidence(
     profile_times_s: np.ndarray | None,
     pose_times_s: np.ndarray | None,
 ) -> MountEvidence:
-    """Read and check profiles and poses from arrays or files; raises DescriptionError if they do not match."""
+    """Read and check profiles and poses from arrays or files.
+
+    Parameters
+    ----------
+    profiles
+        Folder, CSV file or TOML description of the profiles, or arrays.
+    poses
+        File or array of the platform's poses; None with a TOML description.
+    artefact
+        Kind of the artefact.
+    radius_mm, height_mm
+        Known size of the artefact.
+    pose_format
+        Format of the poses (`read_poses`).
+    profile_unit, pose_unit
+        Units of files without a unit in the names of their columns.
+    axis
+        Direction of the sensor's frame nearest to the axis of a rotary table.
+    scale, time
+        Estimate the scale of the robot's lengths, and the offset of its clock.
+    profile_times_s, pose_times_s : (N,), optional
+        Times of profiles and poses, if these are arrays.
+
+    Raises
+    ------
+    DescriptionError
+        Profiles and poses do not match, or one of them is not valid.
+    """
     digests: dict[str, str] = {}
     names: list[str] | None = None
     if isinstance(profiles, str | Path) and Path(profiles).suffix == ".toml":
@@ -248,4 +275,4 @@ def _points_of(table: NumberTable, unit: Unit | None) -> np.ndarray:
 
 def read_mount(path: str | Path) -> Mount:
     """Read a mount; raises CaptureError if the file is missing, foreign, newer or damaged."""
-    return read_model(path, Mount, format=FORMAT, version=VERSION, called="mount")
+    return read_model(path, Mount, file_format=FORMAT, version=VERSION, called="mount")

@@ -32,7 +32,7 @@ class Shape(ABC):
     fewest_poses: ClassVar[int]
     """Number of poses that makes the problem overdetermined, with two or three equations per pose."""
     flat: ClassVar[bool] = True
-    """Whether profiles contain nearly straight lines, which determine the rotation of a pose."""
+    """True if profiles contain nearly straight lines, which determine the rotation of a pose."""
     has_size: ClassVar[bool] = False
     place: ClassVar[int] = 3
     """Number of parameters besides the size."""

@@ -67,11 +67,11 @@ def calibrate_mount(
     Parameters
     ----------
     profiles
-        Folder with one CSV file (columns x and z) for each pose, one CSV file with a column pose, a cloud whose frames
-        are the poses, or a description of everything (.toml; docs/reference/mount-files.md). With a calibration: a
-        capture of the artefact, or of a target in images with the laser off. Or one array for each pose: (N, 2)
-        with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in the order along the profile,
-        mm, NaN for missing points.
+        Folder with one CSV file (columns x and z) for each pose, or one CSV file with a column pose. A cloud whose
+        frames are the poses, or a description of everything (.toml; docs/reference/mount-files.md). With a
+        calibration: a capture of the artefact, or of a target in images with the laser off. Or one array for each pose
+        in the order along the profile, mm, NaN for missing points: (N, 2) with x along the profile and z, or (N, 3)
+        with x, y, z in the sensor's frame.
     poses
         CSV file with the pose of the platform in the base frame for each profile or target image, or
         ``T_base_platform`` (P, 4, 4), mm. Default: the poses of the capture.

@@ -214,7 +214,7 @@ def _start_of_plane(
 def _start_of_step(
     problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
-    """Estimate a state from the lines of a step: as for a plane from the first face, then the height."""
+    """Estimate a state from the lines of a step: the plane of the first face, then the height."""
     first = [points[part == 0] for points, part in zip(problem.points, problem.part, strict=True)]
     none = [np.zeros(len(points), dtype=int) for points in first]
     state = _start_of_plane(replace(problem, points=first, part=none, shape=PlaneShape()), lines, sheet, rng)

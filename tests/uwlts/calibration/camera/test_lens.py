@@ -126,7 +126,7 @@ def test_an_image_that_alone_decides_is_left_out_and_named():
 
 @pytest.mark.slow
 def test_halves_of_the_images_by_another_focal_length_are_noticed():
-    """A lens that was zoomed from image to image: leaving out single ones states a sixth of the halves' difference."""
+    """The lens was zoomed between images: leaving out images states only a sixth of the halves' difference."""
     same, zoomed = views(8, count=18), views(9, count=18, fx=1.02 * F, fy=1.02 * F)
     alike = lens(views(8, count=36), distortion=("k1", "k2"), pixels="square")
     assert alike.half_doubts() == []

@@ -100,7 +100,7 @@ def least_scatter_mm(campaign: Campaign) -> float:
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 @pytest.mark.parametrize("radius", [RADIUS_MM, None])
 def test_smooth_errors_of_the_profiler_are_weighed(seed, radius):
-    """2,000 points with little noise, and with a larger smooth error of the profiler, as in real ones.
+    """Profiles of 2,000 points have little noise and, as real ones, a larger smooth error of the profiler.
 
     If the points counted as independent, they would outweigh the robot, and the estimate would jump by millimetres.
     """
@@ -354,7 +354,7 @@ TURN = Rotation.from_euler("zyx", [0.3, -0.2, 0.5])
 
 
 @pytest.mark.parametrize(
-    ("format", "numbers"),
+    ("pose_format", "numbers"),
     [
         ("matrix", TURN.as_matrix()),
         ("quaternion-xyzw", TURN.as_quat()),
@@ -364,11 +364,11 @@ TURN = Rotation.from_euler("zyx", [0.3, -0.2, 0.5])
         ("euler-XYZ-deg", np.degrees([0.5, -0.2, 0.3])),
     ],
 )
-def test_poses_of_every_format(tmp_path, format, numbers):
+def test_poses_of_every_format(tmp_path, pose_format, numbers):
     shift = np.array([0.1, 0.2, 0.3])
-    row = np.column_stack([numbers, shift]).ravel() if format == "matrix" else np.append(shift, numbers)
+    row = np.column_stack([numbers, shift]).ravel() if pose_format == "matrix" else np.append(shift, numbers)
     (tmp_path / "poses.csv").write_text(",".join(f"{value:.12f}" for value in row) + "\n")
-    poses, times = read_poses(tmp_path / "poses.csv", pose_format=format, unit="m")
+    poses, times = read_poses(tmp_path / "poses.csv", pose_format=pose_format, unit="m")
     assert times is None
     # Turns about fixed axes in one order are those about moved axes in the other one.
     assert poses[0, :3, :3] == pytest.approx(TURN.as_matrix(), abs=1e-9)
@@ -376,7 +376,7 @@ def test_poses_of_every_format(tmp_path, format, numbers):
 
 
 @pytest.mark.parametrize(
-    ("format", "row", "says"),
+    ("pose_format", "row", "says"),
     [
         ("matrix", "1,0,0,0,0,1,0,0,0,0,-1,0", "It is a reflection"),
         ("matrix", "1,0,0,0,0,1,0,0,0,0,1,0,5,6,7,1", "column by column"),
@@ -388,10 +388,10 @@ def test_poses_of_every_format(tmp_path, format, numbers):
         ("rotvec-rad", "1,2,3,a,0,0\n1,2,3,a,0,0", "no table of numbers"),
     ],
 )
-def test_wrong_poses_are_refused_in_words(tmp_path, format, row, says):
+def test_wrong_poses_are_refused_in_words(tmp_path, pose_format, row, says):
     (tmp_path / "poses.csv").write_text(row + "\n")
     with pytest.raises(DescriptionError, match=says):
-        read_poses(tmp_path / "poses.csv", pose_format=format)
+        read_poses(tmp_path / "poses.csv", pose_format=pose_format)
 
 
 def test_wrong_profiles_are_refused_in_words(tmp_path, rng):
