@@ -1,5 +1,7 @@
 """Prior of a path correction, compared with drifts simulated step by step."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -12,16 +14,16 @@ STD = np.array([30.0, 20.0, 10.0, 0.01, 0.01, 0.02])
 WALK = np.array([0.2, 0.2, 1.0, 0.05, 0.05, 0.05])
 
 
-def straight_path(towards: np.ndarray) -> Trajectory:
+def straight_path(towards: Sequence[float]) -> Trajectory:
     """Along a horizontal direction (2,)."""
     times = np.linspace(0, SECONDS, 81)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
-    poses[:, :2, 3] = SPEED_MM_S * times[:, None] * towards
+    poses[:, :2, 3] = SPEED_MM_S * times[:, None] * np.asarray(towards)
     return Trajectory(times, poses)
 
 
 def prior_of(
-    *, correlation: float = np.inf, dead_reckoned: bool = False, towards: np.ndarray = np.array([0.6, 0.8])
+    *, correlation: float = np.inf, dead_reckoned: bool = False, towards: Sequence[float] = (0.6, 0.8)
 ) -> PathPrior:
     """With 81 even nodes."""
     drift = DriftModel(STD, WALK, correlation, dead_reckoned, True)
@@ -83,7 +85,7 @@ def test_a_heading_error_adds_to_a_dead_reckoned_position(heading_deg: float):
     towards, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     at = np.array([SECONDS])
     with_, without = (
-        covariance(prior_of(dead_reckoned=each, towards=towards), at)[:, 0, :, 0] for each in (True, False)
+        covariance(prior_of(dead_reckoned=each, towards=tuple(towards)), at)[:, 0, :, 0] for each in (True, False)
     )
     # A heading error that grows linearly to e shifts the end sideways by e / 2 of the way, and a walk by e / sqrt(3).
     way = SPEED_MM_S * SECONDS
