@@ -2,12 +2,15 @@
 
 import re
 import subprocess
+import sys
 from collections.abc import Iterator
+from datetime import date
 from functools import cache
 from pathlib import Path
 
 import pytest
 
+from docs.studies import result_tables
 from tests.documented import PAGES, PROGRAMS, README, ROOT, name_of
 
 FOLDER = ROOT / "docs" / "results"
@@ -143,3 +146,22 @@ def test_an_older_figure_is_noticed():
     assert _differing("| spacing | 0.074 | 0.024 |", results) == []
     assert _differing("| spacing | 0.073 | 0.025 |", results) == ["0.073", "0.025"]
     assert _differing("a mean error of 0.08 mm", results) == ["0.08"]
+
+
+def test_a_study_writes_its_table_with_date_commit_and_command(tmp_path, monkeypatch):
+    page = tmp_path / "page.md"
+    page.write_text("before\n\n<!-- results: a table -->\n\nolder\n\n<!-- end -->\n\nafter\n", encoding="utf-8")
+    monkeypatch.setattr(result_tables, "PAGES", tmp_path)
+    # The commit is this one, so that the test also runs without a repository.
+    monkeypatch.setattr(result_tables, "_git", lambda *words: "0123abc" if words[0] == "rev-parse" else " M uwlts/x.py")
+    monkeypatch.setattr(sys, "argv", [str(ROOT / "docs/studies/mount_calibration.py"), "60", "--write"])
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)
+    result_tables.publish({"a table": result_tables.table(["mm"], [["0.074"]])}, write=True)
+    today = date.today().isoformat()
+    line = f"*Measured {today} at commit `0123abc` with changes: `python docs/studies/mount_calibration.py 60`.*"
+    table = "| mm |\n| --- |\n| 0.074 |"
+    block = f"<!-- results: a table -->\n\n{line}\n\n{table}\n\n<!-- end -->"
+    assert page.read_text(encoding="utf-8") == f"before\n\n{block}\n\nafter\n"
+    assert MEASURED.search(block)
+    with pytest.raises(SystemExit, match="0 places for the table 'another'"):
+        result_tables.publish({"another": table}, write=True)

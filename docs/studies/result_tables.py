@@ -46,7 +46,7 @@ def publish(tables: dict[str, str], *, write: bool) -> None:
             raise SystemExit(f"error: {count} places for the table '{name}' in {PAGES}, expected one: add its markers")
         path, page = next((path, page) for path, page in pages.items() if marked.search(page))
         path.write_text(marked.sub(lambda _, block=block: block, page), encoding="utf-8")
-        print(f"wrote the table '{name}' to {path.relative_to(ROOT)}", flush=True)
+        print(f"wrote the table '{name}' to {path.name}", flush=True)
 
 
 def _git(*arguments: str) -> str:
