@@ -1,13 +1,12 @@
-"""Profiles of spheres, boards, steps and rings by a laser profiler on a robot, and plain least squares of the mount.
+"""Profiles of spheres, boards, steps and rings by a laser profiler on a robot, with NumPy only.
 
-Scenes are drawn and cut with NumPy, and solved by SciPy's `least_squares` with all parameters free and equal weights.
+The profiler has noise, smooth errors, gaps and scattered points; the robot's poses have errors.
 """
 
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy.optimize import least_squares
 
 Kind = Literal["sphere", "plane", "step", "ring"]
 
@@ -276,23 +275,3 @@ def scatter_mm(
         else:
             off.append(height - size_mm * surface[rows] * (given.kind == "step"))
     return np.concatenate(off)
-
-
-def least_squares_mount(given: ProfilerSet, *, size_known: bool) -> tuple[np.ndarray, float]:
-    """Return the mount (4, 4) by plain least squares from the true values, and the rms distance of the points, mm."""
-    axes = given.artefact[:3, :3]
-    # Along a plane, or about an axis, nothing changes: these steps are not parameters.
-    free = {"sphere": (0, 1, 2), "ring": (0, 1, 2, 3, 4), "plane": (2, 3, 4), "step": (2, 3, 4)}[given.kind]
-    sized = given.kind != "plane" and not size_known
-
-    def moved(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        step = np.zeros(5)
-        step[list(free)] = values[6 : 6 + len(free)]
-        mount = given.mount @ pose_of(turn_by(values[3:6]), values[:3])
-        axis = axes @ turn_by(np.array([step[3], step[4], 0.0])) @ [0, 0, 1]
-        return mount, given.artefact[:3, 3] + axes @ step[:3], axis, given.size_mm + (values[-1] if sized else 0.0)
-
-    solution = least_squares(
-        lambda values: scatter_mm(given, *moved(values)), np.zeros(6 + len(free) + sized), x_scale="jac"
-    )
-    return moved(solution.x)[0], float(np.sqrt(np.mean(solution.fun**2)))
