@@ -18,7 +18,16 @@ from result_tables import publish, table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tests.uwlts.mount_views import MOUNT, RADIUS_MM, Campaign, errors_of, ring_campaign, sphere_campaign, step_campaign
+from tests.uwlts.mount_views import (
+    MOUNT,
+    RADIUS_MM,
+    RING_MM,
+    Campaign,
+    errors_of,
+    ring_campaign,
+    sphere_campaign,
+    step_campaign,
+)
 from tests.uwlts.sensor_profiles import captured_by, joint_estimate
 from uwlts.calibration.mount.calibrate import calibrate_mount
 from uwlts.model.library import load_sensor
@@ -77,7 +86,8 @@ def by_faces(campaigns: int, artefact: Literal["step", "ring"], *, write: bool) 
         for seed in range(campaigns):
             rng = np.random.default_rng([seed, 24])
             campaign = ring_campaign(rng, robot_mm=robot) if artefact == "ring" else step_campaign(rng, height_mm=12.0)
-            mount = calibrate_mount(*_of(campaign), artefact=artefact)
+            radius = RING_MM["inner"] if artefact == "ring" else None
+            mount = calibrate_mount(*_of(campaign), artefact=artefact, radius_mm=radius)
             shift, turn = errors_of(mount.transform())
             within = np.mean(np.abs([*shift, *turn]) < mount.coverage_factor * mount.std())
             rows.append((np.linalg.norm(shift), np.degrees(np.linalg.norm(turn)), within))

@@ -73,7 +73,7 @@ def read_mount_evidence(
     profiles: str | Path | Sequence[np.ndarray],
     poses: str | Path | np.ndarray | None,
     *,
-    artefact: Artefact,
+    artefact: Artefact | None,
     radius_mm: float | None,
     height_mm: float | None,
     pose_format: str,
@@ -119,18 +119,40 @@ def read_mount_evidence(
         path = Path(profiles)
         if poses is not None:
             raise DescriptionError(f"{path} names the poses already: leave the other ones out")
+        options = {
+            "artefact": artefact,
+            "radius_mm": radius_mm,
+            "height_mm": height_mm,
+            "pose_format": None if pose_format == "matrix" else pose_format,
+            "profile_unit": profile_unit,
+            "pose_unit": pose_unit,
+            "axis": axis,
+            "scale": scale or None,
+            "time": time or None,
+        }
+        if beside := [name for name, value in options.items() if value is not None]:
+            raise DescriptionError(
+                f"{path} describes the artefact, the formats and the unknowns: leave out "
+                f"{', '.join(f'`{name}`' for name in beside)}, or change the file"
+            )
         given = validate_description(MountDescription, read_table(path), path)
         profiles, poses = path.parent / given.profiles, path.parent / given.poses
         artefact, radius_mm, height_mm = given.artefact, given.radius_mm, given.height_mm
         pose_format = given.pose_format
         profile_unit, pose_unit, scale, time = given.profile_unit, given.pose_unit, given.scale, given.time
         axis = given.axis
+    artefact = artefact or "sphere"
     if artefact not in get_args(Artefact):
         raise DescriptionError(f"the artefact is {artefact!r}; expected one of {', '.join(get_args(Artefact))}")
     for name, size in (("radius", radius_mm), ("height", height_mm)):
         if size is not None and not (np.isfinite(size) and size > 0 and _SIZES.get(artefact) == name):
             kinds = " or ".join(kind for kind, own in _SIZES.items() if own == name)
             raise DescriptionError(f"{name}_mm is {size:g} for a {artefact}; expected the positive {name} of a {kinds}")
+    if artefact == "ring" and radius_mm is None:
+        raise DescriptionError(
+            "the radius of the ring is missing: give `radius_mm`, that of the wall which the sheet meets. From its "
+            "profiles alone it cannot be told from another wall"
+        )
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):
