@@ -37,6 +37,9 @@ _SOFT = 2.0  # robust standard deviations from which a point has less weight
 _OUTLIER = 5.0  # robust standard deviations from which a point is rejected
 _LARGEST_REJECTED = 0.3  # fraction of an image's points; more indicate another board or pose
 _LEAST_SCATTER_PX = 1e-6  # scatter of points; simulated ones may have none
+_FINEST_PX = 0.05
+"""Scatter of a coordinate below which points and images are not distinguished. Blur, light and print differ between
+good images by a few hundredths of a pixel; false points are off by much more. Chosen by hand, not fitted to data."""
 _MOVED = 3.0  # standard uncertainties by which one image may change a parameter
 HALVES_APART = 4.0
 """Largest difference of a parameter between two halves of the images, in its standard uncertainties."""
@@ -101,8 +104,8 @@ class LensCalibration:
     solution : solution for the used images, in their order; its covariance assumes independent points
     used, images : numbers (F,) of the used images, and these images without outliers
     left_out : number of each rejected image, and the reason
-    moved : (F,); largest change of a parameter without each used image, in its standard deviations without it; NaN if
-        the parameters are then not determined
+    moved : (F,); largest change of a parameter without each used image, in its standard deviations without it (for
+        points that scatter by at least 0.05 px); NaN if the parameters are then not determined
     rejected_share : fraction of rejected points in the used images
     halves : (2,); solutions from every second image and from the others; None if not determined
     without : (F,); solutions from all used images except one; None if not determined
@@ -262,7 +265,7 @@ def calibrate_lens(
         without = _solve_subsets(centred, solution, all_but_one, solved_again)
         values, none = intrinsics.from_model(solution.model), np.full(len(intrinsics.names), np.nan)
         changes = np.array([none if s is None else intrinsics.from_model(s.model) - values for s in without])
-        others_std = np.array([none if s is None else np.sqrt(np.diag(s.covariance)) for s in without])
+        others_std = np.array([none if s is None else _expected_std(s) for s in without])
         if not np.isfinite(changes).any():
             moved = np.full(len(used), np.nan)
             break
@@ -315,9 +318,15 @@ def _scatter(solution: CameraSolution) -> float:
 
 
 def _inliers(solution: CameraSolution) -> list[np.ndarray]:
-    """Return masks (N,) of points within five robust standard deviations."""
-    limit = _OUTLIER * _scatter(solution)
+    """Return masks (N,) of points within five robust standard deviations, which are at least `_FINEST_PX`."""
+    limit = _OUTLIER * max(_scatter(solution), _FINEST_PX)
     return [np.linalg.norm(residuals, axis=1) <= limit for residuals in solution.residuals_px]
+
+
+def _expected_std(solution: CameraSolution) -> np.ndarray:
+    """Return the standard deviations (P,) of the parameters, for points that scatter by at least `_FINEST_PX`."""
+    larger = max(_FINEST_PX / max(solution.sigma_px, _LEAST_SCATTER_PX), 1.0)
+    return larger * np.sqrt(np.diag(solution.covariance))
 
 
 def _has_enough_inliers(inside: np.ndarray) -> bool:
