@@ -28,6 +28,9 @@ BESIDES = (("p1", "p2"), ("k3",), ("p1", "p2", "k3"))
 RATIONAL_BESIDES = (("k4", "k5"), ("p1", "p2", "k4", "k5"))
 """Coefficients that are tried if k3 helps."""
 _USUAL = ("k1", "k2")
+_WIDE_USUAL = (*_USUAL, *RATIONAL_BESIDES[0])
+WIDE_DEG = 45.0
+"""Angle to the axis beyond which lenses are wide: tan > 1, so that the powers of k1 to k3 grow instead of fading."""
 _DISTORTIONS = ((), ("k1",), _USUAL, *((*_USUAL, *names) for names in BESIDES))
 _RATIONAL = tuple((*_USUAL, *names) for names in RATIONAL_BESIDES)
 _FOLDS = 5
@@ -135,6 +138,10 @@ class LensCalibration:
         """Return every estimated parameter."""
         return self.solution.values()
 
+    def widest_deg(self) -> float:
+        """Return the largest angle of a target point to the camera's axis, deg."""
+        return _widest_deg(self.images, self.solution)
+
     def std(self) -> dict[str, float]:
         """Return the standard uncertainty of every estimated parameter."""
         return dict(zip(self.solution.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
@@ -188,7 +195,8 @@ def calibrate_lens(
     choice
         Parameters to estimate. If the stage's direction is wrongly assumed to be the target's normal, this has the same
         effect as another lens. With the poses "stage-normal", "auto" therefore is k1 and k2; with both stage poses,
-        pixels are square.
+        pixels are square. Wide lenses, with points more than `WIDE_DEG` from the axis, usually have k1 k2 k4 k5: a
+        rational function follows the arctangent, which a polynomial cannot.
     progress
         Called with the number of models tried and the total.
 
@@ -215,14 +223,19 @@ def calibrate_lens(
     tried = _candidates(_DISTORTIONS, choice, poses)
     usual = tried[0] if len(tried) == 1 else _candidates((_USUAL,), replace(choice, distortion="auto"), poses)[0]
 
-    def inliers(options: CameraOptions) -> list[np.ndarray]:
+    plain = solve(images, options=usual, circles=True)
+    wide = choice.distortion == "auto" and poses != "stage-normal" and _widest_deg(images, plain) > WIDE_DEG
+    if wide:
+        usual = replace(usual, distortion=_WIDE_USUAL)
+
+    def inliers(options: CameraOptions, plain: CameraSolution | None = None) -> list[np.ndarray]:
         """Return masks (N,) of the points near their predicted positions, from a robust fit."""
-        plain = solve(images, options=options, circles=True)
+        plain = solve(images, options=options, circles=True) if plain is None else plain
         robust = solve(images, plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)), circles=True)
         return _inliers(robust)
 
     candidates: list[LensCandidate] = []
-    options, keep = usual, inliers(usual)
+    options, keep = usual, inliers(usual, None if wide else plain)
     good = [_remove_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _has_enough_inliers(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
         centred = _correct_circles(good, solve(good, options=usual, circles=True))
@@ -233,7 +246,7 @@ def calibrate_lens(
                 progress(number + 1, len(further))
             candidates = _compare_models(squares)
             options = _select_model(candidates, usual)
-            if choice.distortion != "auto" or "k3" not in options.distortion:
+            if choice.distortion != "auto" or ("k3" not in options.distortion and not wide):
                 break
     if options != usual:
         keep = inliers(options)
@@ -309,6 +322,13 @@ def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Po
     any_shape = (known, None) if poses == "free" else (known,)
     shapes = {"auto": any_shape, "square": (known,), "free": (None,)}[choice.pixels]
     return [CameraOptions(names, pixel_aspect=shape) for names in sets for shape in shapes]
+
+
+def _widest_deg(images: Sequence[TargetImage], solution: CameraSolution) -> float:
+    """Return the largest angle of a target point to the camera's axis, deg, from the points' poses."""
+    seen = [i.points_mm @ pose[:3, :3].T + pose[:3, 3] for i, pose in zip(images, solution.target_poses, strict=True)]
+    points = np.vstack(seen)
+    return float(np.degrees(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max()))
 
 
 def _scatter(solution: CameraSolution) -> float:
