@@ -12,7 +12,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
-from uwlts.stripe.methods import quadratic
+from uwlts.stripe.line_scatter import least_scattered
+from uwlts.stripe.methods import centre_of_mass, quadratic, zero_crossing
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow
 
 _STEPS = 5
@@ -111,6 +112,10 @@ def centres(peak: PeakWindow) -> np.ndarray:
 
     Saturated pixels are not treated separately, because the contrast gives the top little weight. If they are most of
     the stripe, in a halo with speckle, the flanks are not Gaussian: then the parabola of `quadratic` scatters less.
+
+    Real flanks may be no Gaussian for other reasons, such as flare, texture, sharpening or compression by the camera.
+    The noise model then gives them too much weight. Another method is used for all lines if it scatters less along the
+    stripe (`uwlts.stripe.line_scatter`).
     """
     sampled = np.arange(0, peak.start.size, max(1, peak.start.size // _SAMPLED))
     flanks = np.zeros(sampled.size, np.float32)
@@ -126,7 +131,7 @@ def centres(peak: PeakWindow) -> np.ndarray:
     _fit_profiles(peak, noise, sampled, signal, known, sums[0], centre, flat)
     if flat.any():
         centre[flat] = quadratic.centres(peak.select(flat))
-    return centre
+    return least_scattered(peak, centre, (zero_crossing, quadratic, centre_of_mass))
 
 
 def _allocate_aligned(*shapes: tuple[int, int]) -> Iterator[np.ndarray]:
