@@ -307,7 +307,9 @@ class _SearchedImage:
         line, clear, peak = search_all(self.profiles, board, lines, self.rules, fewest=2 if rivals else 1)
         if not rivals:
             line, clear, peak = line[clear], clear[clear], peak.select(clear)
-        place, amplitude = peak.start + peak.middle.astype(float), peak.height.copy()
+        # The middle of a stripe that is cut off by the border may be outside the image.
+        place = np.clip(peak.start + peak.middle.astype(float), 0, len(self.profiles) - 1)
+        amplitude = peak.height.copy()
         width, certainty = np.full(len(line), np.nan, np.float32), np.zeros(len(line))
         measured = peak.select(clear)
         centre, amplitude[clear] = place_centre(self.options.method, measured)

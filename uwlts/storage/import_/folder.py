@@ -92,7 +92,7 @@ class _Content:
 
     def find_stripe(self, image: np.ndarray) -> None:
         """Look for a stripe in a laser image (H, W) after background subtraction, if any."""
-        direction = find_stripe_direction(image, stripe_along=self.stripe_along)
+        direction = find_stripe_direction(image, stripe_along=self.stripe_along, saturation=self.saturation_dn)
         self.with_stripe += direction == "along"
         self.sideways += direction == "across"
 
