@@ -248,7 +248,7 @@ class Rendered:
 
 
 class _Capture(SimpleNamespace):
-    def seen(self, index: int) -> np.ndarray:
+    def read_observation(self, index: int) -> np.ndarray:
         return self.images[index]
 
     def image(self, index: int) -> np.ndarray:
