@@ -7,9 +7,9 @@ on either side, on the lines that all methods find. Distances above 3 px, at edg
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from uwlts.storage.image_file import read_image
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe, method_names
 
 DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
@@ -23,14 +23,14 @@ def stripes() -> Iterator[tuple[str, np.ndarray, np.ndarray | None, PeakRule]]:
         ("bust", "x400_y0", (PeakRule.STRONGEST,)),
     ):
         lit, dark = (
-            np.ascontiguousarray(cv2.imread(str(DATA / "ciclop" / folder / f"{name}_{corner}.png"))[:, :, 2])
+            np.ascontiguousarray(read_image(DATA / "ciclop" / folder / f"{name}_{corner}.png")[:, :, 2])
             for name in ("laser", "laser-background")
         )
         for rule in rules:
             yield f"{folder}, {rule}", lit, None, rule
             yield f"{folder}, {rule}, background subtracted", lit, dark, rule
     for number in range(1, 17):
-        image = cv2.imread(str(DATA / "etna" / f"frame{number:04d}.jpg"), cv2.IMREAD_GRAYSCALE)
+        image = read_image(DATA / "etna" / f"frame{number:04d}.jpg")
         yield f"saturated {number}", image, None, PeakRule.STRONGEST
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -35,6 +36,9 @@ class ScatterRule:
     narrowest : float
         Least median sigma of a stripe, px. The simple methods pull the centres of narrower stripes to the pixels'
         middles, which lowers their scatter.
+    largest_px : float
+        Limit of the distances, px; larger ones are due to edges and would conceal the others. Squares, as in the fits
+        for which the centres are used.
     jump : float
         Largest distance of neighbouring centres, as a fraction of the window; other lines belong to two surfaces.
     """
@@ -46,6 +50,7 @@ class ScatterRule:
     gain: float = 0.02
     gain_px: float = 0.0035
     narrowest: float = WINDOW_RULE.least_kernel
+    largest_px: float = 3.0
     jump: float = 0.2
 
 
@@ -75,10 +80,11 @@ def least_scattered(peak: PeakWindow, centre: np.ndarray, others: Iterable[Modul
         return centre
 
     def scatter(of_runs: np.ndarray) -> float:
-        """Return the mean distance, px, of the centres from the parabolas through their neighbours."""
+        """Return the root mean square distance, px, of the centres from the parabolas through their neighbours."""
         place = (some.start + of_runs.astype(float)).reshape(rows.shape)
         near = np.lib.stride_tricks.sliding_window_view(place, 2 * _RULE.reach + 1, axis=1)
-        return float(np.abs(near @ _residual_weights(_RULE.reach))[smooth].mean())
+        apart = np.minimum(np.abs(near @ _residual_weights(_RULE.reach))[smooth], _RULE.largest_px)
+        return math.sqrt(np.mean(np.square(apart)))
 
     scatters = {other: scatter(other.centres(some)) for other in others}
     best, own = min(scatters, key=scatters.__getitem__), scatter(centre[rows.ravel()])

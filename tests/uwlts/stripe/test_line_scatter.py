@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
+from uwlts.storage.image_file import read_image
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe, method_names
 
 DATA = Path(__file__).resolve().parents[2] / "data"
@@ -37,8 +37,8 @@ def of_every_method(image: np.ndarray, **settings) -> dict[str, float]:
 
 
 def real(name: str) -> np.ndarray:
-    image = cv2.imread(str(DATA / name))
-    return np.ascontiguousarray(image[:, :, 2])
+    image = read_image(DATA / name)
+    return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, 2])
 
 
 @pytest.mark.parametrize(

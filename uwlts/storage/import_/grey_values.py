@@ -46,7 +46,7 @@ def combine_clipped(clipped: np.ndarray, channel: str | None) -> np.ndarray:
         return clipped
     named = "" if channel is None or "grey" in channel else channel
     used = [place for colour, place in _COLOURS.items() if colour in named]
-    return clipped[:, :, used or slice(None)].any(axis=2)
+    return np.asarray(clipped[:, :, used or slice(None)].any(axis=2))
 
 
 def extract_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
