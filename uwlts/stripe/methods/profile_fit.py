@@ -135,7 +135,7 @@ def centres(peak: PeakWindow) -> np.ndarray:
     _fit_profiles(peak, noise, sampled, signal, known, sums[0], centre, flat)
     if flat.any():
         centre[flat] = quadratic.centres(peak.select(flat))
-    return least_scattered(peak, centre, (zero_crossing, quadratic, centre_of_mass))
+    return least_scattered(peak, centre, zero_crossing, (quadratic, centre_of_mass))
 
 
 def _allocate_aligned(*shapes: tuple[int, int]) -> Iterator[np.ndarray]:
