@@ -304,9 +304,14 @@ def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, 
     return 100.0 * wrong / max(count, 1), 100.0 * (1.0 - right / len(lines)), count
 
 
-def groups() -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]:
-    """Yield the images of all tables, rendered on demand."""
+def groups(seeds: range) -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]:
+    """Yield the images of all tables, rendered on demand; with ``seeds`` only scenes drawn with them."""
     small, full = load_sensor("thesis-small"), load_sensor("thesis")
+    if seeds:
+        turns = (small, SHORT, HIGH, NOISY)
+        fresh = ((drawn(n)[0], rendered_small(drawn(n)[1], turns[k % 4], n)) for k, n in enumerate(seeds))
+        yield "four sensors, drawn", fresh
+        return
     yield "named, small camera: chosen on", ((name, rendered_small(of, small, 0)) for name, of in NAMED.items())
     yield (
         "other sensors: unseen",
@@ -321,8 +326,8 @@ def groups() -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]:
     yield "drawn, thesis's sensor: unseen", ((drawn(n)[0], rendered(drawn(n)[1], full)) for n in HELD_OUT)
 
 
-def rows() -> Iterator[str]:
-    for title, group in groups():
+def rows(seeds: range) -> Iterator[str]:
+    for title, group in groups(seeds):
         yield f"| {title} | brightest peak: wrong % | lost % | direct stripe: wrong % | lost % |"
         yield "| --- | --- | --- | --- | --- |"
         sums = np.zeros((2, 2))
@@ -357,10 +362,10 @@ def draw(of: Rendered) -> None:
     figure.savefig(PICTURE, dpi=110)
 
 
-def main() -> None:
-    """Print the rows."""
+def main(first: int = 0, count: int = 0) -> None:
+    """Print the rows; with a ``count`` those of as many scenes drawn with seeds from ``first`` on."""
     use_variant()
-    for row in rows():
+    for row in rows(range(first, first + count)):
         print(row, flush=True)
 
 
