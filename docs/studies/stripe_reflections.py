@@ -306,9 +306,14 @@ def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, 
     return 100.0 * wrong / max(count, 1), 100.0 * (1.0 - right / len(lines)), count, len(lines)
 
 
-def groups() -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]:
-    """Yield the images of all tables, rendered on demand."""
+def groups(seeds: range) -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]:
+    """Yield the images of all tables, rendered on demand; with ``seeds`` only scenes drawn with them."""
     small, full = load_sensor("thesis-small"), load_sensor("thesis")
+    if seeds:
+        turns = (small, SHORT, HIGH, NOISY)
+        fresh = ((drawn(n)[0], rendered_small(drawn(n)[1], turns[k % 4], n)) for k, n in enumerate(seeds))
+        yield "four sensors, drawn", fresh
+        return
     yield "chosen on", ((name, rendered_small(of, small, 0)) for name, of in NAMED.items())
     turns = (SHORT, HIGH, NOISY)
     yield (
@@ -322,9 +327,9 @@ def groups() -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]:
     yield "drawn, thesis's sensor: unseen", ((drawn(n)[0], rendered(drawn(n)[1], full)) for n in HELD_OUT)
 
 
-def tables() -> Iterator[tuple[str, str]]:
+def tables(seeds: range) -> Iterator[tuple[str, str]]:
     """Yield title and table of each group of scenes."""
-    for title, group in groups():
+    for title, group in groups(seeds):
         rows, sums = [], np.zeros((2, 2, 2))
         for name, shown in group:
             found = [wrong_and_lost(shown, options) for options in (BRIGHTEST, StripeOptions())]
@@ -362,11 +367,14 @@ def draw(of: Rendered) -> None:
     figure.savefig(PICTURE, dpi=110)
 
 
-def main(*, write: bool = False) -> None:
-    """Print the tables; with `--write`, put the first two into their page."""
+def main(*, first: int = 0, count: int = 0, write: bool = False) -> None:
+    """Print the tables; with `--write`, put the first two into their page.
+
+    With a ``count``, only the table of as many scenes drawn with seeds from ``first`` on is printed.
+    """
     use_variant()
-    for number, (title, text) in enumerate(tables()):
-        publish({f"reflections, {title}": text}, write=write and number < 2)
+    for number, (title, text) in enumerate(tables(range(first, first + count))):
+        publish({f"reflections, {title}": text}, write=write and number < 2 and not count)
 
 
 if __name__ == "__main__":

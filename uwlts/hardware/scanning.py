@@ -319,7 +319,9 @@ class _Taking:
             self._count(stripe, bright)
         seen.repeated = rig.repeated
         if zero_dn and isinstance(image, np.ndarray):
-            image = image.astype(np.uint16) if unlit is None else subtract_background(image, unlit, zero_dn=zero_dn)
+            clipped = image >= self._sensor.detector.full_scale_dn()
+            lit = image.astype(np.uint16)
+            image = lit if unlit is None else subtract_background(image, unlit, clipped, zero_dn=zero_dn)
         return Frame(image, position, light == "laser", exposure_ms, 0.0, encoder=frame.encoder)
 
     def check_steps(self) -> None:

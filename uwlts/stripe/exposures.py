@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from uwlts.model.clipped import split_clipped
 from uwlts.model.sensor import LEAST_BRACKET_STEP, MOST_IN_BRACKET, CaptureHeader
 from uwlts.model.stripe import Stripe
 
@@ -148,7 +149,9 @@ def fuse_exposures(
     The offset is estimated from the background of the shortest and the longest image. Cameras expose some microseconds
     longer or shorter than they report. T / t is therefore estimated from pixels that are well exposed in both images.
     """
-    pixels = [image.astype(np.float32) for image in images]
+    # Clipped pixels of differences have any grey value (`uwlts.model.clipped`).
+    known = (split_clipped(image, full_dn) for image in images)
+    pixels = [np.where(clipped, full_dn, values).astype(np.float32) for values, clipped in known]
     offset = _estimate_offset(pixels[0], pixels[-1], float(exposure_ms[-1] / exposure_ms[0]))
     low, high = (share * (full_dn - offset) for share in (_RULE.roll_off_from, _RULE.roll_off_to))
     # From the longest to the shortest exposure: the scale is the product of successive ratios.
