@@ -38,6 +38,7 @@ _CHECK: dict[SingleParameter, str] = {
     StageParameter.SLOPE_2: _ALIGNMENT,
     TargetParameter.BOW: "the target's flatness, or uncertainty.target_bow_mm",
     TargetParameter.SADDLE: "the target's flatness, or uncertainty.target_bow_mm",
+    TargetParameter.TWIST: "the target's flatness, or uncertainty.target_bow_mm",
     TargetParameter.STRETCH_X: "the target's spacings, or uncertainty.target_stretch",
     TargetParameter.STRETCH_Y: "the target's spacings, or uncertainty.target_stretch",
     LensParameter.P1: "the lens, or uncertainty.tangential",

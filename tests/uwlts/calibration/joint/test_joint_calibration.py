@@ -123,6 +123,7 @@ def at_truth(view):
         "stage_scale": 1e-4,
         "target_bow": 0.02,
         "target_saddle": -0.015,
+        "target_twist": 0.01,
         "target_stretch_x": 2e-4,
         "target_stretch_y": -1e-4,
         "target_stripe": 0.04,

@@ -214,7 +214,7 @@ def test_every_candidate_has_the_parameters_its_name_says(plain):
         return {key.text for key in problem.parameters.keys}
 
     usual = names_of(apply_candidate(plain, Candidate()))
-    usually = {"p1", "p2", "target_saddle", "target_stretch_x", "target_stretch_y", "target_stripe"}
+    usually = {"p1", "p2", "target_saddle", "target_twist", "target_stretch_x", "target_stretch_y", "target_stripe"}
     assert usual == names_of(plain) - usually
 
     def lacking(**changes):
