@@ -16,6 +16,7 @@ from uwlts.evaluation.spheres import SphereEvaluation
 from uwlts.evaluation.step_faces import StepFace
 from uwlts.fitting.propagation import PointErrors, noise_shifts
 from uwlts.fitting.shapes import FlatFit, fit_cylinder, fit_plane, fit_sphere
+from uwlts.model.artefacts import StepStandard
 from uwlts.storage.cloud import PointCloud
 
 _MOST_DRAWS, _FEWEST_DRAWS = 400, 50
@@ -182,16 +183,18 @@ class _LinearisedStep:
     """Figures of a step in a cloud, with fixed faces."""
 
     def __init__(self, cloud: PointCloud, evaluation: StepEvaluation):
+        assert isinstance(evaluation.artefact, StepStandard)
         self._cloud, self._evaluation, self._labels = cloud, evaluation, evaluation.labels
+        self._artefact = evaluation.artefact
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
         """Return the evaluation's figures after shifts (N, 3) of all points."""
-        points, artefact = self._cloud.points_mm + moves, self._evaluation.artefact
-        return measure_step(points, self._cloud.frame, self._labels, artefact).figures_mm
+        points = self._cloud.points_mm + moves
+        return measure_step(points, self._cloud.frame, self._labels, self._artefact).figures_mm
 
     def gradients(self) -> dict[str, np.ndarray]:
         """Return the derivatives (N, 3) of the height: mean distance of a face from the plane of the other."""
-        points, base = self._cloud.points_mm, StepFace[self._evaluation.artefact.reference.upper()]
+        points, base = self._cloud.points_mm, StepFace[self._artefact.reference.upper()]
         used, across = (np.flatnonzero(self._labels == face) for face in (base, base.other))
         plane = fit_plane(points[used])
         design = _flat_design(plane, points[used])

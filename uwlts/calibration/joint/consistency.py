@@ -114,7 +114,8 @@ class Findings:
     ``contradictions`` are those of prior knowledge, and make the estimate useless. ``unfit`` maps the sources of images
     that contradict all others to messages. ``misfits`` are kinds of residuals with a systematic misfit. Doubts are
     everything else. ``stretch`` is the target's stretch from the evidence alone if it differs from the prior; pixels of
-    another aspect ratio have the same effect.
+    another aspect ratio have the same effect. ``form`` says whether the target's form or size differs from the prior,
+    as a wrong lens also makes it appear.
     """
 
     contradictions: list[str]
@@ -122,6 +123,7 @@ class Findings:
     misfits: dict[str, str]
     doubts: list[str]
     stretch: dict[ParameterKey, float] = field(default_factory=dict)
+    form: bool = False
 
     def all_against(self) -> list[str]:
         """Return all messages except doubts."""
