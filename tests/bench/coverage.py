@@ -1,8 +1,9 @@
-"""Coverage of the stated 95 % intervals: ``python -m tests.bench.coverage [campaigns] [--varied] [--write]``.
+"""Coverage of the stated 95 % intervals: ``python -m tests.bench.coverage [campaigns] [--varied] [--lab] [--write]``.
 
 Campaigns are simulated by Fermat's principle (`tests.uwlts.simulated_campaign`), calibrated jointly, and a sphere
 standard is scanned and measured with each calibration. With ``--varied``, campaigns in water use other sensors than the
-thesis's, sensors whose uncertainty is stated wrongly, and errors that the calibration does not model.
+thesis's, sensors whose uncertainty is stated wrongly, and errors that the calibration does not model. With ``--lab``,
+scale, form and finish of the target are drawn as stated, or off by a factor of two, on two sensors.
 """
 
 import tempfile
@@ -77,12 +78,13 @@ class Measured:
 
 @dataclass(frozen=True)
 class Variation:
-    """Variation of a campaign: changes of the sensor's description, ``spread`` and ``errors`` of `drawn_reality`."""
+    """Variation of a campaign: changes of the sensor's description; the others are parameters of `drawn_reality`."""
 
     name: str = "as described"
     changes: dict[str, Any] = field(default_factory=dict)
     spread: float = 1.0
     errors: ModelErrors = ModelErrors()
+    apart: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -111,11 +113,36 @@ VARIATIONS = (
     Variation("k3 of 0.1", errors=ModelErrors(distortion=(("k3", 0.1),))),
     Variation("p1 of 0.001, p2 of -0.001", errors=ModelErrors(distortion=(("p1", 1e-3), ("p2", -1e-3)))),
     Variation("saddle of 0.05 mm", errors=ModelErrors(saddle_mm=0.05)),
+    Variation("twist of 0.05 mm", errors=ModelErrors(twist_mm=0.05)),
+    Variation("target 0.01 % wider", errors=ModelErrors(stretch=1e-4)),
+    Variation("target 0.02 % wider", errors=ModelErrors(stretch=2e-4)),
     Variation("target 0.1 % wider", errors=ModelErrors(stretch=1e-3)),
     Variation("stripe on the target 0.1 px off by gloss", errors=ModelErrors(gloss_px=0.1)),
-    Variation("the same, stated", {"uncertainty": {"target_stripe_px": 0.1}}, errors=ModelErrors(gloss_px=0.1)),
+    Variation("0.01 % wider, gloss, saddle, k3", errors=ModelErrors((("k3", 0.1),), 0.03, stretch=1e-4, gloss_px=0.1)),
 )
 """Sizes of model errors: distortion that moves the image's corner by 0.1 to 1 px; boards and gloss of usual quality."""
+
+
+OTHER_SENSOR: dict[str, Any] = {
+    "camera": {"focal_length_mm": 8.0, "window": {"distance_mm": 90.0}},
+    "laser": {"baseline_mm": 200.0, "triangulation_angle_deg": 25.0},
+}
+_TERMS = ("target_stretch", "target_bow_mm", "target_stripe_px")
+
+
+def lab_variations() -> tuple[Variation, ...]:
+    """Return variations of the target's scale, form and finish, each alone and all together, on two sensors.
+
+    They are drawn as stated, or with half or twice the stated uncertainty.
+    """
+    found = []
+    for sensor, changes in (("thesis", {}), ("other sensor", OTHER_SENSOR)):
+        found.append(Variation(f"{sensor}, as stated", changes))
+        for factor in (0.5, 2.0):
+            for names in (*((name,) for name in _TERMS), _TERMS):
+                what = "scale, form and stripe" if len(names) > 1 else names[0]
+                found.append(Variation(f"{sensor}, {what} x {factor:g}", changes, apart=dict.fromkeys(names, factor)))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -136,7 +163,8 @@ def run_campaign(campaign: Campaign, send: Any = None) -> Outcome:
     """Calibrate, scan spheres at one of three places in turn, measure them; CalibrationError as `solve_jointly`."""
     how = campaign.variation
     described = altered(load_sensor("thesis"), how.changes)
-    real = drawn_reality(described, np.random.default_rng(campaign.seed), spread=how.spread, errors=how.errors)
+    rng = np.random.default_rng(campaign.seed)
+    real = drawn_reality(described, rng, spread=how.spread, errors=how.errors, apart=how.apart)
     gathered = evidence(real, described, wet=campaign.wet)
     start = time.perf_counter()
     calibration = solve_jointly(gathered, options=OPTIONS).calibration
@@ -175,6 +203,7 @@ def parameter_pulls(calibration: Calibration, real: Reality, described: Sensor) 
         LensParameter.P2: camera.distortion.p2,
         TargetParameter.BOW: real.target_bow_mm,
         TargetParameter.SADDLE: real.target_saddle_mm,
+        TargetParameter.TWIST: real.target_twist_mm,
         TargetParameter.STRETCH_X: real.stretch[0],
         TargetParameter.STRETCH_Y: real.stretch[1],
         TargetParameter.STRIPE: real.gloss_px,
@@ -264,12 +293,12 @@ def attempt(campaign: Campaign, send: Any = None) -> Outcome | None:
         return None
 
 
-def varied_campaigns(count: int, *, write: bool) -> int:
+def varied_campaigns(count: int, variations: Sequence[Variation], *, name: str, write: bool) -> int:
     """Run ``count`` campaigns of each variation and print the coverage of their stated intervals."""
     rows = []
-    jobs = [Campaign(seed, True, variation=each) for each in VARIATIONS for seed in range(count)]
+    jobs = [Campaign(seed, True, variation=each) for each in variations for seed in range(count)]
     outcomes = run_jobs(attempt, jobs)
-    for number, variation in enumerate(VARIATIONS):
+    for number, variation in enumerate(variations):
         own = outcomes[number * count : (number + 1) * count]
         kept = [outcome for outcome in own if outcome is not None]
         found = judged(kept)
@@ -291,16 +320,21 @@ def varied_campaigns(count: int, *, write: bool) -> int:
             ]
         )
     head = ["campaigns", "refused", "warned", "spacing within 95 %", "diameters", "error of the spacing, rms", "stated"]
-    publish({"coverage, varied": table([*head, "mean square of whitened parameters"], rows)}, write=write)
+    publish({name: table([*head, "mean square of whitened parameters"], rows)}, write=write)
     return 0
 
 
 def main(
-    campaigns: int = CAMPAIGNS, *, varied: Annotated[bool, Parameter(negative="")] = False, write: bool = False
+    campaigns: int = CAMPAIGNS,
+    *,
+    varied: Annotated[bool, Parameter(negative="")] = False,
+    lab: Annotated[bool, Parameter(negative="")] = False,
+    write: bool = False,
 ) -> int:
     """Run all campaigns and print the coverage of the stated intervals; with `--write`, put it into its page."""
-    if varied:
-        return varied_campaigns(campaigns, write=write)
+    if varied or lab:
+        variations, name = (lab_variations(), "coverage, lab") if lab else (VARIATIONS, "coverage, varied")
+        return varied_campaigns(campaigns, variations, name=name, write=write)
     jobs = [Campaign(seed, wet) for seed in range(campaigns) for wet in (True, False)]
     outcomes = run_jobs(run_campaign, jobs)
     rows = []

@@ -1,5 +1,6 @@
 """Whole campaigns by Fermat's principle: all quantities with an uncertainty in the sensor's description are drawn."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,13 +33,14 @@ class ModelErrors:
     """Errors that the joint calibration does not model and the description does not mention.
 
     ``distortion`` contains coefficients added to those of the lens. The target is a saddle, ``saddle_mm`` high at the
-    middles of its edges, and stretched along x by the fraction ``stretch``. Its gloss moves the stripe by ``gloss_px``.
-    In the focus, the noise of circles and stripe is ``noise`` times the usual one. At 100 mm from the focus, it is
-    larger by the fraction ``blur``.
+    middles of its edges, or twisted by ``twist_mm`` at its corners, and stretched along x by the fraction ``stretch``.
+    Its gloss moves the stripe by ``gloss_px``. In the focus, the noise of circles and stripe is ``noise`` times the
+    usual one. At 100 mm from the focus, it is larger by the fraction ``blur``.
     """
 
     distortion: tuple[tuple[str, float], ...] = ()
     saddle_mm: float = 0.0
+    twist_mm: float = 0.0
     stretch: float = 0.0
     gloss_px: float = 0.0
     noise: float = 1.0
@@ -51,9 +53,9 @@ class Reality:
 
     ``lean`` (2,) are the slopes of the stage's direction against the target's normal. ``warmer_k`` is the error of the
     thermometer: true minus measured temperature of the water. ``target_saddle_mm`` is twice the height of the middles
-    of the target's sides across x. ``stretch`` (2,) is the relative stretch of its columns and rows. The target's gloss
-    moves the stripe by ``gloss_px``. ``circles_px`` and ``stripe_px`` are the noise in the focus, which grows by the
-    fraction ``blur`` within 100 mm.
+    of the target's sides across x, ``target_twist_mm`` the height of its corners by a twist. ``stretch`` (2,) is the
+    relative stretch of its columns and rows. The target's gloss moves the stripe by ``gloss_px``. ``circles_px`` and
+    ``stripe_px`` are the noise in the focus, which grows by the fraction ``blur`` within 100 mm.
     """
 
     sensor: Sensor
@@ -69,6 +71,7 @@ class Reality:
     stage_mm: float
     rng: np.random.Generator
     target_saddle_mm: float
+    target_twist_mm: float
     stretch: np.ndarray
     gloss_px: float
     blur: float
@@ -89,17 +92,22 @@ class Reality:
 
 
 def drawn_reality(
-    described: Sensor, rng: np.random.Generator, *, spread: float = 1.0, errors: ModelErrors = ModelErrors()
+    described: Sensor,
+    rng: np.random.Generator,
+    *,
+    spread: float = 1.0,
+    errors: ModelErrors = ModelErrors(),
+    apart: Mapping[str, float] | None = None,
 ) -> Reality:
     """Draw a sensor built from drawings.
 
-    Quantities with a stated uncertainty are drawn with ``spread`` times this uncertainty. All others differ as in the
-    sensor as built.
+    Quantities with a stated uncertainty are drawn with ``spread`` times this uncertainty, those in ``apart`` with the
+    given factor times it. All others differ as in the sensor as built.
     """
     stated = described.uncertainty
-    known = stated.model_copy(
-        update={name: spread * value for name, value in stated.model_dump().items() if isinstance(value, float)}
-    )
+    known = stated.scaled(spread)
+    for name, factor in (apart or {}).items():
+        known = known.model_copy(update={name: getattr(stated.scaled(factor), name)})
     built = built_sensor()
     camera, window = described.camera, described.camera.window
     distortion = built.camera.distortion.model_dump()
@@ -150,7 +158,8 @@ def drawn_reality(
         stage_mm=known.stage_position_mm,
         rng=rng,
         target_saddle_mm=rng.normal(0, known.target_bow_mm) + 2 * errors.saddle_mm,
-        stretch=rng.normal(0, known.target_stretch, 2) + [errors.stretch, 0.0],
+        target_twist_mm=rng.normal(0, known.target_bow_mm) + errors.twist_mm,
+        stretch=rng.normal(0, known.stretch_by_axis()) + [errors.stretch, 0.0],
         gloss_px=rng.normal(0, known.target_stripe_px) + errors.gloss_px,
         blur=errors.blur,
     )
@@ -223,8 +232,9 @@ def target_series(
     corner = np.sum(grid[:, :2] ** 2, axis=1).max()
 
     def bulge(points: np.ndarray) -> np.ndarray:
-        x2, y2 = points[:, 0] ** 2, points[:, 1] ** 2
-        return (real.target_bow_mm * (x2 + y2) + real.target_saddle_mm * (x2 - y2)) / corner
+        x2, y2, xy = points[:, 0] ** 2, points[:, 1] ** 2, points[:, 0] * points[:, 1]
+        saddle, twist = real.target_saddle_mm * (x2 - y2), 2 * real.target_twist_mm * xy
+        return (real.target_bow_mm * (x2 + y2) + saddle + twist) / corner
 
     bent = np.column_stack([flat[:, :2] * (1 + real.stretch), bulge(flat)])
     fan = FanRays.of(real, index, rays)

@@ -132,7 +132,7 @@ def evaluate_pipe(points: np.ndarray, artefact: PipeStandard) -> PipeEvaluation:
         diameter_std_mm=2 * float(np.sqrt(fit.covariance[4, 4])),
         range_mm=spread_mm(fit.residuals_mm),
         std_mm=fit.std_mm,
-        ovality_mm=_measure_ovality(points[robust.inliers], fit),
+        ovality_mm=measure_ovality(points[robust.inliers], fit),
         point_mm=tuple(fit.point_mm.tolist()),
         axis=tuple(fit.axis.tolist()),
     )
@@ -153,7 +153,7 @@ def _fit_robustly_checked(
     return robust, {"points_used": used, "points_rejected": robust.rejected, "deviation_mm": deviation}
 
 
-def _measure_ovality(points: np.ndarray, fit: CylinderFit) -> float | None:
+def measure_ovality(points: np.ndarray, fit: CylinderFit) -> float | None:
     """Return 4 sqrt(a2 + b2) of the radius component a cos 2w + b sin 2w; circle shift and size are fitted too."""
     across = (points - fit.point_mm) @ fit.across.T
     angle = np.arctan2(across[:, 1], across[:, 0])
@@ -179,6 +179,8 @@ class StepEvaluation(ArtefactEvaluation):
         without a profile of both faces.
     profiles : int
         Number of profiles that show both faces.
+    labels : (N,) int8
+        Face of each point (`StepFace`).
     lower_std_mm, upper_std_mm : float
         Standard deviation of each face about its own plane.
     parallelism_deg : float
@@ -197,6 +199,7 @@ class StepEvaluation(ArtefactEvaluation):
     lower_std_mm: float
     upper_std_mm: float
     parallelism_deg: float
+    labels: np.ndarray
 
     def values_mm(self) -> dict[FigureId, float | None]:
         return {
@@ -212,14 +215,22 @@ def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard,
     EvaluationError if the points show no two faces of this height.
     """
     labels = label_step_faces(points, height_mm=artefact.height_mm, edge_mm=artefact.edge_mm, seed=seed)
-    planes: dict[StepFace, FlatFit] = {}
     rejected = 0
     for face in (StepFace.LOWER, StepFace.UPPER):
         members = np.flatnonzero(labels == face)
         robust = fit_robustly(_fit_facing_plane, points[members])
         labels[members[~robust.inliers]] = StepFace.NEITHER
-        planes[face] = robust.fit
         rejected += robust.rejected
+    return measure_step(points, frame, labels, artefact, rejected=rejected)
+
+
+def measure_step(
+    points: np.ndarray, frame: np.ndarray, labels: np.ndarray, artefact: StepStandard, *, rejected: int = 0
+) -> StepEvaluation:
+    """Evaluate points (N, 3), mm, of a step with known faces ``labels`` (N,); EvaluationError for too few points."""
+    planes: dict[StepFace, FlatFit] = {
+        face: _fit_facing_plane(points[labels == face]) for face in (StepFace.LOWER, StepFace.UPPER)
+    }
     height = step_height(points, labels, reference=artefact.reference)
     base = StepFace[artefact.reference.upper()]
     deviation = planes[base].distances_mm(points)
@@ -249,4 +260,5 @@ def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard,
         lower_std_mm=lower.std_mm,
         upper_std_mm=upper.std_mm,
         parallelism_deg=float(np.degrees(np.arccos(min(1.0, abs(lower.normal @ upper.normal))))),
+        labels=labels,
     )

@@ -4,43 +4,66 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, spread_mm
+from uwlts.evaluation.artefact_figures import (
+    PipeEvaluation,
+    PlaneEvaluation,
+    StepEvaluation,
+    measure_ovality,
+    measure_step,
+)
+from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quantity, spread_mm
 from uwlts.evaluation.spheres import SphereEvaluation
+from uwlts.evaluation.step_faces import StepFace
 from uwlts.fitting.propagation import PointErrors, noise_shifts
-from uwlts.fitting.shapes import fit_sphere
+from uwlts.fitting.shapes import FlatFit, fit_cylinder, fit_plane, fit_sphere
+from uwlts.model.artefacts import StepStandard
 from uwlts.storage.cloud import PointCloud
 
-_DRAWS = 8
-"""Number of draws with a full evaluation: their standard deviation has a relative uncertainty of 27 %."""
-_QUICK_DRAWS = 50
-"""Number of draws for spheres with linearised fits: their standard deviation has a relative uncertainty of 10 %."""
+_MOST_DRAWS, _FEWEST_DRAWS = 400, 50
+"""Number of draws for figures that are not linear in the points: relative uncertainties of 3.5 % and 10 %."""
+_DRAWN_POINTS = 4_000_000
+"""Points of all draws together, for a second of computation: the number of draws follows within the limits above."""
 
 
 def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> dict[str, FigureUncertainty]:
     """Return the uncertainty of each figure of an evaluation by name; empty if the points have no uncertainty.
 
-    Figures are recalculated with each systematic pattern added to the points, and with random draws of noise
-    (`PointErrors.propagate`). The assignment of points to spheres is kept. EvaluationError as `evaluate_cloud`.
+    Diameters, spacings and heights are linear in small shifts of the points: noise is propagated by their derivatives
+    (GUM, section 5.1). Ranges and standard deviations of residuals are recalculated with random draws of noise. Each
+    systematic pattern is added to the points. The assignment of points to surfaces is kept.
     """
     if (uncertainty := cloud.uncertainty) is None:
         return {}
-    plain = evaluation.figures_mm
-    spheres = LinearisedSpheres(cloud.points_mm, evaluation) if isinstance(evaluation, SphereEvaluation) else None
+    plain, figures = evaluation.figures_mm, linearise_figures(cloud, evaluation)
 
     def changed(by: np.ndarray) -> np.ndarray:
-        if spheres is not None:
-            figures = spheres.figures_mm(by)
-        else:
-            figures = evaluate_cloud(replace(cloud, points_mm=cloud.points_mm + by), evaluation.artefact).figures_mm
-        return np.array([figures[name] - value for name, value in plain.items()])
+        moved = figures.figures_mm(by)
+        return np.array([moved[name] - value for name, value in plain.items()])
 
-    draws = _DRAWS if spheres is None else _QUICK_DRAWS
-    by_noise, by_calibration = PointErrors.from_uncertainty(uncertainty, cloud.frame).propagate(changed, draws=draws)
+    errors = PointErrors.from_uncertainty(uncertainty, cloud.frame)
+    draws = int(np.clip(_DRAWN_POINTS // len(cloud.points_mm), _FEWEST_DRAWS, _MOST_DRAWS))
+    by_noise, by_calibration = errors.propagate(changed, draws=draws)
     assert by_calibration is not None
-    return {
-        name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)
-    }
+    stated = {name: (float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)}
+    linear = {name: errors.linear_std(by_points) for name, by_points in figures.gradients().items()}
+    return {name: FigureUncertainty(linear.get(name, random), system) for name, (random, system) in stated.items()}
+
+
+def linearise_figures(
+    cloud: PointCloud, evaluation: ArtefactEvaluation
+) -> "LinearisedSpheres | _LinearisedPlane | _LinearisedPipe | _LinearisedStep":
+    """Return the figures of an evaluation as functions of small shifts of the cloud's points."""
+    match evaluation:
+        case SphereEvaluation():
+            return LinearisedSpheres(cloud.points_mm, evaluation)
+        case PlaneEvaluation():
+            return _LinearisedPlane(cloud.points_mm, evaluation)
+        case PipeEvaluation():
+            return _LinearisedPipe(cloud.points_mm, evaluation)
+        case StepEvaluation():
+            return _LinearisedStep(cloud, evaluation)
+        case _:
+            raise TypeError(f"no figures of {evaluation.kind} are known")
 
 
 def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
@@ -62,63 +85,188 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     return np.sqrt(np.sum(moved**2, axis=0)) / count
 
 
-class _LinearisedSphere:
-    """Linearised sphere fit of free or known radius to the ``used`` (K,) of points (N, 3).
+class _LinearisedFit:
+    """Linearised fit of a shape to the ``used`` (K,) of N points.
 
-    Centre and free radius are linear in changes of the residuals. The outward unit vectors are constant, since shifts
-    of points are small compared with the radius.
+    A point's shift along ``outward`` (K, 3) changes its distance from the shape. ``design`` (K, P) are the distances'
+    derivatives by the shape's parameters. Both are constant, since shifts are small compared with the shape.
     """
 
-    def __init__(self, points: np.ndarray, used: np.ndarray, radius_mm: float | None):
-        self._used, self._fit = used, fit_sphere(points[used], radius_mm)
-        outward = points[used] - self._fit.centre_mm
-        self._outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
-        free = np.ones((len(used), 1 if radius_mm is None else 0))
-        by_parameters = np.hstack([self._outward, free])
-        self._solve = np.linalg.solve(by_parameters.T @ by_parameters, by_parameters.T)
+    def __init__(self, used: np.ndarray, outward: np.ndarray, design: np.ndarray, residuals_mm: np.ndarray):
+        self.used, self._outward, self._design, self._residuals = used, outward, design, residuals_mm
+        self._solve = np.linalg.solve(design.T @ design, design.T)
 
-    def shift(self, moves: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-        """Return centre (3,), change of radius (0 if known) and residuals (K,) after shifts (N, 3) of points."""
-        change = np.einsum("ni,ni->n", self._outward, moves[self._used])
+    def shift(self, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return changes (P,) of the parameters and residuals (K,) after shifts (N, 3) of points."""
+        change = np.einsum("ni,ni->n", self._outward, moves[self.used])
         step = self._solve @ change
-        by_radius = float(step[3:].sum())
-        residuals = self._fit.residuals_mm + change - self._outward @ step[:3] - by_radius
-        return self._fit.centre_mm + step[:3], by_radius, residuals
+        return step, self._residuals + change - self._design @ step
+
+    def parameter_count(self) -> int:
+        """Return the number of parameters."""
+        return len(self._solve)
+
+    def gradient(self, weights: np.ndarray, count: int) -> np.ndarray:
+        """Return the derivatives (N, 3) of a weighted sum of the parameters by the shifts of N = ``count`` points."""
+        result = np.zeros((count, 3))
+        result[self.used] = (weights @ self._solve)[:, None] * self._outward
+        return result
+
+
+def _linearise_sphere(points: np.ndarray, used: np.ndarray, radius_mm: float | None) -> _LinearisedFit:
+    """Linearise the fit of a sphere of free or known radius: parameters are the centre and the free radius."""
+    fit = fit_sphere(points[used], radius_mm)
+    outward = points[used] - fit.centre_mm
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    free = np.ones((len(used), 1 if radius_mm is None else 0))
+    return _LinearisedFit(used, outward, np.hstack([outward, free]), fit.residuals_mm)
+
+
+def _flat_design(fit: FlatFit, points: np.ndarray) -> np.ndarray:
+    """Return the derivatives (N, 3) of distances of points from a plane by its offset and slopes."""
+    return np.column_stack([np.ones(len(points)), (points - fit.point_mm) @ fit.axes.T])
+
+
+class _LinearisedPlane:
+    """Linearised plane of an evaluation of points (N, 3), mm, with fixed outliers."""
+
+    def __init__(self, points: np.ndarray, evaluation: PlaneEvaluation):
+        used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
+        plane = fit_plane(points[used], towards=np.array(evaluation.normal))
+        outward = np.broadcast_to(plane.normal, (len(used), 3))
+        self._evaluation = evaluation
+        self._fit = _LinearisedFit(used, outward, _flat_design(plane, points[used]), plane.residuals_mm)
+
+    def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
+        """Return the evaluation's figures after shifts (N, 3) of all points."""
+        _, residuals = self._fit.shift(moves)
+        std = float(np.sqrt(residuals @ residuals / (len(residuals) - 3)))
+        return replace(self._evaluation, re_mm=spread_mm(residuals), std_mm=std).figures_mm
+
+    def gradients(self) -> dict[str, np.ndarray]:
+        """Return the derivatives (N, 3) of figures that are linear in the points; here none."""
+        return {}
+
+
+class _LinearisedPipe:
+    """Linearised cylinder of an evaluation of points (N, 3), mm, with fixed outliers."""
+
+    def __init__(self, points: np.ndarray, evaluation: PipeEvaluation):
+        used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
+        self._points, self._evaluation, self._count = points[used], evaluation, len(points)
+        self._pipe = fit_cylinder(points[used], axis_start=evaluation.axis)
+        off = points[used] - self._pipe.point_mm
+        circle = off @ self._pipe.across.T
+        circle /= np.linalg.norm(circle, axis=1, keepdims=True)
+        along = (off @ self._pipe.axis)[:, None]
+        design = np.hstack([circle, along * circle, np.ones_like(along)])
+        self._fit = _LinearisedFit(used, circle @ self._pipe.across, design, self._pipe.residuals_mm)
+
+    def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
+        """Return the evaluation's figures after shifts (N, 3) of all points."""
+        step, residuals = self._fit.shift(moves)
+        return replace(
+            self._evaluation,
+            diameter_error_mm=self._evaluation.diameter_error_mm + 2 * float(step[4]),
+            range_mm=spread_mm(residuals),
+            std_mm=float(np.sqrt(residuals @ residuals / (len(residuals) - 5))),
+            ovality_mm=measure_ovality(self._points, replace(self._pipe, residuals_mm=residuals)),
+        ).figures_mm
+
+    def gradients(self) -> dict[str, np.ndarray]:
+        """Return the derivatives (N, 3) of figures that are linear in the points."""
+        (name,) = (f.key.name for f in self._evaluation.figures if f.key.quantity is Quantity.DIAMETER_ERROR)
+        return {name: self._fit.gradient(np.array([0.0, 0.0, 0.0, 0.0, 2.0]), self._count)}
+
+
+class _LinearisedStep:
+    """Figures of a step in a cloud, with fixed faces."""
+
+    def __init__(self, cloud: PointCloud, evaluation: StepEvaluation):
+        assert isinstance(evaluation.artefact, StepStandard)
+        self._cloud, self._evaluation, self._labels = cloud, evaluation, evaluation.labels
+        self._artefact = evaluation.artefact
+
+    def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
+        """Return the evaluation's figures after shifts (N, 3) of all points."""
+        points = self._cloud.points_mm + moves
+        return measure_step(points, self._cloud.frame, self._labels, self._artefact).figures_mm
+
+    def gradients(self) -> dict[str, np.ndarray]:
+        """Return the derivatives (N, 3) of the height: mean distance of a face from the plane of the other."""
+        points, base = self._cloud.points_mm, StepFace[self._artefact.reference.upper()]
+        used, across = (np.flatnonzero(self._labels == face) for face in (base, base.other))
+        plane = fit_plane(points[used])
+        design = _flat_design(plane, points[used])
+        fit = _LinearisedFit(used, np.broadcast_to(plane.normal, (len(used), 3)), design, plane.residuals_mm)
+        result = -fit.gradient(_flat_design(plane, points[across]).mean(axis=0), len(points))
+        result[across] = plane.normal / len(across)
+        (name,) = (f.key.name for f in self._evaluation.figures if f.key.quantity is Quantity.HEIGHT_ERROR)
+        return {name: np.sign(plane.distances_mm(points[across]).mean()) * result}
 
 
 class LinearisedSpheres:
     """Linearised spheres of an evaluation of points (N, 3), mm, with a fixed assignment of points."""
 
     def __init__(self, points: np.ndarray, evaluation: SphereEvaluation):
-        self._evaluation = evaluation
+        self._evaluation, self._count = evaluation, len(points)
         diameters = evaluation.artefact.diameters_mm
         used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
         centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
         radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
         off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
         members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
-        self._free = [_LinearisedSphere(points, own, None) for own in members]
-        self._known = [_LinearisedSphere(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
+        self._free = [_linearise_sphere(points, own, None) for own in members]
+        self._known = [_linearise_sphere(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
+        self._centres = [fit_sphere(points[own]).centre_mm for own in members]
+        self._known_centres = [
+            fit_sphere(points[own], d / 2).centre_mm for own, d in zip(members, diameters, strict=True)
+        ]
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
         """Return the evaluation's figures after shifts (N, 3) of all points."""
         free = [fit.shift(moves) for fit in self._free]
-        known = [fit.shift(moves)[0] for fit in self._known]
+        moved = [centre + step[:3] for centre, (step, _) in zip(self._centres, free, strict=True)]
+        known = [c + fit.shift(moves)[0] for c, fit in zip(self._known_centres, self._known, strict=True)]
         spheres = [
             replace(
                 sphere,
-                diameter_mm=sphere.diameter_mm + 2 * by_radius,
-                diameter_error_mm=sphere.diameter_error_mm + 2 * by_radius,
+                diameter_mm=sphere.diameter_mm + 2 * step[3],
+                diameter_error_mm=sphere.diameter_error_mm + 2 * step[3],
                 pe_mm=spread_mm(residuals),
                 std_mm=float(np.sqrt(residuals @ residuals / (len(residuals) - 4))),
             )
-            for sphere, (_, by_radius, residuals) in zip(self._evaluation.spheres, free, strict=True)
+            for sphere, (step, residuals) in zip(self._evaluation.spheres, free, strict=True)
         ]
         spacings = []
         for number, spacing in enumerate(self._evaluation.spacings):
             calibrated = spacing.spacing_mm - spacing.sse_mm
-            apart = float(np.linalg.norm(free[number + 1][0] - free[number][0]))
+            apart = float(np.linalg.norm(moved[number + 1] - moved[number]))
             apart_known = float(np.linalg.norm(known[number + 1] - known[number]))
             errors = {"sse_mm": apart - calibrated, "sse_known_radius_mm": apart_known - calibrated}
             spacings.append(replace(spacing, spacing_mm=apart, **errors))
         return replace(self._evaluation, spheres=tuple(spheres), spacings=tuple(spacings)).figures_mm
+
+    def gradients(self) -> dict[str, np.ndarray]:
+        """Return the derivatives (N, 3) of figures that are linear in the points."""
+        found: dict[str, np.ndarray] = {}
+        for key in (figure.key for figure in self._evaluation.figures):
+            match key.quantity:
+                case Quantity.DIAMETER_ERROR:
+                    by_radius = np.array([0.0, 0.0, 0.0, 2.0])
+                    found[key.name] = self._free[key.spheres[0] - 1].gradient(by_radius, self._count)
+                case Quantity.SPACING_ERROR:
+                    found[key.name] = self._spacing_gradient(key.spheres, self._free, self._centres)
+                case Quantity.SPACING_ERROR_KNOWN_RADIUS:
+                    found[key.name] = self._spacing_gradient(key.spheres, self._known, self._known_centres)
+                case _:
+                    pass
+        return found
+
+    def _spacing_gradient(
+        self, spheres: tuple[int, ...], fits: list[_LinearisedFit], centres: list[np.ndarray]
+    ) -> np.ndarray:
+        first = spheres[0] - 1 if spheres else 0
+        between = centres[first + 1] - centres[first]
+        along = np.append(between / np.linalg.norm(between), 0.0)[: fits[first].parameter_count()]
+        return fits[first + 1].gradient(along, self._count) - fits[first].gradient(along, self._count)

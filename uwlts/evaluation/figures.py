@@ -190,7 +190,9 @@ class ArtefactEvaluation(ABC):
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything except the artefact and the deviations of single points as JSON."""
-        own = [field.name for field in dataclasses.fields(self) if field.name not in ("artefact", "deviation_mm")]
+        own = [
+            field.name for field in dataclasses.fields(self) if field.name not in ("artefact", "deviation_mm", "labels")
+        ]
         return {
             "kind": self.kind,
             "figures_mm": self.figures_mm,

@@ -6,7 +6,7 @@ independent inputs). Noise is simulated by random draws (GUM Supplement 1, JCGM 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,17 +61,15 @@ class PointErrors:
         patterns = None if self.patterns_mm is None else self.patterns_mm[:, chosen]
         return PointErrors(self.single_mm[chosen], self.image_mm[:, chosen], self.image[chosen], patterns)
 
-    def draw(self, count: int, rng: np.random.Generator | None = None) -> list[np.ndarray]:
+    def draw(self, count: int, rng: np.random.Generator | None = None) -> Iterator[np.ndarray]:
         """Draw ``count`` random shifts of all points by noise and image errors; by default with a fixed seed."""
         rng, image = rng or np.random.default_rng(_SEED), _group_numbers(self.image)
         one_each = (1,) * (self.single_mm.ndim - 1)
-        moves = []
         for _ in range(count):
             move = np.zeros(self.single_mm.shape)
             for part in self.image_mm:
                 move += rng.standard_normal((image.max() + 1, *one_each))[image] * part
-            moves.append(move + rng.standard_normal((len(image), *one_each)) * self.single_mm)
-        return moves
+            yield move + rng.standard_normal((len(image), *one_each)) * self.single_mm
 
     def by_patterns(self, change: Callable[[np.ndarray], Any]) -> np.ndarray | None:
         """Return the standard deviations (F,) of figures by systematic patterns; None without patterns.
@@ -89,6 +87,13 @@ class PointErrors:
         ``change`` returns the changes (F,) of the figures for given shifts of the points.
         """
         return np.std([change(move) for move in self.draw(draws)], axis=0, ddof=1), self.by_patterns(change)
+
+    def linear_std(self, by_points: np.ndarray) -> float:
+        """Return the standard deviation by noise of a figure with derivatives (N, 3) by the points (GUM, Eq. 13)."""
+        single = np.einsum("ni,ni->n", by_points, self.single_mm)
+        image = _group_numbers(self.image)
+        together = [np.bincount(image, np.einsum("ni,ni->n", by_points, part)) for part in self.image_mm]
+        return float(np.sqrt(single @ single + sum(part @ part for part in together)))
 
     def covariances(
         self, weights: np.ndarray, residuals: np.ndarray, groups: np.ndarray

@@ -92,12 +92,14 @@ class TargetParameter(_SingleParameter):
     """Errors of the target.
 
     ``BOW`` is the deviation of the corners in mm for a bowl shape. ``SADDLE`` is twice the deviation in mm of the
-    midpoints of the sides that the x axis crosses, for a saddle shape. ``STRETCH_X`` and ``STRETCH_Y`` are relative.
+    midpoints of the sides that the x axis crosses, for a saddle shape. ``TWIST`` is the deviation of the corners of a
+    square target in mm for a saddle turned by 45 degrees. ``STRETCH_X`` and ``STRETCH_Y`` are relative.
     ``STRIPE`` is the shift of the stripe in px, caused for example by gloss.
     """
 
     BOW = "target_bow", "bend of the target", "µm", 1e3
     SADDLE = "target_saddle", "saddle of the target", "µm", 1e3
+    TWIST = "target_twist", "twist of the target", "µm", 1e3
     STRETCH_X = "target_stretch_x", "stretch of the target along its rows", "µm/m", 1e6
     STRETCH_Y = "target_stretch_y", "stretch of the target along its columns", "µm/m", 1e6
     STRIPE = "target_stripe", "shift of the stripe on the target", "px"

@@ -141,6 +141,7 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         f"camera: f {camera.fx_px:.2f} x {camera.fy_px:.2f} px, centre {camera.cx_px:.2f}, {camera.cy_px:.2f} px, "
         + ", ".join(f"{name} {value:.5f}" for name, value in camera.distortion.used_coefficients().items()),
         f"sheet: normal {', '.join(f'{x:.6f}' for x in sheet.normal)}, offset {sheet.offset_mm:.4f} mm",
+        *_std_lines(calibration),
     ]
     if window is None:
         kind = _MEDIA[calibration.medium_kind]
@@ -195,6 +196,20 @@ def _image_lines(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]
     by_half = [f"{name} {one[name]:.6g} and {two[name]:.6g}" for name in one if name in two]
     by_half += [f"sheets {apart:.3f} deg apart"] if isinstance(apart, float) else []
     return lines + ([f"by every second image and by the others: {', '.join(by_half)}"] if by_half else [])
+
+
+def _std_lines(calibration: Calibration) -> list[str]:
+    """Describe the standard uncertainties of camera and sheet of a sequential calibration."""
+    if calibration.joint is not None:
+        return []
+    std, found = calibration.std(), []
+    centre = [each for each in (std.cx_px, std.cy_px) if each is not None]
+    found += [f"f {std.fx_px:.2f} px"] if std.fx_px is not None and std.fx_px == std.fy_px else []
+    found += [f"fx {std.fx_px:.2f}, fy {std.fy_px:.2f} px"] if None not in (std.fx_px, std.fy_px) and not found else []
+    found += [f"centre {' and '.join(f'{each:.2f}' for each in centre)} px"] if centre else []
+    found += [f"{name} {value:.2g}" for name, value in std.distortion.items()]
+    found += [] if std.sheet_normal_deg is None else [f"sheet's normal {std.sheet_normal_deg:.3g} deg"]
+    return [f"standard uncertainties: {', '.join(found)}"] if found else []
 
 
 def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tuple[str, str]) -> list[str]:

@@ -23,16 +23,14 @@ from uwlts.model.calibration import CameraModel
 from uwlts.model.sensor import Uncertainty
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 
-BESIDES = (("p1", "p2"), ("k3",), ("p1", "p2", "k3"))
-"""Coefficients that are tried in addition to k1 and k2."""
-RATIONAL_BESIDES = (("k4", "k5"), ("p1", "p2", "k4", "k5"))
-"""Coefficients that are tried if k3 helps."""
 _USUAL = ("k1", "k2")
-_WIDE_USUAL = (*_USUAL, *RATIONAL_BESIDES[0])
+DISTORTIONS = ((), ("k1",), _USUAL, *((*_USUAL, *names) for names in (("p1", "p2"), ("k3",), ("p1", "p2", "k3"))))
+"""Coefficients of the lenses that are compared."""
+RATIONAL = tuple((*_USUAL, *names) for names in (("k4", "k5"), ("p1", "p2", "k4", "k5")))
+"""Coefficients that are tried if k3 helps."""
+_WIDE_USUAL = RATIONAL[0]
 WIDE_DEG = 45.0
 """Angle to the axis beyond which lenses are wide: tan > 1, so that the powers of k1 to k3 grow instead of fading."""
-_DISTORTIONS = ((), ("k1",), _USUAL, *((*_USUAL, *names) for names in BESIDES))
-_RATIONAL = tuple((*_USUAL, *names) for names in RATIONAL_BESIDES)
 _FOLDS = 5
 _WORSE = 1.0  # standard errors of the mean difference of squares within which a model is as good as the best
 _LEAST_GAIN = 0.01  # relative to the mean square; a smaller gain is useless even if significant
@@ -220,7 +218,7 @@ def calibrate_lens(
             circle_diameter_mm=circle_diameter_mm if circles else None,
         )
 
-    tried = _candidates(_DISTORTIONS, choice, poses)
+    tried = _candidates(DISTORTIONS, choice, poses)
     usual = tried[0] if len(tried) == 1 else _candidates((_USUAL,), replace(choice, distortion="auto"), poses)[0]
 
     plain = solve(images, options=usual, circles=True)
@@ -240,12 +238,12 @@ def calibrate_lens(
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
         centred = _correct_circles(good, solve(good, options=usual, circles=True))
         squares: dict[CameraOptions, np.ndarray] = {}
-        for further in (tried, _candidates(_RATIONAL, choice, poses)):
+        for further in (tried, _candidates(RATIONAL, choice, poses)):
             for number, each in enumerate(further):
                 squares[each] = _cross_validate(centred, partial(solve, options=each, circles=False))
                 progress(number + 1, len(further))
-            candidates = _compare_models(squares)
-            options = _select_model(candidates, usual)
+            candidates = compare_models(squares)
+            options = select_model(candidates, usual)
             if choice.distortion != "auto" or ("k3" not in options.distortion and not wide):
                 break
     if options != usual:
@@ -379,7 +377,7 @@ def _cross_validate(images: list[TargetImage], solve: Callable[[Sequence[TargetI
     return squares
 
 
-def _compare_models(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandidate]:
+def compare_models(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandidate]:
     """Compare models by their mean square errors (F,); empty if no model has any."""
     means = {options: float(each.mean()) for options, each in squares.items()}
     least = np.nanmin([*means.values(), np.inf])
@@ -407,7 +405,7 @@ def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
     return float(np.mean(np.sum((image.pixels - seen) ** 2, axis=1)))
 
 
-def _select_model(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOptions:
+def select_model(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOptions:
     """Select the model with the fewest parameters of those as good as the best, else the usual one."""
     good = [each for each in candidates if each.worse <= _WORSE]
     return min(good, key=lambda each: (each.parameters(), each.rms_px)).options if good else usual

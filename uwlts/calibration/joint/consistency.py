@@ -38,6 +38,7 @@ _CHECK: dict[SingleParameter, str] = {
     StageParameter.SLOPE_2: _ALIGNMENT,
     TargetParameter.BOW: "the target's flatness, or uncertainty.target_bow_mm",
     TargetParameter.SADDLE: "the target's flatness, or uncertainty.target_bow_mm",
+    TargetParameter.TWIST: "the target's flatness, or uncertainty.target_bow_mm",
     TargetParameter.STRETCH_X: "the target's spacings, or uncertainty.target_stretch",
     TargetParameter.STRETCH_Y: "the target's spacings, or uncertainty.target_stretch",
     LensParameter.P1: "the lens, or uncertainty.tangential",
@@ -113,7 +114,8 @@ class Findings:
     ``contradictions`` are those of prior knowledge, and make the estimate useless. ``unfit`` maps the sources of images
     that contradict all others to messages. ``misfits`` are kinds of residuals with a systematic misfit. Doubts are
     everything else. ``stretch`` is the target's stretch from the evidence alone if it differs from the prior; pixels of
-    another aspect ratio have the same effect.
+    another aspect ratio have the same effect. ``form`` says whether the target's form or size differs from the prior,
+    as a wrong lens also makes it appear.
     """
 
     contradictions: list[str]
@@ -121,6 +123,7 @@ class Findings:
     misfits: dict[str, str]
     doubts: list[str]
     stretch: dict[ParameterKey, float] = field(default_factory=dict)
+    form: bool = False
 
     def all_against(self) -> list[str]:
         """Return all messages except doubts."""

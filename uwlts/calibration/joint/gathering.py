@@ -309,7 +309,7 @@ def build_priors(
         priors[StageParameter.SCALE] = Prior(0.0, known.stage_scale)
     if gathered.series:
         priors |= dict.fromkeys(BENDS, Prior(0.0, known.target_bow_mm))
-        priors |= dict.fromkeys(STRETCH, Prior(0.0, known.target_stretch))
+        priors |= {key: Prior(0.0, std) for key, std in zip(STRETCH, known.stretch_by_axis(), strict=True)}
         priors[SHIFT] = Prior(0.0, known.target_stripe_px)
         priors |= dict.fromkeys(list_added_tangential(options.camera, known), Prior(0.0, known.tangential))
     return priors | heights

@@ -180,7 +180,8 @@ class Parameters:
     ``sheet`` and ``window`` are as described (None: no view through the window). ``media`` are the names of media other
     than air. ``priors`` contains all parameters in the order of the vector, except lens parameters without prior
     knowledge. Fixed parameters are not part of the vector. ``earlier`` is additional knowledge of the vector's first
-    parameters from an earlier calibration.
+    parameters from an earlier calibration. ``tied`` parameters of the target keep their prior means: the evidence does
+    not change them.
     """
 
     intrinsics: Intrinsics
@@ -189,6 +190,7 @@ class Parameters:
     media: tuple[str, ...]
     priors: dict[ParameterKey, Prior]
     earlier: EarlierEstimate | None = None
+    tied: frozenset[ParameterKey] = frozenset()
     keys: tuple[ParameterKey, ...] = field(init=False)
     places: dict[ParameterKey, int] = field(init=False)
 
@@ -287,7 +289,7 @@ class Parameters:
 
     def add(self, by_global: np.ndarray, key: ParameterKey, column: np.ndarray) -> None:
         """Add derivatives (N,) by a parameter to those by all parameters (N, P), if it is estimated."""
-        if (place := self.places.get(key)) is not None:
+        if (place := self.places.get(key)) is not None and key not in self.tied:
             by_global[:, place] += column
 
     def index_key(self, medium: int) -> MediumIndex:

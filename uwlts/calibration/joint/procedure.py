@@ -1,6 +1,7 @@
 """Joint calibration from any mix of captures: target images in air and in water, stripes on targets, steps, scans."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -8,7 +9,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
-from uwlts.calibration.camera.lens import BESIDES, RATIONAL_BESIDES
+from uwlts.calibration.camera.lens import DISTORTIONS, HALVES_APART, RATIONAL, compare_models, select_model
 from uwlts.calibration.joint.consistency import (
     Findings,
     check_consistency,
@@ -25,10 +26,17 @@ from uwlts.calibration.joint.initial import (
     estimate_line_start,
     estimate_series_start,
 )
-from uwlts.calibration.joint.parameters import Parameters
-from uwlts.calibration.joint.residuals import BENDS, STRETCH
+from uwlts.calibration.joint.parameters import Parameters, Prior
+from uwlts.calibration.joint.residuals import BENDS, STRETCH, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import build_calibration
+from uwlts.calibration.joint.subsets import (
+    HalfDifference,
+    LinearisedEstimate,
+    compare_estimates,
+    keep_images,
+    split_in_halves,
+)
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
@@ -39,6 +47,12 @@ from uwlts.storage.capture import Capture
 
 _ROUNDS_LEFT_OUT = 3
 _CLEARLY_LESS = 0.9  # scatter with free pixel shape, relative to that without
+_MOST_WIDENED = 10.0
+"""Largest factor of a target's stated uncertainty for its observed form or size; more is another target."""
+_NOT_BELIEVED = "it is not believed"
+_UNDETERMINED = 1e-3  # relative shift of the outermost point by a coefficient's uncertainty: a pixel in a thousand
+_TRIAL_LINES = slice(None, None, 4)  # stripe pixels for the comparison of lenses: neighbours are correlated
+_MOST_HALVES = 3  # parameters whose halves disagree that a message names
 _NOTICED = 3.0  # standard uncertainties: a parameter wrongly considered less certain loses little
 
 
@@ -61,8 +75,11 @@ class JointProblem:
     misfits: frozenset[str] = frozenset()
 
     def solve(self) -> Estimate:
-        """Return the estimate without consistency checks; errors as `estimate`."""
-        return estimate(
+        """Return the estimate without consistency checks; errors as `estimate`.
+
+        Parameters that are tied to their prior contribute its uncertainty to all others.
+        """
+        result = estimate(
             self.parameters,
             self.evidence,
             self.global_values,
@@ -70,6 +87,62 @@ class JointProblem:
             uncertainty=self.sensor.uncertainty,
             diameter_mm=self.diameter_mm,
             misfits=self.misfits,
+        )
+        if not self.parameters.tied:
+            return result
+        free = replace(self.parameters, tied=frozenset())
+        parts = [e.residuals(free, result.values, own) for e, own in zip(self.evidence, result.local, strict=True)]
+        full = replace(result, residuals=[each or [] for each in parts])
+        covariance = self.linearise(full).covariance_with(self.parameters.tied)
+        return replace(result, covariance=covariance)
+
+    def linearise(self, result: Estimate) -> LinearisedEstimate:
+        """Return the normal equations of an estimate of this problem."""
+        return LinearisedEstimate(result, self.evidence, self.sensor.uncertainty)
+
+    def _compare_halves_of_form(self, near: Estimate) -> list[HalfDifference] | None:
+        """Estimate from both halves of the images; return parameters of the target that they disagree on.
+
+        None if a half determines no estimate.
+
+        Each half has its own noise: that of all images contains the disagreement.
+        """
+        found = []
+        for half in split_in_halves(self.evidence):
+            evidence, local, _ = keep_images(self.evidence, near.local, half.__contains__)
+            with suppress(CalibrationError):
+                found.append(replace(self, evidence=evidence, local=local, global_values=near.values).solve())
+        if len(found) < 2:
+            return None
+        std = self.parameters.prior_std()
+        shared = np.diag(np.where(np.isfinite(std), std, np.inf) ** -2.0)
+        values, covariances = [each.values for each in found], [each.covariance for each in found]
+        halves = compare_estimates(self.parameters.keys, values, covariances, shared)
+        return [h for h in halves if isinstance(h.key, TargetParameter) and h.sigmas() > HALVES_APART]
+
+    def with_lens(self, camera: CameraOptions, near: Estimate) -> Self:
+        """Return the problem with another lens and fewer stripe pixels, near an estimate: for its prediction only.
+
+        The target is as described, and all other distortion is zero: else both would replace the lens.
+        """
+        known, fixed = self.parameters, Prior(0.0, 0.0)
+        intrinsics = replace(known.intrinsics, options=camera)
+        priors = {
+            key: fixed if isinstance(key, TargetParameter) else prior
+            for key, prior in known.priors.items()
+            if not isinstance(key, LensParameter)
+        }
+        parameters = replace(known, intrinsics=intrinsics, priors=priors)
+        start = dict(zip(known.keys, near.values, strict=True))
+        start |= {LensParameter.FX: start.get(LensParameter.F, start.get(LensParameter.FX))}
+        start |= {LensParameter.F: start[LensParameter.FX]}
+        start |= {LensParameter.FY: start.get(LensParameter.FY, start[LensParameter.F])}
+        return replace(
+            self,
+            parameters=parameters,
+            evidence=[e.with_stripes(_TRIAL_LINES) if isinstance(e, TargetEvidence) else e for e in self.evidence],
+            global_values=np.array([start.get(key, 0.0) for key in parameters.keys]),
+            local=near.local,
         )
 
     def solve_and_check(self) -> tuple[Estimate, Findings]:
@@ -101,7 +174,8 @@ class JointProblem:
 
         If all prior knowledge deviates more than stated, or the target is bent or stretched more than stated, the prior
         uncertainties are enlarged to the observed deviations: parameters without evidence may be as wrong. This is not
-        done if a single parameter contradicts prior knowledge.
+        done if a single parameter contradicts prior knowledge. Form and size of the target are only believed if both
+        halves of the images agree on them, and never for many times what is stated.
         """
         result = self.solve()
         compared, factor = deviations(result, least=0.0), estimate_birge_ratio(result)
@@ -111,25 +185,43 @@ class JointProblem:
         stretched = compared[0] in form and compared[0].key in STRETCH
         stretch = {each.key: each.alone for each in of_target if stretched and each.key in STRETCH}
         if not (form or factor > 1.0) or any(each.wrong() for each in compared if each not in of_target):
-            return result, replace(check_consistency(result, self.evidence, sensor=self.sensor), stretch=stretch)
+            against = check_consistency(result, self.evidence, sensor=self.sensor)
+            return result, replace(against, stretch=stretch, form=bool(form))
         off = {each.key: abs(each.alone - each.known) for each in of_target}
-        priors = {key: replace(prior, std=factor * prior.std) for key, prior in self.parameters.priors.items()}
+        scaled = {key: replace(prior, std=factor * prior.std) for key, prior in self.parameters.priors.items()}
+        priors = dict(scaled)
         for alike in (BENDS, STRETCH):
             if any(each.key in alike for each in form):
                 together = sum(off.get(key, 0.0) for key in alike)
                 priors |= {key: replace(priors[key], std=max(priors[key].std, together)) for key in alike}
-        stated = self.sensor.uncertainty
-        scaled = stated.model_copy(update={name: factor * value for name, value in stated})
-        sensor = self.sensor.model_copy(update={"uncertainty": scaled})
-        result = replace(self, parameters=replace(self.parameters, priors=priors), sensor=sensor).solve()
+        sensor = self.sensor.model_copy(update={"uncertainty": self.sensor.uncertainty.scaled(factor)})
+        parameters = replace(self.parameters, priors=priors)
+        apart = replace(self, parameters=parameters)._compare_halves_of_form(result) if form else []
+        many = {each.key: priors[each.key].std / scaled[each.key].std for each in form}
+        refused = [each for each in form if many[each.key] > _MOST_WIDENED or apart is None]
+        apart = apart or []
+        tied = {key for alike in (BENDS, STRETCH) for each in (*apart, *refused) if each.key in alike for key in alike}
+        doubts = [f"{each.words()}; its uncertainty was enlarged accordingly" for each in form if each.key not in tied]
+        doubts += [f"{each.words()}: {_NOT_BELIEVED}, the target is taken as described" for each in apart]
+        said = {each: f"{each.words()}; {many[each.key]:.0f} times what is stated" for each in refused if not apart}
+        if tied := tied & set(self.parameters.keys):
+            known = priors | {key: scaled[key] for key in tied}
+            parameters = replace(parameters, priors=known, tied=frozenset(tied))
+        result = replace(self, parameters=parameters, sensor=sensor).solve()
         against = check_consistency(result, self.evidence, sensor=sensor)
-        doubts = [f"{each.words()}; its uncertainty was enlarged accordingly" for each in form]
+        # Systematic deviations enlarge all uncertainties; without them, nothing would.
+        covered = self.misfits or (not against.contradictions and against.all_against())
+        contradictions = [f"{words}: state it if this is so" for e, words in said.items() if e.wrong() and not covered]
+        doubts += [f"{words}: {_NOT_BELIEVED}; state it if so" for e, words in said.items() if covered or not e.wrong()]
         if factor > 1.0:
             doubts.append(
                 f"the description's values of window, media, laser, stage and target deviate by {factor:.1f} times the "
                 "stated uncertainties: all uncertainties were enlarged by this factor; check [uncertainty]"
             )
-        return result, replace(against, doubts=doubts + against.doubts, stretch=stretch)
+        against = replace(
+            against, contradictions=[*contradictions, *against.contradictions], doubts=[*doubts, *against.doubts]
+        )
+        return result, replace(against, stretch=stretch, form=bool(form))
 
 
 def _free_sizes(piece: Evidence) -> Evidence:
@@ -239,18 +331,21 @@ class _Attempt:
         return cls(gathered, options, problem, *problem.solve_and_check(), said)
 
     def improve(self) -> "_Attempt":
-        """Try a richer lens, then remove images that do not fit; contradictions of the description remain.
+        """Try other lenses, then remove images that do not fit; contradictions of the description remain.
 
-        If images still show systematic deviations, all residuals of an image count as one.
+        If images still show systematic deviations, or their halves disagree, all residuals of an image count as one.
         """
-        attempt = self._with_richer_lens()
+        attempt = self._with_better_lens()
         if attempt.against.contradictions:
             return attempt
         for _ in range(_ROUNDS_LEFT_OUT):
             if not attempt.against.unfit or (fewer := attempt._without_unfit()) is None:
                 break
             attempt = fewer
-        return attempt._with_error_of_model() if attempt.against.all_against() else attempt
+        halves = attempt.problem.linearise(attempt.result).disagreements()
+        words = [each.words() for each in halves[:_MOST_HALVES]]
+        attempt = attempt if not words else replace(attempt, said=(*attempt.said, *words))
+        return attempt._with_error_of_model() if words or attempt.against.all_against() else attempt
 
     def _without_unfit(self) -> "_Attempt | None":
         """Remove the images that contradict all others; None if too few remain, or more contradictions appear."""
@@ -261,8 +356,8 @@ class _Attempt:
         fewer = _Attempt.solve(kept, self.options, (*self.said, *said))
         return None if fewer.against.contradictions else fewer
 
-    def _with_richer_lens(self) -> "_Attempt":
-        """Try more distortion coefficients, free pixel shape, or both; return the attempt that fits the evidence best.
+    def _with_better_lens(self) -> "_Attempt":
+        """Try fewer and more distortion coefficients, free pixel shape, or both, if something is odd.
 
         Only parameters that the options leave open are changed. The pixel shape of a sensor on a stage is not freed for
         contradictions only: a wrong spacing along one side has the same effect.
@@ -271,24 +366,64 @@ class _Attempt:
         if choice is None or choice.distortion != "auto":
             return best
         odd = any(isinstance(each.key, LensParameter) for each in deviations(self.result, least=_NOTICED))
-        for further in (BESIDES, RATIONAL_BESIDES) if odd or self.against.all_against() else ():
-            tried = [best._with_lens(replace(camera, distortion=(*camera.distortion, *names))) for names in further]
-            best = _select_best([best, *filter(None, tried)])
-            if "k3" not in best.options.camera.distortion:
-                break
-        free_poses = self.options.poses == "free"
-        if choice.pixels == "auto" and (free_poses or best.against.misfits):
-            free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
-            if free is not None and (free_poses or free._scatter() < _CLEARLY_LESS * best._scatter()):
-                best = _select_best([best, free])
-        if best is not self:
-            given = [name for name in best.options.camera.distortion if name not in camera.distortion]
-            given += ["free pixels"] if best.options.camera.pixel_aspect != camera.pixel_aspect else []
-            said = f"{', '.join(given)} were added to the lens: without them, images and description disagree"
-            best = replace(best, said=(*best.said, said))
-        if choice.pixels == "auto" and not free_poses:
-            best = best._with_spacings_and_pixels_free() or best
-        return best
+        odd |= bool(self.against.all_against() or self.against.form or self._undetermined())
+        free_pixels = choice.pixels == "auto" and self.options.poses == "free"
+        if odd:
+            chosen = self._select_lens([replace(camera, distortion=names) for names in DISTORTIONS])
+            if "k3" in chosen.distortion:
+                chosen = self._select_lens([chosen, *(replace(camera, distortion=names) for names in RATIONAL)])
+            best = self._with_lens(chosen) or self if chosen != camera else self
+        if free_pixels and camera.pixel_aspect is not None:
+            square = best.options.camera
+            free = best._select_lens([square, replace(square, pixel_aspect=None)])
+            best = best._with_lens(free) or best if free != square else best
+        if choice.pixels == "auto" and not free_pixels:
+            if best.against.misfits:
+                free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
+                best = free if free is not None and free._scatter() < _CLEARLY_LESS * best._scatter() else best
+            best = best._describe_lens(camera)
+            return best._with_spacings_and_pixels_free() or best
+        return best._describe_lens(camera)
+
+    def _undetermined(self) -> list[str]:
+        """Describe distortion coefficients that the images do not determine.
+
+        Their uncertainty alone shifts the outermost point of the target noticeably, and zero is as likely.
+        """
+        camera, std, found = self.result.parameters.camera(self.result.values), self.result.std(), []
+        points = [e.placement.pixels for e in self.problem.evidence if isinstance(e, TargetEvidence)]
+        off = (np.vstack(points) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+        reach = float(np.linalg.norm(off, axis=1).max())
+        for key, power in ((LensParameter.K1, 2), (LensParameter.K2, 4), (LensParameter.K3, 6)):
+            value = getattr(camera.distortion, key.text)
+            if key in std and std[key] * reach**power > _UNDETERMINED and abs(value) < 2 * std[key]:
+                found.append(f"{key.quantity.words} is not determined: {key.quantity.format_with_std(value, std[key])}")
+        return found
+
+    def _select_lens(self, lenses: Sequence[CameraOptions]) -> CameraOptions:
+        """Select the lens with the fewest parameters of those that predict held-out images as well as the best."""
+        stated, tried = joint_problem(self.gathered, options=self.options), {}
+        for options in lenses:
+            with suppress(CalibrationError):
+                trial = stated.with_lens(options, self.result)
+                result = trial.solve()
+                tried[options] = trial.linearise(result).predict(), result
+        if not tried:
+            return self.options.camera
+        noise = min((result for _, result in tried.values()), key=_scatter).noise
+        squares = {options: held.squares(noise) for options, (held, _) in tried.items()}
+        return select_model(compare_models(squares), self.options.camera)
+
+    def _describe_lens(self, before: CameraOptions) -> "_Attempt":
+        """Add warnings on changes of the lens, and on coefficients that remain undetermined."""
+        camera, said = self.options.camera, []
+        given = [name for name in camera.distortion if name not in before.distortion]
+        given += ["free pixels"] if camera.pixel_aspect != before.pixel_aspect else []
+        if given:
+            said.append(f"{', '.join(given)} were added to the lens: held-out images are predicted better with them")
+        if fewer := [name for name in before.distortion if name not in camera.distortion]:
+            said.append(f"{', '.join(fewer)} were left out of the lens: images are predicted as well without them")
+        return replace(self, said=(*self.said, *said, *self._undetermined()))
 
     def _with_spacings_and_pixels_free(self) -> "_Attempt | None":
         """Estimate the target's spacings and the pixel shape; None if the spacings are as described.
@@ -299,8 +434,8 @@ class _Attempt:
         found = list(self.against.stretch.values())
         if not found or self.options.camera.pixel_aspect is None:
             return None
-        stated = self.gathered.sensor.uncertainty.target_stretch
-        known = {"target_stretch": max(stated, sum(map(abs, found)))}
+        stated = self.gathered.sensor.uncertainty.stretch_by_axis()
+        known = {"target_stretch": tuple(max(each, sum(map(abs, found))) for each in stated)}
         uncertainty = self.gathered.sensor.uncertainty.model_copy(update=known)
         sensor = self.gathered.sensor.model_copy(update={"uncertainty": uncertainty})
         camera = replace(self.options.camera, pixel_aspect=None)
@@ -320,27 +455,9 @@ class _Attempt:
             return None
         return None if richer.against.contradictions else richer
 
-    def _criterion(self, like: Estimate) -> float:
-        """Return -2 ln of the likelihood, plus the cost of parameters without prior knowledge.
-
-        The number of independent residuals is that of ``like``.
-        """
-        number = {
-            kind: sum(len(part.values) for parts in like.residuals for part in parts if part.kind == kind)
-            / (noise.together + noise.besides)
-            for kind, noise in like.noise.items()
-        }
-        result, parameters = self.result, self.result.parameters
-        scatter = sum(2 * n * np.log(result.noise[kind].sigma_px) for kind, n in number.items())
-        off = [(result.values - parameters.prior_mean()) / parameters.prior_std()]
-        for piece, local in zip(self.problem.evidence, result.local, strict=True):
-            off.append(piece.known_before(local, self.problem.sensor.uncertainty)[0])
-        known = np.sum(np.concatenate(off) ** 2)
-        return float(scatter + known + np.isinf(parameters.prior_std()).sum() * np.log(sum(number.values())))
-
     def _scatter(self) -> float:
         """Return the geometric mean of the scatter of target points and stripes, px."""
-        return float(np.exp(np.mean(np.log([noise.sigma_px for noise in self.result.noise.values()]))))
+        return _scatter(self.result)
 
     def _with_error_of_model(self) -> "_Attempt":
         """Treat misfits as an error that all residuals of an image share, for every kind of residual.
@@ -353,6 +470,8 @@ class _Attempt:
         factor = float(np.median([after[key] / before[key] for key in before if key in after]))
         said = [f"{words}; kept, as too many images are like this" for words in self.against.unfit.values()]
         said += self.against.misfits.values()
+        # Larger uncertainties hide what the halves disagree on.
+        said += [words for words in self.against.doubts if _NOT_BELIEVED in words and words not in against.doubts]
         said.append(
             "images show systematic deviations from the model: all points of an image count as one, which makes "
             f"uncertainties {factor:.1f} times larger (median)"
@@ -361,20 +480,28 @@ class _Attempt:
         return replace(self, problem=problem, result=result, against=against, said=(*self.said, *said))
 
 
-def _select_best(tried: Sequence[_Attempt]) -> _Attempt:
-    """Select the attempt that fits the evidence best, by the Bayesian information criterion.
+def _scatter(result: Estimate) -> float:
+    return float(np.exp(np.mean(np.log([noise.sigma_px for noise in result.noise.values()]))))
 
-    The number of independent residuals is that of the attempt with the least scatter. Attempts that contradict the
-    description are excluded.
-    """
-    tried = [each for each in tried if not each.against.contradictions] or tried
-    like = min(tried, key=_Attempt._scatter).result
-    return min(tried, key=lambda each: each._criterion(like))
+
+def _first_attempt(gathered: Gathered, options: CalibrationOptions) -> _Attempt:
+    """Solve with the usual lens, or with fewer coefficients if the images do not determine them."""
+    try:
+        return _Attempt.solve(gathered, options)
+    except CalibrationError as refusal:
+        if options.lens is None or options.lens.distortion != "auto":
+            raise
+        for fewer in (("k1",), ()):
+            said = f"the lens has {' '.join(fewer) or 'no distortion'}: with {' '.join(options.camera.distortion)}, "
+            with suppress(CalibrationError):
+                camera = replace(options.camera, distortion=fewer)
+                return _Attempt.solve(gathered, replace(options, camera=camera), (said + str(refusal),))
+        raise
 
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
     """Calibrate from gathered evidence; errors as `calibrate_jointly`."""
-    attempt = _Attempt.solve(gathered, options)
+    attempt = _first_attempt(gathered, options)
     if not options.strict:
         attempt = attempt.improve()
     sensor, problem, result, against = gathered.sensor, attempt.problem, attempt.result, attempt.against

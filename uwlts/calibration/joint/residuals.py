@@ -19,7 +19,7 @@ from uwlts.optics.line_table import LineTable, sum_series
 from uwlts.optics.window import tilt_direction
 
 TARGET, STRIPE, STEP = "target", "stripe on the target", "stripe on the step"
-BENDS = (TargetParameter.BOW, TargetParameter.SADDLE)
+BENDS = (TargetParameter.BOW, TargetParameter.SADDLE, TargetParameter.TWIST)
 STRETCH = (TargetParameter.STRETCH_X, TargetParameter.STRETCH_Y)
 SHIFT = TargetParameter.STRIPE
 _TABLE_MM, _TABLE_SHARE = 1e-7, 1e-7
@@ -325,15 +325,16 @@ class TargetEvidence(StripeEvidence):
         if points is None:
             return None
         at = pose.to_target_frame(points.points)
-        bends, (bow, saddle) = self._bends(at.T), _values(parameters, global_values, BENDS)
+        bends, sizes = self._bends(at.T), _values(parameters, global_values, BENDS)
+        bow, saddle, twist = sizes
         # Gradient of the height above the bent target, in the target's frame.
-        steep = -2.0 / self.radius_mm**2 * np.array([[bow + saddle], [bow - saddle]])
-        gradient = np.stack([*(steep * (at[:2] - self.middle_mm[:, None])), np.ones(at.shape[1])])
+        steep = -2.0 / self.radius_mm**2 * np.array([[bow + saddle, twist], [twist, bow - saddle]])
+        gradient = np.stack([*(steep @ (at[:2] - self.middle_mm[:, None])), np.ones(at.shape[1])])
         outward = pose.rotation @ gradient
         by_stripe = -np.einsum("in,ni->n", outward, points.by[:, :, 0])
         by_global = {SHIFT: by_stripe, StageParameter.SCALE: np.sum(pose.by_scale() * gradient, axis=0)}
         off = Distances(
-            at[2] - bow * bends[0] - saddle * bends[1],
+            at[2] - sizes @ bends,
             outward,
             np.einsum("in,cin->nc", gradient, pose.by_local(points.points)),
             dict(zip(BENDS, -bends, strict=True)) | by_global,
@@ -345,9 +346,9 @@ class TargetEvidence(StripeEvidence):
         return pose.split_by_image(STRIPE, every.values, every.by_global, every.by_local)
 
     def _bends(self, points: np.ndarray) -> np.ndarray:
-        """Return heights (2, N) of target points (N, 2 or 3) for a unit bow, and for a unit saddle."""
-        x2, y2 = ((points[:, :2] - self.middle_mm) / self.radius_mm).T ** 2
-        return np.stack([x2 + y2, x2 - y2])
+        """Return heights (3, N) of target points (N, 2 or 3) for a unit bow, a unit saddle, and a unit twist."""
+        x, y = ((points[:, :2] - self.middle_mm) / self.radius_mm).T
+        return np.stack([x**2 + y**2, x**2 - y**2, 2 * x * y])
 
 
 def _values(parameters: Parameters, global_values: np.ndarray, keys: tuple[ParameterKey, ...]) -> np.ndarray:

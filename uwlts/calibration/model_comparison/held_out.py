@@ -1,6 +1,5 @@
 """Sensor models to choose from, and their predictions of images held out from the calibration."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal, assert_never
 
@@ -16,6 +15,7 @@ from uwlts.calibration.joint.parameters import Parameters, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.residuals import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
+from uwlts.calibration.joint.subsets import keep_images, select_images
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import WindowModel
 from uwlts.model.parameter_keys import LensParameter, ParameterKey, SheetParameter, TargetParameter, WindowParameter
@@ -117,8 +117,8 @@ INSIDE, OUTSIDE = "inside", "outside"
 Image = tuple[int, int]
 """Number of the piece of evidence, and of the image in it."""
 
-_EVERY = 4  # one of four inner images is held out, so that enough images remain on both sides
-_OUTER = 1 / 6  # fraction of the depth range, at either end
+_EVERY = (4, 3, 2)  # one of so many inner images is held out: the first that holds out enough
+_OUTER = (1 / 6, 1 / 4, 1 / 3)  # fraction of the depth range, at either end: likewise
 _FEWEST_KEPT = 4  # images for calibration
 FEWEST_HELD = 4  # held-out images: fewer give no standard error
 
@@ -127,29 +127,46 @@ def split_images(problem: JointProblem) -> dict[str, frozenset[Image]]:
     """Select held-out images inside the volume of the others, and outside of it.
 
     The stripe's position in the image stands for the depth. Inside, every fourth image is held out; outside, all images
-    in the outer sixths of the depth range. Images without a stripe are never held out.
+    in the outer sixths of the depth range. Of few images larger shares are held out. Images without a stripe are never
+    held out.
 
     Raises
     ------
     CalibrationError
         There are too few images.
     """
-    inside: set[Image] = set()
-    outside: set[Image] = set()
-    for found in _sort_by_depth(problem).values():
-        images, places = [image for _, image in found], np.array([place for place, _ in found])
-        inside |= set(images[1:-1:_EVERY])
-        reach = _OUTER * (places[-1] - places[0])
-        outer = (places < places[0] + reach) | (places > places[-1] - reach)
-        if np.count_nonzero(~outer) >= _FEWEST_KEPT:
-            outside |= {image for image, out in zip(images, outer, strict=True) if out}
+    views = list(_sort_by_depth(problem).values())
+    inside = _first_large_enough([_hold_out_inside(views, every) for every in _EVERY])
+    outside = _first_large_enough([_hold_out_outside(views, share) for share in _OUTER])
     fewest = min(len(inside), len(outside))
     if fewest < FEWEST_HELD:
         raise CalibrationError(
-            f"too few images with a stripe: {fewest} can be held out, at least {FEWEST_HELD} are needed; take 16 or "
+            f"too few images with a stripe: {fewest} can be held out, at least {FEWEST_HELD} are needed; take 12 or "
             "more images of the target at different depths"
         )
-    return {INSIDE: frozenset(inside), OUTSIDE: frozenset(outside)}
+    return {INSIDE: inside, OUTSIDE: outside}
+
+
+def _first_large_enough(choices: list[frozenset[Image]]) -> frozenset[Image]:
+    """Return the first choice with enough images, else the largest."""
+    return next((each for each in choices if len(each) >= FEWEST_HELD), max(choices, key=len))
+
+
+def _hold_out_inside(views: list[list[tuple[float, Image]]], every: int) -> frozenset[Image]:
+    """Return one of ``every`` images of each view, without the outermost ones."""
+    return frozenset(image for found in views for _, image in found[1:-1:every])
+
+
+def _hold_out_outside(views: list[list[tuple[float, Image]]], share: float) -> frozenset[Image]:
+    """Return the images of each view in the outer ``share`` of its depth range, if enough others remain."""
+    outside: set[Image] = set()
+    for found in views:
+        places = np.array([place for place, _ in found])
+        reach = share * (places[-1] - places[0])
+        outer = (places < places[0] + reach) | (places > places[-1] - reach)
+        if np.count_nonzero(~outer) >= _FEWEST_KEPT:
+            outside |= {image for (_, image), out in zip(found, outer, strict=True) if out}
+    return frozenset(outside)
 
 
 def _sort_by_depth(problem: JointProblem) -> dict[ViewMedium, list[tuple[float, Image]]]:
@@ -168,31 +185,8 @@ def _sort_by_depth(problem: JointProblem) -> dict[ViewMedium, list[tuple[float, 
 
 def remove_images(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem, list[int]]:
     """Remove the held-out images; return the problem and the numbers of its remaining pieces of evidence."""
-    evidence: list[Evidence] = []
-    local, numbers = [], []
-    for number, (piece, start) in enumerate(zip(problem.evidence, problem.local, strict=True)):
-        if isinstance(piece, TargetEvidence):
-            kept = [image for image in np.unique(piece.placement.image).tolist() if (number, image) not in held]
-            if not kept:
-                continue
-            piece = select_images(piece, kept)
-            if piece.staged:
-                start = np.concatenate([start[:8], np.zeros(len(piece.images()))])
-        elif (number, piece.image) in held:
-            continue
-        evidence.append(piece)
-        local.append(start)
-        numbers.append(number)
+    evidence, local, numbers = keep_images(problem.evidence, problem.local, lambda image: image not in held)
     return replace(problem, evidence=evidence, local=local), numbers
-
-
-def select_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
-    """Return the evidence of some images; stage positions still refer to the first image of all."""
-    placement, wanted = evidence.placement, list(images)
-    here = np.isin(placement.image, wanted)
-    kept = {name: getattr(placement, name)[here] for name in ("points_mm", "shifts_mm", "pixels", "image")}
-    some = replace(evidence, placement=replace(placement, **kept))
-    return some.with_stripes(np.isin(evidence.image, wanted))
 
 
 _ROUNDS = 20  # Gauss-Newton steps of a pose; a few suffice

@@ -41,6 +41,9 @@ from uwlts.stripe import StripeSettings
 
 _FEWEST_LEFT_OUT = 4  # images; with fewer, the jackknife is unreliable
 _CLEARLY_LESS = 0.7  # ratio of residuals: a smaller one with a free stage direction is significant
+_LARGEST_SHIFT = 1e-3
+"""Largest standard uncertainty of depth by the sheet, or of lengths by the lens, relative to the volume's depth: a
+tenth of a millimetre in 100 mm."""
 _LARGEST_USUAL_TURN = np.radians(5)  # design values are rough, so only larger deviations are reported
 
 
@@ -221,6 +224,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
             warnings += half_doubt(words, apart=apart, std=sheet.normal_std_rad)
     figures["sheet"] = sheet.figures(stripe_points, apart)
     warnings += _turn_warnings(camera, sheet, evidence)
+    warnings += _uncertainty_warnings(camera, sheet, sensor)
     calibration = Calibration(
         sensor_name=sensor.name,
         stripe_along=sensor.camera.stripe_along,
@@ -467,6 +471,30 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
         turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
         if turn > np.degrees(_LARGEST_USUAL_TURN):
             warnings.append(f"the stage's direction is {turn:.1f} deg away from the capture's stage_direction")
+    return warnings
+
+
+def _uncertainty_warnings(camera: CameraSolution, sheet: SheetSolution, sensor: Sensor) -> list[str]:
+    """Return warnings if sheet or focal length are too uncertain for the described measuring volume.
+
+    If the sheet turns about the middle of the volume, a point at the volume's end moves along the camera's axis by the
+    sheet's shift there, divided by the normal's component along that axis. The focal length scales all lengths.
+    """
+    warnings, depth = [], sensor.volume.far_mm - sensor.volume.near_mm
+    shift = float(np.tan(sheet.normal_std_rad) * depth / 2 / abs(sheet.model.normal[2]))
+    if shift > _LARGEST_SHIFT * depth:
+        warnings.append(
+            f"the sheet's normal has a standard uncertainty of {np.degrees(sheet.normal_std_rad):.2g} deg, which is "
+            f"{shift:.2g} mm of depth at the ends of the measuring volume of {depth:g} mm: take more images of the "
+            "target, near and far, tilted in several directions"
+        )
+    std, values = camera.std(), camera.values()
+    share = max(std[name] / values[name] for name in ("f", "fx", "fy") if name in std)
+    if share > _LARGEST_SHIFT:
+        warnings.append(
+            f"the focal length has a standard uncertainty of {100 * share:.2g} %, and so have all lengths: "
+            f"{share * depth:.2g} mm of {depth:g} mm; take more images of the target, near and far, and tilted"
+        )
     return warnings
 
 

@@ -145,6 +145,17 @@ def test_the_outermost_images_are_held_out_outside_and_never_inside(plain):
     assert len(inside) >= 4
 
 
+@pytest.mark.parametrize("count", [12, 14])
+def test_fourteen_images_at_even_depths_are_enough(thesis, count):
+    series = target_series(built_sensor(), medium=0, positions=np.linspace(-80.0, 40.0, count), columns=5)
+    few = replace(series, found=replace(series.found, stripes=[pixels[::20] for pixels in series.found.stripes]))
+    problem = joint_problem(gathered(thesis, [few]), options=OPTIONS)
+    images = {(0, int(image)) for image in np.unique(problem.evidence[0].image)}
+    assert len(images) == count
+    for held in split_images(problem).values():
+        assert 4 <= len(held) <= len(images) - 4
+
+
 def test_too_few_images_are_refused(thesis):
     series = target_series(built_sensor(), medium=0, positions=IN_WATER[::3], columns=15)
     with pytest.raises(CalibrationError, match="too few images with a stripe"):
@@ -214,7 +225,7 @@ def test_every_candidate_has_the_parameters_its_name_says(plain):
         return {key.text for key in problem.parameters.keys}
 
     usual = names_of(apply_candidate(plain, Candidate()))
-    usually = {"p1", "p2", "target_saddle", "target_stretch_x", "target_stretch_y", "target_stripe"}
+    usually = {"p1", "p2", "target_saddle", "target_twist", "target_stretch_x", "target_stretch_y", "target_stripe"}
     assert usual == names_of(plain) - usually
 
     def lacking(**changes):

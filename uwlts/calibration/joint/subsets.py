@@ -1,0 +1,289 @@
+"""Linearised joint estimates from some of the images: prediction of held-out images, halves, and tied parameters.
+
+An estimate contains the derivatives of all residuals. Near it, the estimate from fewer images follows from the normal
+equations of these images, without another iteration.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwlts.calibration.camera.lens import HALVES_APART
+from uwlts.calibration.joint.estimate import Estimate, Evidence, Noise, outliers
+from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
+from uwlts.errors import CalibrationError
+from uwlts.model.parameter_keys import ParameterKey
+from uwlts.model.sensor import Uncertainty
+
+_FOLDS = 5  # as for the lens alone
+_CLIPPED = 5.0  # standard deviations; a larger error of prediction counts as this
+_SINGULAR = 1e-12  # eigenvalue of scaled normal equations below which the images do not determine a parameter
+_LEAST_SHARE = 1e-6  # of a parameter's variance: the least of a difference, for parameters without evidence
+_FEWEST_IMAGES = 4  # images of a target in two halves: two in each
+
+ImageId = tuple[int, int]
+"""Number of the piece of evidence, and of the image in it."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Residuals (n,) of one image without outliers, in px, their scale (n,) and derivatives (n, P) and (n, b)."""
+
+    values: np.ndarray
+    scale: np.ndarray
+    kind: np.ndarray
+    by_global: np.ndarray
+    by_local: np.ndarray
+
+    def normal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the normal matrix (P + b, P + b) and gradient (P + b,)."""
+        design = np.hstack([self.by_global, self.by_local]) / self.scale[:, None]
+        return design.T @ design, design.T @ (self.values / self.scale)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Predicted residuals of held-out images, in px: values and their kinds for each image, and parameters' number."""
+
+    images: list[tuple[np.ndarray, np.ndarray]]
+    noise: dict[str, Noise]
+    parameters: int
+
+    def squares(self, noise: dict[str, Noise]) -> np.ndarray:
+        """Return the mean square (F,) of each image's errors relative to a noise, with clipped outliers."""
+        found = []
+        for values, kinds in self.images:
+            sigma = np.array([noise[kind].sigma_px for kind in kinds])
+            weight = np.array([noise[kind].sigma_px / noise[kind].effective_px() for kind in kinds]) ** 2
+            squares = np.minimum(np.square(values / sigma), _CLIPPED**2)
+            found.append(float(np.sum(weight * squares) / np.sum(weight)))
+        return np.array(found)
+
+
+@dataclass(frozen=True)
+class HalfDifference:
+    """Estimates of a parameter from two halves of the images, and the standard uncertainty of their difference."""
+
+    key: ParameterKey
+    one: float
+    other: float
+    std: float
+
+    def sigmas(self) -> float:
+        """Return the difference in its standard uncertainties."""
+        return abs(self.one - self.other) / self.std
+
+    def words(self) -> str:
+        """Describe the disagreement."""
+        quantity = self.key.quantity
+        one, other = (quantity.format_with_std(value, self.std / np.sqrt(2.0)) for value in (self.one, self.other))
+        return f"two halves of the images disagree: {quantity.words} is {one} and {other}"
+
+
+class LinearisedEstimate:
+    """Normal equations of an estimate, for each image of targets and steps; scans belong to all subsets."""
+
+    def __init__(self, result: Estimate, evidence: Sequence[Evidence], uncertainty: Uncertainty):
+        self._result, self._count = result, len(result.values)
+        self._rows: dict[ImageId, _Rows] = {}
+        self._local_prior: list[tuple[np.ndarray, np.ndarray]] = []
+        self._shared: set[int] = set()
+        for number, (piece, local, parts) in enumerate(zip(evidence, result.local, result.residuals, strict=True)):
+            off, by_local = piece.known_before(local, uncertainty)
+            self._local_prior.append((by_local.T @ by_local, by_local.T @ off))
+            if isinstance(piece, SurfaceScanEvidence):
+                self._shared.add(number)
+            for image in dict.fromkeys(part.image for part in parts):
+                self._rows[number, image] = self._gather_rows([p for p in parts if p.image == image], len(local))
+        self._normal = {image: rows.normal() for image, rows in self._rows.items()}
+        self._targets = [image for image in self._rows if isinstance(evidence[image[0]], TargetEvidence)]
+        self._halves = split_in_halves(evidence)
+        std = result.parameters.prior_std()
+        self._prior = np.diag(np.where(np.isfinite(std), 1.0 / np.square(np.where(std > 0, std, 1.0)), 0.0))
+        self._prior_gradient = self._prior @ (result.values - result.parameters.prior_mean())
+        if (earlier := result.parameters.earlier) is not None:
+            off, by_global = earlier.residuals(result.values)
+            self._prior = self._prior + by_global.T @ by_global
+            self._prior_gradient = self._prior_gradient + by_global.T @ off
+
+    def _gather_rows(self, parts: Sequence, local: int) -> _Rows:
+        columns: list[tuple[np.ndarray, ...]] = []
+        for part in parts:
+            noise = self._result.noise[part.kind]
+            used = ~outliers(part, noise)
+            by_local = np.zeros((len(part.values), local))
+            by_local[:, part.local_columns] = part.by_local
+            scale, kind = np.full(used.sum(), noise.effective_px()), np.full(used.sum(), part.kind)
+            columns.append((part.values[used], scale, kind, part.by_global[used], by_local[used]))
+        return _Rows(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+
+    def _reduce(self, chosen: Collection[ImageId]) -> tuple[np.ndarray, np.ndarray, dict[int, tuple[np.ndarray, ...]]]:
+        """Return the normal equations (P, P) and (P,) of chosen images without prior knowledge of global parameters.
+
+        Local parameters are eliminated. The third result gives them for a change (P,) of the global parameters.
+        """
+        p = self._count
+        total, gradient, backwards = np.zeros((p, p)), np.zeros(p), {}
+        for number, (prior, prior_gradient) in enumerate(self._local_prior):
+            own = [image for image in self._rows if image[0] == number and image in chosen]
+            if not own:
+                continue
+            matrix = np.sum([self._normal[image][0] for image in own], axis=0)
+            vector = np.sum([self._normal[image][1] for image in own], axis=0)
+            block, border = matrix[p:, p:] + prior, matrix[:p, p:]
+            inverse = _invert(block)
+            if inverse is None:
+                continue  # too few points of an image for its pose: it says nothing
+            own_gradient = vector[p:] + prior_gradient
+            total += matrix[:p, :p] - border @ inverse @ border.T
+            gradient += vector[:p] - border @ inverse @ own_gradient
+            backwards[number] = (inverse, border, own_gradient)
+        return total, gradient, backwards
+
+    def predict(self) -> HeldOut:
+        """Predict each fifth of the target images, with the stripes on them, from all other images.
+
+        The pose of a held-out image is that of its placement, or fitted to its target points if it was held by hand.
+
+        Raises
+        ------
+        CalibrationError
+            The other images do not determine the parameters, or too few images show a target.
+        """
+        folds, found = min(_FOLDS, len(self._targets)), []
+        if folds < 2:
+            raise CalibrationError("too few images of a target to predict one from the others")
+        for fold in range(folds):
+            held = self._targets[fold::folds]
+            total, gradient, backwards = self._reduce(set(self._rows) - set(held))
+            inverse = _invert(total + self._prior)
+            if inverse is None:
+                raise CalibrationError("without some of the images, the others do not determine the calibration")
+            step = -inverse @ (gradient + self._prior_gradient)
+            for image in held:
+                rows = self._rows[image]
+                moved = rows.values + rows.by_global @ step
+                if image[0] in backwards:
+                    local_inverse, border, own_gradient = backwards[image[0]]
+                    local = -local_inverse @ (own_gradient + border.T @ step)
+                else:
+                    points = rows.kind == TARGET
+                    local = -np.linalg.lstsq(rows.by_local[points], moved[points], rcond=None)[0]
+                found.append((moved + rows.by_local @ local, rows.kind))
+        return HeldOut(found, self._result.noise, self._count)
+
+    def compare_halves(self) -> list[HalfDifference]:
+        """Compare the parameters estimated from every second image and from the others; empty if not determined.
+
+        Prior knowledge and scans belong to both halves.
+        """
+        if len(self._targets) < _FEWEST_IMAGES:
+            return []
+        rest, rest_gradient, _ = self._reduce([image for image in self._rows if image[0] in self._shared])
+        rest, rest_gradient = rest + self._prior, rest_gradient + self._prior_gradient
+        values, covariances = [], []
+        for half in self._halves:
+            total, gradient, _ = self._reduce(half)
+            if (inverse := _invert(total + rest)) is None:
+                return []
+            values.append(self._result.values - inverse @ (gradient + rest_gradient))
+            covariances.append(inverse)
+        return compare_estimates(self._result.parameters.keys, values, covariances, rest)
+
+    def disagreements(self) -> list[HalfDifference]:
+        """Return the parameters whose halves differ by more than their uncertainties allow, the largest first."""
+        far = [each for each in self.compare_halves() if each.sigmas() > HALVES_APART]
+        return sorted(far, key=HalfDifference.sigmas, reverse=True)
+
+    def covariance_with(self, tied: Collection[ParameterKey]) -> np.ndarray:
+        """Return the covariance (P, P) if ``tied`` parameters keep their prior value and uncertainty.
+
+        Their uncertainty is propagated to all others ("consider parameters": Schmidt, NASA TN D-1234, 1962).
+        """
+        keys = self._result.parameters.keys
+        held = np.array([key in tied for key in keys])
+        total = self._reduce(list(self._rows))[0] + self._prior
+        inverse = _invert(total[np.ix_(~held, ~held)])
+        if inverse is None:
+            raise CalibrationError("the evidence does not determine the calibration")
+        variance = np.diag(np.square(self._result.parameters.prior_std()[held]))
+        by_held = -inverse @ total[np.ix_(~held, held)]
+        covariance = np.zeros_like(total)
+        covariance[np.ix_(~held, ~held)] = inverse + by_held @ variance @ by_held.T
+        covariance[np.ix_(~held, held)] = by_held @ variance
+        covariance[np.ix_(held, ~held)] = variance @ by_held.T
+        covariance[np.ix_(held, held)] = variance
+        return covariance
+
+
+def compare_estimates(
+    keys: Sequence[ParameterKey], values: Sequence[np.ndarray], covariances: Sequence[np.ndarray], shared: np.ndarray
+) -> list[HalfDifference]:
+    """Compare two estimates (P,) with covariances (P, P), both with the same prior knowledge ``shared`` (P, P).
+
+    With the normal matrices N of a half and S of the shared knowledge, an estimate is C (N a + S b), C = (N + S)^-1.
+    Two differ with the covariance C1 N1 C1 + C2 N2 C2 + D S D, where D is C1 - C2 and C N C is C - C S C.
+    """
+    one, other = values
+    first, second = covariances
+    apart = first - second
+    covariance = first - first @ shared @ first + second - second @ shared @ second + apart @ shared @ apart
+    variance = np.maximum(np.diag(covariance), (_LEAST_SHARE * np.minimum(np.diag(first), np.diag(second))))
+    columns = zip(keys, one.tolist(), other.tolist(), np.sqrt(variance).tolist(), strict=True)
+    return [HalfDifference(*each) for each in columns]
+
+
+def _invert(matrix: np.ndarray) -> np.ndarray | None:
+    """Return the inverse of normal equations; None if they are singular."""
+    scale = np.sqrt(np.diag(matrix))
+    if not (scale > 0).all():
+        return None
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    if values[0] < _SINGULAR:
+        return None
+    return (vectors / values) @ vectors.T / np.outer(scale, scale)
+
+
+def keep_images(
+    evidence: Sequence[Evidence], local: Sequence[np.ndarray], wanted: Callable[[ImageId], bool]
+) -> tuple[list[Evidence], list[np.ndarray], list[int]]:
+    """Keep the wanted images of targets and steps, and all scans.
+
+    Returns the remaining pieces of evidence, their local parameters, and their numbers before.
+    """
+    kept: list[tuple[Evidence, np.ndarray, int]] = []
+    for number, (piece, start) in enumerate(zip(evidence, local, strict=True)):
+        if isinstance(piece, TargetEvidence):
+            images = [image for image in np.unique(piece.placement.image).tolist() if wanted((number, image))]
+            if not images:
+                continue
+            piece = select_images(piece, images)
+            if piece.staged:
+                start = np.concatenate([start[:8], np.zeros(len(piece.images()))])
+        elif isinstance(piece, StepProfileEvidence) and not wanted((number, piece.image)):
+            continue
+        kept.append((piece, start, number))
+    return [each for each, _, _ in kept], [start for _, start, _ in kept], [number for _, _, number in kept]
+
+
+def select_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
+    """Return the evidence of some images; stage positions still refer to the first image of all."""
+    placement, wanted = evidence.placement, list(images)
+    here = np.isin(placement.image, wanted)
+    kept = {name: getattr(placement, name)[here] for name in ("points_mm", "shifts_mm", "pixels", "image")}
+    some = replace(evidence, placement=replace(placement, **kept))
+    return some.with_stripes(np.isin(evidence.image, wanted))
+
+
+def split_in_halves(evidence: Sequence[Evidence]) -> tuple[set[ImageId], set[ImageId]]:
+    """Return every second image, and the others; targets and steps apart."""
+    targets = [
+        (number, image)
+        for number, piece in enumerate(evidence)
+        if isinstance(piece, TargetEvidence)
+        for image in np.unique(piece.placement.image).tolist()
+    ]
+    steps = [(n, piece.image) for n, piece in enumerate(evidence) if isinstance(piece, StepProfileEvidence)]
+    return {*targets[::2], *steps[::2]}, {*targets[1::2], *steps[1::2]}
