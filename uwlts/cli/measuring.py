@@ -25,12 +25,10 @@ def reconstruct(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts reconstruct scan.h5 --calibration calibration.json --out scan.ply"""
-    from uwlts.storage.calibration_file import load_calibration
     from uwlts.storage.capture import Capture
 
-    calibration = load_calibration(call.given["calibration"])
     with Capture(call.given["capture"]) as capture:
-        cloud = call(capture=capture, calibration=calibration)
+        cloud = call(capture=capture)
         lit = int(capture.laser_on.sum())
     cloud.save(out, overwrite=overwrite)
     warn(*cloud.warnings)

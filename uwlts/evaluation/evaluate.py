@@ -86,7 +86,10 @@ class StoredUncertainty(_Stored):
 
 
 class EvaluationRecord(_Stored):
-    """Content of an evaluation file; ``calibration`` is the digest of the cloud's calibration."""
+    """Content of an evaluation file; ``calibration`` is the digest of the cloud's calibration.
+
+    ``edited`` is set if the file was edited by hand and trusted.
+    """
 
     cloud: str
     capture: str | None = None
@@ -98,6 +101,7 @@ class EvaluationRecord(_Stored):
     evaluation: ArtefactFigures | None = None
     truth: TruthComparisons | None = None
     uncertainty: dict[str, StoredUncertainty] = {}
+    edited: bool = False
 
     def figure_keys(self) -> dict[str, FigureKey]:
         """Return the keys of the artefact's figures by name; empty if the file names no artefact."""

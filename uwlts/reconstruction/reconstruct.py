@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.files.json_files import EDITED, trusting
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount
@@ -31,6 +32,7 @@ from uwlts.stripe import StripeSettings, find_stripes
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 
 
+@trusting
 def reconstruct(
     capture: Capture | str | Path,
     calibration: AnyCalibration | str | Path,
@@ -45,6 +47,7 @@ def reconstruct(
     stripe: StripeSettings = None,
     index: float | None = None,
     with_uncertainty: bool | None = None,
+    trust_edited: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> PointCloud:
     """Turn a capture into a point cloud: find the stripes of all laser images and triangulate them.
@@ -83,6 +86,8 @@ def reconstruct(
     with_uncertainty : bool, optional
         Calculate the uncertainty of the points, which requires a joint calibration; by default if it is joint. Files
         are then more than ten times larger.
+    trust_edited : bool
+        As for `read`.
     progress : callable, optional
         Called after each image with the number of images done and the total number.
 
@@ -130,7 +135,9 @@ def reconstruct(
         if own is not None:
             where = cloud.points_mm, cloud.frame, ride
             own = add_platform_uncertainty(own, *where, mount, mount_covariance=apart, correlation_s=pose_correlation_s)
-        return replace(cloud, uncertainty=own, warnings=warnings, time_s=scan.time_s[cloud.frame])
+        metadata = cloud.metadata | ({EDITED: "mount"} if mount is not None and mount.edited else {})
+        known = {"uncertainty": own, "warnings": warnings, "metadata": metadata}
+        return replace(cloud, **known, time_s=scan.time_s[cloud.frame])
 
 
 def _refuse_free_poses(scan: Capture) -> None:
@@ -229,6 +236,7 @@ def reconstruct_stripes(
             "calibration": digest,
             "images": len(capture.stage_mm),
             **{key: value for key, value in capture.header.provenance.items() if key == "scene"},
+            **({EDITED: "calibration"} if EDITED in calibration.provenance else {}),
             **({} if sheet is None else _footprint_metadata(capture, sheet, stripes)),
         },
         lines_by_status=lines,

@@ -8,6 +8,7 @@ import numpy as np
 from uwlts.errors import EvaluationError, RangeError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties
+from uwlts.files.json_files import trusting
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.sensor import Vector
@@ -83,8 +84,13 @@ class Verification:
         return "\n".join(verdict.text for verdict in self.verdicts)
 
 
+@trusting
 def verify(
-    capture: Capture | str | Path, calibration: AnyCalibration | str | Path, *, limit_mm: float | None = None
+    capture: Capture | str | Path,
+    calibration: AnyCalibration | str | Path,
+    *,
+    limit_mm: float | None = None,
+    trust_edited: bool = False,
 ) -> Verification:
     """Measure the artefact in a capture and compare it with its calibrated values.
 
@@ -99,6 +105,8 @@ def verify(
         Calibration of the sensor; only a joint one states its uncertainty.
     limit_mm : float, optional
         Maximum permissible error.
+    trust_edited : bool
+        As for `read`.
 
     Returns
     -------

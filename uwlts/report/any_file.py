@@ -4,7 +4,7 @@ from pathlib import Path
 
 from uwlts.errors import CaptureError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION, EvaluationRecord, read_evaluation
-from uwlts.files.json_files import read_json
+from uwlts.files.json_files import read_json, trusting
 from uwlts.files.reading import require_regular_file
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.mount import FORMAT as MOUNT, Mount
@@ -26,8 +26,13 @@ _READABLE = (
 )
 
 
+@trusting
 def read(
-    path: str | Path, *, pose_format: PoseFormat = "quaternion-xyzw", pose_unit: Unit | None = None
+    path: str | Path,
+    *,
+    pose_format: PoseFormat = "quaternion-xyzw",
+    pose_unit: Unit | None = None,
+    trust_edited: bool = False,
 ) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Trajectory:
     """Read a file of the program, whose content determines the type of the result.
 
@@ -44,6 +49,8 @@ def read(
         Format of a trajectory, as for `reconstruct`; by default that of `Trajectory.save`.
     pose_unit : {"mm", "m"}, optional
         Unit of a trajectory's positions; by default that in the names of its columns, else mm.
+    trust_edited : bool
+        Accept calibrations, mounts and evaluations that were edited after they were written; results record it.
 
     Returns
     -------

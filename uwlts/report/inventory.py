@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT, EvaluationRecord, TruthComparisons, read_evaluation
-from uwlts.files.json_files import read_json
+from uwlts.files.json_files import read_json, trusting
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import BoardFound, Mount, RingFound, SphereFound, StepFound
@@ -31,13 +31,16 @@ from uwlts.storage.mount_files import FORMAT as MOUNT_FORMAT, read_mount
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 
-def describe(path: str | Path) -> str:
+@trusting
+def describe(path: str | Path, *, trust_edited: bool = False) -> str:
     """Describe a file: a capture, cloud, calibration, mount, evaluation, or a sensor description (by name or path).
 
     Parameters
     ----------
     path : str or Path
         File, or name of a shipped sensor such as thesis.
+    trust_edited : bool
+        As for `read`.
 
     Returns
     -------
