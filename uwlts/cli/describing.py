@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import uwlts
-from uwlts.cli.options import CalibrationOut, Overwrite, app, wrote_files
+from uwlts.cli.options import CalibrationOut, Overwrite, app, cloud_written, wrote_files
 from uwlts.runtime.command_line import Call, command_from, show, warn
 
 
@@ -40,4 +40,4 @@ def import_(call: Call) -> None:
 def export(call: Call) -> None:
     """Example: uwlts export scan.ply --out scan.laz"""
     out, written = Path(call.given["out"]), call()
-    print(f"wrote {written} images and import.toml to {out}" if out.is_dir() else f"wrote {out} with {written} points")
+    print(f"wrote {written} images and import.toml to {out}" if out.is_dir() else cloud_written(out, written))

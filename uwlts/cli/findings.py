@@ -70,7 +70,7 @@ def compare(
     app,
     uwlts,
     "inspect_pipe",
-    also=_INSPECTIONS,
+    also=[*_INSPECTIONS, (uwlts, "export")],
     summary="Find the features of a pipe, weld, step, flange or gap in a cloud and measure them, with uncertainty.",
 )
 def inspect(
@@ -84,6 +84,7 @@ def inspect(
     ] = None,
     coloured: ColouredOut = None,
     datum=None,
+    unit=None,
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts inspect pipe.ply --wall-mm 9.5 --out pipe.json"""
@@ -91,8 +92,8 @@ def inspect(
     from uwlts.report.plot import surface_limit_mm
     from uwlts.storage.cloud_files import read_cloud
 
-    measured = read_cloud(call.given.pop("cloud"))
-    options = call.given if datum is None else call.given | {"datum": datum}
+    measured = read_cloud(call.given.pop("cloud"), unit=unit)
+    options = call.given if datum is None else call.given | {"datum": read_cloud(datum, unit=unit)}
     found = inspect_cloud(measured, kind, **options)
     show(found.lines())
     if coloured:

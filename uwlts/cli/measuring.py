@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import STRIPE, Overwrite, a_cloud, a_file, a_page, app, wrote, wrote_files
+from uwlts.cli.options import STRIPE, Overwrite, a_cloud, a_file, a_page, app, cloud_written, wrote, wrote_files
 from uwlts.runtime.command_line import Before, Call, command_from, show, warn
 
 
@@ -36,7 +36,7 @@ def reconstruct(
     print(f"profile lines: {_counts(cloud.lines_by_status)}")
     if lost := _counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):
         print(f"stripe centres without a point: {lost}")
-    print(f"wrote {out} with {len(cloud)} points")
+    print(cloud_written(out, len(cloud)))
 
 
 def _counts(by_status: dict[str, int]) -> str:

@@ -115,6 +115,13 @@ def wrote_files(*paths: Path | None) -> None:
     print(f"wrote {', '.join(str(path) for path in paths if path is not None)}")
 
 
+def cloud_written(path: Path, points: int) -> str:
+    """Return the line on a written cloud, with its unit."""
+    from uwlts.storage.cloud_files import unit_of
+
+    return f"wrote {path} with {points} points in {unit_of(path)}"
+
+
 def wrote_page(page: Path) -> None:
     """Print the page written for a result, and the JSON beside it."""
     print(f"wrote {page} and {page.with_suffix('.json').name}")

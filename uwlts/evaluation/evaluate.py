@@ -19,6 +19,7 @@ from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.number_tables import Unit
 from uwlts.storage.truth import Truth, TruthHeader, read_truth, scene_digest, truth_path
 
 TOLERANCE_MM = 0.010
@@ -264,6 +265,7 @@ def evaluate(
     truth: Truth | str | Path | None = None,
     *,
     source: str | None = None,
+    unit: Unit | None = None,
 ) -> Evaluation:
     """Compare a cloud with its artefact's calibrated values, and point by point with ground truth.
 
@@ -277,6 +279,8 @@ def evaluate(
         Ground truth of a rendered capture.
     source : str, optional
         Name of the cloud in the evaluation file; by default the name of the cloud's file or capture.
+    unit : {"mm", "m"}, optional
+        As for `export`.
 
     Returns
     -------
@@ -293,7 +297,7 @@ def evaluate(
     """
     if not isinstance(cloud, PointCloud):
         source = source or Path(cloud).name
-        cloud = read_cloud(cloud)
+        cloud = read_cloud(cloud, unit=unit)
     if artefact is None and (named := cloud.metadata.get("artefact")) is not None:
         artefact = parse_artefact(named)
     if isinstance(artefact, str | Path):

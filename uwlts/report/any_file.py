@@ -32,6 +32,7 @@ def read(
     *,
     pose_format: PoseFormat = "quaternion-xyzw",
     pose_unit: Unit | None = None,
+    unit: Unit | None = None,
     trust_edited: bool = False,
 ) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Trajectory:
     """Read a file of the program, whose content determines the type of the result.
@@ -49,6 +50,8 @@ def read(
         Format of a trajectory, as for `reconstruct`; by default that of `Trajectory.save`.
     pose_unit : {"mm", "m"}, optional
         Unit of a trajectory's positions; by default that in the names of its columns, else mm.
+    unit : {"mm", "m"}, optional
+        As for `export`.
     trust_edited : bool
         Accept calibrations, mounts and evaluations that were edited after they were written; results record it.
 
@@ -87,9 +90,9 @@ def read(
     if ending == ".csv":
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
     if ending.lower() in MESH_FORMATS and (ending.lower() != ".ply" or has_faces(path)):
-        return read_mesh(path)
+        return read_mesh(path, unit=unit)
     if is_cloud(path):
-        return read_cloud(path)
+        return read_cloud(path, unit=unit)
     if ending == ".h5":
         found = read_format(path)
         if found == TRUTH:

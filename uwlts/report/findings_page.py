@@ -47,6 +47,7 @@ from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.number_tables import Unit
 
 _BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
 _FIRST = ("depth", "height", "remaining wall")
@@ -96,6 +97,7 @@ def write_findings(
     calibration: str | Path | None = None,
     certificate: str | Path | None = None,
     verification: Sequence[str | Path] = (),
+    unit: Unit | None = None,
     trust_edited: bool = False,
     overwrite: bool = False,
     **options: Any,
@@ -123,6 +125,8 @@ def write_findings(
     verification
         Evaluations (JSON of uwlts evaluate) of artefacts measured with the same calibration; their figures are
         reported.
+    unit
+        Unit of a cloud of another program, mm or m, if neither format nor names of columns state it; by default mm.
     trust_edited
         Accept files that were edited after they were written; results record it.
     overwrite
@@ -151,7 +155,7 @@ def write_findings(
     if pdf:
         refuse_unsuitable_pdf(page.with_suffix(".pdf"))
         refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
-    measured = read_cloud(path)
+    measured = read_cloud(path, unit=unit)
     sources = _sources(path, measured, captures, calibration, certificate)
     checks = [_artefact_check(each, measured) for each in verification]
     sources += [

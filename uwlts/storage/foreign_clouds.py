@@ -13,7 +13,7 @@ from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
 from uwlts.storage.mcap_clouds import covariance_columns, mcap_content
-from uwlts.storage.number_tables import read_number_table
+from uwlts.storage.number_tables import Unit, read_number_table
 
 TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
 """Columns x, y, z by name, or the first three, in mm or the unit of their names; and optionally intensity."""
@@ -21,11 +21,11 @@ FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57")
 WRITTEN_FORMATS = (".xyz", ".laz", ".e57", ".las", ".mcap")
 
 
-def read_foreign(path: Path) -> PointCloud:
+def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
     """Read all points of a file in one of `FOREIGN_FORMATS`.
 
-    Text is in mm or the unit that the names of its columns state; LAS and E57 are in m, as they prescribe. The scans
-    of an E57 file are combined, each at its pose.
+    Text is in the unit that the names of its columns state, else in ``unit``, by default mm; LAS and E57 are in m, as
+    they prescribe. The scans of an E57 file are combined, each at its pose.
 
     Raises CaptureError if the file is damaged or foreign, SetupError if the library for its format is not installed.
     """
@@ -35,13 +35,13 @@ def read_foreign(path: Path) -> PointCloud:
         case ".e57":
             return read_e57(path)
         case _:
-            return _read_text(path)
+            return _read_text(path, unit)
 
 
-def _read_text(path: Path) -> PointCloud:
+def _read_text(path: Path, unit: Unit | None) -> PointCloud:
     try:
         table = read_number_table(path, named=False)
-        columns, scale = table.columns, table.mm_per_unit()
+        columns, scale = table.columns, table.mm_per_unit(unit=unit)
     except DescriptionError as error:
         raise CaptureError(str(error)) from error
     axes = [columns[axis] for axis in "xyz" if axis in columns]

@@ -99,7 +99,8 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
 
     With separators other than commas, numbers may have decimal commas. Lines that begin with #, //, % or ! are
     comments; the last comment before the numbers names the columns if it contains x and z, or an angle. A first line
-    with the number of rows is recognised, as are UTF-8, UTF-16 and Latin-1. Names are in lower case and without unit.
+    with the number of rows is recognised, as are a row of units below the names, UTF-8, UTF-16 and Latin-1. Names are
+    in lower case and without unit.
     Usual names for times, positions, quaternions and Euler angles become ``time_s``, ``x``, ``qw``, ``roll`` and so
     on. Without names, two columns are x and z, and others are numbered. ``digests`` takes the file's SHA-256 by name.
 
@@ -121,6 +122,7 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
         header, *lines = lines
         if not lines:
             raise DescriptionError(f"{path} has no rows after the names of its columns")
+    unit_row = lines.pop(0) if len(lines) > 1 and header is not None and _is_unit_row(lines[0]) else None
     if counted not in (None, len(lines)):
         raise DescriptionError(
             f"{path} states {counted} rows in its first line and has {len(lines)}: it is incomplete or has several "
@@ -131,6 +133,8 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     if header is None:
         header = next((each for each in reversed(comments) if _names_columns(each, delimiter, count)), None)
     cells = [] if header is None else _name_cells(header, delimiter, count)
+    if unit_row is not None:
+        cells = _add_units(cells, _name_cells(unit_row, delimiter, count), path)
     body = b"\n".join(lines) + b"\n"
     if delimiter == b" " and b"  " in body:
         body = re.sub(rb" {2,}", b" ", body)
@@ -191,6 +195,31 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
     if "qw" in names:
         names = [f"q{name[1]}" if name in ("rx", "ry", "rz") else name for name in names]
     return names, units
+
+
+def _is_unit_row(line: bytes) -> bool:
+    """Return whether the cells of a line are units or empty."""
+    cells = [_bare_unit(cell) for cell in re.split(r"[,;\t]" if re.search(rb"[,;\t]", line) else r"\s+", _text(line))]
+    return any(cells) and all(not cell or cell in _UNITS for cell in cells)
+
+
+def _bare_unit(cell: str) -> str:
+    """Return a unit without quotes and brackets; empty for a dash or one, which mean none."""
+    unit = _plain_unit(cell.strip(" \"'[]()<>").lower())
+    return "" if unit in ("-", "1") else unit
+
+
+def _add_units(names: list[str], units: list[str], path: Path) -> list[str]:
+    """Return names with the units of the row below; raises DescriptionError if a name states another unit."""
+    if len(units) != len(names):
+        raise DescriptionError(f"{path} has {len(names)} names of columns and {len(units)} units in the row below")
+    found = []
+    for name, unit in zip(names, map(_bare_unit, units), strict=True):
+        stated = _split_unit(name)[1]
+        if unit and stated not in (None, unit):
+            raise DescriptionError(f"{path} has a column {shorten(repr(name))} and the unit {unit} in the row below")
+        found.append(f"{name} [{unit}]" if unit and stated is None else name)
+    return found
 
 
 def _decode_wide(content: bytes, path: Path) -> bytes:
