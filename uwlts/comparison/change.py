@@ -28,7 +28,7 @@ from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface
-from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances, rounding_std_mm
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.pose_files import Unit
 
@@ -283,6 +283,9 @@ def compare_clouds(
     variance, found = sides.variance_mm2, sides.registration
     if found is not None:
         variance = variance + found.std_along(sides.places, sides.normals) ** 2
+    # Rounding errors of neighbouring points are equal where a surface is parallel to an axis, and do not average out.
+    stored = surface.rounding_std_mm if isinstance(surface, ReferencePoints) else 0.0
+    variance = variance + rounding_std_mm(new) ** 2 + stored**2
     if not np.isfinite(sides.distance_mm).any():
         raise EvaluationError(
             f"the cloud and the reference do not overlap within {deep:g} mm. Check that both have the same frame and "

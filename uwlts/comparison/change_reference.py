@@ -17,7 +17,7 @@ from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
 from uwlts.fitting.point_spacing import POINTS_PER_DISC
 from uwlts.model.sensor import Description, Positive, Vector
-from uwlts.storage.cloud import PointCloud, PointUncertainty
+from uwlts.storage.cloud import PointCloud, PointUncertainty, rounding_std_mm
 from uwlts.storage.cloud_files import is_readable_cloud, read_cloud
 from uwlts.storage.mesh_file import has_faces, load_triangles
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
@@ -40,6 +40,7 @@ class ReferencePoints:
     normals: np.ndarray | None = None
     uncertainty: PointUncertainty | None = None
     frame: np.ndarray | None = None
+    rounding_std_mm: float = 0.0
 
     @property
     def meshed(self) -> bool:
@@ -99,7 +100,7 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
             reference = read_shape(path)
         elif path.suffix.lower() == ".h5" or (is_readable_cloud(path) and not has_faces(path)):
             cloud = read_cloud(path, unit=unit)
-            return ReferencePoints(cloud.points_mm, None, cloud.uncertainty, cloud.frame)
+            return ReferencePoints(cloud.points_mm, None, cloud.uncertainty, cloud.frame, rounding_std_mm(cloud))
         else:
             if path.suffix.lower() in _IN_METRES:
                 if unit == "mm":
@@ -111,7 +112,8 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
         return reference
     if scale != 1.0 and reference.uncertainty is not None:
         raise EvaluationError("the unit is m, but clouds with uncertainty are always in mm; omit the unit")
-    return ReferencePoints(scale * reference.points_mm, None, reference.uncertainty, reference.frame)
+    rounding = scale * rounding_std_mm(reference)
+    return ReferencePoints(scale * reference.points_mm, None, reference.uncertainty, reference.frame, rounding)
 
 
 def sample_mesh(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> ReferencePoints:

@@ -23,10 +23,13 @@ from uwlts.storage.cloud import (
     NO_INDEX,
     PAIRS,
     PER_POINT,
+    STEP,
     PointCloud,
     PointUncertainty,
     concatenate_clouds,
+    find_float_step,
     metadata_json,
+    note_step,
     omit_points,
 )
 from uwlts.storage.copc_file import is_copc, read_copc
@@ -197,7 +200,6 @@ def read_thinned_cloud(
             cloud, total = _read_rows(Path(path), lambda count: _every(count, at_most))
         if not len(cloud) and cloud.warnings:
             raise CaptureError(f"no point is left: {'; '.join(cloud.warnings)}")
-        log_warnings(path, cloud.warnings)
         return _in_mm(cloud, path, unit), total
 
 
@@ -219,7 +221,6 @@ def read_region(
     if is_copc(path):
         with _naming(path):
             cloud = read_copc(path, box_mm=(low, high), at_most=at_most)[0]
-            log_warnings(path, cloud.warnings)
             return _in_mm(cloud, path, unit)
     found = [
         part.select(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
@@ -244,7 +245,6 @@ def read_parts(
     while start < total:
         with _naming(path):
             part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
-            log_warnings(path, part.warnings)
             part = _in_mm(part, path, unit)
         yield part
         start += most
@@ -256,15 +256,21 @@ def unit_of(path: str | os.PathLike[str]) -> Unit:
 
 
 def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -> PointCloud:
-    """Convert a cloud from ``unit`` to mm; raises CaptureError if its file states another unit."""
-    if unit is None or Path(path).suffix.lower() in TEXT_FORMATS:
-        return cloud
-    own = _in_hdf5(path) or bool(cloud.metadata) or cloud.uncertainty is not None
+    """Convert a cloud from ``unit`` to mm, note the step of its numbers, and log its warnings.
+
+    Raises CaptureError if its file states another unit.
+    """
+    own = _in_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
     stated = unit_of(path) if own or unit_of(path) == "m" else None
-    if stated is None:
-        return replace(cloud, points_mm=MM_PER_UNIT[check_unit(unit)] * cloud.points_mm)
-    if stated != unit:
-        raise CaptureError(f"{path} is in {stated}, as its format prescribes, but the unit {unit} was given: omit it")
+    if Path(path).suffix.lower() not in TEXT_FORMATS:
+        if unit is not None and stated not in (None, unit):
+            raise CaptureError(
+                f"{path} is in {stated}, as its format prescribes, but the unit {unit} was given: omit it"
+            )
+        if Path(path).suffix.lower() == ".ply":
+            scale, step = MM_PER_UNIT[check_unit(unit or "mm")], find_float_step(cloud.points_mm)
+            cloud = note_step(replace(cloud, points_mm=scale * cloud.points_mm), scale * step)
+    log_warnings(path, cloud.warnings)
     return cloud
 
 

@@ -200,7 +200,8 @@ def read_copc(
     if np.isnan(columns.get("deviation_mm", np.nan)).all():
         columns.pop("deviation_mm", None)
     points = 1e3 * np.column_stack([found.x, found.y, found.z])
-    return make_foreign_cloud(points, intensity=intensity, omitted=unwanted_points(found), **columns), total
+    named = {"omitted": unwanted_points(found), "step_mm": 1e3 * float(np.max(found.scales))}
+    return make_foreign_cloud(points, intensity=intensity, **named, **columns), total
 
 
 def _query(reader: Any, box: Any, at_most: int | None) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.files.writing import write_atomically
-from uwlts.storage.cloud import PointCloud, make_foreign_cloud
+from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
@@ -49,7 +49,9 @@ def _read_text(path: Path, unit: Unit | None) -> PointCloud:
         if "0" not in columns or len(columns) < 3:
             raise CaptureError(f"{path} has the columns {', '.join(columns)}; expected x, y and z in mm")
         axes = [columns[number] for number in "012"]
-    cloud = make_foreign_cloud(scale * np.column_stack(axes), intensity=columns.get("intensity"))
+    points, used = np.column_stack(axes), "xyz" if "x" in columns else "012"
+    step = scale * max(find_float_step(points), *(table.steps.get(name, 0.0) for name in used))
+    cloud = make_foreign_cloud(scale * points, intensity=columns.get("intensity"), step_mm=step)
     return replace(cloud, warnings=[*table.notes, *cloud.warnings])
 
 

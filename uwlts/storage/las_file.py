@@ -95,7 +95,7 @@ def read_las(path: Path) -> PointCloud:
             if header.are_points_compressed or needed > path.stat().st_size:
                 raise ValueError("its points are compressed, or fewer than its header declares")
             found = reader.read_points(header.point_count)
-        points = 1e3 * np.column_stack([found.x, found.y, found.z])
+        points, step = 1e3 * np.column_stack([found.x, found.y, found.z]), 1e3 * float(np.max(header.scales))
         names = set(found.point_format.dimension_names)
         column = {name: np.asarray(found[name]) for name in names & {"frame", "line", "deviation_mm", "gps_time"}}
         intensity = np.asarray(found["amplitude" if "amplitude" in names else "intensity"], np.float32)
@@ -117,6 +117,7 @@ def read_las(path: Path) -> PointCloud:
         intensity=intensity,
         time_s=None if times is None or not times.any() else times,
         omitted=omitted,
+        step_mm=step,
         **column,
     )
 

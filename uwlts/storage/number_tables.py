@@ -54,6 +54,9 @@ _DECIMAL_COMMA = re.compile(rb"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?")
 _UNIT_IN_COMMENT = re.compile(
     r"\b(?:in|units?)\b[\s:=]*(?:the |are |is )?[\[(]?(m|cm|um|µm|in|inch(?:es)?|ft|feet|(?:centi)?met(?:re|er)s?)\b"
 )
+_NUMBER = re.compile(rb"[+-]?\d*(?:[.,](\d*))?")
+_FIRST, _FEWEST = 200, 10
+"""Rows of which the decimals are counted, and fewest rows that show them."""
 _COMMENTS = (b"#", b"//", b"%", b"!")
 
 
@@ -61,12 +64,13 @@ _COMMENTS = (b"#", b"//", b"%", b"!")
 class NumberTable:
     """Columns (N,) by name, the units that their names state, and notes on doubtful readings.
 
-    Times are in s. Other columns are in the unit that their name states.
+    Times are in s. Other columns are in the unit that their name states. ``steps`` are those of their decimals.
     """
 
     path: Path
     columns: dict[str, np.ndarray]
     units: dict[str, str] = field(default_factory=dict)
+    steps: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def mm_per_unit(self, axes: Iterable[str] = "xyz", *, unit: Unit | None = None) -> float:
@@ -160,7 +164,9 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     said = [text for text in map(_text, comments[:1000]) if _UNIT_IN_COMMENT.search(text.lower())]
     if said and not units.keys() & set("xyz"):
         notes.append(f"a comment may state another unit than that of the coordinates: {shorten(said[0], 100)}")
-    return NumberTable(path, columns, units, notes)
+    decimals = [_decimals(row) for row in zip(*(_cells(line, delimiter) for line in lines[:_FIRST]), strict=False)]
+    steps = {name: 10.0**-count for name, count in zip(names, decimals, strict=False) if count is not None}
+    return NumberTable(path, columns, units, steps, notes)
 
 
 def _parse(body: bytes, names: list[str], delimiter: bytes, comma: bool, path: Path) -> dict[str, np.ndarray]:
@@ -257,6 +263,13 @@ def _separators(line: bytes) -> tuple[bytes, bool]:
 
 def _cells(line: bytes, delimiter: bytes) -> list[bytes]:
     return line.split() if delimiter == b" " else line.split(delimiter)
+
+
+def _decimals(cells: Iterable[bytes]) -> int | None:
+    """Return the largest number of decimals; None if a number has an exponent, or too few rows show it."""
+    found = [_NUMBER.fullmatch(cell.strip().strip(b'"')) for cell in cells]
+    known = [len(match[1] or b"") for match in found if match]
+    return max(known) if known and len(known) == len(found) >= _FEWEST else None
 
 
 def _is_row(line: bytes) -> bool:
