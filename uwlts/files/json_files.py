@@ -16,7 +16,7 @@ from pydantic import BaseModel, JsonValue, ValidationError
 
 from uwlts.errors import CaptureError, Error, describe_problems
 from uwlts.files.reading import MOST_JSON_BYTES, add_article, log_warnings, parse_json, read_text
-from uwlts.files.writing import write_atomically
+from uwlts.files.writing import require_ending, write_atomically
 
 _SHOWN = 3
 """Largest number of different entries that a message names."""
@@ -136,6 +136,7 @@ def validate_content(model: type[AnyModel], content: object, complaint: str, *, 
 
 def write_model(path: str | Path, model: BaseModel, *, format: str, version: int, overwrite: bool) -> None:
     """Write a model with format, version and seal as indented JSON, completely or not; OutputError if that fails."""
+    require_ending(Path(path), (".json",))
     content = {"format": format, "version": version} | model.model_dump(mode="json")
     with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_text(json_text(content, indent=2), encoding="utf-8")
@@ -143,6 +144,7 @@ def write_model(path: str | Path, model: BaseModel, *, format: str, version: int
 
 def write_record(path: str | Path, record: object, *, overwrite: bool) -> None:
     """Write the record of a result as indented JSON, completely or not at all; raises OutputError if that fails."""
+    require_ending(Path(path), (".json",))
     with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_text(json_text(record, indent=1), encoding="utf-8")
 
