@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 import uwlts
 from uwlts.cli.options import STRIPE, CalibrationOut, Overwrite, a_file, a_page, app, wrote, wrote_page
-from uwlts.errors import DescriptionError
+from uwlts.errors import DescriptionError, OutputError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.command_line import Call, command_from, say, show, warn
 
@@ -191,12 +191,16 @@ def certificate(
 
 @command_from(app, uwlts, "verify")
 def verify(call: Call) -> None:
-    """Answer pass or fail: exit code 0 or 1.
+    """Answer pass or fail: exit code 0 or 1. The verdict is kept beside the calibration, for uwlts reconstruct.
 
     Example: uwlts verify step.h5 --calibration calibration.json --limit-mm 0.05
     """
     verification = call()
     show([verification.text, *verification.not_shown])
     print("pass" if verification.passed else "FAIL")
+    try:
+        print(f"wrote {verification.save(call.given['calibration'])}")
+    except OutputError as error:
+        warn(f"the verdict is not kept: {error}")
     if not verification.passed:
         sys.exit(1)

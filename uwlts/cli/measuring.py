@@ -26,12 +26,15 @@ def reconstruct(
 ) -> None:
     """Example: uwlts reconstruct scan.h5 --calibration calibration.json --out scan.ply"""
     from uwlts.storage.capture import Capture
+    from uwlts.storage.cloud import VERIFIED
 
     with Capture(call.given["capture"]) as capture:
         cloud = call(capture=capture)
         lit = int(capture.laser_on.sum())
     cloud.save(out, overwrite=overwrite)
     warn(*cloud.warnings)
+    if until := cloud.metadata.get(VERIFIED):
+        print(f"calibration verified until {until}")
     print(f"laser images with a point: {len(set(cloud.frame.tolist()))} of {lit}")
     print(f"profile lines: {_counts(cloud.lines_by_status)}")
     if lost := _counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):

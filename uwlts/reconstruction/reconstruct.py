@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,10 +25,11 @@ from uwlts.runtime.compiled import compiled
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import NO_STAGE, Capture, FrameTable, open_capture, sensor_poses
-from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, VERIFIED, PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import PoseFormat, read_trajectory
+from uwlts.storage.verification_file import describe_verification
 from uwlts.stripe import StripeSettings, find_stripes
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 
@@ -107,7 +109,17 @@ def reconstruct(
     """
     if pose_correlation_s is not None and not pose_correlation_s >= 0:
         raise DescriptionError(f"pose_correlation_s is {pose_correlation_s:g}; expected zero or a positive number")
-    calibration = resolve_calibration(calibration)
+    file, calibration = calibration, resolve_calibration(calibration)
+    if isinstance(file, str | Path):
+        until, doubts = describe_verification(file, calibration)
+    else:
+        until, doubts = None, []
+
+    def complete(cloud: PointCloud, **changes: Any) -> PointCloud:
+        metadata = changes.pop("metadata", cloud.metadata) | ({} if until is None else {VERIFIED: until})
+        warnings = [*doubts, *changes.pop("warnings", cloud.warnings)]
+        return replace(cloud, **changes, metadata=metadata, warnings=warnings)
+
     with open_capture(capture) as scan:
         check_fits(scan.header, calibration, source=scan.path.name)
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
@@ -115,7 +127,7 @@ def reconstruct(
         if alone and mount is None and trajectory is None and clock_offset_s is None and not clock_drift_ppm:
             _refuse_free_poses(scan)
             stripes = find_stripes(scan, options=stripe, progress=progress)
-            return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
+            return complete(reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known))
         mount = read_mount(mount) if isinstance(mount, str | Path) else mount
         if isinstance(trajectory, str | Path):
             trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
@@ -128,7 +140,7 @@ def reconstruct(
         cloud = reconstruct_stripes(
             table, stripes, calibration, index=index, with_uncertainty=known, mount_by=common if known else None
         )
-        warnings = cloud.warnings
+        warnings = [*ride.doubts, *cloud.warnings]
         if mount is None and scan.header.T_platform_sensor is not None:
             warnings = [*warnings, "the mount has its design values: calibrate it (uwlts mount) and give `mount`"]
         own = cloud.uncertainty
@@ -137,7 +149,7 @@ def reconstruct(
             own = add_platform_uncertainty(own, *where, mount, mount_covariance=apart, correlation_s=pose_correlation_s)
         metadata = cloud.metadata | ({EDITED: "mount"} if mount is not None and mount.edited else {})
         known = {"uncertainty": own, "warnings": warnings, "metadata": metadata}
-        return replace(cloud, **known, time_s=scan.time_s[cloud.frame])
+        return complete(cloud, **known, time_s=scan.time_s[cloud.frame])
 
 
 def _refuse_free_poses(scan: Capture) -> None:

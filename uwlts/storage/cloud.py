@@ -20,6 +20,8 @@ FOOTPRINT, FOOTPRINT_STD = "footprint_mm", "footprint_std"
 """Metadata of clouds of sensors at rest: standard deviations of the footprint, the surface area that a point averages,
 across the sheet (X) and along the stripe (Y), mm; and the relative standard uncertainty of their squares."""
 
+VERIFIED = "calibration_verified_until"
+"""Metadata of clouds whose calibration's file has a valid verification: its end."""
 STEP = "coordinate_step_mm"
 """Metadata of clouds of other programs: step of the stored coordinates, mm, if it is more than a micrometre."""
 _FINEST_STEP_MM = 1e-3
