@@ -58,7 +58,7 @@ COLOURED_FORMATS = (".ply", ".h5", ".laz", ".las", ".e57")
 """Endings of the clouds that can be written with a colour of each point."""
 PLY_COLOURS = ("red", "green", "blue")
 _IN_METRES = (".laz", ".las", ".e57", ".mcap")
-_CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57")
+_CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57", ".pcd")
 """Endings that only clouds have."""
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
@@ -262,7 +262,7 @@ def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -
     """
     own = _in_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
     stated = unit_of(path) if own or unit_of(path) == "m" else None
-    if Path(path).suffix.lower() not in TEXT_FORMATS:
+    if Path(path).suffix.lower() not in (*TEXT_FORMATS, ".pcd"):
         if unit is not None and stated not in (None, unit):
             raise CaptureError(
                 f"{path} is in {stated}, as its format prescribes, but the unit {unit} was given: omit it"

@@ -57,7 +57,7 @@ def export(
     Parameters
     ----------
     file : str or Path
-        Capture (.h5) or cloud (.ply, .h5, .copc.laz, or .xyz, .txt, .csv, .asc, .las, .e57 of other programs).
+        Capture (.h5) or cloud (.ply, .h5, .copc.laz, or .xyz, .txt, .csv, .asc, .pcd, .las, .e57 of other programs).
     out : str or Path
         New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
         .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).

@@ -1,4 +1,4 @@
-"""Clouds in formats of other programs and scanners: text, LAS, E57; LAZ, COPC and MCAP are only written here."""
+"""Clouds in formats of other programs and scanners: text, PCD, LAS, E57; LAZ, COPC and MCAP are only written here."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,19 +13,20 @@ from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
 from uwlts.storage.mcap_clouds import covariance_columns, mcap_content
-from uwlts.storage.number_tables import Unit, read_number_table
+from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit, read_number_table
+from uwlts.storage.pcd_file import read_pcd
 
 TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
 """Columns x, y, z by name, or the first three, in mm or the unit of their names; and optionally intensity."""
-FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57")
+FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57", ".pcd")
 WRITTEN_FORMATS = (".xyz", ".laz", ".e57", ".las", ".mcap")
 
 
 def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
     """Read all points of a file in one of `FOREIGN_FORMATS`.
 
-    Text is in the unit that the names of its columns state, else in ``unit``, by default mm; LAS and E57 are in m, as
-    they prescribe. The scans of an E57 file are combined, each at its pose.
+    Text is in the unit that the names of its columns state, else in ``unit``, by default mm; PCD is in ``unit``; LAS
+    and E57 are in m, as they prescribe. The scans of an E57 file are combined, each at its pose.
 
     Raises CaptureError if the file is damaged or foreign, SetupError if the library for its format is not installed.
     """
@@ -34,8 +35,20 @@ def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
             return read_las(path)
         case ".e57":
             return read_e57(path)
+        case ".pcd":
+            return _read_pcd(path, unit)
         case _:
             return _read_text(path, unit)
+
+
+def _read_pcd(path: Path, unit: Unit | None) -> PointCloud:
+    columns, warnings = read_pcd(path)
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise CaptureError(f"{path} has no {', '.join(missing)}, only {', '.join(columns) or 'nothing'}")
+    points, scale = np.column_stack([columns[axis] for axis in "xyz"]), MM_PER_UNIT[check_unit(unit or "mm")]
+    step = scale * find_float_step(points)
+    cloud = make_foreign_cloud(scale * points.astype(np.float64), intensity=columns.get("intensity"), step_mm=step)
+    return replace(cloud, warnings=[*warnings, *cloud.warnings])
 
 
 def _read_text(path: Path, unit: Unit | None) -> PointCloud:
