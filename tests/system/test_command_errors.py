@@ -385,7 +385,7 @@ def test_info_on_everything_that_is_right(command, folder: Path):
 
 
 def test_info_on_damaged_json(fails, folder: Path, tmp_path: Path):
-    fails("uwlts", "info", folder / "notes.txt", says="expected a capture, cloud, .json or .toml file")
+    fails("uwlts", "info", folder / "notes.txt", says="notes.txt has no rows")
     fails("uwlts", "info", "no-such-sensor", says="known are thesis")
     evaluation = json.loads((folder / "scan.evaluation.json").read_text(encoding="utf-8"))
     calibration = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))

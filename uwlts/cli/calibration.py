@@ -180,7 +180,7 @@ def certificate(
         if call.given.keys() & {"out", "before"}:
             raise DescriptionError("`check` verifies and writes nothing: give it without `out` and `before`")
         against = uwlts.report.check_certificate(check, calibration)
-        print("\n".join(against) or f"{check} is unchanged, and belongs to {calibration}")
+        say("\n".join(against) or f"{check} is unchanged, and belongs to {calibration}")
         if against:
             sys.exit(1)
         return
@@ -197,9 +197,9 @@ def verify(call: Call) -> None:
     """
     verification = call()
     show([verification.text, *verification.not_shown])
-    print("pass" if verification.passed else "FAIL")
+    say("pass" if verification.passed else "FAIL")
     try:
-        print(f"wrote {verification.save(call.given['calibration'])}")
+        say(f"wrote {verification.save(call.given['calibration'])}")
     except OutputError as error:
         warn(f"the verdict is not kept: {error}")
     if not verification.passed:

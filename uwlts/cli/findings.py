@@ -18,7 +18,7 @@ from uwlts.cli.options import (
     wrote_files,
     wrote_page,
 )
-from uwlts.runtime.command_line import Call, command_from, show
+from uwlts.runtime.command_line import Call, command_from, say, show
 
 _INSPECTIONS = [(uwlts, f"inspect_{kind}") for kind in ("pipe", "weld", "flange")]
 """Functions that provide the options of an inspection."""
@@ -132,7 +132,7 @@ def findings_report(
     out = Path(call.given["out"])
     beside = [json_beside(out, "findings"), *([out.with_suffix(".pdf")] if call.given.get("pdf") else [])]
     show(found.lines())
-    print(f"wrote {out}, {', '.join(each.name for each in beside)}")
+    say(f"wrote {out}, {', '.join(each.name for each in beside)}")
 
 
 @command_from(app, uwlts.report, "write_campaign")
@@ -145,7 +145,7 @@ def report(call: Call) -> None:
 
     written = call()
     print_table(written.rows())
-    print(f"wrote {written.page} and {written.summary}")
+    say(f"wrote {written.page} and {written.summary}")
 
 
 @command_from(app, uwlts, "evaluate_thesis")
@@ -155,6 +155,6 @@ def thesis(call: Call) -> None:
     Example: uwlts thesis runs/thesis
     """
     written = call()
-    print(written.headline.rstrip())
+    say(written.headline.rstrip())
     page, *others = written.files
-    print(f"wrote {page}, {', '.join(file.name for file in others)}")
+    say(f"wrote {page}, {', '.join(file.name for file in others)}")
