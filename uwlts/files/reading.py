@@ -114,8 +114,10 @@ def log_warnings(path: str | os.PathLike[str], warnings: Iterable[str]) -> None:
 def read_bytes(path: str | Path, *, most_bytes: int, error: type[Error] = CaptureError, called: str = "file") -> bytes:
     """Read a regular file; raises ``error`` like `open_regular`."""
     with open_regular(path, most_bytes=most_bytes, error=error, called=called) as file:
-        content = file.read(most_bytes + 1)
-    # Some system files report a size of 0.
+        # Python allocates what is asked for, and some system files report a size of 0.
+        content = file.read(min(most_bytes, os.fstat(file.fileno()).st_size) + 1)
+        while len(content) <= most_bytes and (more := file.read(MiB)):
+            content += more
     if len(content) > most_bytes:
         raise error(f"the {called} {_printable_name(path)} has more than {most_bytes / MiB:,.1f} MiB")
     return content

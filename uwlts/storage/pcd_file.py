@@ -41,7 +41,7 @@ def read_pcd(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
             [(f"{n}", f"<{k}{s}", (c,)) for n, (k, s, c) in enumerate(zip(kinds, sizes, counts, strict=True))]
         )
         columns = _columns(content[match.end() :], match[1].decode(), kind, points)
-    except (ValueError, KeyError, IndexError, TypeError, struct.error) as error:
+    except (ValueError, LookupError, TypeError, ArithmeticError, MemoryError, struct.error) as error:
         raise CaptureError(f"{path} is not a complete PCD file: {error}") from error
     moved = [] if viewpoint == _REST else ["the VIEWPOINT of the file is not applied to the points"]
     return {name: column[:, 0] for name, column in zip(names, columns, strict=True)}, moved

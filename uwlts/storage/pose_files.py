@@ -23,24 +23,25 @@ FARTHEST_MM = 1e7
 
 _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
-_N, _NEXT = r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)", r"\s*,\s*"
+# Possessive, as backtracking in long runs of digits or blanks would take minutes.
+_N, _NEXT = r"([+-]?(?:\d++(?:\.\d*+)?+|\.\d++)(?:[eE][+-]?\d++)?+)", r"\s*+,\s*+"
 _ROBOTS: dict[str, tuple[re.Pattern[str], str, Unit, str]] = {
     # ABB RAPID: robtarget [[x, y, z], [q1, q2, q3, q4], ...]
     "abb": (
-        re.compile(rf"\[\s*\[\s*{_NEXT.join([_N] * 3)}\s*\]{_NEXT}\[\s*{_NEXT.join([_N] * 4)}\s*\]"),
+        re.compile(rf"\[\s*+\[\s*+{_NEXT.join([_N] * 3)}\s*+\]{_NEXT}\[\s*+{_NEXT.join([_N] * 4)}\s*+\]"),
         "quaternion-wxyz",
         "mm",
         "!",
     ),
     # KUKA KRL: POS, E6POS or FRAME {X .., Y .., Z .., A .., B .., C ..}; A, B and C turn about the moved z, y and x.
     "kuka": (
-        re.compile(r"\b" + _NEXT.join(rf"{axis}\s*[=:]?\s*{_N}" for axis in "XYZABC"), re.IGNORECASE),
+        re.compile(r"\b" + _NEXT.join(rf"{axis}\s*+[=:]?+\s*+{_N}" for axis in "XYZABC"), re.IGNORECASE),
         "euler-ZYX-deg",
         "mm",
         ";",
     ),
     # Universal Robots, URScript: p[x, y, z, rx, ry, rz]
-    "ur": (re.compile(rf"\bp\s*\[\s*{_NEXT.join([_N] * 6)}\s*\]"), "rotvec-rad", "m", "#"),
+    "ur": (re.compile(rf"\bp\s*+\[\s*+{_NEXT.join([_N] * 6)}\s*+\]"), "rotvec-rad", "m", "#"),
 }
 """Text of robot programs: pattern of a pose, its format, its unit, and the character that begins a comment."""
 _FORMS = {
