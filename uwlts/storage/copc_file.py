@@ -212,8 +212,8 @@ def read_copc(
     if np.isnan(columns.get("deviation_mm", np.nan)).all():
         columns.pop("deviation_mm", None)
     points = 1e3 * np.column_stack([found.x, found.y, found.z])
-    named = {"omitted": unwanted_points(found), "step_mm": 1e3 * float(np.max(found.scales))}
-    return make_foreign_cloud(points, intensity=intensity, **named, **columns), total
+    step, omitted = 1e3 * float(np.max(found.scales)), unwanted_points(found)
+    return make_foreign_cloud(points, intensity=intensity, omitted=omitted, step_mm=step, **columns), total
 
 
 def _require_sound_octree(file: BufferedReader) -> None:
