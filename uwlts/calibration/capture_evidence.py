@@ -188,9 +188,10 @@ def explain_captures_without_stripe(captures: Sequence[Capture]) -> str:
     lit = [image for capture in captures for image in _laser_images(capture, _LOOKED_AT)]
     if not lit:
         return f"no stripe in any of the {count} centre lines of {_names(captures)}: is the laser on?"
-    if any(find_stripe_direction(image, stripe_along=along) == "along" for image in lit):
+    full_dn = header.saturation_dn
+    if any(find_stripe_direction(image, stripe_along=along, saturation=full_dn) == "along" for image in lit):
         return f"the {where} with a stripe were taken at other stage positions than the images with the target"
-    reason = explain_missing_stripe(lit, stripe_along=along, full_dn=header.saturation_dn)
+    reason = explain_missing_stripe(lit, stripe_along=along, full_dn=full_dn)
     return f"no stripe in any of the {count} {where}: {reason}"
 
 

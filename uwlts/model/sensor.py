@@ -595,9 +595,10 @@ class CaptureHeader(Description):
 
     ``medium_name`` is the name of the medium in the sensor's description. ``stage_direction`` is the nominal direction
     of the sensor's motion by the stage, a unit vector in the OCS. ``saturation_dn`` is the grey value of clipped
-    pixels. ``target`` and ``artefact`` describe the measured object; `parse_target` and `parse_artefact` validate them
-    later. ``T_platform_sensor`` (4, 4), mm, is the nominal pose of the sensor on a moving platform; with it, the
-    frames' poses are those of the platform. ``provenance`` documents how the capture was recorded.
+    pixels; values above 2^k - 1 are marks (`uwlts.model.clipped`). ``target`` and ``artefact`` describe the measured
+    object; `parse_target` and `parse_artefact` validate them later. ``T_platform_sensor`` (4, 4), mm, is the nominal
+    pose of the sensor on a moving platform; with it, the frames' poses are those of the platform. ``provenance``
+    documents how the capture was recorded.
     """
 
     name: str

@@ -36,7 +36,7 @@ def verification_path(calibration: str | Path) -> Path:
 def write_verification(calibration: str | Path, record: VerificationRecord) -> Path:
     """Write the record beside the calibration, in place of the last one; OutputError if that fails."""
     path = verification_path(calibration)
-    write_model(path, record, format=FORMAT, version=VERSION, overwrite=True)
+    write_model(path, record, file_format=FORMAT, version=VERSION, overwrite=True)
     return path
 
 
@@ -50,7 +50,7 @@ def describe_verification(
     now, record = now or datetime.now(UTC), None
     if is_regular_file(beside := verification_path(path)):
         called = "record of a verification"
-        record = read_model(beside, VerificationRecord, format=FORMAT, version=VERSION, called=called)
+        record = read_model(beside, VerificationRecord, file_format=FORMAT, version=VERSION, called=called)
     if record is None or record.calibration != calibration_digest(calibration):
         try:
             made = datetime.fromisoformat(str(calibration.provenance.get("date")))

@@ -10,7 +10,7 @@ from uwlts.errors import CaptureError, ImageError
 from uwlts.model.stripe import CaptureStripes, StripeStatus
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.stripe.exposures import BracketImages, fuse_brackets
-from uwlts.stripe.extract import direct_stripe_in, extract_stripe
+from uwlts.stripe.extract import direct_stripe_in
 from uwlts.stripe.options import StripeOptions, StripeSettings
 
 BLACK = 0.02
@@ -25,6 +25,16 @@ FEWEST_LINES = 20
 _ACROSS_RATIO = 3
 """Ratio of lines with a stripe in both reading directions above which the stripe runs across. A stripe along the given
 side has a ratio of about 0.2, from its steep places."""
+
+_REFUSED = {
+    StripeStatus.AMBIGUOUS: "show several stripes, of which none is certainly the laser's own: remove or cover what "
+    "reflects, or choose one by the setting peak",
+    StripeStatus.BORDER: "show a stripe cut off by the image's border: move the sensor or the object",
+    StripeStatus.SATURATED: "are saturated over more than the width of a stripe: reduce the exposure",
+    StripeStatus.END: "show pieces of a stripe shorter than the ends that are left out: increase the exposure, or "
+    "reduce the setting end_lines",
+}
+"""What lines without a centre show although there is light on them, and advice."""
 
 
 def find_stripes(
@@ -94,10 +104,12 @@ def measure_clipped_share(image: np.ndarray, full_dn: float) -> float:
     return float(np.mean(image >= full_dn))
 
 
-def find_stripe_direction(image: np.ndarray, *, stripe_along: str) -> Literal["along", "across"] | None:
+def find_stripe_direction(
+    image: np.ndarray, *, stripe_along: str, saturation: float
+) -> Literal["along", "across"] | None:
     """Return the direction of the stripes in an image (H, W): along the given side, across it, or None."""
-    along = _lines_with_stripe(image, stripe_along)
-    across = _lines_with_stripe(image, "height" if stripe_along == "width" else "width")
+    along = _lines_with_stripe(image, stripe_along, saturation)
+    across = _lines_with_stripe(image, "height" if stripe_along == "width" else "width", saturation)
     if across >= FEWEST_LINES and across > _ACROSS_RATIO * along:
         return "across"
     return "along" if along >= FEWEST_LINES else None
@@ -106,6 +118,7 @@ def find_stripe_direction(image: np.ndarray, *, stripe_along: str) -> Literal["a
 def explain_missing_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: int) -> str:
     """Return the reason why images (H, W) show no stripe, and advice; pixels clip at ``full_dn``."""
     count = black = white = across = 0
+    statuses = np.zeros(len(StripeStatus), int)
     for image in images:
         count += 1
         if is_black(image, full_dn):
@@ -113,7 +126,8 @@ def explain_missing_stripe(images: Iterable[np.ndarray], *, stripe_along: str, f
         elif measure_clipped_share(image, full_dn) > WHITE:
             white += 1
         else:
-            across += find_stripe_direction(image, stripe_along=stripe_along) == "across"
+            across += find_stripe_direction(image, stripe_along=stripe_along, saturation=full_dn) == "across"
+            statuses += np.bincount(_find_status(image, stripe_along, full_dn), minlength=len(StripeStatus))
 
     def count_of(some: int) -> str:
         return "all are" if some == count else f"{some} of {count} are"
@@ -130,17 +144,24 @@ def explain_missing_stripe(images: Iterable[np.ndarray], *, stripe_along: str, f
             f"{across} of {count} images show a stripe across the given direction: the images are rotated by 90 deg, "
             f"or the sensor's stripe_along ('{stripe_along}') is wrong"
         )
+    most = max(_REFUSED, key=lambda status: statuses[status])
+    if statuses[most] >= FEWEST_LINES * count:
+        return f"{statuses[most]} of {statuses.sum()} profile lines {_REFUSED[most]}"
     return (
         "no bright line is above the background: are they laser images, is the exposure long enough, is the object "
         "in view?"
     )
 
 
-def _lines_with_stripe(image: np.ndarray, along: str) -> int:
-    """Count the profile lines with one or more stripes."""
+def _find_status(image: np.ndarray, along: str, saturation: float) -> np.ndarray:
+    """Return the status (L,) of each profile line; no line if they are too short to search for a stripe."""
     try:
-        status = extract_stripe(image, stripe_along=along).status
+        return direct_stripe_in(image, stripe_along=along, options=StripeOptions(), saturation=saturation).status
     except ImageError:
-        # Lines too short to distinguish stripe and background.
-        return 0
+        return np.empty(0, np.uint8)
+
+
+def _lines_with_stripe(image: np.ndarray, along: str, saturation: float) -> int:
+    """Count the profile lines with one or more stripes."""
+    status = _find_status(image, along, saturation)
     return int(np.count_nonzero((status != StripeStatus.NO_STRIPE) & (status != StripeStatus.SATURATED)))

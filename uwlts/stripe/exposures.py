@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from uwlts.model.clipped import split_clipped
 from uwlts.model.sensor import LEAST_BRACKET_STEP, MOST_IN_BRACKET, CaptureHeader
 from uwlts.model.stripe import Stripe
 
@@ -137,8 +138,8 @@ def fuse_exposures(
 ) -> tuple[np.ndarray, float]:
     """Fuse K images (H, W) of one place, and return the float32 image and its grey value of saturation.
 
-    ``exposure_ms`` (K,) is increasing. A pixel with grey value y at exposure t corresponds to o + (y - o) T / t at the
-    longest exposure T, where o is the grey value without light.
+    ``exposure_ms`` (K,) is increasing. Let o be the grey value without light. A pixel with grey value y at exposure t
+    corresponds to o + (y - o) T / t at the longest exposure T.
 
     The pixels are averaged with the weights t^2, which are optimal for the constant noise of faint pixels (Robertson,
     Borman and Stevenson, "Dynamic range improvement through multiple exposures", ICIP 1999, eq. 7). The weight falls to
@@ -148,7 +149,9 @@ def fuse_exposures(
     The offset is estimated from the background of the shortest and the longest image. Cameras expose some microseconds
     longer or shorter than they report. T / t is therefore estimated from pixels that are well exposed in both images.
     """
-    pixels = [image.astype(np.float32) for image in images]
+    # Clipped pixels of differences have any grey value (`uwlts.model.clipped`).
+    known = (split_clipped(image, full_dn) for image in images)
+    pixels = [np.where(clipped, full_dn, values).astype(np.float32) for values, clipped in known]
     offset = _estimate_offset(pixels[0], pixels[-1], float(exposure_ms[-1] / exposure_ms[0]))
     low, high = (share * (full_dn - offset) for share in (_RULE.roll_off_from, _RULE.roll_off_to))
     # From the longest to the shortest exposure: the scale is the product of successive ratios.

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from uwlts.errors import ImageError
+from uwlts.model.clipped import has_marks, split_clipped
 from uwlts.model.stripe import Stripe, StripeCandidates, StripeStatus
 from uwlts.stripe.block_contrast import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
 from uwlts.stripe.direct import direct_stripe
@@ -82,7 +83,7 @@ def extract_stripe(
         case.
     saturation : float, optional
         Grey value of clipped pixels. By default the largest value of the integer type, none for float32. It is
-        needed for 10- or 12-bit images in uint16.
+        needed for 10- or 12-bit images in uint16. Values above 2^k - 1 are marks (`uwlts.model.clipped`).
 
     Returns
     -------
@@ -207,7 +208,9 @@ def _search_image(
         raise ImageError(f"saturation is {saturation!r}; expected the positive grey value of clipped pixels")
     clip = _LARGEST[image.dtype] if saturation is None else saturation
 
-    signal = image
+    signal, clipped = image, None
+    if background is not None or options.smoothing_lines > 1 or has_marks(image, clip):
+        signal, clipped = split_clipped(image, clip)
     if background is not None:
         _check_image(background, name="background")
         if background.shape != image.shape or background.dtype != image.dtype:
@@ -216,29 +219,44 @@ def _search_image(
                 "take both with the same camera settings"
             )
         # The sign is kept.
-        signal = cv2.subtract(image, background, dtype=cv2.CV_16S if image.dtype == np.uint8 else cv2.CV_32F)
+        signal = cv2.subtract(signal, background, dtype=cv2.CV_16S if image.dtype == np.uint8 else cv2.CV_32F)
+    if clipped is not None:
+        signal = _level_clipped(signal, clipped, stripe_along)
+        clipped = _as_profiles(clipped.view(np.uint8), stripe_along=stripe_along)
     if (count := options.smoothing_lines) > 1:
         kernel = (1, count) if stripe_along == "height" else (count, 1)
         signal = cv2.blur(signal.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
     profiles = _as_profiles(signal, stripe_along=stripe_along)
-    found = _search_profiles(profiles, options, clip, stripe_along)
+    found = _search_profiles(profiles, options, clip, stripe_along, clipped)
     # A wider window is used only if it measures the wide stripes.
     wider, widest = options, min(options.widest_window_px, length // 4)
     while found.is_too_wide() and 2 * wider.half_window_px <= widest:
         wider = wider.double_width()
-        found_wider = _search_profiles(profiles, wider, clip, stripe_along)
+        found_wider = _search_profiles(profiles, wider, clip, stripe_along, clipped)
         if not found_wider.is_too_wide():
             found = found_wider
 
-    none = found.stripe.status == _NO_STRIPE
-    if none.any():
-        white = found.white
-        if signal is not image:
-            _, low = block_extremes(_as_profiles(image, stripe_along=stripe_along), found.options.half_window_px // 2)
-            white = low.max(axis=0) >= clip
-        if (none & white).any():
-            found = replace(found, stripe=found.stripe.remove_lines(none & white, StripeStatus.SATURATED))
-    return found
+    none = (found.stripe.status == _NO_STRIPE) & found.white
+    return replace(found, stripe=found.stripe.remove_lines(none, StripeStatus.SATURATED)) if none.any() else found
+
+
+def _level_clipped(image: np.ndarray, clipped: np.ndarray, along: str) -> np.ndarray:
+    """Return an image (H, W) in which neighbouring clipped pixels of a profile line have the largest of their values.
+
+    After a subtraction their values depend on the background and on other channels rather than on the laser, whose
+    light is at least the largest value. Unequal values would shift the stripe or split it.
+    """
+    lines, of_lines = (image, clipped) if along == "height" else (image.T, clipped.T)
+    place = np.flatnonzero(of_lines)
+    if not place.size:
+        return image
+    line, pixel = np.divmod(place, lines.shape[1])
+    first = np.flatnonzero((np.diff(place, prepend=-2) > 1) | (pixel == 0))
+    levelled = image.copy()
+    result = levelled if along == "height" else levelled.T
+    highest = np.maximum.reduceat(lines[line, pixel], first)
+    result[line, pixel] = np.repeat(highest, np.diff(first, append=place.size))
+    return levelled
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +325,9 @@ class _SearchedImage:
         line, clear, peak = search_all(self.profiles, board, lines, self.rules, fewest=2 if rivals else 1)
         if not rivals:
             line, clear, peak = line[clear], clear[clear], peak.select(clear)
-        place, amplitude = peak.start + peak.middle.astype(float), peak.height.copy()
+        # The middle of a stripe that is cut off by the border may be outside the image.
+        place = np.clip(peak.start + peak.middle.astype(float), 0, len(self.profiles) - 1)
+        amplitude = peak.height.copy()
         width, certainty = np.full(len(line), np.nan, np.float32), np.zeros(len(line))
         measured = peak.select(clear)
         centre, amplitude[clear] = place_centre(self.options.method, measured)
@@ -318,8 +338,10 @@ class _SearchedImage:
         return StripeCandidates(line, place, amplitude, width, certainty, count, along)[np.lexsort((place, line))]
 
 
-def _search_profiles(profiles: np.ndarray, options: StripeOptions, clip: float, along: str) -> _SearchedImage:
-    """Search the profiles (N, L) with one window size."""
+def _search_profiles(
+    profiles: np.ndarray, options: StripeOptions, clip: float, along: str, clipped: np.ndarray | None
+) -> _SearchedImage:
+    """Search the profiles (N, L) with one window size; ``clipped`` (N, L) is None if ``clip`` distinguishes pixels."""
     if options.method == LEARNED:
         return _search_by_network(profiles, options, clip, along)
     block = options.half_window_px // 2
@@ -332,6 +354,8 @@ def _search_profiles(profiles: np.ndarray, options: StripeOptions, clip: float, 
     left, rules = cv2.transpose(board), search_rules(options, coarse=coarse, fine=fine, clip=clip)
     status, wide, several, peak = search_profiles(profiles, left, rules)
     # The contrast of a plateau wider than the window is zero.
+    if clipped is not None:
+        low, clip = block_extremes(clipped, block)[1], 1
     white = low.max(axis=0) >= clip if low.max() >= clip else np.zeros(len(status), np.bool_)
     centre, amplitude = place_centre(options.method, peak)
     columns = peak.start + centre.astype(np.float64), amplitude, peak.sigma * FWHM_PER_SIGMA

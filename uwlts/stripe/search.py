@@ -161,9 +161,20 @@ def search_all(
 def mark_rivals(
     profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, known: np.ndarray, rules: SearchRules
 ) -> np.ndarray:
-    """Return a mask (M,) of the lines that have a block of high contrast left in the board ``left``.
+    """Return a mask (M,) of the lines that have a block of high contrast left.
 
-    Spikes are ignored. Lines with ``known`` (M,) rivals are not examined.
+    Parameters
+    ----------
+    profiles : (N, L)
+        Grey values of all lines.
+    left : (N, B + 2 MARGIN)
+        Contrasts of the remaining blocks of all lines; spikes are ignored.
+    lines : (M,)
+        Profile lines to examine.
+    known : (M,)
+        Lines that are marked already and not examined.
+    rules
+        Rules of the search.
     """
     found = known.copy()
     _mark_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)
@@ -243,7 +254,7 @@ def _search_lines(
             start, peak = _follow_peak(profiles, line, start, kernel, pixels, window, smooth, rules)
             verdict = _classify_peak(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
-                wide[line] |= _is_too_wide(peak, rules)
+                wide[line] |= _is_too_wide(peak, start, profiles.shape[0], rules)
                 continue
             # `measure_peak` has searched this window for rivals.
             for k in range(chosen - MARGIN, chosen + MARGIN + 1):
@@ -322,7 +333,7 @@ def _search_all(
                     continue
             start, peak = _follow_peak(profiles, line, start, kernel, pixels, window, smooth, rules)
             verdict = _classify_peak(peak, start, profiles.shape[0], rules)
-            if verdict == _NO_STRIPE and not _is_too_wide(peak, rules):
+            if verdict == _NO_STRIPE and not _is_too_wide(peak, start, profiles.shape[0], rules):
                 continue
             place, known = start + peak.middle, False
             for k in range(first, count):
@@ -394,9 +405,16 @@ def _window_offset(peak: Peak, size: int, rules: SearchRules) -> int:
 
 
 @compiled_inline
-def _is_too_wide(peak: Peak, rules: SearchRules) -> bool:
-    """Return True for a bright peak that is too wide to be measured."""
-    return bool((not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright)
+def _is_too_wide(peak: Peak, start: int, count: int, rules: SearchRules) -> bool:
+    """Return True for a bright peak inside the image that is too wide to be measured."""
+    wide = (not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright
+    return bool(wide and _is_inside(start + peak.top, count))
+
+
+@compiled_part
+def _is_inside(highest: int, count: int) -> bool:
+    """Return True unless a maximum is at the border, where it may be any rise towards the border, such as a frame."""
+    return 1 < highest < count - 2
 
 
 @compiled_inline
@@ -471,9 +489,9 @@ def _classify_peak(peak: Peak, start: int, count: int, rules: SearchRules) -> in
         return _NO_STRIPE
     size, highest = 2 * rules.half + rules.block, start + peak.top
     if not peak.closed:
-        # The far side is outside the image; a maximum at the last pixel may be any rise towards the border.
+        # The far side is outside the image.
         outside = start < 0 or start + size > count
-        return _BORDER if outside and 1 < highest < count - 2 else _NO_STRIPE
+        return _BORDER if outside and _is_inside(highest, count) else _NO_STRIPE
     if not rules.narrowest <= peak.sigma <= rules.widest:
         return _NO_STRIPE
     middle, extent = start + peak.middle, peak.reach + WINDOW_RULE.flank - 1

@@ -21,7 +21,7 @@ def _written(kind: str, folder: Path) -> Path:
     made, path = folder / f"made-{kind}.json", folder / f"{kind}.json"
     READERS[kind].make(made)
     if kind == "evaluation":
-        write_model(path, read_evaluation(made), format=FORMAT, version=VERSION, overwrite=False)
+        write_model(path, read_evaluation(made), file_format=FORMAT, version=VERSION, overwrite=False)
     else:
         uwlts.read(made).save(path)
     return path

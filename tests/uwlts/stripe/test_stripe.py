@@ -11,7 +11,17 @@ from scipy.special import erf
 
 from uwlts.errors import DescriptionError, ImageError, RangeError
 from uwlts.model.library import load_sensor
-from uwlts.stripe import PeakRule, StripeOptions, StripeStatus, extract_stripe, method_names
+from uwlts.storage.import_.grey_values import subtract_background
+from uwlts.stripe import (
+    PeakRule,
+    StripeOptions,
+    StripeStatus,
+    explain_missing_stripe,
+    extract_candidates,
+    extract_stripe,
+    method_names,
+)
+from uwlts.stripe.extract import direct_stripe_in
 
 LENGTH = 120
 METHODS = method_names()
@@ -275,6 +285,79 @@ def test_saturation_is_that_of_the_image_before_subtraction():
     image = grey(gaussian(phases(), sigma=6, amplitude=255 * 8) + 20)
     found = rows(image, background=np.full_like(image, 20))
     assert (found.status == StripeStatus.SATURATED).all()
+
+
+def saturated_before(background, *, amplitude, sigma):
+    """Return a saturated inclined stripe before a background (H, W), the background, and the stripe's places."""
+    rng = np.random.default_rng(5)
+    place = 150.0 + 0.1 * np.arange(len(background))
+    x = np.arange(background.shape[1]) - place[:, None]
+    light = background + amplitude * np.exp(-0.5 * (x / sigma) ** 2)
+    lit, dark = (grey(values + rng.normal(0, 1.5, values.shape)) for values in (light, background))
+    return lit, dark, place
+
+
+def chequered(shape=(200, 320), *, dark=60.0, bright=190.0):
+    row, column = np.indices(shape)
+    return np.where((column // 12 + row // 40) % 2, bright, dark)
+
+
+# The plateau of 65 grey levels before an even background; on a chessboard the plateau is 65 and 195 high in turn. The
+# clipped stripe is 12 sigmas wide at most, and each of its ends is known to half a pixel in the worst case.
+@pytest.mark.parametrize("along", ["height", "width"])
+@pytest.mark.parametrize("background", [np.full((200, 320), 190.0), chequered()], ids=["even", "chessboard"])
+def test_clipped_pixels_are_known_after_subtraction(along, background):
+    lit, dark, place = saturated_before(background, amplitude=600.0, sigma=6.0)
+    assert (lit == 255).any(axis=1).all()
+    turned = [image if along == "height" else image.T.copy() for image in (lit, dark)]
+    pair = extract_stripe(turned[0], stripe_along=along, background=turned[1])
+    stored = subtract_background(*turned, turned[0] == 255, zero_dn=256)
+    found = extract_stripe(stored, stripe_along=along, saturation=511)
+    for stripe in (pair, found):
+        assert len(stripe.lines) > 0.95 * len(place)
+        error = (stripe.centre_px - place)[stripe.lines]
+        assert np.abs(error).max() < 1.0 and abs(error.mean()) < 0.1
+    assert np.array_equal(found.status, pair.status)
+
+
+def test_a_plateau_of_a_difference_wider_than_the_window_is_saturated():
+    lit, dark, _ = saturated_before(np.full((200, 640), 190.0), amplitude=2000.0, sigma=12.0)
+    found = extract_stripe(lit, stripe_along="height", background=dark)
+    assert np.mean(found.status == StripeStatus.SATURATED) > 0.9
+
+
+# A frame round the image, by the camera's or a viewer's software, is a rise towards the border on every line.
+@pytest.mark.parametrize("along", ["height", "width"])
+@pytest.mark.parametrize("method", method_names())
+@pytest.mark.parametrize("thickness", [1, 2, 4])
+def test_a_bright_frame_is_no_stripe(along, method, thickness):
+    image, _, place = saturated_before(np.full((200, 320), 10.0), amplitude=60.0, sigma=2.0)
+    for edge in (np.s_[:thickness], np.s_[-thickness:], np.s_[:, :thickness], np.s_[:, -thickness:]):
+        image[edge] = 255
+    image = image if along == "height" else image.T.copy()
+    inner = np.arange(thickness + 2, len(place) - thickness - 2)
+    for peak in PeakRule:
+        options = StripeOptions(method=method, peak=peak)
+        stripe = direct_stripe_in(image, stripe_along=along, options=options, saturation=255)
+        assert np.abs(stripe.centre_px - place)[inner].max() < 0.2
+        every = extract_candidates(image, stripe_along=along, options=options)
+        assert (every.centre_px >= 0).all() and (every.centre_px <= 319).all()
+
+
+@pytest.mark.parametrize("along", ["height", "width"])
+def test_a_dark_image_in_a_bright_frame_has_no_bright_line(along):
+    image = np.full((200, 320), 10, np.uint8)
+    image[0] = image[-1] = image[:, 0] = image[:, -1] = 255
+    assert "no bright line" in explain_missing_stripe([image], stripe_along=along, full_dn=255)
+
+
+@pytest.mark.parametrize("along", ["height", "width"])
+def test_the_reason_for_missing_centres_is_what_the_lines_show(along):
+    twice = grey(10 + sum(gaussian(np.full(200, centre), sigma=2, amplitude=100, length=320) for centre in (90, 200)))
+    wide, _, _ = saturated_before(np.full((200, 320), 20.0), amplitude=5000.0, sigma=20.0)
+    for image, words in ((twice, "200 of 200 profile lines show several"), (wide, "are saturated over more than")):
+        turned = image if along == "height" else image.T.copy()
+        assert words in explain_missing_stripe([turned], stripe_along=along, full_dn=255)
 
 
 def two_stripes(first, second, *, apart, where=40.0):

@@ -25,18 +25,18 @@ from uwlts.storage.import_.folder_description import (
     described_sensor,
     read_description,
 )
-from uwlts.storage.import_.grey_values import bits_of, extract_channel, grey_values, is_formula, subtract_background
+from uwlts.storage.import_.grey_values import (
+    bits_of,
+    combine_clipped,
+    extract_channel,
+    grey_values,
+    is_formula,
+    subtract_background,
+)
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.storage.import_.mosaic import demosaic, is_mosaic
 from uwlts.stripe import Stripe
-from uwlts.stripe.capture_stripes import (
-    BLACK,
-    FEWEST_LINES,
-    WHITE,
-    find_stripe_direction,
-    is_black,
-    measure_clipped_share,
-)
+from uwlts.stripe.capture_stripes import BLACK, FEWEST_LINES, WHITE, find_stripe_direction, is_black
 
 _SIZE_ADVICE = {
     (True, True): "the images are rotated by 90 deg: rotate them back, or exchange width_px and height_px of the "
@@ -48,6 +48,7 @@ _SIZE_ADVICE = {
 """Advice on an image of another size than the sensor's, by whether it is the first, and whether it is rotated."""
 
 _MOST_EXAMINED = 4  # images of each light in which a mosaic is looked for
+_MANY_LINES = 0.5  # fraction of the profile lines with clipped pixels: the stripe itself rather than reflections
 
 
 @dataclass(eq=False)
@@ -56,8 +57,9 @@ class _Content:
 
     ``saturation_dn`` is that of the files; ``target``: the description has a target. ``black`` has the names of the
     dark images and ``seen`` the number of all, by whether the laser was on. ``with_stripe`` counts the images with a
-    stripe, ``sideways`` those with a stripe across the expected direction. ``mosaics`` has the names of the raw Bayer
-    images among the first of each light, and ``repeats`` the laser images that are equal to the one before.
+    stripe, ``sideways`` those with a stripe across the expected direction, ``clipped`` the laser images with clipped
+    pixels on most lines. ``mosaics`` has the names of the raw Bayer images among the first of each light, and
+    ``repeats`` the laser images that are equal to the one before.
     """
 
     stripe_along: str
@@ -67,14 +69,15 @@ class _Content:
     seen: dict[bool, int] = field(default_factory=lambda: {False: 0, True: 0})
     with_stripe: int = 0
     sideways: int = 0
+    clipped: int = 0
     mosaics: list[str] = field(default_factory=list)
     repeats: list[str] = field(default_factory=list)
     _last: np.ndarray | None = None
 
-    def add_image(self, image: np.ndarray, *, laser_on: bool, name: str) -> None:
-        """Count an image (H, W) from the camera; raises ImageError if most of it is saturated."""
+    def add_image(self, image: np.ndarray, clipped: np.ndarray, *, laser_on: bool, name: str) -> None:
+        """Count an image (H, W) and its ``clipped`` pixels (H, W); raises ImageError if most of it is saturated."""
         self.seen[laser_on] += 1
-        white = measure_clipped_share(image, self.saturation_dn)
+        white = float(clipped.mean())
         if white > WHITE:
             raise ImageError(
                 f"{name} is white: {100 * white:.0f} % of its pixels are saturated ({self.saturation_dn} DN): shorten "
@@ -86,13 +89,14 @@ class _Content:
         if self.seen[laser_on] - len(self.black[laser_on]) <= _MOST_EXAMINED and is_mosaic(image):
             self.mosaics.append(name)
         if laser_on:
+            self.clipped += bool(clipped.any(axis=1 if self.stripe_along == "height" else 0).mean() > _MANY_LINES)
             if self._last is not None and np.array_equal(image, self._last):
                 self.repeats.append(name)
             self._last = image
 
-    def find_stripe(self, image: np.ndarray) -> None:
-        """Look for a stripe in a laser image (H, W) after background subtraction, if any."""
-        direction = find_stripe_direction(image, stripe_along=self.stripe_along)
+    def find_stripe(self, image: np.ndarray, saturation_dn: int) -> None:
+        """Look for a stripe in a laser image (H, W) as it is stored."""
+        direction = find_stripe_direction(image, stripe_along=self.stripe_along, saturation=saturation_dn)
         self.with_stripe += direction == "along"
         self.sideways += direction == "across"
 
@@ -130,6 +134,11 @@ class _Content:
                 f"{self.repeats[0]}: the camera or a copy repeated an image, so that positions may be wrong"
             )
         lasers = self.seen[True]
+        if self.clipped:
+            warnings.append(
+                f"{self.clipped} of {lasers} laser images are saturated on more than {100 * _MANY_LINES:g} % of their "
+                "profile lines, where the stripe is less accurate: shorten the exposure"
+            )
         if lasers and not self.with_stripe:
             advice = "check which images are laser images, the channel, and the exposure"
             if self.sideways:
@@ -207,19 +216,21 @@ def import_images(
     frames = planned_frames(given, matched, in_table=rows is not None)
     reader = _Reader(given, sensor, folder)
     images = [row for row in frames if row.profile is None]
-    bits = sensor.detector.bits
+    bits, zero = sensor.detector.bits, 0
     if images:
-        _, bits = reader.image(images[0].file, laser_on=images[0].light == "laser")
-    zero = _zero_dn(given, frames, bits)
+        *_, bits = reader.image(images[0].file, laser_on=images[0].light == "laser")
+        subtracted = any(row.background is not None for row in frames)
+        zero = _zero_dn(given, bits) if subtracted or reader.derives else 0
+    saturation = 2**bits - 1 if given.saturation_dn is None else given.saturation_dn
     header = capture_header(
         given,
         sensor,
         beside=path.parent,
         name=folder.resolve().name,
-        saturation_dn=(2**bits - 1 if given.saturation_dn is None else given.saturation_dn) + zero,
+        saturation_dn=2 * zero - 1 if zero else saturation,
         remarks=_remarks(given, frames, folder, bits=bits, zero_dn=zero),
     )
-    saturation = header.saturation_dn - zero
+    saturation = reader.saturation_dn = saturation if given.header is None else header.saturation_dn
     if images and saturation > np.iinfo(reader.dtype).max:
         raise DescriptionError(f"saturation_dn is {saturation}; images of {reader.dtype} have no such value")
     in_time = _in_order(frames)
@@ -240,16 +251,16 @@ def import_images(
                     writer.append(Frame(row.profile, row.stage_mm, True, exposure_ms, time_s, row.pose, encoder))
                     progress(number + 1, len(frames))
                     continue
-                image, _ = reader.image(row.file, laser_on=laser_on)
+                image, clipped, _ = reader.image(row.file, laser_on=laser_on)
                 unsigned = np.maximum(image, 0).astype(reader.dtype, copy=False)
-                content.add_image(unsigned, laser_on=laser_on, name=Path(row.file).name)
+                content.add_image(unsigned, clipped, laser_on=laser_on, name=Path(row.file).name)
                 if laser_on and zero:
                     unlit = np.zeros_like(image) if row.background is None else reader.background(row.background)
-                    image = subtract_background(image, unlit, zero_dn=zero)
+                    image = subtract_background(image, unlit, clipped, zero_dn=zero)
                 else:
                     image = unsigned
                 if laser_on:
-                    content.find_stripe(image)
+                    content.find_stripe(image, header.saturation_dn)
                 image = image.astype(dtype, copy=False)
                 writer.append(Frame(image, row.stage_mm, laser_on, exposure_ms, time_s, row.pose))
                 progress(number + 1, len(frames))
@@ -274,13 +285,11 @@ def _in_order(frames: list[ImageRow]) -> bool:
     return bool((np.diff(np.nan_to_num([row.time_s for row in frames])) >= 0).all())
 
 
-def _zero_dn(given: ImportDescription, frames: list[ImageRow], bits: int) -> int:
-    """Return the grey value of zero laser light; 0 if nothing is subtracted from the images."""
-    if all(row.background is None for row in frames) and not is_formula(given.channel):
-        return 0
-    if given.header is None and bits < 16:
+def _zero_dn(given: ImportDescription, bits: int) -> int:
+    """Return the grey value of zero laser light in images that are calculated from others."""
+    if given.header is None and bits < 15:
         return 2**bits
-    reason = "16 bits leave no room for its sign: give the bits that the camera used, or leave both out"
+    reason = f"{bits} bits leave no room for its sign: give the bits that the camera used, or leave both out"
     if given.header is not None:
         reason = "the header is that of a finished capture: leave out one of the two"
     raise DescriptionError(f"a background or another channel is to be subtracted, but {reason}")
@@ -292,21 +301,30 @@ class _Reader:
     def __init__(self, given: ImportDescription, sensor: Sensor, folder: Path):
         self._given, self._sensor, self._folder = given, sensor, folder
         self.dtype: np.dtype = np.dtype(np.void)  # until the first image is read
+        self.saturation_dn = given.saturation_dn  # 2^bits - 1 if None
+        self.derives = False  # whether the laser's channel is calculated from several
         self._kept: tuple[str, np.ndarray] | None = None
 
-    def image(self, name: str, *, laser_on: bool) -> tuple[np.ndarray, int]:
-        """Read a grey image (H, W), signed for a formula, and its bits; raises ImageError if sizes or depths differ."""
+    def image(self, name: str, *, laser_on: bool) -> tuple[np.ndarray, np.ndarray, int]:
+        """Read a grey image (H, W), signed for a formula, where it is clipped (H, W), and its bits.
+
+        Raises ImageError if sizes or depths differ.
+        """
         given = self._given
         raw = read_image(self._folder / name, accept=partial(self._require_size, name))
         if self.dtype not in (np.void, raw.dtype):
-            raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self.dtype}")
+            raise ImageError(f"{name} contains {raw.dtype}, the images before it contain {self.dtype}")
         channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
         # A header does not state the bits, and the grey values of an exported capture fit in it.
         bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
         self.dtype = raw.dtype
         values = grey_values(raw, bits=bits, aligned=given.aligned, name=name)
-        values = values if given.bayer is None else demosaic(values, given.bayer, name=name)
-        return extract_channel(values, channel, name=name), bits
+        clipped = values >= (self.saturation_dn or 2**bits - 1)
+        if given.bayer is not None:
+            values = demosaic(values, given.bayer, name=name)
+            clipped = demosaic(255 * clipped.astype(np.uint8), given.bayer, name=name) > 0
+        self.derives = is_formula(given.channel, values)
+        return extract_channel(values, channel, name=name), combine_clipped(clipped, channel), bits
 
     def _require_size(self, name: str, declared: ImageHeader) -> None:
         camera, size = self._sensor.camera, (declared.width_px, declared.height_px)

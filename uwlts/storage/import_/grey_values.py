@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 from uwlts.errors import ImageError
+from uwlts.model.clipped import mark_clipped
 
 # OpenCV's order of colours.
 _COLOURS = {"blue": 0, "green": 1, "red": 2}
@@ -34,9 +35,18 @@ Channel = Annotated[str, AfterValidator(check_channel)]
 """Name or formula of a channel."""
 
 
-def is_formula(channel: str | None) -> bool:
-    """Return whether a channel is calculated from others, so that its values may be negative."""
-    return channel is not None and channel not in (*_NAMES, "max")
+def is_formula(channel: str | None, image: np.ndarray) -> bool:
+    """Return whether a channel of an image is calculated from several, so that clipped pixels have any value."""
+    return channel is not None and channel not in (*_COLOURS, "max") and (channel != "grey" or image.ndim == 3)
+
+
+def combine_clipped(clipped: np.ndarray, channel: str | None) -> np.ndarray:
+    """Return where a channel, or one of those in its formula, is clipped (H, W), for an image (H, W) or (H, W, 3)."""
+    if clipped.ndim == 2:
+        return clipped
+    named = "" if channel is None or "grey" in channel else channel
+    used = [place for colour, place in _COLOURS.items() if colour in named]
+    return np.asarray(clipped[:, :, used or slice(None)].any(axis=2))
 
 
 def extract_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
@@ -46,7 +56,7 @@ def extract_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.
     and for a formula of colours if the image has no colours.
     """
     if image.ndim == 2:
-        if is_formula(channel):
+        if is_formula(channel, image):
             raise ImageError(f"{name} has no colours, so that {channel!r} means nothing: leave the channel out")
         return image
     if channel is None:
@@ -130,6 +140,10 @@ def grey_values(image: np.ndarray, *, bits: int, aligned: str, name: str) -> np.
     return image
 
 
-def subtract_background(image: np.ndarray, background: np.ndarray, *, zero_dn: int) -> np.ndarray:
-    """Return image minus background (H, W) of the same type as uint16, plus ``zero_dn``, saturated."""
-    return cv2.addWeighted(image, 1.0, background, -1.0, zero_dn, dtype=cv2.CV_16U)
+def subtract_background(image: np.ndarray, background: np.ndarray, clipped: np.ndarray, *, zero_dn: int) -> np.ndarray:
+    """Return image minus background (H, W) of the same type as uint16, plus ``zero_dn``, a power of two.
+
+    Pixels ``clipped`` (H, W) by the camera are marked above the difference's saturation, 2 ``zero_dn`` - 1.
+    """
+    difference = cv2.addWeighted(image, 1.0, background, -1.0, zero_dn, dtype=cv2.CV_16U)
+    return mark_clipped(difference, clipped, saturation_dn=2 * zero_dn - 1)

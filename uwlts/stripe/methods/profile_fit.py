@@ -12,7 +12,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
-from uwlts.stripe.methods import quadratic
+from uwlts.stripe.line_scatter import least_scattered
+from uwlts.stripe.methods import centre_of_mass, quadratic, zero_crossing
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow
 
 _STEPS = 5
@@ -46,6 +47,10 @@ invalid beyond it."""
 
 _SPECKLED_HALO = 0.023
 """Ratio of noise and height above which the flanks of a plateau are less informative than its middle."""
+
+_NEARLY = 0.03
+"""Fraction of a stripe's height by which noise and compression lower the pixels of a plateau. A Gaussian is as high
+over a fifth of its width only."""
 
 _MOSTLY = 0.5
 """Fraction of the width above which a plateau is most of its stripe."""
@@ -100,8 +105,8 @@ def centres(peak: PeakWindow) -> np.ndarray:
     """Fit a Gaussian profile and return its centre (M,) float32, px from the window's first pixel.
 
     The model is f = A exp(-u^2 / 2) with u = (x - c) / s, above the line through the peak's flanks. The variance of a
-    pixel is v = r^2 + (C f)^2, with the noise floor r of detector and surroundings and the speckle contrast C, which
-    includes shot noise. Both are estimated from all lines together: r beside the stripes, C from the residuals of a
+    pixel is v = r^2 + (C f)^2. The noise floor r is that of detector and surroundings; the speckle contrast C includes
+    shot noise. Both are estimated from all lines together: r beside the stripes, C from the residuals of a
     first fit.
 
     Each step solves sum (y - f) df/dp / v = 0, linearised in p = (ln A, c / s, ln s), with v of the previous step. This
@@ -111,6 +116,10 @@ def centres(peak: PeakWindow) -> np.ndarray:
 
     Saturated pixels are not treated separately, because the contrast gives the top little weight. If they are most of
     the stripe, in a halo with speckle, the flanks are not Gaussian: then the parabola of `quadratic` scatters less.
+
+    Real flanks may be no Gaussian for other reasons, such as flare, texture, sharpening or compression by the camera.
+    The noise model then gives them too much weight. Another method is used for all lines if it scatters less along the
+    stripe (`uwlts.stripe.line_scatter`).
     """
     sampled = np.arange(0, peak.start.size, max(1, peak.start.size // _SAMPLED))
     flanks = np.zeros(sampled.size, np.float32)
@@ -126,7 +135,7 @@ def centres(peak: PeakWindow) -> np.ndarray:
     _fit_profiles(peak, noise, sampled, signal, known, sums[0], centre, flat)
     if flat.any():
         centre[flat] = quadratic.centres(peak.select(flat))
-    return centre
+    return least_scattered(peak, centre, zero_crossing, (quadratic, centre_of_mass))
 
 
 def _allocate_aligned(*shapes: tuple[int, int]) -> Iterator[np.ndarray]:
@@ -184,7 +193,7 @@ def _fit_profiles(
             for k in range(size):
                 highest = max(highest, window[k])
             for k in range(size):
-                plateau += window[k] == highest
+                plateau += window[k] >= highest - np.float32(_NEARLY) * peak.height[m]
         flat[m] = plateau > max(_MOSTLY * width, _PLATEAU)
 
 

@@ -1,0 +1,69 @@
+"""Scatter of the stripe methods on real stripes by others (tests/data): python docs/studies/stripe_real.py.
+
+The scatter is the root mean square distance, px, of a centre from the parabola through the centres on the twelve lines
+on either side, on the lines that all methods find. Distances above 3 px, at edges of the objects, are left out.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.storage.image_file import read_image
+from uwlts.stripe import PeakRule, StripeOptions, extract_stripe, method_names
+
+DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
+REACH, LARGEST_PX, SAME_PX = 12, 3.0, 12.0
+
+
+def stripes() -> Iterator[tuple[str, np.ndarray, np.ndarray | None, PeakRule]]:
+    """Yield a name, an image (H, W) with a stripe along its height, its background if any, and the rule."""
+    for folder, corner, rules in (
+        ("board", "x200_y440", (PeakRule.FIRST, PeakRule.LAST)),
+        ("bust", "x400_y0", (PeakRule.STRONGEST,)),
+    ):
+        lit, dark = (
+            np.ascontiguousarray(read_image(DATA / "ciclop" / folder / f"{name}_{corner}.png")[:, :, 2])
+            for name in ("laser", "laser-background")
+        )
+        for rule in rules:
+            yield f"{folder}, {rule}", lit, None, rule
+            yield f"{folder}, {rule}, background subtracted", lit, dark, rule
+    for number in range(1, 17):
+        image = read_image(DATA / "etna" / f"frame{number:04d}.jpg")
+        yield f"saturated {number}", image, None, PeakRule.STRONGEST
+
+
+def scatter(centre: np.ndarray) -> float:
+    """Return the scatter, px, of centres (L,); NaN where there is none."""
+    apart = []
+    for line in np.flatnonzero(np.isfinite(centre)):
+        near = np.arange(max(line - REACH, 0), min(line + REACH + 1, len(centre)))
+        near = near[(near != line) & (np.abs(centre[near] - centre[line]) < SAME_PX)]
+        if len(near) >= REACH:
+            apart.append(centre[line] - np.polyval(np.polyfit(near - line, centre[near], 2), 0))
+    values = np.array(apart)
+    return float(np.sqrt(np.mean(np.square(values[np.abs(values) < LARGEST_PX]))))
+
+
+def main() -> None:
+    """Print the table."""
+    names = method_names()
+    print("| stripe | lines found % |", " | ".join(f"{name} px" for name in names), "| default / best simple |")
+    print("| --- " * (len(names) + 3) + "|")
+    for called, image, background, rule in stripes():
+        centres = {
+            name: extract_stripe(
+                image, stripe_along="height", options=StripeOptions(method=name, peak=rule), background=background
+            ).centre_px
+            for name in names
+        }
+        both = np.isfinite(list(centres.values())).all(axis=0)
+        found = {name: scatter(np.where(both, values, np.nan)) for name, values in centres.items()}
+        default = found.pop(StripeOptions().method)
+        cells = " | ".join(f"{found.get(name, default):.3f}" for name in names)
+        print(f"| {called} | {100 * both.mean():.0f} | {cells} | {default / min(found.values()):.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""Scatter of stripe centres from line to line, to compare methods on the stripe at hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from types import ModuleType
+
+import numpy as np
+
+from uwlts.stripe.peak_window import WINDOW_RULE, PeakWindow
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScatterRule:
+    """Numbers of the comparison, chosen for the reasons below.
+
+    ``reach``, ``run`` and the use of squares were chosen on the real stripes of docs/results/stripe-methods.md, where
+    the result is compared on drawn stripes that were not used.
+
+    Attributes
+    ----------
+    reach : int
+        Lines on either side of a line, through whose centres a parabola is fitted. Surfaces are smooth over them, and
+        errors by texture and flare are longer than a few lines.
+    run, runs : int
+        Consecutive lines of a run, and number of runs. Their 320 evaluated lines compare methods to some percent, and
+        the comparison costs little more than the fit of an image.
+    fewest : int
+        Fewest evaluated lines. With fewer lines the difference of two methods may be chance.
+    advantage : float
+        Ratio of the scatters of the zero crossing and the profile fit above which the noise model describes the stripe:
+        the ratio is 2 in speckle and 1 in white noise. Half of the runs are used, so that speckle costs little time.
+    gain, gain_px : float
+        Least gain by another method, relative and in px. Methods that differ less would be exchanged by chance from
+        image to image. Errors of 0.005 px with the pixel phase (`WindowRule.least_kernel`) are no scatter if the stripe
+        is inclined little: their root mean square is the least gain.
+    narrowest : float
+        Least median sigma of a stripe, px. The simple methods pull the centres of narrower stripes to the pixels'
+        middles, which lowers their scatter.
+    largest_px : float
+        Limit of the distances, px; larger ones are due to edges and would conceal the others. Squares, as in the fits
+        for which the centres are used.
+    jump : float
+        Largest distance of neighbouring centres, as a fraction of the window; other lines belong to two surfaces.
+    """
+
+    reach: int = 12
+    run: int = 64
+    runs: int = 8
+    fewest: int = 64
+    advantage: float = 1.3
+    gain: float = 0.02
+    gain_px: float = 0.0035
+    narrowest: float = WINDOW_RULE.least_kernel
+    largest_px: float = 3.0
+    jump: float = 0.2
+
+
+_RULE = ScatterRule()
+
+
+def least_scattered(
+    peak: PeakWindow, centre: np.ndarray, first: ModuleType, others: tuple[ModuleType, ...]
+) -> np.ndarray:
+    """Return the centres (M,) of the method that scatters least along the stripe.
+
+    Parameters
+    ----------
+    peak
+        Windows of M lines in their order.
+    centre
+        Centres (M,) of the preferred method, px from the first pixel of each window.
+    first
+        Module of another method. Only if the preferred method lacks its advantage over this one, all are compared.
+    others
+        Modules of further methods. One of all is used if it scatters less by `ScatterRule.gain` and ``gain_px``.
+    """
+    rows = _select_runs(peak.start.size)
+    if rows.shape[1] <= 2 * _RULE.reach or np.median(peak.sigma) < _RULE.narrowest:
+        return centre
+    own, (of_first,) = _measure_scatters(peak, centre, (first,), rows[::2])
+    if not of_first <= _RULE.advantage * own:
+        return centre
+    own, scatters = _measure_scatters(peak, centre, (first, *others), rows)
+    best = int(np.argmin(scatters))
+    if not own - scatters[best] > max(_RULE.gain * own, _RULE.gain_px):
+        return centre
+    return (first, *others)[best].centres(peak)
+
+
+def _measure_scatters(
+    peak: PeakWindow, centre: np.ndarray, others: tuple[ModuleType, ...], rows: np.ndarray
+) -> tuple[float, list[float]]:
+    """Return the root mean square distance, px, from parabolas through neighbours: of centres, and of other methods.
+
+    ``rows`` (R, K) are the lines of R runs. The distances are NaN if too few lines belong to a smooth stripe.
+    """
+    some = peak.select(rows.ravel())
+    middle = (some.start + some.middle).reshape(rows.shape)
+    apart = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(middle)), 2 * _RULE.reach, axis=1).max(axis=2)
+    smooth = apart <= _RULE.jump * peak.window.shape[1]
+    if np.count_nonzero(smooth) < _RULE.fewest:
+        return math.nan, [math.nan for _ in others]
+    scatters = []
+    for values in (centre[rows.ravel()], *(other.centres(some) for other in others)):
+        place = (some.start + values.astype(float)).reshape(rows.shape)
+        near = np.lib.stride_tricks.sliding_window_view(place, 2 * _RULE.reach + 1, axis=1)
+        distance = np.minimum(np.abs(near @ _residual_weights(_RULE.reach))[smooth], _RULE.largest_px)
+        scatters.append(math.sqrt(np.mean(np.square(distance))))
+    return scatters[0], scatters[1:]
+
+
+def _select_runs(count: int) -> np.ndarray:
+    """Return the indices (R, K) of runs spread over ``count`` lines, or all lines as one run if they are few."""
+    if count <= _RULE.run * _RULE.runs:
+        return np.arange(count)[None]
+    return np.linspace(0, count - _RULE.run, _RULE.runs).astype(np.intp)[:, None] + np.arange(_RULE.run)
+
+
+@lru_cache
+def _residual_weights(reach: int) -> np.ndarray:
+    """Return weights (2 R + 1,) of centres that give the middle one's distance from their least-squares parabola."""
+    powers = np.vander(np.arange(-reach, reach + 1, dtype=float), 3)
+    weights = -np.linalg.pinv(powers)[-1]
+    weights[reach] += 1.0
+    return weights
