@@ -10,7 +10,7 @@ from cyclopts import App
 import twin
 from uwlts._version import __version__
 from uwlts.errors import CommandFailed
-from uwlts.runtime.command_line import Call, command_from, show
+from uwlts.runtime.command_line import Call, command_from, say, show
 from uwlts.runtime.console import run
 
 app = App(
@@ -34,21 +34,21 @@ def serve(call: Call) -> None:
     Example: twin serve plane --placement near --fault drop@20
     """
     with call() as served:
-        print("\n".join([*served.lines(), "serving; stop with Ctrl-C"]), flush=True)
+        say("\n".join([*served.lines(), "serving; stop with Ctrl-C"]))
         served.wait_for_end()
-    print(f"ended after {served.rates()}")
+    say(f"ended after {served.rates()}")
 
 
 @command_from(app, twin, "record")
 def record(call: Call) -> None:
     """Example: twin record demo --out runs/campaign"""
-    print(f"wrote {call()}")
+    say(f"wrote {call()}")
 
 
 @command_from(app, twin, "dataset")
 def dataset(call: Call) -> None:
     """Example: twin dataset stripe-clean --scenes 20 --out runs/stripes"""
-    print(f"wrote {call()}")
+    say(f"wrote {call()}")
 
 
 @command_from(app, twin, "reproduce")
@@ -89,12 +89,12 @@ def scenes() -> None:
 
     for name in list_names():
         scene = load_scene(name)
-        print(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
+        say(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
     for folder in ("sensors", "campaigns", "datasets", "studies"):
-        print(f"{folder}: {', '.join(list_names(folder))}")
-    print(f"waters: {', '.join(WATERS)}, or a turbidity from 0 to 3")
+        say(f"{folder}: {', '.join(list_names(folder))}")
+    say(f"waters: {', '.join(WATERS)}, or a turbidity from 0 to 3")
     for name, water in WATERS.items():
-        print(f"  {name}: {water.sentence}")
+        say(f"  {name}: {water.sentence}")
 
 
 def main() -> None:

@@ -4,6 +4,7 @@ Messages state what was found, what was expected and what to do. The commands pr
 with code 2.
 """
 
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -20,12 +21,23 @@ _LONGEST_PROBLEM = 300
 _LONGEST = 5000
 
 
+_UNPRINTABLE = re.compile(r"[^\n\t\x20-\x7e\xa0-\u200d\u2010-\u2029\u202f-\u2065\u206a-\ud7ff\ue000-\U0010ffff]")
+
+
+def make_printable(text: str) -> str:
+    """Return text with control characters, marks of the writing direction, and parts of characters as escapes.
+
+    Names and texts from files could otherwise move the cursor, change colours or hide text on a terminal.
+    """
+    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
 class Error(Exception):
     """Base of all errors caused by input, files or the machine rather than by a bug; long messages are shortened."""
 
     def __str__(self) -> str:
-        """Return the message, shortened to about 5000 characters: some quote the content of a file."""
-        text = super().__str__()
+        """Return the message, printable and shortened to about 5000 characters: some quote the content of a file."""
+        text = make_printable(super().__str__())
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1000]} ... {text[-1000:]}"
 
 

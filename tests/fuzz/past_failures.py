@@ -73,6 +73,7 @@ def _replaced(reader: str, old: str, new: str) -> Build:
 def _edited(reader: str, edit: Callable[[dict], None]) -> Build:
     def build(path: Path) -> None:
         content = json.loads(seed_of(READERS[reader], path.parent))
+        content.pop("sha256", None)
         edit(content)
         path.write_text(json.dumps(content))
 

@@ -18,6 +18,7 @@ from tests.uwlts.mount_views import sphere_campaign
 from tests.uwlts.storage.test_capture import a_header, interrupted, record, small_sensor
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
+from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, COLUMNS, INFO, POINTS, PROGRAMS, pcd
 from twin.design.screening import encode_part, read_parts
 from twin.design.study import load_study
 from twin.scene.campaign import load_campaign
@@ -31,7 +32,7 @@ from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
 from uwlts.model.artefacts import read_artefact
-from uwlts.model.library import library_folder, load_sensor
+from uwlts.model.library import library_folder, load_sensor, read_table, validate_description
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.certificate import check_certificate, make_certificate
 from uwlts.report.gather import load_reference
@@ -43,9 +44,10 @@ from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
-from uwlts.storage.mount_files import read_mount, read_profiles
-from uwlts.storage.pose_files import read_trajectory
+from uwlts.storage.mount_files import MountDescription, read_mount, read_profiles
+from uwlts.storage.pose_files import read_poses, read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
+from uwlts.storage.verification_file import describe_verification
 from uwlts.thesis.published_tables import load_published
 from uwlts.thesis.results import CampaignResults, LineProfile, Measurement, SpacingInterval, WindowChoice, WindowProfile
 
@@ -135,6 +137,30 @@ def _text_cloud(path: Path) -> None:
 
 def _foreign(path: Path) -> None:
     write_cloud(path, some_cloud())
+
+
+def _pcd(path: Path) -> None:
+    path.write_bytes(pcd(path.name.partition("-")[2].partition(".")[0], points=POINTS[:21]))
+
+
+def _gocator(path: Path) -> None:
+    rows = "0,0,5,0,0,0,80,10.5,Z,1.5,,3.5\n0,0,5,0,0,0,80,10.5,I,7,8,9\n"
+    path.write_text(f"{INFO}Profile\n{ATTRIBUTES.format(0)}{COLUMNS},-0.5,0,0.5\n{rows}End\n")
+
+
+def _verification(path: Path) -> None:
+    record = {"format": "uwlts-verification", "version": 1, "calibration": "a", "date": "2026-01-02T03:04:05+00:00"}
+    path.write_text(json.dumps(record | {"capture": "a.h5", "passed": True, "lines": ["diameter: 50 mm"]}))
+
+
+def _verified(path: Path) -> None:
+    describe_verification(
+        path.with_name(path.name.replace(".verification", "")), nominal_calibration(load_sensor("thesis"))
+    )
+
+
+def _mount_description(path: Path) -> None:
+    path.write_text('profiles = "p.csv"\nposes = "q.csv"\nradius_mm = 20.0\npose_format = "euler-ZYX-deg"\n')
 
 
 def _las(path: Path) -> None:
@@ -310,6 +336,30 @@ READERS = {
         *(
             Reader(f"cloud-{kind}", f".{kind}", form, make, read_cloud)
             for kind, form, make in (("xyz", "lines", _foreign), ("las", "bytes", _las), ("e57", "bytes", _foreign))
+        ),
+        *(
+            Reader(f"cloud-pcd-{kind}", f"-{kind}.pcd", "lines" if kind == "ascii" else "bytes", _pcd, read_cloud)
+            for kind in ("ascii", "binary", "binary_compressed")
+        ),
+        Reader("cloud-copc", ".copc.laz", "bytes", _foreign, read_cloud),
+        Reader("cloud-gocator", ".csv", "lines", _gocator, read_cloud),
+        *(
+            Reader(
+                f"poses-{robot}",
+                ".src",
+                "lines",
+                lambda path, robot=robot: path.write_text(PROGRAMS[robot][0]),
+                lambda path, robot=robot: read_poses(path, pose_format=robot),
+            )
+            for robot in PROGRAMS
+        ),
+        Reader("verification", ".verification.json", "json", _verification, _verified),
+        Reader(
+            "mount-description",
+            ".toml",
+            "toml",
+            _mount_description,
+            lambda path: validate_description(MountDescription, read_table(path), path),
         ),
         Reader("sensor", ".toml", "toml", _shipped("sensors/thesis.toml"), load_sensor),
         Reader("sensor-shown", ".toml", "toml", _shipped("sensors/thesis.toml"), describe),

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 import uwlts
 from uwlts.cli.options import STRIPE, CalibrationOut, Overwrite, a_file, a_page, app, wrote, wrote_page
-from uwlts.errors import DescriptionError
+from uwlts.errors import DescriptionError, OutputError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.command_line import Call, command_from, say, show, warn
 
@@ -180,7 +180,7 @@ def certificate(
         if call.given.keys() & {"out", "before"}:
             raise DescriptionError("`check` verifies and writes nothing: give it without `out` and `before`")
         against = uwlts.report.check_certificate(check, calibration)
-        print("\n".join(against) or f"{check} is unchanged, and belongs to {calibration}")
+        say("\n".join(against) or f"{check} is unchanged, and belongs to {calibration}")
         if against:
             sys.exit(1)
         return
@@ -191,12 +191,16 @@ def certificate(
 
 @command_from(app, uwlts, "verify")
 def verify(call: Call) -> None:
-    """Answer pass or fail: exit code 0 or 1.
+    """Answer pass or fail: exit code 0 or 1. The verdict is kept beside the calibration, for uwlts reconstruct.
 
     Example: uwlts verify step.h5 --calibration calibration.json --limit-mm 0.05
     """
     verification = call()
     show([verification.text, *verification.not_shown])
-    print("pass" if verification.passed else "FAIL")
+    say("pass" if verification.passed else "FAIL")
+    try:
+        say(f"wrote {verification.save(call.given['calibration'])}")
+    except OutputError as error:
+        warn(f"the verdict is not kept: {error}")
     if not verification.passed:
         sys.exit(1)

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import uwlts
-from uwlts.cli.options import CalibrationOut, Overwrite, app, wrote_files
-from uwlts.runtime.command_line import Call, command_from, show, warn
+from uwlts.cli.options import CalibrationOut, Overwrite, app, cloud_written, wrote_files
+from uwlts.runtime.command_line import Call, command_from, say, show, warn
 
 
 @command_from(app, uwlts, "design")
@@ -25,7 +25,7 @@ def nominal(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) ->
 @command_from(app, uwlts, "describe")
 def info(call: Call) -> None:
     """Example: uwlts info capture.h5"""
-    print(call())
+    say(call())
 
 
 @command_from(app, uwlts, "import_images")
@@ -33,11 +33,11 @@ def import_(call: Call) -> None:
     """Example: uwlts import photographs --out target.h5"""
     imported = call()
     warn(*imported.warnings)
-    print(f"wrote {call.given['out']} with {imported.laser} laser and {imported.lamp} lamp images")
+    say(f"wrote {call.given['out']} with {imported.laser} laser and {imported.lamp} lamp images")
 
 
 @command_from(app, uwlts, "export")
 def export(call: Call) -> None:
     """Example: uwlts export scan.ply --out scan.laz"""
     out, written = Path(call.given["out"]), call()
-    print(f"wrote {written} images and import.toml to {out}" if out.is_dir() else f"wrote {out} with {written} points")
+    say(f"wrote {written} images and import.toml to {out}" if out.is_dir() else cloud_written(out, written))

@@ -18,7 +18,7 @@ from uwlts.cli.options import (
     wrote_files,
     wrote_page,
 )
-from uwlts.runtime.command_line import Call, command_from, show
+from uwlts.runtime.command_line import Call, command_from, say, show
 
 _INSPECTIONS = [(uwlts, f"inspect_{kind}") for kind in ("pipe", "weld", "flange")]
 """Functions that provide the options of an inspection."""
@@ -70,7 +70,7 @@ def compare(
     app,
     uwlts,
     "inspect_pipe",
-    also=_INSPECTIONS,
+    also=[*_INSPECTIONS, (uwlts, "export")],
     summary="Find the features of a pipe, weld, step, flange or gap in a cloud and measure them, with uncertainty.",
 )
 def inspect(
@@ -86,6 +86,7 @@ def inspect(
     ] = None,
     coloured: ColouredOut = None,
     datum=None,
+    unit=None,
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts inspect pipe.ply --wall-mm 9.5 --out pipe.json"""
@@ -93,8 +94,8 @@ def inspect(
     from uwlts.report.plot import surface_limit_mm
     from uwlts.storage.cloud_files import read_cloud
 
-    measured = read_cloud(call.given.pop("cloud"))
-    options = call.given if datum is None else call.given | {"datum": datum}
+    measured = read_cloud(call.given.pop("cloud"), unit=unit)
+    options = call.given if datum is None else call.given | {"datum": read_cloud(datum, unit=unit)}
     found = inspect_cloud(measured, kind, **options)
     show(found.lines())
     if coloured:
@@ -133,7 +134,7 @@ def findings_report(
     out = Path(call.given["out"])
     beside = [json_beside(out, "findings"), *([out.with_suffix(".pdf")] if call.given.get("pdf") else [])]
     show(found.lines())
-    print(f"wrote {out}, {', '.join(each.name for each in beside)}")
+    say(f"wrote {out}, {', '.join(each.name for each in beside)}")
 
 
 @command_from(app, uwlts.report, "write_campaign")
@@ -146,7 +147,7 @@ def report(call: Call) -> None:
 
     written = call()
     print_table(written.rows())
-    print(f"wrote {written.page} and {written.summary}")
+    say(f"wrote {written.page} and {written.summary}")
 
 
 @command_from(app, uwlts, "evaluate_thesis")
@@ -156,6 +157,6 @@ def thesis(call: Call) -> None:
     Example: uwlts thesis runs/thesis
     """
     written = call()
-    print(written.headline.rstrip())
+    say(written.headline.rstrip())
     page, *others = written.files
-    print(f"wrote {page}, {', '.join(file.name for file in others)}")
+    say(f"wrote {page}, {', '.join(file.name for file in others)}")

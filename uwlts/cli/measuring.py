@@ -6,8 +6,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import STRIPE, Overwrite, a_cloud, a_file, a_page, app, wrote, wrote_files
-from uwlts.runtime.command_line import Before, Call, command_from, show, warn
+from uwlts.cli.options import STRIPE, Overwrite, a_cloud, a_file, a_page, app, cloud_written, wrote, wrote_files
+from uwlts.runtime.command_line import Before, Call, command_from, say, show, warn
 
 
 @command_from(app, uwlts, "reconstruct", shortcuts=STRIPE)
@@ -25,20 +25,21 @@ def reconstruct(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts reconstruct scan.h5 --calibration calibration.json --out scan.ply"""
-    from uwlts.storage.calibration_file import load_calibration
     from uwlts.storage.capture import Capture
+    from uwlts.storage.cloud import VERIFIED
 
-    calibration = load_calibration(call.given["calibration"])
     with Capture(call.given["capture"]) as capture:
-        cloud = call(capture=capture, calibration=calibration)
+        cloud = call(capture=capture)
         lit = int(capture.laser_on.sum())
     cloud.save(out, overwrite=overwrite)
     warn(*cloud.warnings)
-    print(f"laser images with a point: {len(set(cloud.frame.tolist()))} of {lit}")
-    print(f"profile lines: {_counts(cloud.lines_by_status)}")
+    if until := cloud.metadata.get(VERIFIED):
+        say(f"calibration verified until {until}")
+    say(f"laser images with a point: {len(set(cloud.frame.tolist()))} of {lit}")
+    say(f"profile lines: {_counts(cloud.lines_by_status)}")
     if lost := _counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):
-        print(f"stripe centres without a point: {lost}")
-    print(f"wrote {out} with {len(cloud)} points")
+        say(f"stripe centres without a point: {lost}")
+    say(cloud_written(out, len(cloud)))
 
 
 def _counts(by_status: dict[str, int]) -> str:
@@ -101,7 +102,7 @@ def align(
     found.save(out, overwrite=overwrite)
     if aligned:
         found.cloud.save(aligned, overwrite=overwrite)
-    print(f"wrote {out} and {out.with_suffix('.json').name}" + (f", {aligned}" if aligned else ""))
+    say(f"wrote {out} and {out.with_suffix('.json').name}" + (f", {aligned}" if aligned else ""))
 
 
 @command_from(app, uwlts, "mesh")

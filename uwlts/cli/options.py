@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 
 from uwlts._version import __version__
 from uwlts.files.writing import refuse_unsuitable
-from uwlts.runtime.command_line import Before, Shortcuts, show, warn
+from uwlts.runtime.command_line import Before, Shortcuts, say, show, warn
 
 if TYPE_CHECKING:
     from uwlts.storage.cloud import PointCloud
@@ -112,9 +112,16 @@ def wrote(lines: Iterable[str], warnings: Iterable[str], *paths: Path | None) ->
 
 def wrote_files(*paths: Path | None) -> None:
     """Print the files written for a result."""
-    print(f"wrote {', '.join(str(path) for path in paths if path is not None)}")
+    say(f"wrote {', '.join(str(path) for path in paths if path is not None)}")
+
+
+def cloud_written(path: Path, points: int) -> str:
+    """Return the line on a written cloud, with its unit."""
+    from uwlts.storage.cloud_files import unit_of
+
+    return f"wrote {path} with {points} points in {unit_of(path)}"
 
 
 def wrote_page(page: Path) -> None:
     """Print the page written for a result, and the JSON beside it."""
-    print(f"wrote {page} and {page.with_suffix('.json').name}")
+    say(f"wrote {page} and {page.with_suffix('.json').name}")

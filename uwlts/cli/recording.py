@@ -4,7 +4,7 @@ import sys
 
 import uwlts
 from uwlts.cli.options import app
-from uwlts.runtime.command_line import Call, command_from, warn
+from uwlts.runtime.command_line import Call, command_from, say, warn
 
 
 @command_from(app, uwlts, "scan")
@@ -14,7 +14,7 @@ def scan(call: Call) -> None:
     warn(*seen.warnings())
     exposures = ", ".join(f"{light} {value:.3g} ms" for light, value in seen.exposure_ms.items())
     lines = f"{seen.found} of {seen.lines} profile lines with a stripe"
-    print(f"wrote {call.given['out']}, {lines}; exposure {exposures or 'as before'}")
+    say(f"wrote {call.given['out']}, {lines}; exposure {exposures or 'as before'}")
 
 
 @command_from(app, uwlts, "watch")

@@ -28,7 +28,7 @@ from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface
-from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances, rounding_std_mm
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.pose_files import Unit
 
@@ -200,7 +200,8 @@ def compare_clouds(
     disc_mm: float | None = None,
     deep_mm: float | None = None,
     same_water: bool = False,
-    unit: Unit = "mm",
+    unit: Unit | None = None,
+    cloud_unit: Unit | None = None,
 ) -> SurfaceChange:
     """Find where a surface differs from an earlier cloud, a mesh or an ideal shape by more than the uncertainty.
 
@@ -235,7 +236,9 @@ def compare_clouds(
         Both clouds were scanned in water of the same temperature and salinity. The error of its refractive index then
         cancels for clouds of one calibration.
     unit
-        Unit of the reference, mm or m.
+        Unit of the reference, mm or m, if its file does not state it; by default mm.
+    cloud_unit
+        The same of the cloud.
 
     Returns
     -------
@@ -257,7 +260,7 @@ def compare_clouds(
     >>> change.significant.mean(), change.distance_mm[change.significant].min()
     >>> uwlts.compare_clouds("pipe.ply", "cylinder").regions()
     """
-    new = load_cloud(cloud)
+    new = load_cloud(cloud, unit=cloud_unit)
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
@@ -280,6 +283,9 @@ def compare_clouds(
     variance, found = sides.variance_mm2, sides.registration
     if found is not None:
         variance = variance + found.std_along(sides.places, sides.normals) ** 2
+    # Rounding errors of neighbouring points are equal where a surface is parallel to an axis, and do not average out.
+    stored = surface.rounding_std_mm if isinstance(surface, ReferencePoints) else 0.0
+    variance = variance + rounding_std_mm(new) ** 2 + stored**2
     if not np.isfinite(sides.distance_mm).any():
         raise EvaluationError(
             f"the cloud and the reference do not overlap within {deep:g} mm. Check that both have the same frame and "

@@ -17,8 +17,8 @@ from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
 from uwlts.fitting.point_spacing import POINTS_PER_DISC
 from uwlts.model.sensor import Description, Positive, Vector
-from uwlts.storage.cloud import PointCloud, PointUncertainty
-from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.cloud import PointCloud, PointUncertainty, rounding_std_mm
+from uwlts.storage.cloud_files import is_readable_cloud, read_cloud
 from uwlts.storage.mesh_file import has_faces, load_triangles
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
 
@@ -27,6 +27,7 @@ _SAMPLES_PER_DISC = 60
 _MOST_SAMPLES = 3_000_000
 """Limit of memory for samples of a mesh."""
 _AT_A_TIME = 20_000
+_IN_METRES = (".glb", ".gltf")
 
 Reference = PointCloud | IdealShape | str | os.PathLike[str]
 
@@ -39,6 +40,7 @@ class ReferencePoints:
     normals: np.ndarray | None = None
     uncertainty: PointUncertainty | None = None
     frame: np.ndarray | None = None
+    rounding_std_mm: float = 0.0
 
     @property
     def meshed(self) -> bool:
@@ -87,25 +89,31 @@ def read_datums(datums: np.ndarray | str | os.PathLike[str]) -> np.ndarray:
     return given
 
 
-def read_reference(reference: Reference, *, unit: Unit, disc_mm: float) -> ReferencePoints | IdealShape:
+def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -> ReferencePoints | IdealShape:
     """Read a reference as points in mm, or as an ideal shape from its name (plane, sphere, cylinder) or TOML file."""
-    scale = MM_PER_UNIT[check_unit(unit)]
+    scale = MM_PER_UNIT[check_unit(unit or "mm")]
     if isinstance(reference, str) and reference in KINDS:
         reference = KINDS[reference]
     if isinstance(reference, str | os.PathLike):
         path = Path(reference)
         if path.suffix.lower() == ".toml":
             reference = read_shape(path)
-        elif path.suffix.lower() == ".h5" or (path.suffix.lower() == ".ply" and not has_faces(path)):
-            reference = read_cloud(path)
+        elif path.suffix.lower() == ".h5" or (is_readable_cloud(path) and not has_faces(path)):
+            cloud = read_cloud(path, unit=unit)
+            return ReferencePoints(cloud.points_mm, None, cloud.uncertainty, cloud.frame, rounding_std_mm(cloud))
         else:
+            if path.suffix.lower() in _IN_METRES:
+                if unit == "mm":
+                    raise DescriptionError(f"{path} is in m, as glTF prescribes, but the unit mm was given: omit it")
+                scale = MM_PER_UNIT["m"]
             mesh = load_triangles(path)
             return sample_mesh(scale * np.asarray(mesh.vertices, float), np.asarray(mesh.faces), disc_mm=disc_mm)
     if not isinstance(reference, PointCloud):
         return reference
     if scale != 1.0 and reference.uncertainty is not None:
         raise EvaluationError("the unit is m, but clouds with uncertainty are always in mm; omit the unit")
-    return ReferencePoints(scale * reference.points_mm, None, reference.uncertainty, reference.frame)
+    rounding = scale * rounding_std_mm(reference)
+    return ReferencePoints(scale * reference.points_mm, None, reference.uncertainty, reference.frame, rounding)
 
 
 def sample_mesh(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> ReferencePoints:
@@ -144,7 +152,8 @@ def require_same_unit(cloud: np.ndarray, reference: np.ndarray) -> None:
         )
     if sizes[1] > 1000 * OPTIONS.other_unit_ratio * sizes[0]:
         raise EvaluationError(
-            f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g} mm. Check that the cloud is in mm"
+            f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g} mm. If the former is in metres, "
+            "give `cloud_unit` m"
         )
 
 

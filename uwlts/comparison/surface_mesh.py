@@ -24,6 +24,7 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud, project_image_errors, project_variance
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.mesh_file import SurfaceMesh
+from uwlts.storage.number_tables import Unit
 
 _BLOCK = 48
 """Cubes along the edge of a block that marching cubes processes at once."""
@@ -49,6 +50,7 @@ def mesh(
     cube_mm: float | None = None,
     radius_mm: float | None = None,
     towards: Sequence[tuple[float, float, float]] | None = None,
+    unit: Unit | None = None,
     progress: ProgressListener = ignore_progress,
 ) -> SurfaceMesh:
     """Make a mesh with uncertainty and open holes from one or several clouds in one frame.
@@ -65,6 +67,8 @@ def mesh(
         three images.
     towards
         Direction x y z from the surface to the sensor for each cloud; by default -Z, rotated by the pose of each scan.
+    unit
+        As for `export`.
     progress
         Called with the number of places done and the total number.
 
@@ -91,7 +95,7 @@ def mesh(
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
     if not clouds:
         raise EvaluationError("no cloud was given; a mesh needs at least one")
-    read = [load_cloud(each) for each in clouds]
+    read = [load_cloud(each, unit=unit) for each in clouds]
     if towards is not None and (np.shape(towards) != (len(read), 3) or not np.all(np.linalg.norm(towards, axis=1) > 0)):
         raise EvaluationError(
             f"the directions are not valid; expected {len(read)} of three numbers, one per cloud, none of them 0 0 0"

@@ -19,6 +19,7 @@ from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.number_tables import Unit
 from uwlts.storage.truth import Truth, TruthHeader, read_truth, scene_digest, truth_path
 
 TOLERANCE_MM = 0.010
@@ -86,7 +87,10 @@ class StoredUncertainty(_Stored):
 
 
 class EvaluationRecord(_Stored):
-    """Content of an evaluation file; ``calibration`` is the digest of the cloud's calibration."""
+    """Content of an evaluation file; ``calibration`` is the digest of the cloud's calibration.
+
+    ``edited`` is set if the file was edited by hand and trusted.
+    """
 
     cloud: str
     capture: str | None = None
@@ -98,6 +102,7 @@ class EvaluationRecord(_Stored):
     evaluation: ArtefactFigures | None = None
     truth: TruthComparisons | None = None
     uncertainty: dict[str, StoredUncertainty] = {}
+    edited: bool = False
 
     def figure_keys(self) -> dict[str, FigureKey]:
         """Return the keys of the artefact's figures by name; empty if the file names no artefact."""
@@ -260,6 +265,7 @@ def evaluate(
     truth: Truth | str | Path | None = None,
     *,
     source: str | None = None,
+    unit: Unit | None = None,
 ) -> Evaluation:
     """Compare a cloud with its artefact's calibrated values, and point by point with ground truth.
 
@@ -273,6 +279,8 @@ def evaluate(
         Ground truth of a rendered capture.
     source : str, optional
         Name of the cloud in the evaluation file; by default the name of the cloud's file or capture.
+    unit : {"mm", "m"}, optional
+        As for `export`.
 
     Returns
     -------
@@ -289,7 +297,7 @@ def evaluate(
     """
     if not isinstance(cloud, PointCloud):
         source = source or Path(cloud).name
-        cloud = read_cloud(cloud)
+        cloud = read_cloud(cloud, unit=unit)
     if artefact is None and (named := cloud.metadata.get("artefact")) is not None:
         artefact = parse_artefact(named)
     if isinstance(artefact, str | Path):

@@ -1,29 +1,76 @@
-"""Files of JSON: an object identified by its "format" and "version"; and differences between two of them."""
+"""Files of JSON: an object identified by its "format" and "version" and sealed; and differences between two of them.
 
+The seal is the SHA-256 of the content. Edited files are refused unless a function's ``trust_edited`` is set.
+"""
+
+import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from functools import wraps
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from pydantic import BaseModel, JsonValue, ValidationError
 
 from uwlts.errors import CaptureError, Error, describe_problems
-from uwlts.files.reading import MOST_JSON_BYTES, add_article, parse_json, read_text
-from uwlts.files.writing import write_atomically
+from uwlts.files.reading import MOST_JSON_BYTES, add_article, log_warnings, parse_json, read_text
+from uwlts.files.writing import require_ending, write_atomically
 
 _SHOWN = 3
 """Largest number of different entries that a message names."""
 _BRIEF = 80
 """Largest number of characters of a value in a message."""
 
+SEAL = "sha256"
+EDITED = "edited"
+"""Keys of a file's seal, and of the record that an edited file was trusted."""
+
 AnyModel = TypeVar("AnyModel", bound=BaseModel)
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+_trusts_edited: ContextVar[bool] = ContextVar("trusts_edited", default=False)
 
 
-def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
-    """Read the object in a file; raises CaptureError if it is missing, not JSON or truncated.
+def trusting(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Apply the parameter ``trust_edited`` of a function to all files that it reads."""
+
+    @wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        token = _trusts_edited.set(_trusts_edited.get() or bool(kwargs.get("trust_edited")))
+        try:
+            return function(*args, **kwargs)
+        finally:
+            _trusts_edited.reset(token)
+
+    return call
+
+
+def to_canonical_json(content: Mapping[str, Any]) -> bytes:
+    """Return the content without its seal as canonical JSON bytes: sorted keys, no spaces, UTF-8."""
+    bare = {key: value for key, value in content.items() if key != SEAL}
+    text = json.dumps(bare, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return text.encode("utf-8", "surrogatepass")
+
+
+def compute_seal(content: Mapping[str, Any]) -> str:
+    """Return the seal of a content: SHA-256 of its canonical bytes."""
+    return hashlib.sha256(to_canonical_json(content)).hexdigest()
+
+
+def add_seal(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content as JSON, with its seal."""
+    plain = json.loads(json.dumps(content, allow_nan=False))
+    return plain | {SEAL: compute_seal(plain)}
+
+
+def read_json(path: str | Path, *, called: str, check_seal: bool = True) -> dict[str, JsonValue]:
+    """Read the object in a file; raises CaptureError if it is missing, not JSON, truncated or edited.
 
     ``called`` names the expected content in messages. Numbers are finite and keys are unique (`uwlts.files.reading`).
+    The object contains the seal, if there is one, and ``edited`` if it does not match but is trusted (`trusting`).
     """
     text = read_text(path, most_bytes=MOST_JSON_BYTES, called=called)
     try:
@@ -34,6 +81,13 @@ def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
         raise CaptureError(f"{path} is not a valid {called}: {error}") from error
     if not isinstance(content, dict):
         raise CaptureError(f"{path} is JSON but not {add_article(called)}: expected an object with named entries")
+    if check_seal and SEAL in content and content[SEAL] != compute_seal(content):
+        if not _trusts_edited.get():
+            raise CaptureError(
+                f"{path} was edited after it was written: its content does not match its seal ({SEAL}). Use the "
+                "original file, or `trust_edited` to use the edited one"
+            )
+        content[EDITED] = True
     return content
 
 
@@ -80,6 +134,12 @@ def model_from_json(
         raise CaptureError(f'{path} is JSON but not {add_article(called)}: expected "format": "{file_format}"')
     if (found := content.pop("version", None)) != version:
         raise CaptureError(f"{path} has version {found}; this program reads {version}")
+    if content.pop(SEAL, None) is None:
+        log_warnings(path, [f"it has no seal ({SEAL}), as from older versions: edited numbers cannot be noticed"])
+    if EDITED in content:
+        log_warnings(path, ["it was edited after it was written, and is trusted all the same"])
+    if EDITED in content and isinstance(provenance := content.get("provenance"), dict):
+        content["provenance"] = provenance | {EDITED: content.pop(EDITED)}
     return validate_content(model, content, f"{path} is not a valid {called}", advice=advice)
 
 
@@ -94,7 +154,7 @@ def validate_content(model: type[AnyModel], content: object, complaint: str, *, 
 
 
 def write_model(path: str | Path, model: BaseModel, *, file_format: str, version: int, overwrite: bool) -> None:
-    """Write a model as indented JSON, completely or not at all.
+    """Write a model as indented JSON with a seal, completely or not at all.
 
     Parameters
     ----------
@@ -112,13 +172,15 @@ def write_model(path: str | Path, model: BaseModel, *, file_format: str, version
     OutputError
         The file exists and ``overwrite`` is not set, or cannot be written.
     """
+    require_ending(Path(path), (".json",))
     content = {"format": file_format, "version": version} | model.model_dump(mode="json")
     with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        aside.write_text(json_text(content, indent=2), encoding="utf-8")
 
 
 def write_record(path: str | Path, record: object, *, overwrite: bool) -> None:
     """Write the record of a result as indented JSON, completely or not at all; raises OutputError if that fails."""
+    require_ending(Path(path), (".json",))
     with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_text(json_text(record, indent=1), encoding="utf-8")
 
@@ -169,6 +231,10 @@ def _brief(value: object) -> str:
 
 
 def json_text(content: object, *, indent: int | None = None, only_ascii: bool = True) -> str:
-    """Return JSON text, for a model of its set fields only; raises ValueError for numbers that are not finite."""
+    """Return JSON text, for a model of its set fields only; raises ValueError for numbers that are not finite.
+
+    Objects are sealed.
+    """
     plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
+    plain = add_seal(plain) if isinstance(plain, dict) else plain
     return json.dumps(plain, indent=indent, ensure_ascii=only_ascii, allow_nan=False) + "\n"

@@ -18,7 +18,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from uwlts.errors import CaptureError, Error
+from uwlts.errors import CaptureError, Error, make_printable
 from uwlts.files.inputs import record_input
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def open_regular(
 
 def _printable_name(path: str | Path) -> str:
     """Return a name for messages: printable, and not longer than a line."""
-    return shorten(str(path).encode("unicode_escape").decode() if "\0" in str(path) else str(path))
+    return shorten(make_printable(str(path)))
 
 
 def shorten(text: str, most: int = 300) -> str:
@@ -108,14 +108,16 @@ def shorten(text: str, most: int = 300) -> str:
 def log_warnings(path: str | os.PathLike[str], warnings: Iterable[str]) -> None:
     """Log warnings about the content of a file; without further settings, Python prints them on standard error."""
     for warning in warnings:
-        _LOG.warning("warning: %s: %s", path, warning)
+        _LOG.warning("%s", make_printable(f"warning: {path}: {warning}"))
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, error: type[Error] = CaptureError, called: str = "file") -> bytes:
     """Read a regular file; raises ``error`` like `open_regular`."""
     with open_regular(path, most_bytes=most_bytes, error=error, called=called) as file:
-        content = file.read(most_bytes + 1)
-    # Some system files report a size of 0.
+        # Python allocates what is asked for, and some system files report a size of 0.
+        content = file.read(min(most_bytes, os.fstat(file.fileno()).st_size) + 1)
+        while len(content) <= most_bytes and (more := file.read(MiB)):
+            content += more
     if len(content) > most_bytes:
         raise error(f"the {called} {_printable_name(path)} has more than {most_bytes / MiB:,.1f} MiB")
     return content

@@ -28,6 +28,7 @@ from uwlts.reconstruction.latency import measure_latency
 from uwlts.runtime.progress import ProgressListener
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
+from uwlts.storage.encoder_counts import unwrap_counts
 from uwlts.stripe import find_stripe
 
 _SPARE_MM, _SPARE_S = 1.0, 0.3
@@ -326,7 +327,7 @@ class _FrameReader:
             scatters.append(fitted.scatter_s)
             speeds.append(fitted.speed)
         if continuous.mm_per_count is not None:
-            stage = self._read_encoder(continuous.mm_per_count, at_rest_mm)
+            stage = self._read_encoder(continuous.mm_per_count, at_rest_mm, continuous.encoder_bits)
         latency_s, std_s = 1e-3 * (continuous.latency_ms or 0.0), None
         if continuous.latency_ms is None and continuous.mm_per_count is None:
             if len(speeds) < 2:
@@ -342,14 +343,15 @@ class _FrameReader:
         self._writer.place(stage, speed, np.array(reports))
         return FramePlaces(latency_s, std_s, max(scatters), tuple(speeds))
 
-    def _read_encoder(self, mm_per_count: float, at_rest_mm: float) -> np.ndarray:
+    def _read_encoder(self, mm_per_count: float, at_rest_mm: float, bits: int | None) -> np.ndarray:
         counts = np.array(self._encoders)
         if self._clock.encoder is None or not np.isfinite(counts).all():
             raise HardwareError(
                 "mm_per_count is given, but the camera sends no ChunkEncoderValue with its frames: wire the encoder to "
                 "it and set its EncoderSource, or leave mm_per_count out"
             )
-        return at_rest_mm + mm_per_count * (counts - self._clock.encoder)
+        counts = unwrap_counts(np.append(self._clock.encoder, counts), bits)
+        return at_rest_mm + mm_per_count * (counts[1:] - counts[0])
 
 
 def _time_of(report: StageReport) -> float:

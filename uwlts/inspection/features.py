@@ -1,6 +1,8 @@
 """Features of an inspected object: values with uncertainty, place in the cloud, and definitions."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -8,6 +10,7 @@ import numpy as np
 from uwlts.files.json_files import RecordFile
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.storage.cloud import PointCloud, rounding_std_mm
 
 COVERAGE = 0.95
 """Coverage probability of the intervals of all values."""
@@ -156,6 +159,15 @@ class FeatureValue:
         """Combined standard uncertainty of the known parts."""
         return float(np.hypot(self.random, self.systematic or 0.0))
 
+    def count_steps(self, std: float) -> FeatureValue:
+        """Return the value with another systematic standard uncertainty in addition, and a wider interval."""
+        below, above = (
+            np.hypot(side, COVERAGE_FACTOR * std) for side in (self.value - self.low, self.high - self.value)
+        )
+        low, high = self.value - below, self.value + above
+        low = max(low, 0.0) if self.low >= 0 else low
+        return replace(self, systematic=float(np.hypot(self.systematic or 0.0, std)), low=float(low), high=float(high))
+
     def text(self) -> str:
         """Return name, value and interval as text."""
         return f"{self.name} {self.value:.4g} ({self.low:.4g} to {self.high:.4g}) {self.unit}"
@@ -255,6 +267,17 @@ class Inspection(Brief, RecordFile):
     deviation_mm: np.ndarray
     level_mm: np.ndarray
     notes: tuple[str, ...] = ()
+
+    def count_steps(self, cloud: PointCloud) -> Inspection:
+        """Return the inspection with the steps of the cloud's stored coordinates in the uncertainties of lengths."""
+        if not (std := rounding_std_mm(cloud)):
+            return self
+        features = tuple(
+            replace(each, values=tuple(v.count_steps(std) if v.unit == "mm" else v for v in each.values))
+            for each in self.features
+        )
+        note = f"uncertainties contain {std:.2g} mm for the steps of the cloud's stored coordinates"
+        return replace(self, features=features, notes=(*self.notes, note))
 
     def select(self, *kinds: FeatureKind) -> tuple[Feature, ...]:
         """Return the features of the given kinds."""

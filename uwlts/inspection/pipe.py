@@ -108,7 +108,7 @@ def inspect_pipe(
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
     notes = *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *of_blemishes
-    return Inspection("pipe", (*features, *blemishes), deviation, level, notes)
+    return Inspection("pipe", (*features, *blemishes), deviation, level, notes).count_steps(cloud)
 
 
 def _check_size(diameter_mm: float, wall_mm: float | None) -> list[str]:

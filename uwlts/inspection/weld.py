@@ -162,7 +162,7 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
     ]
     if cloud.uncertainty is None:
         notes.append(WITHOUT_UNCERTAINTY)
-    return Inspection("weld", (feature,), deviation, np.full(len(cloud), np.nan), tuple(notes))
+    return Inspection("weld", (feature,), deviation, np.full(len(cloud), np.nan), tuple(notes)).count_steps(cloud)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from uwlts.files.writing import write_atomically
+from uwlts.files.json_files import add_seal
+from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import Residuals
 from uwlts.model.sensor import Description, Medium, Positive, Rows, Table
@@ -72,7 +73,8 @@ class PolynomialCalibration(Brief, Description):
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the calibration as JSON, completely or not at all; OutputError if that fails."""
         # One line for each key; with indentation, each of thousands of coefficients would take a line.
-        content = {"format": FORMAT, "version": VERSION} | self.model_dump(mode="json")
+        require_ending(Path(path), (".json",))
+        content = add_seal({"format": FORMAT, "version": VERSION} | self.model_dump(mode="json"))
         lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
         with write_atomically(path, overwrite=overwrite) as aside:
             aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from uwlts.errors import DescriptionError
-from uwlts.files.writing import write_atomically
+from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 
@@ -75,6 +75,7 @@ class Trajectory(Brief):
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the trajectory as CSV, format quaternion-xyzw, mm, with covariances; OutputError if that fails."""
+        require_ending(Path(path), (".csv",))
         turns = Rotation.from_matrix(self.poses[:, :3, :3]).as_quat()
         table = np.column_stack([self.times_s, self.poses[:, :3, 3], turns])
         names = ["time_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"]

@@ -22,6 +22,7 @@ from uwlts.reconstruction.path_uncertainty import (
     root_covariances,
     sample_indices,
 )
+from uwlts.reconstruction.trajectory_doubts import find_trajectory_doubts
 from uwlts.storage.capture import Capture, FrameTable
 from uwlts.storage.cloud import PointUncertainty
 
@@ -51,12 +52,15 @@ class PlatformPoses:
         Times of the images.
     rates : (N, 6) float64 or None
         Velocity (mm/s) and angular velocity (rad/s) in the base frame; None without a trajectory.
+    doubts : tuple of str
+        Warnings about the trajectory.
     """
 
     poses: np.ndarray
     covariance: np.ndarray | None
     times_s: np.ndarray
     rates: np.ndarray | None = None
+    doubts: tuple[str, ...] = ()
 
 
 def find_platform_poses(
@@ -110,7 +114,9 @@ def find_platform_poses(
         covariance[laser] = stated
     poses[:, :3, 3] *= scale
     rates[:, :3] *= scale
-    return PlatformPoses(poses, covariance, capture.time_s, rates)
+    own = capture.header.T_platform_sensor if mount is None else mount.transform()
+    doubts = find_trajectory_doubts(trajectory, times, poses[laser] if own is None else poses[laser] @ np.array(own))
+    return PlatformPoses(poses, covariance, capture.time_s, rates, tuple(doubts))
 
 
 def add_platform_poses(capture: Capture, ride: PlatformPoses, mount: Mount | None) -> FrameTable:

@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.files.json_files import EDITED, trusting
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount
@@ -23,14 +25,16 @@ from uwlts.runtime.compiled import compiled
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import NO_STAGE, Capture, FrameTable, open_capture, sensor_poses
-from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, VERIFIED, PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import PoseFormat, read_trajectory
+from uwlts.storage.verification_file import describe_verification
 from uwlts.stripe import StripeSettings, find_stripes
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 
 
+@trusting
 def reconstruct(
     capture: Capture | str | Path,
     calibration: AnyCalibration | str | Path,
@@ -45,6 +49,7 @@ def reconstruct(
     stripe: StripeSettings = None,
     index: float | None = None,
     with_uncertainty: bool | None = None,
+    trust_edited: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> PointCloud:
     """Turn a capture into a point cloud: find the stripes of all laser images and triangulate them.
@@ -83,6 +88,8 @@ def reconstruct(
     with_uncertainty : bool, optional
         Calculate the uncertainty of the points, which requires a joint calibration; by default if it is joint. Files
         are then more than ten times larger.
+    trust_edited : bool
+        As for `read`.
     progress : callable, optional
         Called after each image with the number of images done and the total number.
 
@@ -102,7 +109,17 @@ def reconstruct(
     """
     if pose_correlation_s is not None and not pose_correlation_s >= 0:
         raise DescriptionError(f"pose_correlation_s is {pose_correlation_s:g}; expected zero or a positive number")
-    calibration = resolve_calibration(calibration)
+    file, calibration = calibration, resolve_calibration(calibration)
+    if isinstance(file, str | Path):
+        until, doubts = describe_verification(file, calibration)
+    else:
+        until, doubts = None, []
+
+    def complete(cloud: PointCloud, **changes: Any) -> PointCloud:
+        metadata = changes.pop("metadata", cloud.metadata) | ({} if until is None else {VERIFIED: until})
+        warnings = [*doubts, *changes.pop("warnings", cloud.warnings)]
+        return replace(cloud, **changes, metadata=metadata, warnings=warnings)
+
     with open_capture(capture) as scan:
         check_fits(scan.header, calibration, source=scan.path.name)
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
@@ -110,7 +127,7 @@ def reconstruct(
         if alone and mount is None and trajectory is None and clock_offset_s is None and not clock_drift_ppm:
             _refuse_free_poses(scan)
             stripes = find_stripes(scan, options=stripe, progress=progress)
-            return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
+            return complete(reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known))
         mount = read_mount(mount) if isinstance(mount, str | Path) else mount
         if isinstance(trajectory, str | Path):
             trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
@@ -123,14 +140,16 @@ def reconstruct(
         cloud = reconstruct_stripes(
             table, stripes, calibration, index=index, with_uncertainty=known, mount_by=common if known else None
         )
-        warnings = cloud.warnings
+        warnings = [*ride.doubts, *cloud.warnings]
         if mount is None and scan.header.T_platform_sensor is not None:
             warnings = [*warnings, "the mount has its design values: calibrate it (uwlts mount) and give `mount`"]
         own = cloud.uncertainty
         if own is not None:
             where = cloud.points_mm, cloud.frame, ride
             own = add_platform_uncertainty(own, *where, mount, mount_covariance=apart, correlation_s=pose_correlation_s)
-        return replace(cloud, uncertainty=own, warnings=warnings, time_s=scan.time_s[cloud.frame])
+        metadata = cloud.metadata | ({EDITED: "mount"} if mount is not None and mount.edited else {})
+        known = {"uncertainty": own, "warnings": warnings, "metadata": metadata}
+        return complete(cloud, **known, time_s=scan.time_s[cloud.frame])
 
 
 def _refuse_free_poses(scan: Capture) -> None:
@@ -229,6 +248,7 @@ def reconstruct_stripes(
             "calibration": digest,
             "images": len(capture.stage_mm),
             **{key: value for key, value in capture.header.provenance.items() if key == "scene"},
+            **({EDITED: "calibration"} if EDITED in calibration.provenance else {}),
             **({} if sheet is None else _footprint_metadata(capture, sheet, stripes)),
         },
         lines_by_status=lines,

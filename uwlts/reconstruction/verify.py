@@ -1,6 +1,7 @@
 """Field verification: measurement of a calibrated artefact and comparison with its certificate."""
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,14 @@ import numpy as np
 from uwlts.errors import EvaluationError, RangeError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties
-from uwlts.model.any_calibration import AnyCalibration
+from uwlts.files.json_files import trusting
+from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.sensor import Vector
 from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture, open_capture
+from uwlts.storage.verification_file import VerificationRecord, write_verification
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +70,15 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Verification:
-    """Results for all calibrated quantities of an artefact, and errors that the artefact cannot reveal."""
+    """Results for all calibrated quantities of an artefact, and errors that the artefact cannot reveal.
+
+    ``capture`` is its name, and ``calibration`` the digest of the calibration.
+    """
 
     verdicts: tuple[Verdict, ...]
     not_shown: tuple[str, ...] = ()
+    capture: str = ""
+    calibration: str = ""
 
     @property
     def passed(self) -> bool:
@@ -82,9 +90,25 @@ class Verification:
         """One line of text for each quantity."""
         return "\n".join(verdict.text for verdict in self.verdicts)
 
+    def save(self, calibration: str | Path) -> Path:
+        """Write verdict and date beside the calibration's file, where `reconstruct` finds them; OutputError if not."""
+        record = VerificationRecord(
+            calibration=self.calibration,
+            date=datetime.now(UTC),
+            capture=self.capture,
+            passed=self.passed,
+            lines=tuple(verdict.text for verdict in self.verdicts),
+        )
+        return write_verification(calibration, record)
 
+
+@trusting
 def verify(
-    capture: Capture | str | Path, calibration: AnyCalibration | str | Path, *, limit_mm: float | None = None
+    capture: Capture | str | Path,
+    calibration: AnyCalibration | str | Path,
+    *,
+    limit_mm: float | None = None,
+    trust_edited: bool = False,
 ) -> Verification:
     """Measure the artefact in a capture and compare it with its calibrated values.
 
@@ -99,6 +123,8 @@ def verify(
         Calibration of the sensor; only a joint one states its uncertainty.
     limit_mm : float, optional
         Maximum permissible error.
+    trust_edited : bool
+        As for `read`.
 
     Returns
     -------
@@ -142,7 +168,7 @@ def verify(
     )
     if not verdicts:
         raise EvaluationError(f"the artefact '{artefact.kind}' has no calibrated size; add one to its description")
-    return Verification(verdicts, not_shown)
+    return Verification(verdicts, not_shown, scan.path.name, calibration_digest(calibration))
 
 
 _ACROSS = 0.1

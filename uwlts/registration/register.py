@@ -227,6 +227,7 @@ def register(
     search: bool = False,
     sphere_mm: float | None = None,
     reach_mm: float | None = None,
+    unit: Unit | None = None,
     progress: ProgressListener = ignore_progress,
 ) -> RegisteredScans:
     """Register overlapping scans in the frame of the first, and merge them into one cloud with uncertainty.
@@ -251,6 +252,8 @@ def register(
         Diameter of spheres in the scene. Their centres connect scans without a common surface.
     reach_mm : float, optional
         Largest distance between overlapping surfaces at the initial poses; by default a twentieth of a scan's size.
+    unit : {"mm", "m"}, optional
+        As for `export`.
     progress : callable, optional
         Called with the number of steps done and the total number.
 
@@ -274,7 +277,7 @@ def register(
     >>> found.cloud.save("pipe.ply")
     """
     names = tuple(_scan_name(each, number) for number, each in enumerate(clouds))
-    scans = [load_cloud(each) for each in clouds]
+    scans = [load_cloud(each, unit=unit) for each in clouds]
     if isinstance(poses, str | os.PathLike):
         poses = read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0]
     if len(scans) < 2:

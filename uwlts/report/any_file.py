@@ -4,7 +4,7 @@ from pathlib import Path
 
 from uwlts.errors import CaptureError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION, EvaluationRecord, read_evaluation
-from uwlts.files.json_files import read_json
+from uwlts.files.json_files import read_json, trusting
 from uwlts.files.reading import require_regular_file
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.mount import FORMAT as MOUNT, Mount
@@ -26,8 +26,14 @@ _READABLE = (
 )
 
 
+@trusting
 def read(
-    path: str | Path, *, pose_format: PoseFormat = "quaternion-xyzw", pose_unit: Unit | None = None
+    path: str | Path,
+    *,
+    pose_format: PoseFormat = "quaternion-xyzw",
+    pose_unit: Unit | None = None,
+    unit: Unit | None = None,
+    trust_edited: bool = False,
 ) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Trajectory:
     """Read a file of the program, whose content determines the type of the result.
 
@@ -44,6 +50,10 @@ def read(
         Format of a trajectory, as for `reconstruct`; by default that of `Trajectory.save`.
     pose_unit : {"mm", "m"}, optional
         Unit of a trajectory's positions; by default that in the names of its columns, else mm.
+    unit : {"mm", "m"}, optional
+        As for `export`.
+    trust_edited : bool
+        Accept calibrations, mounts and evaluations that were edited after they were written; results record it.
 
     Returns
     -------
@@ -80,9 +90,9 @@ def read(
     if ending == ".csv":
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
     if ending.lower() in MESH_FORMATS and (ending.lower() != ".ply" or has_faces(path)):
-        return read_mesh(path)
+        return read_mesh(path, unit=unit)
     if is_cloud(path):
-        return read_cloud(path)
+        return read_cloud(path, unit=unit)
     if ending == ".h5":
         found = read_format(path)
         if found == TRUTH:

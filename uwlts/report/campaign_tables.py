@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from uwlts.errors import make_printable
 from uwlts.model.calibration import Calibration
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.pages.numbers import entries_of, format_fixed, format_number, is_number, split_name, unit_of
@@ -72,7 +73,7 @@ def print_table(rows: list[Row], *, published: str = "thesis", console: Console 
         table.add_column(heading, justify="left" if number < 2 else "right", no_wrap=number >= 2)
     last = None
     for row in rows:
-        name, *others = row.texts()
+        name, *others = map(make_printable, row.texts())
         if last not in (None, name):
             table.add_section()
         # Text, so that names from files are not interpreted as markup.

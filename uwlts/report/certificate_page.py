@@ -14,6 +14,7 @@ from markupsafe import Markup
 from uwlts.calibration.joint.observability import list_regions
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.files.inputs import protect_inputs
+from uwlts.files.json_files import trusting
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
@@ -44,8 +45,14 @@ _WORST_IMAGES = 5
 
 
 @protect_inputs()
+@trusting
 def write_certificate(
-    calibration: str | Path, *, out: str | Path | None = None, before: str | Path | None = None, overwrite: bool = False
+    calibration: str | Path,
+    *,
+    out: str | Path | None = None,
+    before: str | Path | None = None,
+    trust_edited: bool = False,
+    overwrite: bool = False,
 ) -> tuple[Path, AnyCertificate]:
     """Write the certificate of a calibration: a page to read and print, and its content as sealed JSON.
 
@@ -57,6 +64,8 @@ def write_certificate(
         Page to write (default: CALIBRATION.certificate.html). The JSON is written beside it.
     before : str or Path, optional
         Another calibration of the same sensor to compare with.
+    trust_edited : bool
+        Accept files that were edited after they were written; results record it.
     overwrite : bool
         Replace existing files.
 

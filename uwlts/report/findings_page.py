@@ -15,7 +15,7 @@ from uwlts._version import __version__
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.files.inputs import protect_inputs
-from uwlts.files.json_files import json_text
+from uwlts.files.json_files import EDITED, json_text, trusting
 from uwlts.files.writing import hash_file, refuse_unsuitable
 from uwlts.inspection.features import (
     COVERAGE,
@@ -47,6 +47,7 @@ from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.number_tables import Unit
 
 _BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
 _FIRST = ("depth", "height", "remaining wall")
@@ -84,6 +85,7 @@ class _CheckedFigure:
 
 
 @protect_inputs()
+@trusting
 def write_findings(
     cloud: str | os.PathLike[str],
     kind: InspectionKind = "pipe",
@@ -95,6 +97,8 @@ def write_findings(
     calibration: str | Path | None = None,
     certificate: str | Path | None = None,
     verification: Sequence[str | Path] = (),
+    unit: Unit | None = None,
+    trust_edited: bool = False,
     overwrite: bool = False,
     **options: Any,
 ) -> Inspection:
@@ -121,6 +125,10 @@ def write_findings(
     verification
         Evaluations (JSON of uwlts evaluate) of artefacts measured with the same calibration; their figures are
         reported.
+    unit
+        Unit of a cloud of another program, mm or m, if neither format nor names of columns state it; by default mm.
+    trust_edited
+        Accept files that were edited after they were written; results record it.
     overwrite
         Replace existing files.
     **options
@@ -147,7 +155,7 @@ def write_findings(
     if pdf:
         refuse_unsuitable_pdf(page.with_suffix(".pdf"))
         refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
-    measured = read_cloud(path)
+    measured = read_cloud(path, unit=unit)
     sources = _sources(path, measured, captures, calibration, certificate)
     checks = [_artefact_check(each, measured) for each in verification]
     sources += [
@@ -186,14 +194,15 @@ def _sources(
         same = Path(each).name == cloud.metadata.get("capture")
         sources.append(Source("capture", Path(each).name, hash_file(each), "named by the cloud" if same else ""))
     if calibration is not None:
-        digest = calibration_digest(load_calibration(calibration))
+        known = load_calibration(calibration)
+        digest, edited = calibration_digest(known), ", edited" if EDITED in known.provenance else ""
         if named is not None and named != digest:
             raise EvaluationError(
                 f"the cloud {path.name} was reconstructed by another calibration than {calibration}: it names "
                 f"{str(named)[:12]}..., and this one has {digest[:12]}...; give the calibration that it was made with"
             )
         note = "the one that the cloud names" if named == digest else "the cloud names no calibration"
-        sources.append(Source("calibration", Path(calibration).name, hash_file(calibration), note))
+        sources.append(Source("calibration", Path(calibration).name, hash_file(calibration), note + edited))
     if certificate is not None:
         if calibration is None:
             raise EvaluationError("a certificate belongs to a calibration: give that, too")
@@ -219,7 +228,7 @@ def _artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, list[_Che
         known, key = record.uncertainty.get(name), keys.get(name)
         calibrated = None if key is None or key.calibrated is None else key.calibrated.value_mm
         rows.append(_CheckedFigure(name, calibrated, measured, None if known is None else known.expanded_mm))
-    return f"{record.evaluation.kind}, {record.cloud}", rows
+    return f"{record.evaluation.kind}, {record.cloud}{', edited' if record.edited else ''}", rows
 
 
 def _check_rows(figures: Sequence[_CheckedFigure]) -> list[tuple[str, ...]]:

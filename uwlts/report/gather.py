@@ -22,8 +22,10 @@ from uwlts.storage.capture import Capture, CaptureHeader
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_cloud, read_cloud
 from uwlts.storage.truth import read_truth
+from uwlts.storage.verification_file import ENDING as VERIFICATION
 
 _EVALUATION, _TRUTH = ".evaluation.json", ".truth.h5"
+_NOT_CALIBRATIONS = (_EVALUATION, ".certificate.json", VERIFICATION)
 
 CALIBRATION = "calibration"
 """Name of the calibrations' values in a reference."""
@@ -133,7 +135,7 @@ def gather_campaign(folder: str | Path) -> GatheredCampaign:
         raise CaptureError(f"there is no folder {folder}; give the folder of the campaign's files")
     in_hdf5 = list(_files(folder, "*.h5", but=_TRUTH))
     captures = {path.name: _capture(path) for path in in_hdf5 if not is_cloud(path)}
-    read = {path.stem: read_calibration(path) for path in _files(folder, "calibration*.json", but=_EVALUATION)}
+    read = {path.stem: read_calibration(path) for path in _files(folder, "calibration*.json", but=_NOT_CALIBRATIONS)}
     by_length = sorted(read, key=lambda name: (len(name), name))
     calibrations = [GatheredCalibration(name, read[name], calibration_digest(read[name])) for name in by_length]
     clouds = {path.stem: read_cloud(path) for path in [*filter(is_cloud, in_hdf5), *_files(folder, "*.ply")]}
@@ -160,7 +162,7 @@ def gather_campaign(folder: str | Path) -> GatheredCampaign:
     )
 
 
-def _files(folder: Path, pattern: str, *, but: str | None = None) -> Iterator[Path]:
+def _files(folder: Path, pattern: str, *, but: str | tuple[str, ...] | None = None) -> Iterator[Path]:
     for path in sorted(folder.glob(pattern)):
         # Hidden files are still being written.
         if is_regular_file(path) and not path.name.startswith(".") and not (but and path.name.endswith(but)):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT, EvaluationRecord, TruthComparisons, read_evaluation
-from uwlts.files.json_files import read_json
+from uwlts.files.json_files import read_json, trusting
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import BoardFound, Mount, RingFound, SphereFound, StepFound
@@ -26,18 +26,24 @@ from uwlts.storage.calibration_file import (
 )
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import is_cloud, read_cloud
+from uwlts.storage.cloud_files import is_readable_cloud, read_cloud
 from uwlts.storage.mount_files import FORMAT as MOUNT_FORMAT, read_mount
+from uwlts.storage.number_tables import Unit
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 
-def describe(path: str | Path) -> str:
+@trusting
+def describe(path: str | Path, *, unit: Unit | None = None, trust_edited: bool = False) -> str:
     """Describe a file: a capture, cloud, calibration, mount, evaluation, or a sensor description (by name or path).
 
     Parameters
     ----------
     path : str or Path
         File, or name of a shipped sensor such as thesis.
+    unit : {"mm", "m"}, optional
+        As for `export`.
+    trust_edited : bool
+        As for `read`.
 
     Returns
     -------
@@ -53,8 +59,8 @@ def describe(path: str | Path) -> str:
     match [s for s in path.suffixes if s != ".part"]:
         case [*_, ".truth", ".h5"]:
             lines = truth_lines(*read_truth(path))
-        case _ if is_cloud(path):
-            lines = cloud_lines(read_cloud(path))
+        case _ if is_readable_cloud(path):
+            lines = cloud_lines(read_cloud(path, unit=unit))
         case [*_, ".h5"]:
             with Capture(path) as capture:
                 lines = capture_lines(capture)

@@ -1,6 +1,5 @@
 """Key figures of a campaign, and their file summary.json."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -9,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 
 from uwlts.evaluation.evaluate import TruthComparisons, TruthFigures
 from uwlts.evaluation.figures import Quantity
-from uwlts.files.writing import write_atomically
+from uwlts.files.json_files import write_record
 from uwlts.report.gather import CALIBRATION, GatheredCampaign, GatheredMeasurement, Reference
 
 KEY_FIGURES = {
@@ -149,9 +148,7 @@ def write_summary(
     path: str | Path, campaign: GatheredCampaign, reference: Reference | None = None, *, overwrite: bool = False
 ) -> None:
     """Write the summary as indented JSON, completely or not at all; OutputError if that fails."""
-    text = json.dumps(summary(campaign, reference).model_dump(), indent=2, allow_nan=False)
-    with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_text(text + "\n", encoding="utf-8")
+    write_record(path, summary(campaign, reference).model_dump(), overwrite=overwrite)
 
 
 def _key_figures(measurements: Iterable[GatheredMeasurement]) -> dict[str, KeyFigure]:

@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from cyclopts import App, Parameter
 
+from uwlts.errors import make_printable
 from uwlts.runtime.console import progress_bar, replace_by_options
 
 _LISTENERS = ("progress", "report", "warn")
@@ -347,15 +348,15 @@ def docstring(package: ModuleType, function: str) -> str:
 
 def say(line: str) -> None:
     """Print a line at once, also to a pipe."""
-    print(line, flush=True)
+    print(make_printable(line), flush=True)
 
 
 def show(lines: Iterable[str]) -> None:
     """Print lines."""
-    print("\n".join(lines))
+    print(make_printable("\n".join(lines)))
 
 
 def warn(*texts: str) -> None:
     """Print warnings on standard error."""
     for text in texts:
-        print(f"warning: {text}", file=sys.stderr, flush=True)
+        print(make_printable(f"warning: {text}"), file=sys.stderr, flush=True)

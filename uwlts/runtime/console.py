@@ -12,7 +12,7 @@ from cyclopts import App, CycloptsError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from uwlts.errors import Error
+from uwlts.errors import Error, make_printable
 from uwlts.files.inputs import protect_inputs, refuse_named_inputs
 from uwlts.runtime.interrupts import preserve_interrupts
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -78,7 +78,7 @@ def run(app: App) -> int:
         # The reader has closed the pipe; Python must not try to write the rest when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
-        print(f"error: {error.strerror or error}: {error.filename}", file=sys.stderr)
+        print(make_printable(f"error: {error.strerror or error}: {error.filename}"), file=sys.stderr)
         return USER_ERROR
     return 0
 

@@ -19,6 +19,7 @@ from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, stack_rows
 from uwlts.storage.capture import (
+    CAPTURES,
     COVARIANCE,
     FORMAT,
     MORE,
@@ -90,7 +91,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         if self._dtype not in (np.uint8, np.uint16):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
         with self._storage(), ExitStack() as claimed:
-            refuse_unsuitable(self.path, overwrite=overwrite)
+            refuse_unsuitable(self.path, overwrite=overwrite, endings=CAPTURES)
             claimed.enter_context(lock_output(self.path))
             if not resume:
                 refuse_input(self._part)

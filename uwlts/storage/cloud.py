@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,6 +19,15 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 FOOTPRINT, FOOTPRINT_STD = "footprint_mm", "footprint_std"
 """Metadata of clouds of sensors at rest: standard deviations of the footprint, the surface area that a point averages,
 across the sheet (X) and along the stripe (Y), mm; and the relative standard uncertainty of their squares."""
+
+VERIFIED = "calibration_verified_until"
+"""Metadata of clouds whose calibration's file has a valid verification: its end."""
+STEP = "coordinate_step_mm"
+"""Metadata of clouds of other programs: step of the stored coordinates, mm, if it is more than a micrometre."""
+_FINEST_STEP_MM = 1e-3
+"""Finer steps are below the uncertainty of any scanner."""
+_COARSE_STEP = 0.1
+"""Ratio of the step to the point spacing from which there is a warning: the noise of scanners is about as large."""
 
 NO_INDEX = -1
 """Frame and line of points whose file does not state them."""
@@ -236,15 +245,16 @@ def make_foreign_cloud(
     deviation_mm: np.ndarray | None = None,
     time_s: np.ndarray | None = None,
     omitted: Mapping[str, np.ndarray] | None = None,
+    step_mm: float = 0.0,
 ) -> PointCloud:
     """Make a cloud of another program, without uncertainty; raises CaptureError like `PointCloud`.
 
     ``omitted`` maps reasons to masks (N,) of points that are omitted, with a warning. Unmeasured points are omitted as
-    well (`omit_points`).
+    well (`omit_points`). ``step_mm`` is the step of the stored coordinates (`note_step`).
     """
     chosen, warnings = omit_points(points_mm, omitted or {})
     unknown = np.full(len(points_mm), NO_INDEX)
-    return PointCloud(
+    cloud = PointCloud(
         points_mm[chosen],
         (np.full(len(points_mm), np.nan) if intensity is None else intensity)[chosen],
         (unknown if frame is None else frame)[chosen],
@@ -253,6 +263,39 @@ def make_foreign_cloud(
         time_s=None if time_s is None else time_s[chosen],
         warnings=warnings,
     )
+    return note_step(cloud, step_mm)
+
+
+def find_float_step(numbers: np.ndarray) -> float:
+    """Return the largest step of numbers (N, 3) that are stored, or were once rounded, in 32 bits; 0 for others."""
+    # Far numbers become infinite, and are no 32-bit numbers then.
+    with np.errstate(over="ignore"):
+        single = numbers.astype(np.float32)
+    if not len(numbers) or not np.array_equal(single, numbers, equal_nan=True):
+        return 0.0
+    return float(np.spacing(np.abs(single).max(initial=0, where=np.isfinite(single))))
+
+
+def note_step(cloud: PointCloud, step_mm: float) -> PointCloud:
+    """Return a cloud with the step of its stored coordinates in its metadata, and with a warning if it is coarse."""
+    if step_mm < _FINEST_STEP_MM or not len(cloud):
+        return cloud
+    sides = np.sort(np.ptp(cloud.points_mm, axis=0))
+    spacing = float(np.sqrt(sides[1] * sides[2] / len(cloud)))
+    warnings = cloud.warnings
+    if step_mm > _COARSE_STEP * spacing:
+        warnings = [
+            *warnings,
+            f"coordinates are stored in steps of {step_mm:.3g} mm, and points are about {spacing:.3g} mm apart: "
+            "details are lost, and uncertainties contain the steps. Export with more digits, or with a smaller offset",
+        ]
+    return replace(cloud, metadata=cloud.metadata | {STEP: step_mm}, warnings=warnings)
+
+
+def rounding_std_mm(cloud: PointCloud) -> float:
+    """Return the standard deviation of a uniform error of one step of the stored coordinates (JCGM 100, 4.3.7)."""
+    step = cloud.metadata.get(STEP)
+    return step / np.sqrt(12) if isinstance(step, float) and 0 < step < np.inf else 0.0
 
 
 def omit_points(points_mm: np.ndarray, omitted: Mapping[str, np.ndarray]) -> tuple[slice | np.ndarray, list[str]]:

@@ -23,21 +23,26 @@ from uwlts.storage.cloud import (
     NO_INDEX,
     PAIRS,
     PER_POINT,
+    STEP,
     PointCloud,
     PointUncertainty,
     concatenate_clouds,
+    find_float_step,
     metadata_json,
+    note_step,
     omit_points,
 )
 from uwlts.storage.copc_file import is_copc, read_copc
 from uwlts.storage.foreign_clouds import (
     FOREIGN_FORMATS,
+    TEXT_FORMATS,
     WRITTEN_FORMATS,
     read_foreign,
     require_libraries,
     write_foreign,
 )
 from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
+from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
 
 FORMAT = "uwlts-cloud"
 VERSION = 1
@@ -52,7 +57,8 @@ CLOUD_FORMATS = (".ply", ".h5", *WRITTEN_FORMATS)
 COLOURED_FORMATS = (".ply", ".h5", ".laz", ".las", ".e57")
 """Endings of the clouds that can be written with a colour of each point."""
 PLY_COLOURS = ("red", "green", "blue")
-_CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57")
+_IN_METRES = (".laz", ".las", ".e57", ".mcap")
+_CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57", ".pcd")
 """Endings that only clouds have."""
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
@@ -154,27 +160,32 @@ def _require_format(path: Path, *, coloured: bool) -> None:
         raise OutputError(f"{path}: COPC is written without colours; give a name that ends with .laz alone")
 
 
-def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
+def read_cloud(path: str | os.PathLike[str], *, unit: Unit | None = None) -> PointCloud:
     """Read a cloud from HDF5 (``.h5``), COPC (``.copc.laz``), PLY, or a format of other programs.
 
     PLY of other programs needs only x, y, z. Further formats are text (``.xyz``, ``.csv`` and others, mm), LAS and E57
     (m). Field names as changed by CloudCompare (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
     missing frame and line are -1, and a deviation that is missing or all NaN is None.
 
+    ``unit`` is that of PLY and text of other programs whose names of columns state none; by default mm.
+
     Raises
     ------
     CaptureError
-        The file is missing, not a cloud, or truncated, has no x, y, z, or its metadata is damaged.
+        The file is missing, not a cloud, or truncated, has no x, y, z, or its metadata is damaged. It states
+        another unit than ``unit``.
     """
-    return read_thinned_cloud(path)[0]
+    return read_thinned_cloud(path, unit=unit)[0]
 
 
-def load_cloud(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
+def load_cloud(cloud: PointCloud | str | os.PathLike[str], *, unit: Unit | None = None) -> PointCloud:
     """Return a cloud unchanged, or read it from a file; raises the errors of `read_cloud`."""
-    return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
+    return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud, unit=unit)
 
 
-def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None) -> tuple[PointCloud, int]:
+def read_thinned_cloud(
+    path: str | os.PathLike[str], at_most: int | None = None, *, unit: Unit | None = None
+) -> tuple[PointCloud, int]:
     """Read every n-th point of a cloud's file, at most ``at_most``, and the number of points; see `read_cloud`.
 
     For HDF5 and binary PLY only these are held in memory. For COPC the upper levels are read, an even sample.
@@ -183,18 +194,22 @@ def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None)
         if is_copc(path):
             cloud, total = read_copc(path, at_most=at_most)
         elif _is_foreign(path):
-            whole = read_foreign(Path(path))
+            whole = read_foreign(Path(path), unit=unit)
             cloud, total = whole.select(_every(len(whole), at_most)), len(whole)
         else:
             cloud, total = _read_rows(Path(path), lambda count: _every(count, at_most))
         if not len(cloud) and cloud.warnings:
             raise CaptureError(f"no point is left: {'; '.join(cloud.warnings)}")
-        log_warnings(path, cloud.warnings)
-        return cloud, total
+        return _in_mm(cloud, path, unit), total
 
 
 def read_region(
-    path: str | os.PathLike[str], low_mm: ArrayLike, high_mm: ArrayLike, at_most: int | None = None
+    path: str | os.PathLike[str],
+    low_mm: ArrayLike,
+    high_mm: ArrayLike,
+    at_most: int | None = None,
+    *,
+    unit: Unit | None = None,
 ) -> PointCloud:
     """Read the points in the box from ``low_mm`` (3,) to ``high_mm`` (3,), or an even sample of ``at_most``.
 
@@ -206,32 +221,57 @@ def read_region(
     if is_copc(path):
         with _naming(path):
             cloud = read_copc(path, box_mm=(low, high), at_most=at_most)[0]
-            log_warnings(path, cloud.warnings)
-            return cloud
+            return _in_mm(cloud, path, unit)
     found = [
         part.select(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
-        for part in read_parts(path)
+        for part in read_parts(path, unit=unit)
     ]
     whole = concatenate_clouds(found)
     return whole.select(_every(len(whole), at_most))
 
 
-def read_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Iterator[PointCloud]:
+def read_parts(
+    path: str | os.PathLike[str], most: int = POINTS_OF_PART, *, unit: Unit | None = None
+) -> Iterator[PointCloud]:
     """Read a cloud's file in parts of at most ``most`` points, in order.
 
     For HDF5 and binary PLY only one part is held in memory.
     """
     if is_copc(path) or _is_foreign(path):
-        whole = read_cloud(path)
+        whole = read_cloud(path, unit=unit)
         yield from (whole.select(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
         return
     start, total = 0, 1
     while start < total:
         with _naming(path):
             part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
-            log_warnings(path, part.warnings)
+            part = _in_mm(part, path, unit)
         yield part
         start += most
+
+
+def unit_of(path: str | os.PathLike[str]) -> Unit:
+    """Return the unit in which `write_cloud` writes coordinates, by the ending of the name."""
+    return "m" if Path(path).suffix.lower() in _IN_METRES else "mm"
+
+
+def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -> PointCloud:
+    """Convert a cloud from ``unit`` to mm, note the step of its numbers, and log its warnings.
+
+    Raises CaptureError if its file states another unit.
+    """
+    own = _in_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
+    stated = unit_of(path) if own or unit_of(path) == "m" else None
+    if Path(path).suffix.lower() not in (*TEXT_FORMATS, ".pcd"):
+        if unit is not None and stated not in (None, unit):
+            raise CaptureError(
+                f"{path} is in {stated}, as its format prescribes, but the unit {unit} was given: omit it"
+            )
+        if Path(path).suffix.lower() == ".ply":
+            scale, step = MM_PER_UNIT[check_unit(unit or "mm")], find_float_step(cloud.points_mm)
+            cloud = note_step(replace(cloud, points_mm=scale * cloud.points_mm), scale * step)
+    log_warnings(path, cloud.warnings)
+    return cloud
 
 
 def _is_foreign(path: str | os.PathLike[str]) -> bool:
@@ -266,6 +306,11 @@ def is_cloud(path: str | os.PathLike[str]) -> bool:
     if _in_hdf5(path):
         return read_format(Path(path)) == FORMAT
     return is_copc(path) or Path(path).suffix.lower() in _CLOUDS_ALONE
+
+
+def is_readable_cloud(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file is a cloud (`is_cloud`), or is text, which may contain one."""
+    return is_cloud(path) or Path(path).suffix.lower() in TEXT_FORMATS
 
 
 def _in_hdf5(path: str | os.PathLike[str]) -> bool:

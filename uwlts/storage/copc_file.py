@@ -7,9 +7,11 @@ nodes, four times as many as the level above, as suits a surface. All levels dow
 from __future__ import annotations
 
 import os
+import struct
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,8 @@ from uwlts.storage.cloud import PointCloud, make_foreign_cloud
 from uwlts.storage.las_file import (
     INTENSITY_LIMITS,
     LAZ_STEP_M,
+    RECORD_BYTES,
+    START_BYTES,
     las_middle,
     load_library,
     shorten_error,
@@ -35,6 +39,10 @@ _POINTS_OF_NODE = 60_000
 """Points of the root, and of a typical node: compressed about 500 kB, one request of a viewer."""
 _DEEPEST = 7
 _MOST_LEVELS = 16
+_INFO, _INFO_BYTES, _ENTRY, _EXTENDED = 429, 160, 32, 60
+"""Place and size of the description of the octree, and sizes of its entries and of an extended record's header."""
+_LARGEST_RATIO = 10_000
+"""Largest number of points in a byte; equal points have 600. Higher ones are damage, and exhaust the memory."""
 _FIELDS: dict[str, type] = {"amplitude": np.float32, "frame": np.int32, "line": np.int32, "deviation_mm": np.float32}
 
 
@@ -189,18 +197,54 @@ def read_copc(
     laspy, path = load_library("laspy", "COPC"), Path(path)
     try:
         with open_regular(path, called="cloud") as file:
+            _require_sound_octree(file)
             reader = laspy.CopcReader(file)
             total = int(reader.header.point_count)
             box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
             found = _query(reader, box, at_most)
-    except (OSError, RuntimeError, ValueError, KeyError, laspy.errors.LaspyException) as error:
-        raise CaptureError(f"{path} is not a complete COPC file: {shorten_error(error)}") from error
+    except BaseException as error:
+        # The decompressor, in Rust, panics at damaged chunks: the exception is no Exception.
+        if isinstance(error, Exception) or type(error).__name__ == "PanicException":
+            raise CaptureError(f"{path} is not a complete COPC file: {shorten_error(error)}") from error
+        raise
     columns = {name: np.asarray(found[name]) for name in found.point_format.dimension_names if name in _FIELDS}
     intensity = columns.pop("amplitude", found["intensity"])
     if np.isnan(columns.get("deviation_mm", np.nan)).all():
         columns.pop("deviation_mm", None)
     points = 1e3 * np.column_stack([found.x, found.y, found.z])
-    return make_foreign_cloud(points, intensity=intensity, omitted=unwanted_points(found), **columns), total
+    step, omitted = 1e3 * float(np.max(found.scales)), unwanted_points(found)
+    return make_foreign_cloud(points, intensity=intensity, omitted=omitted, step_mm=step, **columns), total
+
+
+def _require_sound_octree(file: BufferedReader) -> None:
+    """Raise ValueError if header or octree (LAS 1.4, 2.4; COPC 1.0) point beyond the file, or declare other points."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    start = file.read(_INFO + _INFO_BYTES)
+    if len(start) < _INFO + _INFO_BYTES or start[:4] != b"LASF":
+        raise ValueError("its header is incomplete")
+    points_begin, records = struct.unpack("<II", start[96:START_BYTES])
+    extended, extended_count, total = struct.unpack("<QIQ", start[235:255])
+    if points_begin > size or records * RECORD_BYTES > points_begin or extended + _EXTENDED * extended_count > size:
+        raise ValueError("its header declares more records than it has")
+    pages, seen, found = [struct.unpack("<QQ", start[_INFO + 40 : _INFO + 56])], set(), 0
+    while pages:
+        offset, length = pages.pop()
+        if offset in seen or length % _ENTRY or offset + length > size:
+            raise ValueError("a page of its octree is outside the file, or occurs twice")
+        seen.add(offset)
+        file.seek(offset)
+        for entry in struct.iter_unpack("<4iQii", file.read(length)):
+            place, stored, count = entry[4:]
+            if count < 0:
+                pages.append((place, stored))
+                continue
+            if stored < 0 or place + stored > size or count > _LARGEST_RATIO * stored:
+                raise ValueError("a node of its octree is outside the file, or holds too many points")
+            found += count
+    if found != total:
+        raise ValueError(f"its octree has {found} points and its header {total}")
+    file.seek(0)
 
 
 def _query(reader: Any, box: Any, at_most: int | None) -> Any:

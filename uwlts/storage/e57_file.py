@@ -11,7 +11,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import require_regular_file
-from uwlts.storage.cloud import FEW_ZEROS, PointCloud, make_foreign_cloud
+from uwlts.storage.cloud import FEW_ZEROS, PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.las_file import load_library, shorten_error
 
 PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"
@@ -158,6 +158,7 @@ def read_e57(path: Path) -> PointCloud:
         intensity=np.concatenate([scan["intensity"] for scan in scans]) if lit else None,
         time_s=np.concatenate([scan["time_s"] for scan in scans]) if timed else None,
         omitted={"at the position of their scanner": at_scanner} if np.count_nonzero(at_scanner) > FEW_ZEROS else {},
+        step_mm=1e3 * find_float_step(np.concatenate(placed)),
     )
     if total > len(points):
         cloud.warnings.insert(0, f"{total - len(points)} of {total} points marked as invalid are omitted")

@@ -20,7 +20,7 @@ from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import (
     CLOUD_FORMATS,
-    is_cloud,
+    is_readable_cloud,
     read_cloud,
     read_parts,
     read_region,
@@ -31,6 +31,7 @@ from uwlts.storage.cloud_files import (
 from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.import_.folder_description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
+from uwlts.storage.number_tables import Unit
 from uwlts.stripe import Stripe
 
 HEADER, TABLE = "header.json", "frames.csv"
@@ -47,6 +48,7 @@ def export(
     images: Literal["png", "tiff"] = "png",
     region_mm: tuple[Corner, Corner] | None = None,
     at_most: int | None = None,
+    unit: Unit | None = None,
     overwrite: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> int:
@@ -55,7 +57,7 @@ def export(
     Parameters
     ----------
     file : str or Path
-        Capture (.h5) or cloud (.ply, .h5, .copc.laz, or .xyz, .las, .e57 of other programs).
+        Capture (.h5) or cloud (.ply, .h5, .copc.laz, or .xyz, .txt, .csv, .asc, .pcd, .las, .e57 of other programs).
     out : str or Path
         New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
         .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).
@@ -65,6 +67,8 @@ def export(
         Only the points in a box: x y z of one corner, x y z of the other.
     at_most : int, optional
         Only an even sample of about this many points.
+    unit : {"mm", "m"}, optional
+        Unit of clouds of other programs, if neither format nor names of columns state it; by default mm.
     overwrite : bool
         Replace an existing cloud.
     progress : callable, optional
@@ -84,18 +88,21 @@ def export(
     SetupError
         The library for the cloud's format is not installed.
     """
-    if is_cloud(file):
+    if of_points := is_readable_cloud(file):
         refuse_unsuitable_cloud(out, overwrite=overwrite)
     if region_mm is not None or at_most is not None:
-        if not is_cloud(file):
+        if not of_points:
             raise CaptureError(f"{file} is not a cloud: only clouds have regions and points")
-        cloud = read_thinned_cloud(file, at_most)[0] if region_mm is None else read_region(file, *region_mm, at_most)
+        if region_mm is None:
+            cloud = read_thinned_cloud(file, at_most, unit=unit)[0]
+        else:
+            cloud = read_region(file, *region_mm, at_most, unit=unit)
         _write(cloud, out, overwrite=overwrite)
         return len(cloud)
-    if is_cloud(file) and is_copc(out):
-        return write_copc(out, lambda: read_parts(file), overwrite=overwrite, progress=progress)
-    if is_cloud(file):
-        cloud = read_cloud(file)
+    if of_points and is_copc(out):
+        return write_copc(out, lambda: read_parts(file, unit=unit), overwrite=overwrite, progress=progress)
+    if of_points:
+        cloud = read_cloud(file, unit=unit)
         _write(cloud, out, overwrite=overwrite)
         return len(cloud)
     if Path(out).name.lower().endswith(CLOUD_FORMATS):

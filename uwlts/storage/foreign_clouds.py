@@ -1,4 +1,4 @@
-"""Clouds in formats of other programs and scanners: text, LAS, E57; LAZ, COPC and MCAP are only written here."""
+"""Clouds in formats of other programs and scanners: text, PCD, LAS, E57; LAZ, COPC and MCAP are only written here."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,24 +8,25 @@ import numpy as np
 
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.files.writing import write_atomically
-from uwlts.storage.cloud import PointCloud, make_foreign_cloud
+from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
 from uwlts.storage.mcap_clouds import covariance_columns, mcap_content
-from uwlts.storage.number_tables import read_number_table
+from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit, read_number_table
+from uwlts.storage.pcd_file import read_pcd
 
 TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
 """Columns x, y, z by name, or the first three, in mm or the unit of their names; and optionally intensity."""
-FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57")
+FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57", ".pcd")
 WRITTEN_FORMATS = (".xyz", ".laz", ".e57", ".las", ".mcap")
 
 
-def read_foreign(path: Path) -> PointCloud:
+def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
     """Read all points of a file in one of `FOREIGN_FORMATS`.
 
-    Text is in mm or the unit that the names of its columns state; LAS and E57 are in m, as they prescribe. The scans
-    of an E57 file are combined, each at its pose.
+    Text is in the unit that the names of its columns state, else in ``unit``, by default mm; PCD is in ``unit``; LAS
+    and E57 are in m, as they prescribe. The scans of an E57 file are combined, each at its pose.
 
     Raises CaptureError if the file is damaged or foreign, SetupError if the library for its format is not installed.
     """
@@ -34,14 +35,26 @@ def read_foreign(path: Path) -> PointCloud:
             return read_las(path)
         case ".e57":
             return read_e57(path)
+        case ".pcd":
+            return _read_pcd(path, unit)
         case _:
-            return _read_text(path)
+            return _read_text(path, unit)
 
 
-def _read_text(path: Path) -> PointCloud:
+def _read_pcd(path: Path, unit: Unit | None) -> PointCloud:
+    columns, warnings = read_pcd(path)
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise CaptureError(f"{path} has no {', '.join(missing)}, only {', '.join(columns) or 'nothing'}")
+    points, scale = np.column_stack([columns[axis] for axis in "xyz"]), MM_PER_UNIT[check_unit(unit or "mm")]
+    step = scale * find_float_step(points)
+    cloud = make_foreign_cloud(scale * points.astype(np.float64), intensity=columns.get("intensity"), step_mm=step)
+    return replace(cloud, warnings=[*warnings, *cloud.warnings])
+
+
+def _read_text(path: Path, unit: Unit | None) -> PointCloud:
     try:
         table = read_number_table(path, named=False)
-        columns, scale = table.columns, table.mm_per_unit()
+        columns, scale = table.columns, table.mm_per_unit(unit=unit)
     except DescriptionError as error:
         raise CaptureError(str(error)) from error
     axes = [columns[axis] for axis in "xyz" if axis in columns]
@@ -49,7 +62,9 @@ def _read_text(path: Path) -> PointCloud:
         if "0" not in columns or len(columns) < 3:
             raise CaptureError(f"{path} has the columns {', '.join(columns)}; expected x, y and z in mm")
         axes = [columns[number] for number in "012"]
-    cloud = make_foreign_cloud(scale * np.column_stack(axes), intensity=columns.get("intensity"))
+    points, used = np.column_stack(axes), "xyz" if "x" in columns else "012"
+    step = scale * max(find_float_step(points), *(table.steps.get(name, 0.0) for name in used))
+    cloud = make_foreign_cloud(scale * points, intensity=columns.get("intensity"), step_mm=step)
     return replace(cloud, warnings=[*table.notes, *cloud.warnings])
 
 

@@ -23,9 +23,9 @@ _REACH_M = LAZ_STEP_M * (2**31 - 1)
 INTENSITY_LIMITS = 0, 2**16 - 1
 _NOISE_CLASSES = 7, 18
 """Low and high noise."""
-_START = 104
+START_BYTES = 104
 """Bytes of a LAS header up to its number of variable length records (LAS 1.4, 2.4)."""
-_RECORD = 54
+RECORD_BYTES = 54
 """Smallest size of such a record in bytes: its header (LAS 1.4, 2.5)."""
 
 
@@ -95,11 +95,11 @@ def read_las(path: Path) -> PointCloud:
     """Read all points of a LAS file; raises CaptureError if it is damaged or compressed, SetupError without laspy."""
     laspy = load_library("laspy", "LAS")
     with open_regular(path, called="cloud") as file:
-        start = file.read(_START)
+        start = file.read(START_BYTES)
     try:
         # The library reads as many records before the points as the header declares, without a limit.
-        points_begin, records = struct.unpack("<II", start[96:_START])
-        if records * _RECORD > points_begin:
+        points_begin, records = struct.unpack("<II", start[96:START_BYTES])
+        if records * RECORD_BYTES > points_begin:
             raise ValueError(f"{records} records do not fit before its points")
         with laspy.open(path, read_evlrs=False) as reader:
             header = reader.header
@@ -107,7 +107,7 @@ def read_las(path: Path) -> PointCloud:
             if header.are_points_compressed or needed > path.stat().st_size:
                 raise ValueError("its points are compressed, or fewer than its header declares")
             found = reader.read_points(header.point_count)
-        points = 1e3 * np.column_stack([found.x, found.y, found.z])
+        points, step = 1e3 * np.column_stack([found.x, found.y, found.z]), 1e3 * float(np.max(header.scales))
         names = set(found.point_format.dimension_names)
         column = {name: np.asarray(found[name]) for name in names & {"frame", "line", "deviation_mm", "gps_time"}}
         intensity = np.asarray(found["amplitude" if "amplitude" in names else "intensity"], np.float32)
@@ -129,6 +129,7 @@ def read_las(path: Path) -> PointCloud:
         intensity=intensity,
         time_s=None if times is None or not times.any() else times,
         omitted=omitted,
+        step_mm=step,
         **column,
     )
 

@@ -18,6 +18,7 @@ from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.storage.cloud_files import open_ply
+from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
 
 if TYPE_CHECKING:
     import trimesh
@@ -142,8 +143,8 @@ def load_triangles(path: Path) -> trimesh.Trimesh:
     return loaded
 
 
-def read_mesh(path: str | Path) -> SurfaceMesh:
-    """Read a mesh in mm from PLY, STL or OBJ.
+def read_mesh(path: str | Path, *, unit: Unit | None = None) -> SurfaceMesh:
+    """Read a mesh from PLY, STL or OBJ in mm or ``unit``.
 
     The standard uncertainties are those of a PLY file written by `SurfaceMesh.save`, otherwise 0. Normals that are not
     in the file are averages over the adjacent triangles.
@@ -158,7 +159,8 @@ def read_mesh(path: str | Path) -> SurfaceMesh:
     if path.suffix.lower() == ".stl":
         # STL repeats each vertex for every triangle.
         loaded.merge_vertices()
-    vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64)
+    scale, faces = MM_PER_UNIT[check_unit(unit or "mm")], np.asarray(loaded.faces, np.int64)
+    vertices = scale * np.asarray(loaded.vertices, float)
     is_ply = path.suffix.lower() == ".ply"
     known = PlyData.read(open_ply(path, called="mesh"))["vertex"].data if is_ply else np.empty(len(vertices), [])
     names = known.dtype.names or ()
@@ -166,7 +168,7 @@ def read_mesh(path: str | Path) -> SurfaceMesh:
     if {"nx", "ny", "nz"} <= set(names):
         normals = np.column_stack([known[name] for name in ("nx", "ny", "nz")]).astype(float)
     noise, shared = (
-        known[name].astype(float) if name in names else np.zeros(len(vertices))
+        scale * known[name].astype(float) if name in names else np.zeros(len(vertices))
         for name in ("uncertainty_noise", "uncertainty_shared")
     )
     return SurfaceMesh(vertices, normals, faces, noise, shared)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
 from uwlts.files.json_files import read_model
@@ -29,6 +30,12 @@ SENSOR_AXES: dict[SensorAxis, np.ndarray] = {
 }
 _ON_AXIS = 1e-6
 """Tolerance for rotations about a table's axis, in mm and as a ratio, for numbers printed with six decimals."""
+
+_NARROWEST_MM = 1.0
+"""Profiles of profilers are several millimetres to metres long; in metres, those of up to a metre are shorter."""
+_NEAREST_MM, _TURNED = 10.0, np.radians(5)
+"""A platform whose positions are all this near to its base's origin does not keep an artefact in view while it turns;
+positions in metres of robots of up to ten metres are nearer."""
 
 
 class MountDescription(Description):
@@ -181,6 +188,7 @@ def read_mount_evidence(
             )
     if not checked:
         raise DescriptionError("there are no profiles")
+    _refuse_metres(checked, matrices)
     return MountEvidence(
         profiles=checked,
         poses=matrices,
@@ -194,6 +202,22 @@ def read_mount_evidence(
         pose_times_s=pose_times_s,
         digests=digests,
     )
+
+
+def _refuse_metres(profiles: list[np.ndarray], poses: np.ndarray) -> None:
+    """Raise DescriptionError for profiles or positions (P, 4, 4) that are too small to be in mm."""
+    seen = [np.ptp(known, axis=0).max() for points in profiles if len(known := points[np.isfinite(points).all(axis=1)])]
+    if seen and np.median(seen) < _NARROWEST_MM:
+        raise DescriptionError(
+            f"the profiles are only {np.median(seen):.3g} mm long: if they are in metres, give `profile_unit` m"
+        )
+    farthest = np.abs(poses[:, :3, 3]).max()
+    turned = Rotation.from_matrix(poses[0, :3, :3].T @ poses[:, :3, :3]).magnitude().max()
+    if 0 < farthest < _NEAREST_MM and turned > _TURNED:
+        raise DescriptionError(
+            f"the platform turns by {np.degrees(turned):.3g} deg and stays within {farthest:.3g} mm of its base: if "
+            "its positions are in metres, give `pose_unit` m"
+        )
 
 
 def require_table(poses: np.ndarray, *, axis: str) -> None:

@@ -15,6 +15,7 @@ from pyarrow import csv
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import read_bytes, shorten
 from uwlts.files.writing import hash_file
+from uwlts.storage.gocator_csv import is_gocator_csv, read_gocator_csv
 
 Unit = Literal["mm", "m"]
 MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
@@ -54,6 +55,9 @@ _DECIMAL_COMMA = re.compile(rb"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?")
 _UNIT_IN_COMMENT = re.compile(
     r"\b(?:in|units?)\b[\s:=]*(?:the |are |is )?[\[(]?(m|cm|um|µm|in|inch(?:es)?|ft|feet|(?:centi)?met(?:re|er)s?)\b"
 )
+_NUMBER = re.compile(rb"[+-]?\d*(?:[.,](\d*))?")
+_FIRST, _FEWEST = 200, 10
+"""Rows of which the decimals are counted, and fewest rows that show them."""
 _COMMENTS = (b"#", b"//", b"%", b"!")
 
 
@@ -61,12 +65,13 @@ _COMMENTS = (b"#", b"//", b"%", b"!")
 class NumberTable:
     """Columns (N,) by name, the units that their names state, and notes on uncertain readings.
 
-    Times are in s. Other columns are in the unit that their name states.
+    Times are in s. Other columns are in the unit that their name states. ``steps`` are those of their decimals.
     """
 
     path: Path
     columns: dict[str, np.ndarray]
     units: dict[str, str] = field(default_factory=dict)
+    steps: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def mm_per_unit(self, axes: Iterable[str] = "xyz", *, unit: Unit | None = None) -> float:
@@ -99,7 +104,8 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
 
     With separators other than commas, numbers may have decimal commas. Lines that begin with #, //, % or ! are
     comments; the last comment before the numbers names the columns if it contains x and z, or an angle. A first line
-    with the number of rows is recognised, as are UTF-8, UTF-16 and Latin-1. Names are in lower case and without unit.
+    with the number of rows is recognised, as are a row of units below the names, UTF-8, UTF-16 and Latin-1. Names are
+    in lower case and without unit.
     Usual names for times, positions, quaternions and Euler angles become ``time_s``, ``x``, ``qw``, ``roll`` and so
     on. Without names, two columns are x and z, and others are numbered. ``digests`` takes the file's SHA-256 by name.
 
@@ -109,6 +115,9 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     if digests is not None:
         digests[path.name] = hash_file(path)
     content = _decode_wide(content, path)
+    if is_gocator_csv(content):
+        columns, notes = read_gocator_csv(content, path)
+        return NumberTable(path, columns, dict.fromkeys("xyz", "mm"), notes=notes)
     lines = [stripped for line in content.splitlines() if (stripped := line.strip(b" ")) and not stripped.isspace()]
     comments = [*takewhile(lambda line: line.startswith(_COMMENTS), lines)]
     if any(mark in content for mark in _COMMENTS):
@@ -121,6 +130,7 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
         header, *lines = lines
         if not lines:
             raise DescriptionError(f"{path} has no rows after the names of its columns")
+    unit_row = lines.pop(0) if len(lines) > 1 and header is not None and _is_unit_row(lines[0]) else None
     if counted not in (None, len(lines)):
         raise DescriptionError(
             f"{path} states {counted} rows in its first line and has {len(lines)}: it is incomplete or has several "
@@ -131,6 +141,8 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     if header is None:
         header = next((each for each in reversed(comments) if _names_columns(each, delimiter, count)), None)
     cells = [] if header is None else _name_cells(header, delimiter, count)
+    if unit_row is not None:
+        cells = _add_units(cells, _name_cells(unit_row, delimiter, count), path)
     body = b"\n".join(lines) + b"\n"
     if delimiter == b" " and b"  " in body:
         body = re.sub(rb" {2,}", b" ", body)
@@ -156,7 +168,9 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     said = [text for text in map(_text, comments[:1000]) if _UNIT_IN_COMMENT.search(text.lower())]
     if said and not units.keys() & set("xyz"):
         notes.append(f"a comment may state another unit than that of the coordinates: {shorten(said[0], 100)}")
-    return NumberTable(path, columns, units, notes)
+    decimals = [_decimals(row) for row in zip(*(_cells(line, delimiter) for line in lines[:_FIRST]), strict=False)]
+    steps = {name: 10.0**-count for name, count in zip(names, decimals, strict=False) if count is not None}
+    return NumberTable(path, columns, units, steps, notes)
 
 
 def _parse(body: bytes, names: list[str], delimiter: bytes, comma: bool, path: Path) -> dict[str, np.ndarray]:
@@ -191,6 +205,31 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
     if "qw" in names:
         names = [f"q{name[1]}" if name in ("rx", "ry", "rz") else name for name in names]
     return names, units
+
+
+def _is_unit_row(line: bytes) -> bool:
+    """Return whether the cells of a line are units or empty."""
+    cells = [_bare_unit(cell) for cell in re.split(r"[,;\t]" if re.search(rb"[,;\t]", line) else r"\s+", _text(line))]
+    return any(cells) and all(not cell or cell in _UNITS for cell in cells)
+
+
+def _bare_unit(cell: str) -> str:
+    """Return a unit without quotes and brackets; empty for a dash or one, which mean none."""
+    unit = _plain_unit(cell.strip(" \"'[]()<>").lower())
+    return "" if unit in ("-", "1") else unit
+
+
+def _add_units(names: list[str], units: list[str], path: Path) -> list[str]:
+    """Return names with the units of the row below; raises DescriptionError if a name states another unit."""
+    if len(units) != len(names):
+        raise DescriptionError(f"{path} has {len(names)} names of columns and {len(units)} units in the row below")
+    found = []
+    for name, unit in zip(names, map(_bare_unit, units), strict=True):
+        stated = _split_unit(name)[1]
+        if unit and stated not in (None, unit):
+            raise DescriptionError(f"{path} has a column {shorten(repr(name))} and the unit {unit} in the row below")
+        found.append(f"{name} [{unit}]" if unit and stated is None else name)
+    return found
 
 
 def _decode_wide(content: bytes, path: Path) -> bytes:
@@ -228,6 +267,13 @@ def _separators(line: bytes) -> tuple[bytes, bool]:
 
 def _cells(line: bytes, delimiter: bytes) -> list[bytes]:
     return line.split() if delimiter == b" " else line.split(delimiter)
+
+
+def _decimals(cells: Iterable[bytes]) -> int | None:
+    """Return the largest number of decimals; None if a number has an exponent, or too few rows show it."""
+    found = [_NUMBER.fullmatch(cell.strip().strip(b'"')) for cell in cells]
+    known = [len(match[1] or b"") for match in found if match]
+    return max(known) if known and len(known) == len(found) >= _FEWEST else None
 
 
 def _is_row(line: bytes) -> bool:

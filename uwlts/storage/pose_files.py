@@ -8,22 +8,51 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
-from uwlts.files.reading import log_warnings
-from uwlts.files.writing import write_atomically
+from uwlts.files.reading import log_warnings, read_bytes
+from uwlts.files.writing import hash_file, write_atomically
 from uwlts.model.calibration import is_rigid
 from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
-from uwlts.storage.number_tables import ROTATION_NAMES, NumberTable, Unit, read_number_table
+from uwlts.storage.number_tables import MM_PER_UNIT, ROTATION_NAMES, NumberTable, Unit, read_number_table
 from uwlts.storage.ros_bags import read_bag_poses
 
 PoseFormat = str
-"""matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg, angle-rad."""
+"""matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg, angle-rad,
+abb, kuka, ur."""
 FARTHEST_MM = 1e7
 """Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
 
 _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
+# Possessive, as backtracking in long runs of digits or blanks would take minutes.
+_N, _NEXT = r"([+-]?(?:\d++(?:\.\d*+)?+|\.\d++)(?:[eE][+-]?\d++)?+)", r"\s*+,\s*+"
+_ROBOTS: dict[str, tuple[re.Pattern[str], str, Unit, str]] = {
+    # ABB RAPID: robtarget [[x, y, z], [q1, q2, q3, q4], ...]
+    "abb": (
+        re.compile(rf"\[\s*+\[\s*+{_NEXT.join([_N] * 3)}\s*+\]{_NEXT}\[\s*+{_NEXT.join([_N] * 4)}\s*+\]"),
+        "quaternion-wxyz",
+        "mm",
+        "!",
+    ),
+    # KUKA KRL: POS, E6POS or FRAME {X .., Y .., Z .., A .., B .., C ..}; A, B and C turn about the moved z, y and x.
+    "kuka": (
+        re.compile(r"\b" + _NEXT.join(rf"{axis}\s*+[=:]?+\s*+{_N}" for axis in "XYZABC"), re.IGNORECASE),
+        "euler-ZYX-deg",
+        "mm",
+        ";",
+    ),
+    # Universal Robots, URScript: p[x, y, z, rx, ry, rz]
+    "ur": (re.compile(rf"\bp\s*+\[\s*+{_NEXT.join([_N] * 6)}\s*+\]"), "rotvec-rad", "m", "#"),
+}
+"""Text of robot programs: pattern of a pose, its format, its unit, and the character that begins a comment."""
+_FORMS = {
+    "abb": "[[x, y, z], [q1, q2, q3, q4], ...]",
+    "kuka": "{X .., Y .., Z .., A .., B .., C ..}",
+    "ur": "p[x, y, z, rx, ry, rz]",
+}
+_MOST_PROGRAM_BYTES = 64 * 2**20
 _EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
 _FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
+_FORMATS += ", abb, kuka, ur (text of robot programs)"
 _MOST_POSES = 1_000_000
 _LATEST_S = 1e11
 """Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns."""
@@ -45,6 +74,9 @@ def read_poses(
     single column ``angle-deg`` or ``angle-rad`` is the angle of a rotary table that turns the object about its z axis:
     the poses are those of the sensor's side relative to the object.
 
+    With the formats ``abb``, ``kuka`` and ``ur`` the file is text of a robot's program, whose poses are read in order
+    (`_ROBOTS`).
+
     Names decide the order of columns where they say it: x, y, z; qw, qx, qy, qz; roll, pitch, yaw or rx, ry, rz. Units
     in names (``x_m``, ``yaw [deg]``) are obeyed; without them positions are in ``unit``, by default mm.
 
@@ -54,8 +86,27 @@ def read_poses(
         Names or their units contradict the format or ``unit``, or the number of columns is wrong. Numbers are not
         finite, matrices not rigid, quaternions not of unit length, or angles in rad look like degrees.
     """
+    if pose_format in _ROBOTS:
+        return _read_program(Path(path), pose_format, unit, digests), None
     table = read_number_table(Path(path), digests, named=False)
     return _poses(table, pose_format, unit)
+
+
+def _read_program(path: Path, robot: str, unit: Unit | None, digests: dict[str, str] | None) -> np.ndarray:
+    """Read the poses (P, 4, 4) in mm in the text of a robot's program; raises DescriptionError without any."""
+    pattern, pose_format, own, comment = _ROBOTS[robot]
+    if unit not in (None, own):
+        raise DescriptionError(f"the poses of the format {robot} are in {own}, but the unit {unit} was given: omit it")
+    content = read_bytes(path, most_bytes=_MOST_PROGRAM_BYTES, error=DescriptionError, called="poses")
+    if digests is not None:
+        digests[path.name] = hash_file(path)
+    lines = (line.partition(comment)[0] for line in content.decode("latin-1").splitlines())
+    rows = np.array([[float(each) for each in found] for found in pattern.findall("\n".join(lines))])
+    if not len(rows):
+        raise DescriptionError(f"{path} has no pose in the form of {robot} ({_FORMS[robot]})")
+    poses = poses_from_rows(rows, pose_format, path)
+    poses[:, :3, 3] *= MM_PER_UNIT[own]
+    return poses
 
 
 def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None) -> Trajectory:

@@ -20,6 +20,7 @@ from tests.virtual_sensors import altered
 from twin.datasets.data_set import SPLITS, DataSetDescription
 from twin.datasets.draws import draw_scene
 from uwlts.errors import CaptureError, DescriptionError, DesignError, OutputError
+from uwlts.files.json_files import json_text
 from uwlts.files.writing import hash_file
 from uwlts.model.library import load_sensor
 
@@ -222,7 +223,8 @@ def test_damaged_files_are_named(folder, tmp_path):
     with pytest.raises(CaptureError, match=re.escape(shard.name)):
         twin.load_dataset(copy)[0]
     card = copy / "dataset.json"
-    card.write_text(card.read_text(encoding="utf-8").replace(f'"{shard.name}"', '"../other.tar"'), encoding="utf-8")
+    text = card.read_text(encoding="utf-8").replace(f'"{shard.name}"', '"../other.tar"')
+    card.write_text(json_text(json.loads(text)), encoding="utf-8")
     with pytest.raises(CaptureError, match="which is not a file of a data set"):
         twin.load_dataset(copy)
     with pytest.raises(CaptureError, match="run twin dataset again"):

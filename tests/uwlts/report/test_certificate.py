@@ -13,18 +13,11 @@ from uwlts.calibration.joint.observability import SheetRegion, list_regions, pro
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError, OutputError
+from uwlts.files.json_files import compute_seal, to_canonical_json
 from uwlts.model.calibration import KnownMedium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
-from uwlts.report.certificate import (
-    NOT_JOINT,
-    JointCertificate,
-    check_certificate,
-    compute_seal,
-    make_certificate,
-    read_certificate,
-    to_canonical_json,
-)
+from uwlts.report.certificate import NOT_JOINT, JointCertificate, check_certificate, make_certificate, read_certificate
 from uwlts.report.certificate_page import certificate_page, write_certificate
 from uwlts.report.certificate_volume import (
     compare_calibrations,

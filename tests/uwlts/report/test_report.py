@@ -257,6 +257,7 @@ def test_a_truncated_file_is_named(folder, tmp_path, name):
 )
 def test_an_evaluation_with_the_wrong_content_is_named(folder, tmp_path, change):
     content = json.loads((folder / "spheres-near.evaluation.json").read_text()) | change
+    del content["sha256"]
     (tmp_path / "odd.evaluation.json").write_text(json.dumps(content))
     with pytest.raises(CaptureError, match=r"odd\.evaluation\.json.*evaluate the cloud again"):
         gather_campaign(tmp_path)

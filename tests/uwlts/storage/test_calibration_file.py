@@ -36,8 +36,9 @@ def refused(path: Path, *words: str) -> None:
 
 
 def edited(path: Path, **changes) -> Path:
-    """The file with values replaced; keys are written as camera__fx_px."""
+    """The file with values replaced and without seal; keys are written as camera__fx_px."""
     content = json.loads(path.read_text(encoding="utf-8"))
+    content.pop("sha256", None)
     for key, value in changes.items():
         *tables, name = key.split("__")
         table = content
@@ -166,7 +167,7 @@ def test_rotation_rounded_to_seven_digits_is_accepted(path: Path, calibration: C
 
 def test_missing_keys_are_named(path: Path):
     content = json.loads(path.read_text(encoding="utf-8"))
-    del content["camera"]["fx_px"], content["sheet"]
+    del content["camera"]["fx_px"], content["sheet"], content["sha256"]
     path.write_text(json.dumps(content), encoding="utf-8")
     refused(path, "camera.fx_px: Field required", "sheet: Field required")
 

@@ -97,6 +97,11 @@ def test_a_table_gives_encoder_and_time_of_every_profile(tmp_path: Path):
         assert np.allclose(capture.stage_mm, [1.25, 2.25, -0.25], atol=1e-12)
         assert capture.encoder.tolist() == [100, 180, -20] and capture.time_s.tolist() == [0.5, 0.51, 0.6]
         assert capture[1].encoder == 180
+    (folder / "profiles.csv").write_text("encoder\n4294967286\n4294967294\n6\n")
+    uwlts.import_images(folder, tmp_path / "wrapped.h5")
+    with Capture(tmp_path / "wrapped.h5") as capture:
+        assert np.allclose(np.diff(capture.stage_mm), 0.1, atol=1e-6)
+        assert capture.encoder.tolist() == [4294967286, 4294967294, 6]
     (folder / "profiles.csv").write_text("encoder, time_s\n100, 0.5\n")
     with pytest.raises(DescriptionError, match=r"profiles.csv has 1 rows, the laser files 3 profiles"):
         uwlts.import_images(folder, tmp_path / "b.h5")

@@ -140,3 +140,19 @@ def test_names_that_contradict_the_format_are_refused(tmp_path, header, pose_for
     (tmp_path / "a.csv").write_text(f"{header}\n1,2,3,0.1,0.2,0.3\n")
     with pytest.raises(uwlts.Error, match=message):
         read_poses(tmp_path / "a.csv", pose_format=pose_format, unit=unit)
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["x,y,z\nm,m,m", 'x,y,z\n"[m]","[m]","[m]"', "x,y,z,note\nm,m,m,-", "# made in Basel\nX,Y,Z\nmetres,metres,metres"],
+)
+def test_a_row_of_units_below_the_names_is_obeyed(tmp_path: Path, header: str):
+    rows = [",".join(f"{value / 1000:.9f}" for value in point) + ",1" * ("note" in header) for point in POINTS_MM]
+    (tmp_path / "a.csv").write_text("\n".join([header, *rows]) + "\n")
+    assert np.abs(read_cloud(tmp_path / "a.csv").points_mm - POINTS_MM).max() < 2e-6
+
+
+def test_a_row_of_units_that_contradicts_the_names_is_refused(tmp_path: Path):
+    (tmp_path / "a.csv").write_text("x_mm,y_mm,z_mm\nm,m,m\n1,2,3\n")
+    with pytest.raises(uwlts.Error, match="'x_mm' and the unit m in the row below"):
+        read_cloud(tmp_path / "a.csv")

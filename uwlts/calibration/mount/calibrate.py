@@ -17,6 +17,7 @@ from uwlts.calibration.mount.profiles import LEAST_POINTS
 from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, reconstruct_profiles
 from uwlts.calibration.mount.start import NoFit, require_surfaces, start
 from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.files.json_files import trusting
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose
 from uwlts.model.trajectory import Trajectory
@@ -36,6 +37,7 @@ _SURE = 5.0
 """The same in standard uncertainties (one in a million for normal errors); the larger limit applies."""
 
 
+@trusting
 def calibrate_mount(
     profiles: str | Path | Sequence[np.ndarray] | CapturedProfiles,
     poses: str | Path | np.ndarray | None = None,
@@ -52,6 +54,7 @@ def calibrate_mount(
     time: bool = False,
     profile_times_s: np.ndarray | None = None,
     pose_times_s: np.ndarray | None = None,
+    trust_edited: bool = False,
 ) -> Mount:
     """Calibrate the mount of a laser profiler on a robot or stage, from its profiles of a sphere, plane, step or ring.
 
@@ -87,7 +90,8 @@ def calibrate_mount(
         propagated to the mount.
     pose_format
         matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved axes),
-        euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table.
+        euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table; abb, kuka
+        or ur for text of robot programs.
     profile_unit
         Unit of the profiles; by default that in the names of columns, else mm.
     pose_unit
@@ -103,6 +107,8 @@ def calibrate_mount(
     profile_times_s, pose_times_s
         Times (P,) of the profiles and (M,) of the poses. The poses are then a trajectory with any number M of poses
         (`uwlts.Trajectory`).
+    trust_edited
+        As for `read`.
 
     Returns
     -------

@@ -247,6 +247,16 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
             raise CalibrationError(f"no step image can be used for the window's distance; {why}")
         window = solve_window(calibration, described, used, known=sensor.uncertainty)
         figures["window"] = window.figures(used)
+        off = abs(window.model.distance_mm - described.distance_mm)
+        # Three standard uncertainties of the described distance and of the found one.
+        if options.refractions == 2 and off > 3 * np.hypot(
+            sensor.uncertainty.window_distance_mm, window.uncertainty_mm
+        ):
+            warnings.append(
+                f"the window is {window.model.distance_mm:.1f} mm from the pupil and described at "
+                f"{described.distance_mm:.1f} ± {sensor.uncertainty.window_distance_mm:g} mm: check the medium and "
+                "step of each step capture, and the description"
+            )
     warnings += on_steps
     how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
     calibration = calibration.model_copy(

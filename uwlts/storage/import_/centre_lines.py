@@ -11,6 +11,7 @@ from uwlts.errors import DescriptionError, ImageError
 from uwlts.files.reading import read_bytes, read_text
 from uwlts.model.sensor import Camera
 from uwlts.model.stripe import ROWS, Coordinates
+from uwlts.storage.encoder_counts import unwrap_counts
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.folder_description import CentreLines
 from uwlts.storage.import_.matching import ImageRow
@@ -84,14 +85,16 @@ def profile_rows(rows: list[ImageRow], given: CentreLines, camera: Camera, *, fo
     known = _read_table(folder / given.table)
     if len(known) != len(found):
         raise DescriptionError(f"{given.table} has {len(known)} rows, the laser files {len(found)} profiles")
-    placed = []
-    for row, values in zip(found, known, strict=True):
-        if given.mm_per_count is not None:
-            if "encoder" not in values or "stage_mm" in values:
-                raise DescriptionError(f"mm_per_count needs a column encoder in {given.table}, and no stage_mm")
-            values = values | {"stage_mm": given.mm_per_count * values["encoder"]}
-        placed.append(replace(row, **values))
-    return placed
+    if given.mm_per_count is not None and known:
+        if "encoder" not in known[0] or "stage_mm" in known[0]:
+            raise DescriptionError(f"mm_per_count needs a column encoder in {given.table}, and no stage_mm")
+        try:
+            counts = unwrap_counts(np.array([values["encoder"] for values in known]), given.encoder_bits)
+        except DescriptionError as error:
+            raise DescriptionError(f"{given.table}: {error}") from error
+        stages = (given.mm_per_count * counts).tolist()
+        known = [values | {"stage_mm": stage} for values, stage in zip(known, stages, strict=True)]
+    return [replace(row, **values) for row, values in zip(found, known, strict=True)]
 
 
 def _read_table(path: Path) -> list[dict[str, float]]:

@@ -52,7 +52,7 @@ class CentreLines(Description):
 
     A position in px is ``scale`` times the number plus ``offset``; the number ``invalid`` marks lines without a stripe.
     ``table`` is a CSV file with a row for each profile: any of stage_mm, exposure_ms, time_s and encoder. With
-    ``mm_per_count`` the encoder gives the stage's positions.
+    ``mm_per_count`` the encoder, a counter of ``encoder_bits``, gives the stage's positions (`unwrap_counts`).
     """
 
     scale: Annotated[float, Field(gt=0)] = 1.0
@@ -60,6 +60,7 @@ class CentreLines(Description):
     invalid: float | None = None
     table: str | None = None
     mm_per_count: float | None = None
+    encoder_bits: Annotated[int, Field(ge=8, le=52)] | None = None
 
 
 class ImportDescription(Description):

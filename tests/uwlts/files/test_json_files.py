@@ -1,0 +1,105 @@
+"""The seal of result files: edited numbers are refused, unless they are trusted."""
+
+import json
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import uwlts
+from tests.fuzz.readers import READERS
+from uwlts.cli import app
+from uwlts.errors import CaptureError
+from uwlts.evaluation.evaluate import FORMAT, VERSION, read_evaluation
+from uwlts.files.json_files import RecordFile, compute_seal, read_json, write_model
+
+
+def _written(kind: str, folder: Path) -> Path:
+    """A file of a calibration, mount or evaluation as the program writes it."""
+    made, path = folder / f"made-{kind}.json", folder / f"{kind}.json"
+    READERS[kind].make(made)
+    if kind == "evaluation":
+        write_model(path, read_evaluation(made), file_format=FORMAT, version=VERSION, overwrite=False)
+    else:
+        uwlts.read(made).save(path)
+    return path
+
+
+def _numbers(content: Any) -> Iterator[tuple[dict | list, Any]]:
+    """Places of the numbers in a JSON value."""
+    for key, value in content.items() if isinstance(content, dict) else enumerate(content):
+        if isinstance(value, dict | list):
+            yield from _numbers(value)
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield content, key
+
+
+@pytest.mark.parametrize("kind", ["calibration", "joint", "polynomials", "mount", "evaluation"])
+def test_every_number_that_is_changed_by_five_percent_is_noticed(kind, tmp_path):
+    path = _written(kind, tmp_path)
+    uwlts.read(path)
+    content = json.loads(path.read_text())
+    places = [place for place in _numbers(content) if place[0][place[1]]]
+    assert len(places) > 5
+    for place, key in places[:: 1 + len(places) // 40]:
+        before = place[key]
+        place[key] = 1.05 * before
+        path.write_text(json.dumps(content))
+        with pytest.raises(CaptureError, match="was edited after it was written"):
+            uwlts.read(path)
+        place[key] = before
+    path.write_text(json.dumps(content))
+    uwlts.read(path)
+
+
+def test_trusted_edits_are_recorded_in_what_is_saved_from_them(tmp_path, caplog):
+    for kind in ("calibration", "mount", "evaluation"):
+        path = _written(kind, tmp_path)
+        content = json.loads(path.read_text())
+        place, key = next(place for place in _numbers(content) if place[1] not in ("version",))
+        place[key] *= 1 + 1e-9
+        path.write_text(json.dumps(content))
+        with caplog.at_level(logging.WARNING, "uwlts"):
+            found = uwlts.read(path, trust_edited=True)
+        assert "was edited after it was written" in caplog.text
+        assert found.edited if kind != "calibration" else found.provenance["edited"]
+        if kind != "evaluation":
+            found.save(path, overwrite=True)
+            assert uwlts.read(path) == found
+
+
+def test_a_file_of_an_older_version_is_read_with_a_notice(tmp_path, caplog):
+    path = _written("calibration", tmp_path)
+    expected = uwlts.read(path)
+    content = json.loads(path.read_text())
+    del content["sha256"]
+    path.write_text(json.dumps(content))
+    with caplog.at_level(logging.WARNING, "uwlts"):
+        assert uwlts.read(path) == expected
+    assert "has no seal" in caplog.text
+
+
+class _Found(RecordFile):
+    def record(self) -> object:
+        return {"depth_mm": 1.25, "by_number": {10: 1, 9: 2}, "name": "hull ☃"}
+
+
+def test_records_are_sealed_too(tmp_path):
+    path = tmp_path / "found.json"
+    _Found().save(path)
+    content = read_json(path, called="record")
+    assert content["sha256"] == compute_seal(content) and content["depth_mm"] == 1.25
+    path.write_text(path.read_text().replace("1.25", "1.35"))
+    with pytest.raises(CaptureError, match="original file"):
+        read_json(path, called="record")
+
+
+def test_the_command_trusts_an_edited_calibration_only_when_told(tmp_path, caplog, capsys):
+    path = _written("calibration", tmp_path)
+    path.write_text(path.read_text().replace('"width_px": 1', '"width_px": 2', 1))
+    with pytest.raises(CaptureError, match="`trust_edited`"):
+        app(["info", str(path)], result_action="return_value")
+    app(["info", str(path), "--trust-edited"], result_action="return_value")
+    assert "edited" in caplog.text and "calibration of the sensor" in capsys.readouterr().out

@@ -1,0 +1,94 @@
+"""Mistakes in a trajectory raise doubts; correct trajectories of several kinds raise none."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwlts.model.trajectory import Trajectory
+from uwlts.reconstruction.trajectory_doubts import find_trajectory_doubts
+
+IMAGES_S = np.linspace(0.5, 39.5, 30)
+KNOWN_S = np.linspace(-1, 41, 421)
+TURN = Rotation.from_euler("ZYX", [40, -20, 75], degrees=True)
+
+
+def way(times: np.ndarray, kind: str) -> tuple[np.ndarray, Rotation]:
+    """Positions and rotations of a sensor that moves by 58 mm along its x axis, or about an axis, in 40 s."""
+    part, rng = times / 40, np.random.default_rng(7)
+    turns = TURN * Rotation.from_rotvec(np.zeros((len(times), 3)))
+    match kind:
+        case "steady":
+            along = 58 * part
+        case "accelerating":
+            along = 58 * np.clip(part, 0, 1) ** 2
+        case "noisy":
+            along = 58 * part + rng.normal(0, 0.1, len(times))
+        case "stop and go":
+            along = 2 * np.floor(times / 40 * 29) + 2 * np.clip((times / 40 * 29) % 1 / 0.2, 0, 1)
+        case "late start":
+            along = 58 * np.clip((times - 1) / 38, 0, 1)
+        case "rotary":
+            along = np.zeros(len(times))
+            turns = TURN * Rotation.from_euler("Y", 90 * part[:, None], degrees=True)
+        case "curved":
+            along = 58 * part
+            turns = TURN * Rotation.from_euler("Z", 20 * part[:, None], degrees=True)
+    return TURN.apply(np.column_stack([along, 0 * along, 0 * along])) + [900, -340, 610], turns
+
+
+def trajectory(kind: str, times: np.ndarray = KNOWN_S) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    places, turns = way(times, kind)
+    return times, places, turns.as_quat()
+
+
+def doubts_of(times: np.ndarray, places: np.ndarray, quaternions: np.ndarray) -> str:
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(quaternions).as_matrix(), places
+    found = Trajectory(times, poses)
+    return "; ".join(find_trajectory_doubts(found, IMAGES_S, found.poses_at(IMAGES_S)))
+
+
+@pytest.mark.parametrize("kind", ["steady", "accelerating", "noisy", "rotary", "curved"])
+@pytest.mark.parametrize("rate", [1.0, 10.0, 200.0])
+def test_correct_trajectories_raise_no_doubt(kind, rate):
+    times = np.arange(-1, 41, 1 / rate)
+    assert doubts_of(*trajectory(kind, times)) == ""
+
+
+@pytest.mark.parametrize("kind", ["stop and go", "late start"])
+def test_a_platform_that_stops_has_no_outliers(kind):
+    assert "jumps" not in doubts_of(*trajectory(kind))
+
+
+def test_a_long_log_around_a_short_scan_raises_no_doubt():
+    assert doubts_of(*trajectory("steady", np.arange(-3600, 7200, 0.1))) == ""
+
+
+def test_metres_are_noticed():
+    times, places, turns = trajectory("steady")
+    assert "`pose_unit`" in doubts_of(times, places / 1000, turns)
+
+
+@pytest.mark.parametrize("rate", [1.0, 10.0, 100.0])
+def test_milliseconds_are_noticed(rate):
+    times, places, turns = trajectory("steady", np.arange(-1, 41, 1 / rate))
+    assert "are its times in s?" in doubts_of(1000 * times, places, turns)
+
+
+def test_one_outlier_is_noticed():
+    times, places, turns = trajectory("noisy")
+    places[200, 1] += 320.0
+    assert "jumps by up to 319.9 mm, at 19 s" in doubts_of(times, places, turns)
+
+
+def test_a_frozen_trajectory_is_noticed():
+    times, places, turns = trajectory("steady")
+    places[150:260], turns[150:260] = places[150], turns[150]
+    assert "8 of 30 images, from 15.29" in doubts_of(times, places, turns)
+
+
+def test_a_swapped_quaternion_that_leads_along_the_sheet_is_noticed():
+    times, places, turns = trajectory("steady")
+    # The sensor's y axis, in the sheet, points along the motion.
+    swapped = (Rotation.from_quat(turns) * Rotation.from_euler("Z", -90, degrees=True)).as_quat()
+    assert "is across the laser sheet" in doubts_of(times, places, swapped)

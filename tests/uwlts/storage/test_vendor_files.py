@@ -1,0 +1,167 @@
+"""Files of other makers: PCD clouds, CSV of Gocator sensors, and poses in robot programs."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import uwlts
+from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.number_tables import read_number_table
+from uwlts.storage.pose_files import read_poses
+
+# Equal values follow each other, so that the compressed file has references of all kinds.
+POINTS = np.repeat(np.random.default_rng(8).uniform(-80, 80, (60, 3)).astype(np.float32), 7, axis=0)
+INTENSITY = np.repeat(np.arange(60, dtype=np.float32), 7)
+
+
+def compress(plain: bytes) -> bytes:
+    """LZF by brute force: at each place the longest earlier match of up to 264 bytes, or literal bytes."""
+    packed, literals, at = bytearray(), bytearray(), 0
+
+    def flush() -> None:
+        for start in range(0, len(literals), 32):
+            part = literals[start : start + 32]
+            packed.append(len(part) - 1)
+            packed.extend(part)
+        literals.clear()
+
+    while at < len(plain):
+        place = plain.rfind(plain[at : at + 3], max(0, at - 8191), at + 2) if at + 3 <= len(plain) else -1
+        if place < 0 or place >= at:
+            literals.append(plain[at])
+            at += 1
+            continue
+        length = 3
+        while length < 264 and at + length < len(plain) and plain[place + length] == plain[at + length]:
+            length += 1
+        flush()
+        far, rest = at - place - 1, length - 2
+        packed.append(min(rest, 7) << 5 | far >> 8)
+        if rest >= 7:
+            packed.append(rest - 7)
+        packed.append(far & 255)
+        at += length
+    flush()
+    return bytes(packed)
+
+
+def pcd(
+    form: str, *, points: np.ndarray = POINTS, declared: int | None = None, viewpoint: str = "0 0 0 1 0 0 0"
+) -> bytes:
+    fields = [*points.T, np.zeros((len(points), 2), np.float32), INTENSITY[: len(points)]]
+    header = (
+        "# .PCD v0.7 - Point Cloud Data\nVERSION 0.7\nFIELDS x y z _ intensity\nSIZE 4 4 4 4 4\nTYPE F F F F F\n"
+        f"COUNT 1 1 1 2 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\n"
+        f"POINTS {len(points) if declared is None else declared}\nDATA {form}\n"
+    ).encode()
+    table = np.column_stack(fields).astype("<f4")
+    if form == "ascii":
+        return header + "\n".join(" ".join(map(repr, map(float, row))) for row in table).encode() + b"\n"
+    if form == "binary":
+        return header + table.tobytes()
+    plain = b"".join(np.ascontiguousarray(each.astype("<f4")).tobytes() for each in fields)
+    packed = compress(plain)
+    assert len(packed) < len(plain) / 2
+    return header + struct.pack("<II", len(packed), len(plain)) + packed
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
+def test_pcd_is_read(tmp_path: Path, form: str):
+    (tmp_path / "a.pcd").write_bytes(pcd(form))
+    cloud = read_cloud(tmp_path / "a.pcd")
+    assert np.array_equal(cloud.points_mm, POINTS) and np.array_equal(cloud.intensity, INTENSITY)
+    assert cloud.warnings == []
+    assert np.allclose(uwlts.read(tmp_path / "a.pcd", unit="m").points_mm, 1000.0 * POINTS, rtol=1e-6)
+    moved = POINTS.copy()
+    moved[10] = np.nan
+    (tmp_path / "b.pcd").write_bytes(pcd(form, points=moved, viewpoint="1 0 0 1 0 0 0"))
+    found = read_cloud(tmp_path / "b.pcd")
+    assert len(found) == len(POINTS) - 1
+    assert "VIEWPOINT" in found.warnings[0] and "without finite coordinates" in found.warnings[1]
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
+def test_a_damaged_pcd_is_refused(tmp_path: Path, form: str):
+    content = pcd(form)
+    damaged = [content[: len(content) - 40], pcd(form, declared=2**31 - 1), pcd(form, declared=len(POINTS) + 1)]
+    damaged += [content.replace(b"FIELDS x", b"FIELDS q"), content.replace(b"COUNT 1", b"COUNT -1"), b"# .PCD\n"]
+    if form == "binary_compressed":
+        damaged.append(content[:-20] + b"\xff" * 20)
+    for each in damaged:
+        (tmp_path / "a.pcd").write_bytes(each)
+        with pytest.raises(uwlts.Error, match=r"a\.pcd"):
+            read_cloud(tmp_path / "a.pcd")
+
+
+INFO = "Info\nCSV Version,Sensor Count,Trigger Mode\n2,1,0\nEnd\nDeviceInfo\nID,Model\n13434,2M\nEnd\n"
+COLUMNS = "Frame,Source,Time,Encoder,Z Encoder,Inputs,Exposure,Y,Axis"
+ATTRIBUTES = "Frame Count,Column Count,X Offset,Y Offset,Z Offset\n2,3,{},0,0\n"
+
+
+def test_profiles_of_a_gocator_are_read(tmp_path: Path):
+    rows = "0,0,5,0,0,0,80,10.5,Z,1.5,,3.5\n0,0,5,0,0,0,80,10.5,I,7,8,9\n1,0,6,0,0,0,80,11,Z,4,5,6\n"
+    (tmp_path / "a.csv").write_text(f"{INFO}Profile\n{ATTRIBUTES.format(0)}{COLUMNS},-0.5,0,0.5\n{rows}End\n")
+    cloud = read_cloud(tmp_path / "a.csv")
+    expected = [[-0.5, 10.5, 1.5], [0.5, 10.5, 3.5], [-0.5, 11, 4], [0, 11, 5], [0.5, 11, 6]]
+    assert cloud.points_mm.tolist() == expected and cloud.intensity[:2].tolist() == [7, 9]
+    assert "Profile of a Gocator" in cloud.warnings[0] and "1 of 6 points" in cloud.warnings[1]
+    raw = "0,0,5,0,0,0,80,10.5,X,-1,0,1\n0,0,5,0,0,0,80,10.5,Z,2,3,4\n"
+    (tmp_path / "b.csv").write_text(f"{INFO}RawProfile\n{ATTRIBUTES.format(2.5)}{COLUMNS},0,1,2\n{raw}End\n")
+    found = read_number_table(tmp_path / "b.csv")
+    assert (found.columns["x"].tolist(), found.columns["z"].tolist()) == ([-1, 0, 1], [2, 3, 4])
+    assert found.notes[1] == "offsets are not added: X Offset 2.5 mm"
+
+
+def test_a_surface_of_a_gocator_is_read(tmp_path: Path):
+    part = "Part\nFrame,X Offset,Y Offset,Z Offset\n0,0,0,0\nY\\X,0,0.1,0.2\n5,1,2,3\n6,4,,6\nEnd\n"
+    (tmp_path / "a.csv").write_text(INFO + part)
+    cloud = read_cloud(tmp_path / "a.csv")
+    assert cloud.points_mm.tolist() == [[0, 5, 1], [0.1, 5, 2], [0.2, 5, 3], [0, 6, 4], [0.2, 6, 6]]
+    for text, message in (
+        (INFO, "this reads Profile"),
+        (INFO + part.replace("5,1,2,3", "5,1,2"), "section Part is damaged"),
+    ):
+        (tmp_path / "b.csv").write_text(text)
+        with pytest.raises(uwlts.Error, match=message):
+            read_cloud(tmp_path / "b.csv")
+
+
+PROGRAMS = {
+    "abb": (
+        "MODULE a\n! CONST robtarget p0:=[[9,9,9],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];\n"
+        "CONST robtarget p1:=[[600.5,-20,300],[0.5,0.5,-0.5,0.5],[0,-1,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];\n"
+        "MoveL [ [6.1E2, 0, 310], [0.5, 0.5, -0.5, 0.5], [0,0,0,0], [9E9,9E9,9E9,9E9,9E9,9E9] ], v100, fine, tool0;\n",
+        [[600.5, -20, 300], [610, 0, 310]],
+        Rotation.from_quat([0.5, -0.5, 0.5, 0.5]),
+    ),
+    "kuka": (
+        "DECL E6POS XP1={X 600.5,Y -20.0,Z 300.0,A 30.0,B 40.0,C -50.0,S 6,T 27,E1 0.0}\n"
+        ";FOLD X 1,Y 1,Z 1,A 0,B 0,C 0\n"
+        "PTP {x 610, y 0, z 310, a 30, b 40, c -50}\n",
+        [[600.5, -20, 300], [610, 0, 310]],
+        Rotation.from_euler("ZYX", [30, 40, -50], degrees=True),
+    ),
+    "ur": (
+        "global p1 = p[0.6005, -0.020, 0.3, 0.1, -1.2, 0.3]\n# p[9,9,9,0,0,0]\nmovej([0,0,0,0,0,0])\n"
+        "movel(p[.61, 0, 3.1e-1, 0.1, -1.2, 0.3], a=1.2)\n",
+        [[600.5, -20, 300], [610, 0, 310]],
+        Rotation.from_rotvec([0.1, -1.2, 0.3]),
+    ),
+}
+
+
+@pytest.mark.parametrize("robot", PROGRAMS)
+def test_poses_of_robot_programs_are_read(tmp_path: Path, robot: str):
+    text, places, rotation = PROGRAMS[robot]
+    (tmp_path / "a.mod").write_text(text)
+    poses, times = read_poses(tmp_path / "a.mod", pose_format=robot)
+    assert times is None and np.allclose(poses[:, :3, 3], places, atol=1e-9)
+    assert np.allclose(poses[:, :3, :3], rotation.as_matrix(), atol=1e-9)
+    with pytest.raises(uwlts.Error, match="are in m"):
+        read_poses(tmp_path / "a.mod", pose_format=robot, unit="mm" if robot == "ur" else "m")
+    (tmp_path / "b.mod").write_text("no pose")
+    with pytest.raises(uwlts.Error, match=f"no pose in the form of {robot}"):
+        read_poses(tmp_path / "b.mod", pose_format=robot)

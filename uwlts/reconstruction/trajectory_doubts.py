@@ -1,0 +1,78 @@
+"""Doubts about a trajectory at the images of a scan: units, clocks, outliers, standstill and direction."""
+
+import numpy as np
+
+from uwlts.model.trajectory import Trajectory, format_time
+
+_REACH_MM = 300.0
+"""Distance of the surface at which a rotation counts as a motion: the stand-off of the reference sensor."""
+_SMALLEST_STEP_MM = 5e-3
+"""Slower scans would take over a hundred images of each spot of the laser; positions in metres are a thousandth."""
+_LEAST_COVER = 5e-3
+"""Least part of a trajectory's time with images, if it also has few poses among them; times in ms give a thousandth."""
+_OUTLIER, _LEAST_OUTLIER_MM = 30.0, 1.0
+"""Least deviation of an outlier from its neighbours, in medians of all deviations, and in mm."""
+_STEPS_OF_OUTLIER = 5.0
+"""The same in steps between poses (their 90th percentile), as a platform that starts to move deviates by half."""
+_LEAST_ACROSS = 0.1
+"""Least part of the motion across the laser sheet: scans along it have no points beside each other."""
+
+
+def find_trajectory_doubts(trajectory: Trajectory, times_s: np.ndarray, sensor_poses: np.ndarray) -> list[str]:
+    """Return warnings about a trajectory, for the poses (N, 4, 4) of the sensor at the times (N,) of N laser images."""
+    if len(times_s) < 2:
+        return []
+    places, known = trajectory.poses[:, :3, 3], trajectory.times_s
+    first, last = times_s.min(), times_s.max()
+    doubts = []
+    inside = int(np.count_nonzero((known >= first) & (known <= last)))
+    cover = (last - first) / (known[-1] - known[0])
+    if cover < _LEAST_COVER and inside < len(times_s) / 2:
+        doubts.append(
+            f"the images cover {100 * cover:.2g} % of the trajectory's time, with {inside} of its {len(known)} poses: "
+            "are its times in s?"
+        )
+    moves, turns = np.diff(sensor_poses[:, :3, 3], axis=0), sensor_poses[:, :3, :3]
+    turned = np.linalg.norm(np.diff(turns, axis=0), axis=(1, 2)) / np.sqrt(2)
+    way = np.linalg.norm(moves, axis=1)
+    if np.mean(way + _REACH_MM * turned) < _SMALLEST_STEP_MM:
+        doubts.append(
+            f"the sensor moves by {way.sum():.3g} mm in {len(times_s)} images: does the platform stand still, or are "
+            "positions in metres (`pose_unit`)?"
+        )
+    across = np.abs(np.einsum("ni,ni->n", moves, turns[:-1, :, 0]))
+    if way.sum() > _REACH_MM * turned.sum() and across.sum() < _LEAST_ACROSS * way.sum():
+        doubts.append(
+            f"{100 * across.sum() / way.sum():.2g} % of the motion is across the laser sheet: check the order of "
+            "quaternions and angles, and the mount"
+        )
+    return [*doubts, *_find_outliers(known, places), *_find_standstill(trajectory, times_s)]
+
+
+def _find_outliers(times: np.ndarray, places: np.ndarray) -> list[str]:
+    """Return a warning about positions (N, 3) far from the line between their neighbours."""
+    if len(times) < 4:
+        return []
+    part = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]
+    off = np.linalg.norm(places[1:-1] - (1 - part) * places[:-2] - part * places[2:], axis=1)
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    limit = max(_OUTLIER * np.median(off), _STEPS_OF_OUTLIER * np.percentile(steps, 90), _LEAST_OUTLIER_MM)
+    if off[worst := int(np.argmax(off))] <= limit:
+        return []
+    at = format_time(times[worst + 1])
+    return [f"the trajectory jumps by up to {off[worst]:.4g} mm, at {at}: remove outliers, or fill the gap"]
+
+
+def _find_standstill(trajectory: Trajectory, times_s: np.ndarray) -> list[str]:
+    """Return a warning about images at times at which the trajectory repeats a pose exactly."""
+    same = (trajectory.poses[1:] == trajectory.poses[:-1]).all(axis=(1, 2))
+    # Images between two equal poses.
+    after = np.searchsorted(trajectory.times_s, times_s, side="right") - 1
+    frozen = same[np.clip(after, 0, len(same) - 1)]
+    if np.count_nonzero(frozen) < 2:
+        return []
+    some = times_s[frozen]
+    return [
+        f"{len(some)} of {len(times_s)} images, from {format_time(some[0])} to {format_time(some[-1])}, are at times "
+        "at which the trajectory repeats the same pose: did it freeze?"
+    ]

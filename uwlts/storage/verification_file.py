@@ -1,0 +1,67 @@
+"""Record of a calibration's last verification, in a file beside the calibration."""
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict
+
+from uwlts.files.json_files import read_model, write_model
+from uwlts.files.reading import is_regular_file
+from uwlts.model.any_calibration import AnyCalibration, calibration_digest
+
+FORMAT, VERSION = "uwlts-verification", 1
+ENDING = ".verification.json"
+_VALID = timedelta(days=1)
+"""Validity of a verification, and of a new calibration: standards for such sensors ask for a check each day of use."""
+
+
+class VerificationRecord(BaseModel):
+    """Verdict on a calibration, given by its digest, from a capture at a date; ``lines`` are the results as text."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    calibration: str
+    date: AwareDatetime
+    capture: str
+    passed: bool
+    lines: tuple[str, ...]
+    edited: bool = False
+
+
+def verification_path(calibration: str | Path) -> Path:
+    """Return the path of the record beside a calibration's file: for water.json, water.verification.json."""
+    return Path(calibration).with_suffix(ENDING)
+
+
+def write_verification(calibration: str | Path, record: VerificationRecord) -> Path:
+    """Write the record beside the calibration, in place of the last one; OutputError if that fails."""
+    path = verification_path(calibration)
+    write_model(path, record, file_format=FORMAT, version=VERSION, overwrite=True)
+    return path
+
+
+def describe_verification(
+    path: str | Path, calibration: AnyCalibration, *, now: datetime | None = None
+) -> tuple[str | None, list[str]]:
+    """Return until when a calibration's file is verified, as text or None, and warnings if it is not.
+
+    There is no warning in the first day after the calibration, or if its date is unknown.
+    """
+    now, record = now or datetime.now(UTC), None
+    if is_regular_file(beside := verification_path(path)):
+        called = "record of a verification"
+        record = read_model(beside, VerificationRecord, file_format=FORMAT, version=VERSION, called=called)
+    if record is None or record.calibration != calibration_digest(calibration):
+        try:
+            made = datetime.fromisoformat(str(calibration.provenance.get("date")))
+        except ValueError:
+            return None, []
+        if now - (made if made.tzinfo else made.replace(tzinfo=UTC)) <= _VALID:
+            return None, []
+        return None, [f"the calibration of {made:%Y-%m-%d} was not verified since: measure an artefact (uwlts verify)"]
+    if not record.passed:
+        return None, [f"the calibration FAILED its verification of {record.date:%Y-%m-%d}: {'; '.join(record.lines)}"]
+    until = record.date + _VALID
+    if now > until:
+        return None, [f"the calibration was last verified on {record.date:%Y-%m-%d}: today's check is missing"]
+    return f"{until:%Y-%m-%d %H:%M} UTC", []
