@@ -11,7 +11,7 @@ from uwlts.cli import app as uwlts_app
 ROOT = Path(__file__).resolve().parents[1]
 
 project = "uwlts"
-copyright = "the uwlts authors"
+project_copyright = "the uwlts authors"
 release = version = version_of("uwlts")
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]

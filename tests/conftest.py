@@ -31,7 +31,7 @@ os.environ["PYTHONPATH"] = str(ROOT)
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
-        "--noise", type=int, default=0, help="draw all noise anew: another number, other noise (0: the usual)"
+        "--noise", type=int, default=0, help="draw all noise again: another number, other noise (0: the usual)"
     )
     parser.addoption(
         "--lanes", type=int, default=0, help="vectors in the renderer's kernels as of another processor: 4, 8 or 16"

@@ -207,7 +207,7 @@ def homogeneous(medium: Medium, *, wavelength_nm: float) -> dict[str, Any]:
 def _shape(thing: AnyObject, pose: np.ndarray, sensor: Sensor, medium: Medium) -> dict[str, Any]:
     """Return Mitsuba's description of an object at its pose (4, 4) in the OCS."""
     if thing.mirror_share() > 0:
-        raise ValueError("stock Mitsuba cannot connect to a point light by way of a mirror")
+        raise ValueError("stock Mitsuba cannot connect to a point light through a mirror")
     wavelength = sensor.laser.wavelength_nm
     bsdf = finish_bsdf(thing, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength)
     at, scaled = mi.ScalarTransform4f(pose), mi.ScalarTransform4f().scale

@@ -105,6 +105,34 @@ def test_mentioned_commands_and_options_exist(page):
             pytest.fail(f"{name_of(page)}:{line}: '{command}': {error}")
 
 
+def _accepts(app: cyclopts.App, command: str, words: list[str]) -> bool:
+    """Return whether a command has an option and, if they are given, accepts its values."""
+    arguments = app[command].assemble_argument_collection()
+    if len(words) == 1:
+        return words[0] in {name for each in arguments for name in each.names}
+    needed = [each for each in arguments if each.required and not set(each.names) & set(words)]
+    places = [f"{number}.h5" for number, each in enumerate(needed) if each.field_info.is_positional]
+    options = [word for each in needed if not each.field_info.is_positional for word in (each.name, "1.h5")]
+    try:
+        app.parse_args([command, *places, *words, *options], exit_on_error=False, print_error=False)
+    except cyclopts.CycloptsError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_options_in_sentences_are_accepted_with_their_values(page):
+    """Such as `--distortion k1 k2`: by a command, or, on pages of results, by a study's script."""
+    commands = [(app, name) for app in (uwlts_app, twin_app) for name in app if not name.startswith("-")]
+    studies = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "studies").glob("*.py"))
+    for line, text in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
+        for words in map(words_of, re.findall(r"`(--[a-z][^`]*)`", text)):
+            if words == ["--help"] or any(word.isupper() or "[" in word for word in words):
+                continue  # cyclopts adds it; the others are names of values, not values
+            known = any(_accepts(app, name, words) for app, name in commands)
+            assert known or f'"{words[0]}"' in studies, f"{name_of(page)}:{line}: no command accepts {' '.join(words)}"
+
+
 @pytest.mark.parametrize("package", ["uwlts", "twin"])
 def test_the_layers_are_those_of_the_contract(package):
     text = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")

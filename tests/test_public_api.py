@@ -120,7 +120,7 @@ def test_every_option_is_explained(program: str, name: str):
 
 @pytest.mark.parametrize("line", ["serve plane", "reproduce", "demo", "sweep baseline-angle"])
 def test_commands_run_with_their_defaults(line: str, monkeypatch: pytest.MonkeyPatch):
-    """Parsing hands over what was given, and nothing else."""
+    """Parsing passes the given arguments on, and no others."""
     name, *words = line.split()
     function, taken = getattr(twin, name), []
     assert inspect.signature(twin.cli.app[name].default_command).parameters

@@ -159,7 +159,21 @@ class Options:
     def from_names(
         cls, *, spp: int, seed: int, effects: Sequence[str], without: Sequence[str], ideal: bool
     ) -> "Options":
-        """Make options with the flaws ``effects``, without the effects ``without``; ``ideal``: without all effects."""
+        """Make options from the names of effects, as in commands.
+
+        Parameters
+        ----------
+        spp
+            Samples per lit pixel.
+        seed
+            Seed of noise and random walks.
+        effects
+            Names of flaws to add.
+        without
+            Names of effects to omit.
+        ideal
+            Omit all effects.
+        """
         return cls(spp, seed, (NONE if ideal else ALL).remove(*without), Flaws.parse(*effects))
 
     def names(self) -> list[str]:

@@ -1,6 +1,6 @@
 """Spheres measured from images and from the centre lines of a 3D camera, rendered with the same noise.
 
-python docs/studies/centre_lines.py
+python docs/studies/centre_lines.py [--write]
 """
 
 import os
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from cyclopts import App
+from result_tables import publish, table
 
 import twin
 import uwlts
@@ -19,10 +20,10 @@ PLACES = "near", "standoff", "far"
 CAMERAS = {"images": (), "centre lines": ("camera-3d",)}
 
 
-def main() -> None:
-    """Print a row for each water and camera."""
+def main(*, write: bool = False) -> None:
+    """Print a row for each water and camera; with `--write`, put the table into its page."""
     calibration = uwlts.nominal("thesis", medium="water")
-    print("water    camera        spacing error/um  std/um  diameter error/um  points  bytes       frames/s")
+    cells = []
     with tempfile.TemporaryDirectory() as folder:
         for water in WATERS:
             for camera, effects in CAMERAS.items():
@@ -42,11 +43,12 @@ def main() -> None:
                         (1e3 * spacing, 1e3 * std, 1e3 * diameter.max(), len(cloud), os.path.getsize(path), rate)
                     )
                 spacing, std, diameter, points, size, rate = np.mean(rows, axis=0)
-                print(
-                    f"{water:8s} {camera:12s}  {spacing:16.1f}  {std:6.1f}  {diameter:17.1f}  {points:6.0f}  "
-                    f"{size:10,.0f}  {rate:8.0f}",
-                    flush=True,
+                errors = [f"{value:.1f} µm" for value in (spacing, std, diameter)]
+                cells.append(
+                    [water, camera, *errors, f"{points:,.0f}", f"{size / 1e6:.3g} MB", f"{rate:,.0f} frames/s"]
                 )
+    head = ["water", "camera", "spacing error", "std about the spheres", "diameter error", "points", "file"]
+    publish({"centre lines": table([*head, "stripes and points, one core"], cells)}, write=write)
 
 
 if __name__ == "__main__":

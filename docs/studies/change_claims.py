@@ -1,11 +1,12 @@
 """False positives of `uwlts compare`: fraction of an unchanged surface that is reported as changed.
 
 Clouds are drawn with the errors that they state: noise of single points, the position of each image, and a shift and a
-tilt that all points share. Prints the rows of the table in docs/results/comparison.md; numbers select rows.
+tilt that all points share. Prints the table of docs/results/comparison.md, or puts it there (`--write`).
 """
 
 import numpy as np
 from cyclopts import App
+from result_tables import publish, table
 
 import uwlts
 from uwlts.storage.cloud import PointCloud, PointUncertainty
@@ -27,7 +28,7 @@ def flat(x, y):
 
 
 def scanned(rng: np.random.Generator, surface, *, common: bool, calibration: np.ndarray | None = None) -> PointCloud:
-    """Return a scanned cloud; errors of its calibration (2,) in standard deviations are drawn unless given."""
+    """Return a scanned cloud; errors of its calibration (2,) in standard deviations are drawn by default."""
     axis = np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM)
     x, y = np.meshgrid(axis, axis)
     image = np.repeat(np.arange(len(axis))[None], len(axis), axis=0).ravel()
@@ -44,8 +45,9 @@ def scanned(rng: np.random.Generator, surface, *, common: bool, calibration: np.
     return PointCloud(np.column_stack([x, y, z]), np.ones(count), image, np.zeros(count, int), uncertainty=known)
 
 
-def main(*rows_drawn: int) -> None:
-    """Print all rows of the table, or those with the given numbers."""
+def main(*, write: bool = False) -> None:
+    """Print the table; with `--write`, put it into its page."""
+    cells = []
     rows = (
         ("two scans, noise and images only", wavy, False, False, None, False),
         ("two scans of one calibration", wavy, True, True, None, False),
@@ -54,8 +56,7 @@ def main(*rows_drawn: int) -> None:
         ("plane, fitted", flat, True, False, "plane", False),
         ("cylinder of 300 mm, fitted", pipe, True, False, "cylinder", False),
     )
-    for number in rows_drawn or range(len(rows)):
-        name, surface, common, one, reference, register = rows[number]
+    for number, (name, surface, common, one, reference, register) in enumerate(rows):
         rng = np.random.default_rng([11, number])
         shares, ratios, levels = [], [], []
         for _ in range(PAIRS):
@@ -68,10 +69,9 @@ def main(*rows_drawn: int) -> None:
             ratios.append(np.mean((1.96 * change.distance_mm[seen] / change.level_mm[seen]) ** 2))
             levels.append(np.median(change.level_mm))
         mean, median, most = (f"{100 * value:.1f} %" for value in (np.mean(shares), np.median(shares), max(shares)))
-        print(
-            f"| {name} | {mean} | {median} | {most} | {np.mean(levels):.3f} | {np.sqrt(np.mean(ratios)):.2f} |",
-            flush=True,
-        )
+        cells.append([name, mean, median, most, f"{np.mean(levels):.3f}", f"{np.sqrt(np.mean(ratios)):.2f}"])
+    head = ["compared", "claimed fraction of the area, mean", "median", "largest", "level, mm"]
+    publish({"unchanged surfaces": table([*head, "scatter relative to stated"], cells)}, write=write)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@ import math
 
 import cv2
 import numpy as np
+from result_tables import table
 from scipy.spatial import cKDTree
-from stripe_tables import table
 
 from twin.options import Options
 from twin.scene.description import CirclePlate, load_scene

@@ -97,7 +97,7 @@ JOBS: dict[str, str] = {
             ("sphere", "--radius-mm 20"),
             ("plane", "--artefact plane"),
             ("step", "--artefact step"),
-            ("ring", "--artefact ring"),
+            ("ring", "--artefact ring --radius-mm 25"),
         )
     ),
     "evaluate": """

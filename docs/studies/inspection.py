@@ -18,9 +18,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from cyclopts import App
 from inspection_scenes import AXIS_Z_MM, DIAMETER_MM, OVALITY, SIDES_DEG, WATERS, Pits, large_pits, small_pits
+from result_tables import publish, table
 from scipy import optimize
 from scipy.spatial.transform import Rotation
-from stripe_tables import table
 
 import uwlts
 from twin.scene.description import load_scene
@@ -267,15 +267,18 @@ def draw_again(folder: Path, draw: int) -> None:
     print(table(HEAD, rows))
 
 
-def main(folder: Path, pictures: str) -> None:
-    """Print all tables and draw the pictures into a folder; with the number of another draw, only print its tables."""
+def main(folder: Path, pictures: str, *, write: bool = False) -> None:
+    """Print all tables and draw the pictures into a folder; with the number of another draw, only print its tables.
+
+    With `--write`, put the table of the detection into its page.
+    """
     if pictures.isdecimal():
         draw_again(folder, int(pictures))
     else:
-        print_and_draw(folder, Path(pictures))
+        print_and_draw(folder, Path(pictures), write=write)
 
 
-def print_and_draw(folder: Path, pictures: Path) -> None:
+def print_and_draw(folder: Path, pictures: Path, *, write: bool) -> None:
     """Print all tables and draw the pictures."""
     seen, figures, curves = [], [], {}
     for water in WATERS:
@@ -284,7 +287,8 @@ def print_and_draw(folder: Path, pictures: Path) -> None:
         figures += large_pits_in(folder, water)
         unchanged_in(folder, water)
         print(table(HEAD, wholes_in(folder, water)))
-    print(table(["water", "diameter mm", "found", "a90 mm", "a90/95 mm"], seen))
+    head = ["water", "pit's diameter, mm", "found", "90 % are found from (depth, mm)"]
+    publish({"detection of pits": table([*head, "with 95 % confidence (a90/95)"], seen)}, write=write)
     print(table(HEAD, figures))
     draw_curves(curves, pictures / "inspection-detection.svg")
     draw_map(folder, pictures / "inspection-pits.png")

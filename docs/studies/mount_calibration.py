@@ -14,15 +14,26 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from stripe_tables import table
+from result_tables import publish, table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tests.uwlts.mount_views import MOUNT, RADIUS_MM, Campaign, errors_of, ring_campaign, sphere_campaign, step_campaign
+from tests.uwlts.mount_views import (
+    MOUNT,
+    RADIUS_MM,
+    RING_MM,
+    Campaign,
+    errors_of,
+    ring_campaign,
+    sphere_campaign,
+    step_campaign,
+)
 from tests.uwlts.sensor_profiles import captured_by, joint_estimate
 from uwlts.calibration.mount.calibrate import calibrate_mount
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import Mount, SphereFound
+
+ERRORS = "shift, median / 95 % mm", "rotation, median / 95 % deg"
 
 
 def held_out_ratio(mount: Mount, campaign: Campaign) -> float:
@@ -49,8 +60,8 @@ def held_out_ratio(mount: Mount, campaign: Campaign) -> float:
     return rms(mount.transform()) / rms(MOUNT)
 
 
-def by_sensors(campaigns: int) -> None:
-    """Print the errors and coverage of mounts of sensors that differ from their calibration."""
+def by_sensors(campaigns: int, *, write: bool) -> None:
+    """Publish the errors and coverage of mounts of sensors that differ from their calibration."""
     known, rows = joint_estimate(load_sensor("thesis")), []
     for seed in range(campaigns):
         rng = np.random.default_rng(seed)
@@ -62,35 +73,31 @@ def by_sensors(campaigns: int) -> None:
         within = [np.mean(np.abs([*shift, *turn]) < mount.coverage_factor * std) for std in (mount.std(), apart)]
         rows.append((np.linalg.norm(shift), np.degrees(np.linalg.norm(turn)), *within))
     shifts, turns, own, exact = np.transpose(rows)
-    print(
-        f"{campaigns} campaigns: shift {np.median(shifts):.3f} mm, turn {np.median(turns):.4f} deg (median); "
-        f"within 95 % intervals {100 * own.mean():.1f} %, with the sensor taken as exact {100 * exact.mean():.1f} %"
-    )
+    head = [*ERRORS, "within 95 % interval", "with the sensor taken as exact"]
+    row = [*_errors(shifts, turns), *(f"{100 * within.mean():.1f} %" for within in (own, exact))]
+    publish({"mount by other sensors": table(head, [row])}, write=write)
 
 
-def by_faces(campaigns: int, artefact: Literal["step", "ring"]) -> None:
-    """Print the errors and coverage of mounts by a step or ring, by ideal robots and, for the ring, others."""
+def by_faces(campaigns: int, artefact: Literal["step", "ring"], *, write: bool) -> None:
+    """Publish the errors and coverage of mounts by a step or ring, by ideal robots and, for the ring, others."""
+    cells = []
     for robot in (0.0, 0.05) if artefact == "ring" else (0.0,):
         rows = []
         for seed in range(campaigns):
             rng = np.random.default_rng([seed, 24])
             campaign = ring_campaign(rng, robot_mm=robot) if artefact == "ring" else step_campaign(rng, height_mm=12.0)
-            mount = calibrate_mount(*_of(campaign), artefact=artefact)
+            radius = RING_MM["inner"] if artefact == "ring" else None
+            mount = calibrate_mount(*_of(campaign), artefact=artefact, radius_mm=radius)
             shift, turn = errors_of(mount.transform())
             within = np.mean(np.abs([*shift, *turn]) < mount.coverage_factor * mount.std())
             rows.append((np.linalg.norm(shift), np.degrees(np.linalg.norm(turn)), within))
         shifts, turns, within = np.transpose(rows)
-        print(
-            f"{campaigns} campaigns, robot {robot:g} mm: "
-            f"shift {np.median(shifts):.3f} / {np.quantile(shifts, 0.95):.3f} mm, "
-            f"turn {np.median(turns):.4f} / {np.quantile(turns, 0.95):.4f} deg (median / 95 %); within 95 % intervals "
-            f"{100 * within.mean():.1f} %",
-            flush=True,
-        )
+        cells.append([f"{robot:g}", *_errors(shifts, turns), f"{100 * within.mean():.1f} %"])
+    publish({f"mount by a {artefact}": table(["robot mm", *ERRORS, "within 95 % interval"], cells)}, write=write)
 
 
-def main(campaigns: int) -> None:
-    """Print the table of the documentation."""
+def by_sphere(campaigns: int, *, write: bool) -> None:
+    """Publish the errors and coverage of mounts by a sphere, and points on a sphere that was held out."""
     rows = []
     for poses, robot, noise, radius in [
         (15, 0.0, 0.02, RADIUS_MM),
@@ -117,14 +124,22 @@ def main(campaigns: int) -> None:
                 f"{robot:g}",
                 f"{noise:g}",
                 "known" if radius else "unknown",
-                f"{np.median(shifts):.3f} / {np.quantile(shifts, 0.95):.3f}",
-                f"{np.median(turns):.4f} / {np.quantile(turns, 0.95):.4f}",
+                *_errors(shifts, turns),
                 f"{100 * np.mean(within):.1f} %",
                 f"{np.median(ratios):.3f} / {np.quantile(ratios, 0.95):.3f}",
             ]
         )
-    head = ["poses", "robot mm", "noise mm", "radius", "shift, median / 95 % mm", "turn, median / 95 % deg"]
-    print(table([*head, "within 95 % interval", "held-out sphere over robot's own, median / 95 %"], rows))
+    head = ["poses", "robot mm", "noise mm", "radius", *ERRORS, "within 95 % interval"]
+    last = "held-out sphere relative to the robot's own error, median / 95 %"
+    publish({"mount by a sphere": table([*head, last], rows)}, write=write)
+
+
+def _errors(shifts_mm: list[float] | np.ndarray, turns_deg: list[float] | np.ndarray) -> list[str]:
+    """Return the cells of the columns `ERRORS`."""
+    return [
+        f"{np.median(shifts_mm):.3f} / {np.quantile(shifts_mm, 0.95):.3f}",
+        f"{np.median(turns_deg):.4f} / {np.quantile(turns_deg, 0.95):.4f}",
+    ]
 
 
 def _of(campaign: Campaign) -> tuple[list[np.ndarray], np.ndarray]:
@@ -136,8 +151,11 @@ if __name__ == "__main__":
     parser.add_argument("campaigns", type=int)
     parser.add_argument("--sensors", action="store_true")
     parser.add_argument("--artefact", choices=["sphere", "step", "ring"], default="sphere")
+    parser.add_argument("--write", action="store_true", help="put the tables into their page of docs/results")
     given = parser.parse_args()
     if given.artefact != "sphere":
-        by_faces(given.campaigns, given.artefact)
+        by_faces(given.campaigns, given.artefact, write=given.write)
+    elif given.sensors:
+        by_sensors(given.campaigns, write=given.write)
     else:
-        (by_sensors if given.sensors else main)(given.campaigns)
+        by_sphere(given.campaigns, write=given.write)

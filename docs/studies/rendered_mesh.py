@@ -13,8 +13,8 @@ import numpy as np
 from cyclopts import App
 from inspection import cloud_of
 from inspection_scenes import AXIS_Z_MM, WATERS, large_pits, radius_mm
+from result_tables import publish, table
 from scipy.spatial import KDTree
-from stripe_tables import table
 
 import uwlts
 from twin.scene.description import load_scene
@@ -67,8 +67,8 @@ def row(name: str, vertices: np.ndarray, std: np.ndarray | None, off: np.ndarray
     ]
 
 
-def main(folder: Path) -> None:
-    """Mesh and print the table."""
+def main(folder: Path, *, write: bool = False) -> None:
+    """Mesh and print the table; with `--write`, put it into its page."""
     rows = []
     for water in WATERS:
         for name, cloud, off in (
@@ -94,7 +94,7 @@ def main(folder: Path) -> None:
         "where nothing was seen",
         "off the edges",
     ]
-    print(table(head, rows))
+    publish({"rendered meshes": table(head, rows)}, write=write)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from cyclopts import App
+from result_tables import publish, table
 from scipy.spatial.transform import Rotation
-from stripe_tables import table
 
 import uwlts
 from twin.scene.description import Scene
@@ -47,8 +47,8 @@ def errors(mount: Mount, true: np.ndarray) -> np.ndarray:
     return np.append(true[:3, 3] - found[:3, 3], turn)
 
 
-def main(folder: Path) -> None:
-    """Print the table of the documentation."""
+def main(folder: Path, *, write: bool = False) -> None:
+    """Print the table; with `--write`, put it into its page."""
     figures: dict[str, list[tuple[float, ...]]] = {}
     for path in sorted(folder.glob("sensor-*/robot-sphere-*.h5")):
         if ".truth." in path.name:
@@ -77,10 +77,11 @@ def main(folder: Path) -> None:
     rows = []
     for name, values in figures.items():
         mean = np.mean(values, axis=0)
-        cells = [f"{mean[0]:.3f}", f"{mean[1]:.4f}", f"{mean[2]:.3f}", f"{mean[3]:.3f}", f"{mean[4]:.3f}"]
+        cells = [f"{mean[0]:.3f}", f"{mean[1]:.4f}", f"{mean[2]:.3f}"]
         rows.append([name, str(len(values)), *cells, *(f"{100 * share:.0f} %" for share in mean[5:])])
-    head = ["robot", "campaigns", "shift mm", "turn deg", "held-out over the robot's own", "noise mm", "robot mm"]
-    print(table([*head, "within 95 % interval", "sensor taken as exact"], rows))
+    head = ["robot", "campaigns", "shift mm", "rotation deg", "held-out sphere relative to the robot's own error"]
+    head += ["within 95 % interval", "with the sensor taken as exact"]
+    publish({"mount by a robot": table(head, rows)}, write=write)
 
 
 def profiles_of_poses(captured: CapturedProfiles, poses: np.ndarray) -> CapturedProfiles:

@@ -1,12 +1,13 @@
 """Dark surfaces beside shiny ones, at one exposure and in a bracket of three, compared with the true stripe.
 
-``python docs/studies/stripe_brackets.py`` prints the table of docs/results/stripe-methods.md.
+``python docs/studies/stripe_brackets.py`` prints a table of docs/results/stripe-methods.md; ``--write`` puts it there.
 """
 
 from collections.abc import Iterator
 
 import numpy as np
 from cyclopts import App
+from result_tables import publish, table
 
 from twin.options import Options, use_variant
 from twin.scene.description import Scene
@@ -73,14 +74,15 @@ def rows() -> Iterator[str]:
             error = np.concatenate(values)
             near = error[np.abs(error) < 2.0]
             bias, spread = np.median(near) if len(near) else np.nan, np.std(near) if len(near) else np.nan
-            yield f"| {name} | {surface} | {shown} | {100 * len(near) / len(error):.1f} | {bias:+.3f} | {spread:.3f} |"
+            found = f"{100 * len(near) / len(error):.1f}"
+            yield [name, surface, shown, found, *([f"{bias:+.3f}", f"{spread:.3f}"] if len(near) else ["none", "none"])]
 
 
-def main() -> None:
-    """Print the rows."""
+def main(*, write: bool = False) -> None:
+    """Print the table; with `--write`, put it into its page."""
     use_variant()
-    for row in rows():
-        print(row, flush=True)
+    head = ["scene", "surface", "image", "lines found %", "bias px", "std px"]
+    publish({"exposure brackets": table(head, list(rows()))}, write=write)
 
 
 if __name__ == "__main__":

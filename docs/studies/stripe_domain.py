@@ -2,7 +2,8 @@
 
     python docs/studies/stripe_domain.py --generated runs/clean runs/turbid runs/shiny --real etna=height bust=height
 
-Real images are given as FOLDER=DIRECTION, with the direction of their stripe. Without --out, only the table is printed.
+Real images are given as FOLDER=DIRECTION, with the direction of their stripe. Without --out, no picture is drawn;
+--write puts the table into its page.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
+from result_tables import publish, table
 
 import twin
 from uwlts.stripe import StripeOptions, extract_stripe
@@ -87,6 +89,7 @@ def main() -> None:
     parser.add_argument("--generated", nargs="*", type=Path, default=[], help="data sets of twin dataset")
     parser.add_argument("--real", nargs="*", default=[], help="FOLDER=height or FOLDER=width")
     parser.add_argument("--out", type=Path, help="picture to write")
+    parser.add_argument("--write", action="store_true", help="put the tables into their page of docs/results")
     given = parser.parse_args()
     sets: dict[str, dict[str, np.ndarray]] = {}
     for folder in given.generated:
@@ -95,13 +98,14 @@ def main() -> None:
     for each in given.real:
         folder, _, along = each.partition("=")
         sets[f"{Path(folder).name} (real)"] = gathered(real_images(Path(folder)), along)
-    print("| 5 %, median, 95 % of | " + " | ".join(sets) + " |\n|" + " --- |" * (len(sets) + 1))
+    rows = []
     for name, words in FIGURES.items():
         cells = []
         for figures in sets.values():
             values = figures[name]
             cells.append(", ".join(f"{x:.3g}" for x in np.quantile(values, [0.05, 0.5, 0.95])) if len(values) else "-")
-        print(f"| {words} | " + " | ".join(cells) + " |")
+        rows.append([words, *cells])
+    publish({"stripe domain": table(["5 %, median, 95 %", *sets], rows)}, write=given.write)
     if given.out:
         figure, axes = plt.subplots(4, 2, figsize=(11, 11), layout="constrained")
         axes.flat[-1].set_axis_off()

@@ -2,22 +2,22 @@
 
     python docs/studies/stripe_errors.py
 
-renders every case, draws the plots into docs/pictures, and writes the tables between their markers in the page.
+renders every case, draws the plots into docs/pictures, and prints the tables; ``--write`` puts them into the page.
 """
 
 import argparse
 import time
 from pathlib import Path
 
+from result_tables import publish, table
 from stripe_cases import CROSSING, FILTERED, MASS, VERTEX, Frames, measure
 from stripe_plan import NAME_CORE, PLACES, Plan
-from stripe_tables import table, write_tables
 
 from twin.options import use_variant
 from uwlts.pages.numbers import format_fixed
 from uwlts.runtime.console import progress_bar
 
-PAGE = Path(__file__).parents[1] / "results" / "stripe-errors.md"
+PICTURES = Path(__file__).parents[1] / "pictures"
 SHOWN = (CROSSING, MASS, "quadratic", FILTERED, VERTEX)
 
 
@@ -64,7 +64,9 @@ def main() -> None:
     """Measure, draw, write."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--frames", type=int, default=4, help="frames of a case (default 4)")
-    plan, start = Plan(parser.parse_args().frames), time.perf_counter()
+    parser.add_argument("--write", action="store_true", help="put the tables into their page of docs/results")
+    given, start = parser.parse_args(), time.perf_counter()
+    plan = Plan(given.frames)
     use_variant()
     from stripe_figures import draw_all
 
@@ -73,9 +75,9 @@ def main() -> None:
         for number, case in enumerate(cases, start=1):
             measure(case)
             progress(number, len(cases))
-    draw_all(plan, PAGE.parents[1] / "pictures")
+    draw_all(plan, PICTURES)
     tables = {"effects": effects_table(plan), "methods": methods_table(plan), "unknown": unknown_table(plan)}
-    write_tables(PAGE, tables)
+    publish({f"stripe errors, {name}": text for name, text in tables.items()}, write=given.write)
     print(f"{len(cases)} cases, {sum(case.frames for case in cases)} frames in {time.perf_counter() - start:.0f} s")
 
 

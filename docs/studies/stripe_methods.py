@@ -2,27 +2,26 @@
 
     python docs/studies/stripe_methods.py [--frames 4]
 
-renders every place once, photographs it with fresh speckle and noise, and writes the tables between their markers.
+renders every place once, photographs it with fresh speckle and noise, and prints the tables. ``--write`` puts them into
+the page.
 """
 
 import argparse
 import math
 import time
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from circle_methods import circles_table
 from method_limits import bound_px, grain_px, spot_limit_px
 from method_shots import LEVELS, Place, Spread, places, render, round_to_zero, sweeps
+from result_tables import publish, table
 from stripe_cases import FILTERED, MASS, METHODS
-from stripe_tables import table, write_tables
 
 from twin.options import use_variant
 from uwlts.runtime.console import progress_bar
-from uwlts.stripe import StripeOptions, extract_stripe, method_names
+from uwlts.stripe import StripeOptions, extract_stripe
 
-PAGE = Path(__file__).parents[1] / "results" / "stripe-methods.md"
 FIT, FIT_FIVE, CROSSING = "profile fit", "profile fit, 5 lines averaged", "zero crossing"
 ALL_METHODS = {
     FIT: StripeOptions(method="profile-fit"),
@@ -30,7 +29,6 @@ ALL_METHODS = {
     **METHODS,
 }
 ONE_LINE = (FIT, MASS, "quadratic", CROSSING)
-TIMED = 40
 
 
 @cache
@@ -129,23 +127,6 @@ def lateral_table(frames: int) -> str:
     return table([*head, "sphere, near: more than 2 px off", "lines found"], rows)
 
 
-def time_table() -> str:
-    """Time of extraction per frame of 1280 lines, all effects."""
-    rows = []
-    for method in method_names():
-        times = []
-        for name in ("plane, near", "plane, far"):
-            image, options = shot_image(places()[name], 0, 1.0, True), StripeOptions(method=method)
-            each = []
-            for _ in range(TIMED):
-                start = time.perf_counter()
-                extract_stripe(image, stripe_along="width", options=options)
-                each.append(1e3 * (time.perf_counter() - start))
-            times.append(f"{np.median(each):.1f}")
-        rows.append([str(method), *times])
-    return table(["method", "plane, near: ms", "plane, far: ms"], rows)
-
-
 def _signed(value: float) -> str:
     return f"{round_to_zero(value):+.3f}"
 
@@ -154,7 +135,9 @@ def main() -> None:
     """Render, measure, write."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--frames", type=int, default=4, help="photographs of a place (default 4)")
-    frames, start = parser.parse_args().frames, time.perf_counter()
+    parser.add_argument("--write", action="store_true", help="put the tables into their page of docs/results")
+    given, start = parser.parse_args(), time.perf_counter()
+    frames = given.frames
     use_variant()
     wanted = [*places().values(), *sweeps().values()]
     with progress_bar("places") as progress:
@@ -168,10 +151,9 @@ def main() -> None:
         "sweeps": sweep_table(frames),
         "exposure": exposure_table(frames),
         "lateral": lateral_table(frames),
-        "time": time_table(),
         "circles": circles_table(),
     }
-    write_tables(PAGE, tables)
+    publish({f"stripe methods, {name}": text for name, text in tables.items()}, write=given.write)
     print(f"{len(wanted)} places, {frames} photographs each, in {time.perf_counter() - start:.0f} s")
 
 

@@ -1,21 +1,23 @@
 """Wrong and lost points on scenes with mirrors and inside corners: the brightest peak, and the direct stripe.
 
 ``python docs/studies/stripe_reflections.py`` prints the tables of docs/results/reflections.md and draws their
-picture. A point is correct within 3 px of a true position, otherwise wrong. True positions are the intersections of the
-sheet's middle with surfaces, and the stripes of direct light, which differ if an edge cuts the sheet. A profile line is
-lost if the sheet's middle lights a surface there and no point is correct. The parameters of the rule were chosen only
-on the named scenes, with a small camera.
+picture; ``--write`` puts the first two there. A point is correct within 3 px of a true position, otherwise wrong. True
+positions are the intersections of the sheet's middle with surfaces, and the stripes of direct light, which differ if an
+edge cuts the sheet. A profile line is lost if the sheet's middle lights a surface there and no point is correct. The
+parameters of the rule were chosen only on the named scenes, with a small camera.
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from cyclopts import App
+from result_tables import publish, table
 from scipy.spatial import cKDTree
 
 from twin.options import ALL, Options, use_variant
@@ -290,8 +292,8 @@ def direct_light(of: Scene, sensor: Sensor, options: Options) -> np.ndarray:
     return np.concatenate(result)
 
 
-def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, int]:
-    """Return the percentage of wrong points, that of lit lines without a correct point, and the number of points."""
+def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, int, int]:
+    """Return the percentages of wrong points and of lit lines without a correct point, and both numbers."""
     stripes, wrong, right = find_stripes(of.capture, options=options), 0, 0
     lines, places = np.unique(of.lit[:, :2], axis=0), np.concatenate([of.lit, of.direct])
     for number in range(len(of.images)):
@@ -301,7 +303,7 @@ def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, 
         wrong += int(np.count_nonzero(away > NEAR_PX))
         right += len(np.intersect1d(here.line[away <= NEAR_PX], lines[lines[:, 0] == number, 1]))
     count = len(stripes.line)
-    return 100.0 * wrong / max(count, 1), 100.0 * (1.0 - right / len(lines)), count
+    return 100.0 * wrong / max(count, 1), 100.0 * (1.0 - right / len(lines)), count, len(lines)
 
 
 def groups(seeds: range) -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]:
@@ -312,33 +314,36 @@ def groups(seeds: range) -> Iterator[tuple[str, Iterator[tuple[str, Rendered]]]]
         fresh = ((drawn(n)[0], rendered_small(drawn(n)[1], turns[k % 4], n)) for k, n in enumerate(seeds))
         yield "four sensors, drawn", fresh
         return
-    yield "named, small camera: chosen on", ((name, rendered_small(of, small, 0)) for name, of in NAMED.items())
-    yield (
-        "other sensors: unseen",
-        ((name, rendered_small(of, by, 7 + n)) for n, (name, (by, of)) in enumerate(OTHERS.items())),
-    )
+    yield "chosen on", ((name, rendered_small(of, small, 0)) for name, of in NAMED.items())
     turns = (SHORT, HIGH, NOISY)
     yield (
-        "other sensors, drawn: unseen",
-        ((drawn(n)[0], rendered_small(drawn(n)[1], turns[n % 3], n)) for n in OTHERS_DRAWN),
+        "other sensors",
+        chain(
+            ((name, rendered_small(of, by, 7 + n)) for n, (name, (by, of)) in enumerate(OTHERS.items())),
+            ((drawn(n)[0], rendered_small(drawn(n)[1], turns[n % 3], n)) for n in OTHERS_DRAWN),
+        ),
     )
     yield "named, thesis's sensor", ((name, rendered(of, full)) for name, of in NAMED.items())
     yield "drawn, thesis's sensor: unseen", ((drawn(n)[0], rendered(drawn(n)[1], full)) for n in HELD_OUT)
 
 
-def rows(seeds: range) -> Iterator[str]:
+def tables(seeds: range) -> Iterator[tuple[str, str]]:
+    """Yield title and table of each group of scenes."""
     for title, group in groups(seeds):
-        yield f"| {title} | brightest peak: wrong % | lost % | direct stripe: wrong % | lost % |"
-        yield "| --- | --- | --- | --- | --- |"
-        sums = np.zeros((2, 2))
+        rows, sums = [], np.zeros((2, 2, 2))
         for name, shown in group:
             found = [wrong_and_lost(shown, options) for options in (BRIGHTEST, StripeOptions())]
-            yield f"| {name} | " + " | ".join(f"{wrong:.2f} | {lost:.1f}" for wrong, lost, _ in found) + " |"
-            sums += [(0.01 * wrong * count, count) for wrong, _, count in found]
+            rows.append([name, *(cell for wrong, lost, _, _ in found for cell in (f"{wrong:.2f}", f"{lost:.1f}"))])
+            sums += [((wrong * count, count), (lost * lines, lines)) for wrong, lost, count, lines in found]
             if name == PICTURED and len(shown.images) == FRAMES:
                 draw(shown)
-        yield "| all points | " + " | ".join(f"{100 * wrong / count:.3f} |" for wrong, count in sums) + " |"
-        yield ""
+        shares = sums[:, :, 0] / sums[:, :, 1]
+        count = round(sums[1, 0, 1], -2)
+        rows.append(
+            [f"all {count:,.0f} points", *(cell for wrong, lost in shares for cell in (f"{wrong:.2f}", f"{lost:.1f}"))]
+        )
+        head = ["scene", "brightest peak: wrong %", "lost %", "direct stripe: wrong %", "lost %"]
+        yield title, table(head, rows)
 
 
 def draw(of: Rendered) -> None:
@@ -362,11 +367,14 @@ def draw(of: Rendered) -> None:
     figure.savefig(PICTURE, dpi=110)
 
 
-def main(first: int = 0, count: int = 0) -> None:
-    """Print the rows; with a ``count`` those of as many scenes drawn with seeds from ``first`` on."""
+def main(*, write: bool = False, first: int = 0, count: int = 0) -> None:
+    """Print the tables; with `--write`, put the first two into their page.
+
+    With a ``count`` print the table of as many scenes drawn with seeds from ``first`` on.
+    """
     use_variant()
-    for row in rows(range(first, first + count)):
-        print(row, flush=True)
+    for number, (title, text) in enumerate(tables(range(first, first + count))):
+        publish({f"reflections, {title}": text}, write=write and number < 2 and not count)
 
 
 if __name__ == "__main__":

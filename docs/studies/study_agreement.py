@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from cyclopts import App
+from result_tables import publish, table
 
 from twin.design.designs import EvaluatedDesign, HighlightedDesign
 from twin.design.parameters import adjust_to_standoff, extract_parameters
@@ -35,13 +36,10 @@ CASES: tuple[tuple[str, str, dict[str, Any]], ...] = (
 )
 
 
-def main() -> None:
-    """Render and print."""
-    print(
-        "| design | formulas, µm | rendered, µm | rendered / formulas | exposure, formulas / rendered, ms | "
-        "largest systematic error, µm |"
-    )
-    print("| --- | --- | --- | --- | --- | --- |")
+def main(*, write: bool = False) -> None:
+    """Render and print; with `--write`, put the table into its page."""
+    head = ["design", "formulas, µm", "rendered, µm", "rendered / formulas", "exposure, formulas / rendered, ms"]
+    rows = []
     for number, (name, medium, changes) in enumerate(CASES):
         sensor = validate_description(Sensor, merge_tables(load_sensor("thesis").model_dump(), changes), name)
         set_by = adjust_to_standoff(np, extract_parameters([sensor], [sensor.medium(medium)]), FOLLOW)
@@ -57,18 +55,23 @@ def main() -> None:
         candidate = HighlightedDesign(name, built, EvaluatedDesign(number, {}, {}, 0.0, ""))
         found = verify_candidate(study, candidate, workers=2, variant=CPU)
         if found.failure:
-            print(f"| {name} | | | | | {found.failure} |", flush=True)
+            rows.append([name, *[""] * 4, found.failure])
             continue
         foretold, measured = (
             [f"{1e3 * scatter[k]:.0f}" for k in (0, len(scatter) // 2, -1)]
             for scatter in (found.predicted_mm, found.rendered_mm)
         )
-        print(
-            f"| {name} | {' / '.join(foretold)} | {' / '.join(measured)} | {found.rendered_over_predicted:.2f} | "
-            f"{found.predicted_exposure_ms:.2f} / {found.exposure_ms:.2f} | "
-            f"{1e3 * np.nanmax(np.abs(found.error_mm)):.0f} |",
-            flush=True,
+        rows.append(
+            [
+                name,
+                " / ".join(foretold),
+                " / ".join(measured),
+                f"{found.rendered_over_predicted:.2f}",
+                f"{found.predicted_exposure_ms:.2f} / {found.exposure_ms:.2f}",
+                f"{1e3 * np.nanmax(np.abs(found.error_mm)):.0f}",
+            ]
         )
+    publish({"designs": table([*head, "largest systematic error, µm"], rows)}, write=write)
 
 
 if __name__ == "__main__":

@@ -18,9 +18,9 @@ import numpy as np
 import tomli_w
 import trimesh
 from cyclopts import App
+from result_tables import publish, table
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from stripe_tables import table
 
 import uwlts
 from uwlts.storage.capture_writer import CaptureWriter
@@ -125,15 +125,15 @@ def draw(path: Path, meshes: dict[str, trimesh.Trimesh], points: np.ndarray) -> 
     figure.savefig(path)
 
 
-def main(folder: Path, pictures: Path | None = None) -> None:
+def main(folder: Path, pictures: Path | None = None, *, write: bool = False) -> None:
     """Write the scenes; with a folder for pictures, evaluate the rendered scans instead."""
     if pictures is None:
         write_scenes(folder)
     else:
-        judge(folder, pictures)
+        judge(folder, pictures, write=write)
 
 
-def judge(folder: Path, pictures: Path) -> None:
+def judge(folder: Path, pictures: Path, *, write: bool) -> None:
     """Mesh both sides, print the table and draw the cut."""
     clouds = [side_cloud(folder, side) for side in SIDES]
     made = uwlts.mesh(*clouds, towards=[[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
@@ -147,7 +147,7 @@ def judge(folder: Path, pictures: Path) -> None:
         meshes["Open3D, screened Poisson"] = trimesh.Trimesh(saved["vertices"], saved["faces"], process=False)
     rows = [row(name, np.asarray(each.vertices), np.asarray(each.faces), points) for name, each in meshes.items()]
     head = ["mesh", "vertices", "rms, um", "thickness, um", "of both faces", "in the hole, mm2", "> 1 mm from points"]
-    print(table(head, rows))
+    publish({"thin wall": table(head, rows)}, write=write)
     known = np.hypot(*made.vertices_mm[:, :2].T)
     on = (known > HOLE_MM + _EDGE_MM) & (known < OUTER_MM - _EDGE_MM)
     off = np.abs(np.abs(made.vertices_mm[on, 2]) - THICKNESS_MM / 2)

@@ -1,6 +1,6 @@
 """Time offset of a robot that carries a profiler over a sphere at 100 mm/s: errors in simulated campaigns.
 
-python docs/studies/time_offset.py [CAMPAIGNS]
+python docs/studies/time_offset.py [CAMPAIGNS] [--write]
 """
 
 import sys
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from cyclopts import App
+from result_tables import publish, table
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -52,11 +53,13 @@ def error_ms(seed: int) -> tuple[float, float]:
     return 1e3 * (mount.time_offset_s - offset_s), 1e3 * mount.time_offset_std_s
 
 
-def main(campaigns: int = 16) -> None:
-    """Print the errors."""
+def main(campaigns: int = 16, *, write: bool = False) -> None:
+    """Print the errors; with `--write`, put them into their page."""
     found = np.array([error_ms(seed) for seed in range(campaigns)])
     rms, largest, stated = np.sqrt(np.mean(found[:, 0] ** 2)), np.abs(found[:, 0]).max(), found[:, 1].mean()
-    print(f"{len(found)} campaigns: {rms:.3f} ms rms, {largest:.3f} ms at most; {stated:.3f} ms stated")
+    head = ["campaigns", "error, rms ms", "largest ms", "stated ms"]
+    row = [str(len(found)), *(f"{value:.3f}" for value in (rms, largest, stated))]
+    publish({"time offset": table(head, [row])}, write=write)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Coverage of the stated 95 % intervals: ``python -m tests.bench.coverage [campaigns] [--varied]``.
+"""Coverage of the stated 95 % intervals: ``python -m tests.bench.coverage [campaigns] [--varied] [--write]``.
 
 Campaigns are simulated by Fermat's principle (`tests.uwlts.simulated_campaign`), calibrated jointly, and a sphere
 standard is scanned and measured with each calibration. With ``--varied``, campaigns in water use other sensors than the
@@ -14,9 +14,8 @@ from typing import Annotated, Any
 
 import numpy as np
 from cyclopts import App, Parameter
-from rich.console import Console
-from rich.table import Table
 
+from docs.studies.result_tables import publish, table
 from tests.uwlts.calibration_views import STEP_MM
 from tests.uwlts.simulated_campaign import (
     PLACES_MM,
@@ -265,18 +264,9 @@ def attempt(campaign: Campaign, send: Any = None) -> Outcome | None:
         return None
 
 
-def varied_campaigns(count: int) -> int:
+def varied_campaigns(count: int, *, write: bool) -> int:
     """Run ``count`` campaigns of each variation and print the coverage of their stated intervals."""
-    table = Table(
-        "campaigns in water",
-        "refused",
-        "warned",
-        "spacing within 95 %",
-        "diameter",
-        "rms spacing",
-        "stated",
-        "parameters",
-    )
+    rows = []
     jobs = [Campaign(seed, True, variation=each) for each in VARIATIONS for seed in range(count)]
     outcomes = run_jobs(attempt, jobs)
     for number, variation in enumerate(VARIATIONS):
@@ -285,42 +275,50 @@ def varied_campaigns(count: int) -> int:
         found = judged(kept)
         spacing, diameter = (found.get(("water known better", what), []) for what in ("spacing", "diameter"))
         if not spacing:
-            table.add_row(variation.name, str(count), *["-"] * 6)
+            rows.append([variation.name, str(count), *["-"] * 6])
             continue
         error, std = np.array([(m.error_mm, m.std_mm) for m in spacing]).T
-        table.add_row(
-            variation.name,
-            str(count - len(kept)),
-            str(sum(outcome.warned for outcome in kept)),
-            f"{100 * within(spacing):.0f} %",
-            f"{100 * within(diameter):.0f} %",
-            f"{1e3 * np.sqrt(np.mean(error**2)):.1f} µm",
-            f"{1e3 * np.sqrt(np.mean(std**2)):.1f} µm",
-            f"{np.mean(np.concatenate([outcome.pulls for outcome in kept]) ** 2):.2f}",
+        rows.append(
+            [
+                variation.name,
+                str(count - len(kept)),
+                str(sum(outcome.warned for outcome in kept)),
+                f"{100 * within(spacing):.0f} %",
+                f"{100 * within(diameter):.0f} %",
+                f"{1e3 * np.sqrt(np.mean(error**2)):.1f} µm",
+                f"{1e3 * np.sqrt(np.mean(std**2)):.1f} µm",
+                f"{np.mean(np.concatenate([outcome.pulls for outcome in kept]) ** 2):.2f}",
+            ]
         )
-    Console(width=140).print(table)
+    head = ["campaigns", "refused", "warned", "spacing within 95 %", "diameters", "error of the spacing, rms", "stated"]
+    publish({"coverage, varied": table([*head, "mean square of whitened parameters"], rows)}, write=write)
     return 0
 
 
-def main(campaigns: int = CAMPAIGNS, *, varied: Annotated[bool, Parameter(negative="")] = False) -> int:
-    """Run all campaigns and print the coverage of the stated intervals."""
+def main(
+    campaigns: int = CAMPAIGNS, *, varied: Annotated[bool, Parameter(negative="")] = False, write: bool = False
+) -> int:
+    """Run all campaigns and print the coverage of the stated intervals; with `--write`, put it into its page."""
     if varied:
-        return varied_campaigns(campaigns)
+        return varied_campaigns(campaigns, write=write)
     jobs = [Campaign(seed, wet) for seed in range(campaigns) for wet in (True, False)]
     outcomes = run_jobs(run_campaign, jobs)
-    table = Table("scan", "quantity", "number", "within 95 %", "rms error / std", "mean |error|", "mean std")
+    rows = []
     for (scan, quantity), measured in judged(outcomes).items():
         error, std = np.array([(m.error_mm, m.std_mm) for m in measured]).T
-        table.add_row(
-            scan,
-            quantity,
-            str(len(measured)),
-            f"{100 * within(measured):.1f} %",
-            f"{np.sqrt(np.mean((error / std) ** 2)):.2f}",
-            f"{1e3 * np.mean(np.abs(error)):.1f} µm",
-            f"{1e3 * np.mean(std):.1f} µm",
+        rows.append(
+            [
+                scan,
+                quantity,
+                str(len(measured)),
+                f"{100 * within(measured):.1f} %",
+                f"{np.sqrt(np.mean((error / std) ** 2)):.2f}",
+                f"{1e3 * np.mean(np.abs(error)):.1f} µm",
+                f"{1e3 * np.mean(std):.1f} µm",
+            ]
         )
-    Console(width=120).print(table)
+    head = ["scan", "quantity", "number", "within 95 %", "error / stated, rms", "mean error", "mean stated"]
+    publish({"coverage": table(head, rows)}, write=write)
     pulls = np.concatenate([outcome.pulls for outcome in outcomes])
     print(f"parameters: mean square of {len(pulls)} whitened errors {np.mean(pulls**2):.3f}; 1 is right")
     solve, figures = (np.median([getattr(o, name) for o in outcomes]) for name in ("solve_s", "figures_s"))

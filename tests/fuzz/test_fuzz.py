@@ -42,7 +42,7 @@ def test_corpus(tmp_path: Path):
 
 @pytest.fixture(scope="module")
 def outcomes_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Outcome]]:
-    """Outcomes of changed files by reader: one process imports once and reads for all chosen tests of this module."""
+    """Return the outcomes of changed files by reader. One process reads for all chosen tests of this module."""
     items = [item for item in request.session.items if isinstance(item, pytest.Function) and item.path == request.path]
     params = [item.callspec.params for item in items if hasattr(item, "callspec")]
     chosen = [values["reader"] for values in params if "reader" in values]

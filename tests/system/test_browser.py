@@ -60,7 +60,7 @@ TRIANGLE = """
 
 
 class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:
+    def log_message(self, *message: object) -> None:
         pass
 
 

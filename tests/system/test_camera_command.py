@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.oracles import drawings
 from tests.system.in_process import uwlts
 from tests.system.test_imported_calibration import CENTRE, CHESSBOARD, SIZE, F, photographs, poses
 from uwlts.storage.import_ import read_intrinsics
@@ -82,3 +83,25 @@ def test_what_cannot_be_calibrated_is_refused(folder: Path, tmp_path: Path, targ
     done = uwlts(*words)
     assert done.returncode != 0 and message in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "camera.yaml").exists()
+
+
+def test_a_polynomial_for_a_wide_lens_names_the_lens(tmp_path: Path):
+    """As the documentation prints it; without the option the model follows the lens."""
+    centre, rng = (281.3, 222.2), np.random.default_rng(4)
+    for number, turns in enumerate([(10, -20, 8), (-18, 12, -10), (20, 15, 95), (-10, -22, 185), (4, 3, 40)]):
+        place = drawings.pose(turns, (0.0, 0.0, 150.0))
+        place[:3, 3] -= place[:3, :3] @ [140.0, 80.0, 0.0]
+        board, rays = drawings.chessboard(15, 9, 20.0), drawings.equidistant(250.0, centre)
+        image = drawings.draw(board, rays, place, size=(560, 448), rng=rng, samples=2)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
+    (tmp_path / "target.toml").write_text('kind = "chessboard"\ncolumns = 15\nrows = 9\nsquare_mm = 20.0\n')
+    out = tmp_path / "camera.yaml"
+    done = uwlts("camera", str(tmp_path), "--out", str(out), "--distortion", "k1", "k2")
+    assert (
+        done.returncode == 0 and "this is a wide-angle lens, which bends straight lines more than k1 k2" in done.stderr
+    )
+    done = uwlts("camera", str(tmp_path), "--out", str(out), "--overwrite")
+    assert done.returncode == 0 and "wide-angle" not in done.stderr
+    known = read_intrinsics(out)
+    assert known.distortion.is_rational() and known.fx_px == pytest.approx(250.0, abs=0.5)
+    assert (known.cx_px, known.cy_px) == pytest.approx(centre, abs=0.5)

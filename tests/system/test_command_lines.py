@@ -52,7 +52,7 @@ def _values(kind: Any) -> list[tuple[list[str], object]]:
 
 
 def _required(app: App, command: str, option: str) -> list[str]:
-    """Words for all that a command needs but for an option."""
+    """Return words for all required arguments of a command except an option."""
     words = []
     for argument in app[command].assemble_argument_collection():
         if argument.required and argument.name != option:

@@ -294,7 +294,7 @@ SIZES = {"desktop": (1280, 800), "tablet": (800, 1280), "phone": (390, 844)}
 MOBILE = (
     "Mozilla/5.0 (Linux; Android 14; Pixel 8) AppleWebKit/537.36 (KHTML, like Gecko) Chrome/130.0 Mobile Safari/537.36"
 )
-"""Quasar opens choices as dialogs there."""
+"""User agent of a phone, for which Quasar opens choices as dialogs."""
 
 
 @pytest.fixture(params=["desktop", "phone", pytest.param("tablet", marks=pytest.mark.slow)])

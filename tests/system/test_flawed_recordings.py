@@ -42,7 +42,7 @@ its peak is 0.02 px lower, its centre of mass where it was, as for a stripe draw
 
 
 class Tripod(SensorSimulator):
-    """A studio that rotates the sensor before the board instead of moving it by a stage."""
+    """Simulator that rotates the sensor in front of the board instead of moving it by a stage."""
 
     def pose(self, shot: Shot) -> np.ndarray:
         rotation, place = VIEWS[round(shot.stage_mm)]

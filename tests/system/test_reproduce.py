@@ -228,7 +228,7 @@ def test_interrupted_takes_are_completed_and_another_seed_adds_a_campaign(
         assert any((one.image(index) != other.image(index)).any() for index in range(len(one)))
 
 
-def test_overwriting_renders_anew(copied: Path, rendered: tuple[Path, Progress], described: Path):
+def test_overwriting_renders_again(copied: Path, rendered: tuple[Path, Progress], described: Path):
     before = contents(copied)
     part = copied / "campaign-0" / "last.h5.part"
     part.write_bytes(b"of another run")

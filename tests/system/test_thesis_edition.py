@@ -1,4 +1,4 @@
-"""A small edition of the thesis's reproduction, whose gates catch a lost 0.02 mm.
+"""A small version of the thesis's reproduction; its limits reveal an additional error of 0.02 mm.
 
 Uses the as-built sensor, full physics and the whole chain of calibrations, but no random imperfections. Errors are due
 to speckle, noise and the methods only. Images depend on the seeds only, so limits are close to the measured values.

@@ -23,7 +23,7 @@ FORMULA = 1.5e-5
 _LEAST_COSINE = 0.4
 _FEWEST_LIT = 50
 _LENGTHENED = 12.93 / 12.5
-"""Ratio of the true focal length to that of the drawings, as for the sensor as built."""
+"""Ratio of the true focal length to the drawn one, as for the sensor as built."""
 _TRACED = 60
 
 

@@ -109,7 +109,7 @@ def write_card(
     if "mask" in names:
         write_coco(folder, card)
     # The last file: with it the data set is complete.
-    write_model(folder / CARD, card, format=CARD_FORMAT, version=CARD_VERSION, overwrite=True)
+    write_model(folder / CARD, card, file_format=CARD_FORMAT, version=CARD_VERSION, overwrite=True)
     return card
 
 

@@ -48,7 +48,7 @@ class LineStatus(IntEnum):
 
 
 class Mask(IntFlag):
-    """Bits of the mask of an image."""
+    """Bits of an image mask and their meaning."""
 
     STRIPE = 1
     """Direct light of the lit surface is at least 1/e^2 of its maximum on the profile line, and one electron."""

@@ -131,7 +131,7 @@ def load_dataset(folder: str | Path, *, split: Split | None = None, names: Seque
     )
     try:
         card = read_model(
-            folder / CARD, DataCard, format=CARD_FORMAT, version=CARD_VERSION, called="card of a data set"
+            folder / CARD, DataCard, file_format=CARD_FORMAT, version=CARD_VERSION, called="card of a data set"
         )
     except CaptureError as error:
         raise CaptureError(f"{error}{advice}") from error

@@ -1,7 +1,7 @@
 """Files of a data set: tar archives for the webdataset library, or HDF5 files; each frame is a sample.
 
-In a tar archive, the files of a sample are consecutive and share the name up to the first dot, such as ``000123-00``
-for frame 0 of scene 123. ``.png`` is the image, and ``.mask.png`` and ``.object_map.png`` are 8-bit images. ``.json``
+In a tar archive, the files of a sample are consecutive and share the name up to the first dot. Frame 0 of scene 123 is
+``000123-00``. ``.png`` is the image, and ``.mask.png`` and ``.object_map.png`` are 8-bit images. ``.json``
 contains the metadata. Each further array is a ``.npy`` file with its name.
 
 In an HDF5 file, each array is a dataset with the frames along its first axis; further datasets are ``image``, ``json``
@@ -52,10 +52,10 @@ class ShardWriter(Protocol):
 
 
 @contextmanager
-def open_shard(path: Path, format: Format, *, frames: int) -> Iterator[ShardWriter]:
+def open_shard(path: Path, file_format: Format, *, frames: int) -> Iterator[ShardWriter]:
     """Open a shard with a number of frames; it appears at ``path`` if the body ends without an exception."""
     with write_atomically(path, overwrite=True) as aside:
-        match format:
+        match file_format:
             case "webdataset":
                 with tarfile.open(aside, "w", format=tarfile.USTAR_FORMAT) as archive:
                     yield _TarWriter(archive)
@@ -63,7 +63,7 @@ def open_shard(path: Path, format: Format, *, frames: int) -> Iterator[ShardWrit
                 with h5py.File(aside, "w", libver="latest") as file:
                     yield _Hdf5Writer(file, frames)
             case _:
-                assert_never(format)
+                assert_never(file_format)
 
 
 class _TarWriter:
@@ -127,9 +127,9 @@ class ShardReader:
     Raises CaptureError if the file is missing, damaged, or has another number of frames than ``frames``.
     """
 
-    def __init__(self, path: Path, format: Format, *, frames: int):
+    def __init__(self, path: Path, file_format: Format, *, frames: int):
         self.path, self.frames = path, frames
-        self.format: Format = format
+        self.format: Format = file_format
         self._places: list[tuple[str, dict[str, tuple[int, int]]]] | None = None
 
     def sample(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:

@@ -261,10 +261,23 @@ def find_depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
 
 
 def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
-    """Evaluate designs at depths from the window's outer face and ``places`` (-1 to 1) along the stripe.
+    """Evaluate designs at depths and places along the stripe.
 
     An error d of the stripe's centre on its profile line causes the error (dY, dZ) = J^-1 (d, 0) of the point. J is the
     Jacobian of the pixel across and along the stripe with respect to Y and Z.
+
+    Parameters
+    ----------
+    xp
+        Array library: NumPy, or Dr.Jit for derivatives.
+    p
+        Parameters of the designs.
+    depth_mm
+        Depths from the window's outer face.
+    places
+        Positions along the stripe, from -1 to 1 between its ends.
+    reflectance
+        Reflectance of the object.
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff = standoff_mm(pose)
@@ -357,7 +370,7 @@ class Figures:
     sigma_z_far_mm: np.ndarray = _figure("σ Z at the far end")
     depth_per_px_mm: np.ndarray = _figure("depth per pixel", "mm/px")
     along_per_px_mm: np.ndarray = _figure("length along the stripe per pixel", "mm/px")
-    coverage: np.ndarray = _figure("share of the volume in reach", "")  # of camera and laser
+    coverage: np.ndarray = _figure("fraction of the volume in reach", "")  # of camera and laser
     standoff_mm: np.ndarray = _figure("stand-off")  # where the sheet crosses the camera's axis
     near_mm: np.ndarray = _figure("near end of the volume")
     far_mm: np.ndarray = _figure("far end of the volume")

@@ -80,7 +80,21 @@ class Light:
         return None if self._mirror is None else self._intersect_mirror(p, -light.direction)[1]
 
     def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, after_s: Float | None, active: Bool):
-        """Return the mask of points in the sensor's OCS with a free path to the laser's window."""
+        """Return the mask of points with a free path to the laser's window.
+
+        Parameters
+        ----------
+        objects
+            Scene, for shadows.
+        p
+            Points in the sensor's OCS.
+        light
+            Light of the sheet at these points.
+        after_s
+            Times of the points after that of the pose, s; None: at rest.
+        active
+            Mask of the points to test.
+        """
         towards = -light.direction
         if self._mirror is None:
             return active & ~self._is_blocked(objects, p, towards, light.exit_mm, after_s, active)

@@ -27,7 +27,7 @@ WALK_CELL_PX = 8
 WALKS_AT_ONCE = 2**21
 """Largest number of random walks traced together; this many take about 200 MB."""
 SPREAD_MM = (0.3, 1.2, 5.0, 20.0, 80.0)
-"""Distances from the sheet over which light that water scatters onto surfaces decays to 1 / e."""
+"""Decay lengths, to 1 / e, of light that the water scatters from the sheet onto surfaces."""
 TOLERANCE = 2.5e-4
 """Tolerated noise as a fraction of the stripe's peak: a fifth of the 8-bit rounding error at a peak of 200."""
 NOISE_SHARES = (0.05, 0.2)

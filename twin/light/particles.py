@@ -82,11 +82,33 @@ def sample_spots(
     sparkle: bool,
     rng: np.random.Generator,
 ) -> Spots:
-    """Sample bodies in a light's sheet as the camera sees them, ``per_litre`` of them larger than 0.1 mm.
+    """Sample bodies in a light's sheet that the camera sees.
 
-    Only visible bodies are returned: those behind, inside or shadowed by objects are omitted. ``extinction`` is in
-    1/mm; ``defocus`` blurs the spots. ``sparkle`` varies the light of each spot by speckle, with as many independent
-    grains as its disc holds (gamma distribution: Goodman, Speckle Phenomena, Sec. 4.6).
+    Parameters
+    ----------
+    view
+        View of the camera.
+    light
+        Light with the sheet.
+    objects
+        Objects of the scene; bodies behind, inside or shadowed by them are omitted.
+    pose
+        Pose of the sensor.
+    body
+        Kind of the bodies.
+    per_litre
+        Number of bodies larger than 0.1 mm per litre.
+    extinction
+        Extinction coefficient of the medium, 1/mm.
+    wavelength_nm
+        Wavelength of the light.
+    defocus
+        Blur the spots by defocus.
+    sparkle
+        Vary the light of each spot by speckle, with as many independent grains as its disc holds (gamma distribution:
+        Goodman, Speckle Phenomena, Sec. 4.6).
+    rng
+        Source of positions, sizes and speckle.
     """
     camera = view.camera
     width, height = camera.width_px + 2 * _MARGIN_PX, camera.height_px + 2 * _MARGIN_PX
@@ -151,9 +173,9 @@ def sample_spots(
 def diffuse_sphere(cosine: np.ndarray) -> np.ndarray:
     """Return the radiant intensity in 1/sr of a diffuse sphere per irradiance and squared radius.
 
-    2 / 3 rho (sin a + (pi - a) cos a) / pi, where a is the phase angle between the directions to the light and to the
-    viewer (Lambert's sphere: H. N. Russell, Astrophys. J. 43, 173, 1916). ``cosine`` is that of the scattering angle pi
-    - a.
+    It is 2 / 3 rho (sin a + (pi - a) cos a) / pi (Lambert's sphere: H. N. Russell, Astrophys. J. 43, 173, 1916). The
+    phase angle a is that between the directions to the light and to the viewer. ``cosine`` is that of the scattering
+    angle pi - a.
     """
     angle = np.pi - np.arccos(np.clip(cosine, -1, 1))
     return 2 / 3 * _REFLECTANCE * (np.sin(angle) + (np.pi - angle) * np.cos(angle)) / np.pi

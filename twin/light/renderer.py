@@ -158,11 +158,20 @@ class Renderer:
     def irradiance(
         self, light: LightName, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
     ) -> np.ndarray:
-        """Return the irradiance (H, W) on the image sensor in W/mm2, float32, at a pose (4, 4) of the OCS in the scene.
+        """Return the irradiance (H, W) on the image sensor in W/mm2, float32.
 
-        "laser" includes daylight; "day" is daylight with laser and lamp off. ``spp`` is the number of samples per lit
-        pixel, at the same positions in every pixel. ``seed`` determines the random walks. Equal arguments give equal
-        images.
+        Parameters
+        ----------
+        light
+            "laser" includes daylight; "day" is daylight with laser and lamp off.
+        scene_from_object : (4, 4)
+            Pose of the OCS in the scene.
+        spp
+            Number of samples per lit pixel, at the same positions in every pixel.
+        seed
+            Seed of the random walks. Equal arguments give equal images.
+        travel
+            Motion of the sensor during the exposure; None: at rest.
         """
         if light == "laser":
             day = self.irradiance("day", scene_from_object, spp=spp, travel=travel)

@@ -127,10 +127,21 @@ class SmoothLight:
     def evaluate(
         self, rows: np.ndarray, columns: np.ndarray, features: np.ndarray, findings: FoundLight, walks: int
     ) -> np.ndarray:
-        """Return the light (P,) at positions in cells, with features (J, P) of these positions.
+        """Return the light (P,) at positions in cells.
 
-        ``findings`` is the light of ``walks`` at each position. If it is too noisy, the light follows from the feature
-        weights and from the interpolated ratio of the cells to their description.
+        If the light found at a position is too noisy, the result follows from the feature weights and from the
+        interpolated ratio of the cells to their description.
+
+        Parameters
+        ----------
+        rows, columns : (P,)
+            Positions, in cells.
+        features : (J, P)
+            Features at these positions.
+        findings
+            Light found at each position.
+        walks
+            Number of walks at each position.
         """
         ratio = np.divide(self.cells, self.described, out=np.ones_like(self.cells), where=self.described > 0)
         expected = interpolate_cells(ratio, rows, columns) * (self.weights @ features)
@@ -144,9 +155,20 @@ class SmoothLight:
 def estimate_light(
     findings: FoundLight, walks: np.ndarray, features: np.ndarray, *, tolerance: float, noise_share: float
 ) -> SmoothLight:
-    """Estimate the light in cells with ``walks`` (rows, columns) each, described by features (J, rows, columns).
+    """Estimate the light of each cell, with the permitted noise.
 
-    The remaining noise is at most ``tolerance`` or the fraction ``noise_share`` of the light, whichever is larger.
+    Parameters
+    ----------
+    findings
+        Light found by all walks.
+    walks : (rows, columns)
+        Number of walks of each cell.
+    features : (J, rows, columns)
+        Features of each cell.
+    tolerance
+        Permitted noise, in the unit of the light.
+    noise_share
+        Permitted noise as a fraction of the light, if this is larger than ``tolerance``.
     """
     mean_walks = float(walks.mean())
     exposure = (walks / mean_walks).astype(np.float32)

@@ -115,8 +115,27 @@ def record_campaigns(
 ) -> list[Path]:
     """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; return these folders.
 
-    Complete recordings are kept and interrupted ones resumed; ``overwrite`` removes those of the seeds and renders them
-    again. ``progress(done, total)`` counts images.
+    Parameters
+    ----------
+    campaign
+        Recordings of the campaign.
+    folder
+        Folder of the results.
+    seeds
+        Seeds of the campaigns; each draws its own sensor and noise.
+    every
+        Take only every n-th profile of the scans; calibrations keep all images.
+    spp
+        Samples per lit pixel.
+    variant
+        Variant of the renderer.
+    workers
+        Number of parallel recordings (default: number of processors).
+    overwrite
+        Remove complete recordings of these seeds and render them again. Otherwise they are kept, and interrupted ones
+        are resumed.
+    progress
+        Called as ``progress(done, total)`` in images.
 
     Raises
     ------
@@ -200,9 +219,25 @@ def keep_to_plan(
 ) -> None:
     """Write the settings of a folder's contents, or check that they are unchanged.
 
-    ``files`` belong to the plan, ``recorded`` is the glob pattern of such files, and ``called`` is their name in
-    messages. DescriptionError if the folder contains files of another plan, and ``overwrite`` does not replace all of
-    them.
+    Parameters
+    ----------
+    folder
+        Folder with the plan.
+    plan
+        Settings of its contents.
+    files
+        Files that belong to the plan.
+    recorded
+        Glob pattern of such files.
+    called
+        Their name in messages.
+    overwrite
+        Replace the files of another plan.
+
+    Raises
+    ------
+    DescriptionError
+        The folder contains files of another plan, and ``overwrite`` does not replace all of them.
     """
     path = folder / PLAN
     text = json.dumps(plan, indent=2) + "\n"

@@ -39,12 +39,31 @@ def record_scene(
     resume: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> None:
-    """Render a scene into a capture at ``path`` and its ground truth into a file beside it.
+    """Render a scene into a capture and its ground truth into a file beside it.
 
-    Images show ``as_built`` (default: ``sensor``), the capture states ``sensor``. An interrupted run leaves
-    ``path.part`` with all complete frames. ``resume`` continues from there, with the same result as an uninterrupted
-    run. ``progress(done, total)`` is called after every frame. DesignError or DescriptionError if the sensor or the
-    scene cannot work; OutputError if a file exists, or cannot be written.
+    Parameters
+    ----------
+    scene, sensor
+        Scene, and the sensor that the capture states.
+    path
+        Capture to write. An interrupted run leaves ``path.part`` with all complete frames.
+    as_built
+        Sensor that the images show; by default ``sensor``.
+    options
+        Samples, seed and rendered effects.
+    overwrite
+        Replace existing files.
+    resume
+        Continue an interrupted run, with the same result as an uninterrupted one.
+    progress
+        Called as ``progress(done, total)`` after every frame.
+
+    Raises
+    ------
+    DesignError, DescriptionError
+        The sensor or the scene cannot work.
+    OutputError
+        A file exists, or cannot be written.
     """
     path = Path(path)
     if truth_path(path).exists() and not (overwrite or resume):

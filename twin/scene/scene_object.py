@@ -40,8 +40,8 @@ class SceneObject(Pose):
     ``finish`` selects the reflection model: "diffuse" is Lambertian; "painted" and "pvc" are a diffuse body under a
     clear, slightly rough coat; "metal" is rough steel. ``reflectance`` is the diffuse reflectance, that of the body
     under a coat, or the scale of a metal's reflection. It is multiplied by the grey values (0 to 1) of the picture
-    ``texture``, which is mapped by the shape's uv coordinates with the last picture row at v = 0; a relative path
-    starts at the scene's folder. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007), ``roughness_um``
+    ``texture``. The shape's uv coordinates map the picture, with its last row at v = 0; a relative path starts at the
+    scene's folder. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007), ``roughness_um``
     the rms height of the surface.
     """
 

@@ -44,13 +44,29 @@ def grey_values(
     rng: np.random.Generator | None,
     pattern: FixedPattern | None = None,
 ) -> np.ndarray:
-    """Return the image (H, W), uint8 or uint16, for mean photo-electrons (H, W).
+    """Return the image (H, W), uint8 or uint16, for mean photo-electrons.
 
-    With ``rng`` None there is no temporal noise, with ``pattern`` None no fixed-pattern noise. Signal and dark current
-    have Poisson shot noise. Blooming and full well are applied before the read-out, which adds offset pattern and
-    noise; the only quantisation is the final rounding. Bands of rows have independent random numbers, so that the image
-    does not depend on the number of parallel tasks. ImageError if ``electrons`` is not a two-dimensional image of
-    finite numbers from 0 to 1e15, or ``pattern`` has another size.
+    Signal and dark current have Poisson shot noise. Blooming and full well are applied before the read-out, which adds
+    offset pattern and noise; the only quantisation is the final rounding. Bands of rows have independent random
+    numbers, so that the image does not depend on the number of parallel tasks.
+
+    Parameters
+    ----------
+    electrons : (H, W)
+        Mean number of photo-electrons per pixel.
+    detector
+        Full well, noise, offset, gain and bits.
+    exposure_ms
+        Exposure time, for the dark current.
+    rng
+        Source of temporal noise; None: no noise.
+    pattern
+        Fixed-pattern noise of the detector; None: none.
+
+    Raises
+    ------
+    ImageError
+        ``electrons`` is not a two-dimensional image of finite numbers from 0 to 1e15, or ``pattern`` has another size.
     """
     electrons = np.asarray(electrons, np.float32)
     if electrons.ndim != 2 or electrons.size == 0:

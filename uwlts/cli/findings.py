@@ -75,7 +75,9 @@ def compare(
 )
 def inspect(
     call: Call,
-    kind: Annotated[Literal["pipe", "weld", "step", "flange", "gap"], Parameter(help="What the cloud shows.")] = "pipe",
+    kind: Annotated[
+        Literal["pipe", "weld", "step", "flange", "gap"], Parameter(help="Kind of the object in the cloud.")
+    ] = "pipe",
     *,
     out: Annotated[
         Path | None,

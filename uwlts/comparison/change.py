@@ -207,7 +207,7 @@ def compare_clouds(
     At each place, the points of both surfaces in a disc perpendicular to the reference's normal are averaged (M3C2:
     Lague, Brodu and Leroux, ISPRS J. 82, 2013). The variance of the distance follows M3C2-EP (Winiwarter, Anders and
     Höfle, ISPRS J. 178, 2021). It has three parts: noise or roughness divided by the number of points, stage position
-    errors of each image, and systematic calibration errors. Averaging does not reduce the latter.
+    errors of each image, and systematic calibration errors, which averaging does not reduce.
 
     Clouds of one calibration, medium and stage direction share errors of calibration, stage and sheet. These errors
     cancel in the difference. The water's refractive index may drift between the scans and does not cancel, unless

@@ -153,7 +153,7 @@ def _image_sums(
 
 
 def _correlation_factor(together: np.ndarray, alone: np.ndarray, count: np.ndarray) -> float:
-    """Return the factor, at least 1, on the variance of means for correlated noise within an image.
+    """Return the factor (at least 1) by which correlated noise within an image increases the variance of means.
 
     It is estimated from all places together, because each has few images. Places of high scatter are excluded, since
     they may hold edges.

@@ -159,7 +159,21 @@ class Instrument:
         self._ask(self._find_exposure)
 
     def scan(self, plan: ScanPlan, out: Path, *, calibration: Path | None, resume: bool, overwrite: bool) -> None:
-        """Record a scan by a plan."""
+        """Record a scan by a plan, in the worker thread.
+
+        Parameters
+        ----------
+        plan
+            Plan of the scan.
+        out
+            Capture to write.
+        calibration
+            File of a calibration for a cloud that grows during the scan; None: no cloud.
+        resume
+            Continue an interrupted capture.
+        overwrite
+            Replace an existing capture.
+        """
         self._ask(lambda: self._scan(plan, out, calibration, resume, overwrite))
 
     def calibrate(self, plan: GuidedPlan, out: Path, *, resume: bool, overwrite: bool) -> None:

@@ -20,8 +20,8 @@ from uwlts.stripe import CaptureStripes, find_stripe, warm_up
 LOOK_S = 0.1
 """Interval between checks for new images; a check takes a few ms."""
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
-"""A laser image is faint below this fraction of full scale, saturated above this fraction of saturated lines, and shows
-too little of the stripe below this fraction of its lines."""
+"""Limits of a laser image: faint below this fraction of full scale; saturated above this fraction of saturated lines;
+too little of the stripe below this fraction of lines with a point."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -201,7 +201,7 @@ class Evaluation(Brief):
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the evaluation as indented JSON, atomically; OutputError if writing fails."""
-        write_model(path, self.record(), format=FORMAT, version=VERSION, overwrite=overwrite)
+        write_model(path, self.record(), file_format=FORMAT, version=VERSION, overwrite=overwrite)
 
 
 def compare_cloud_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
@@ -236,7 +236,7 @@ def _name_other_scene(header: TruthHeader, path: Path, metadata: Table) -> str |
     capture = metadata.get("capture")
     if (digest := metadata.get("scene")) is not None:
         found = scene_digest(header.scene)
-        return None if found == digest else f"its scene has the digest {found}, that of {capture} {digest}"
+        return None if found == digest else f"its scene has the digest {found}, the scene of {capture} has {digest}"
     own, wanted = _kind_of_artefact(header.scene), _kind_of_artefact(metadata)
     if own is not None and wanted is not None and own != wanted:
         return f"it shows the artefact '{own}', the cloud '{wanted}'"
@@ -325,4 +325,4 @@ def evaluate(
 def read_evaluation(path: str | Path) -> EvaluationRecord:
     """Read an evaluation file; CaptureError if it is missing, newer, damaged, or of another format."""
     advice = "; evaluate the cloud again"
-    return read_model(path, EvaluationRecord, format=FORMAT, version=VERSION, called="evaluation", advice=advice)
+    return read_model(path, EvaluationRecord, file_format=FORMAT, version=VERSION, called="evaluation", advice=advice)

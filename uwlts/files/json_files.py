@@ -38,11 +38,30 @@ def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
 
 
 def read_model(
-    path: str | Path, model: type[AnyModel], *, format: str, version: int, called: str, advice: str = ""
+    path: str | Path, model: type[AnyModel], *, file_format: str, version: int, called: str, advice: str = ""
 ) -> AnyModel:
-    """Read a JSON file of the program as a model; raises CaptureError if it is missing, foreign, newer or damaged."""
+    """Read a JSON file of the program as a model.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    model
+        Type of the content.
+    file_format, version
+        Expected values of the keys "format" and "version".
+    called
+        Name of the expected content in messages.
+    advice
+        End of the message about content that is not valid.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, foreign, newer or damaged.
+    """
     content = read_json(path, called=called)
-    return model_from_json(content, path, model, format=format, version=version, called=called, advice=advice)
+    return model_from_json(content, path, model, file_format=file_format, version=version, called=called, advice=advice)
 
 
 def model_from_json(
@@ -50,15 +69,15 @@ def model_from_json(
     path: str | Path,
     model: type[AnyModel],
     *,
-    format: str,
+    file_format: str,
     version: int,
     called: str,
     advice: str = "",
 ) -> AnyModel:
     """Convert the result of `read_json` to a model; raises CaptureError like `read_model`."""
     content = dict(content)
-    if content.pop("format", None) != format:
-        raise CaptureError(f'{path} is JSON but not {add_article(called)}: expected "format": "{format}"')
+    if content.pop("format", None) != file_format:
+        raise CaptureError(f'{path} is JSON but not {add_article(called)}: expected "format": "{file_format}"')
     if (found := content.pop("version", None)) != version:
         raise CaptureError(f"{path} has version {found}; this program reads {version}")
     return validate_content(model, content, f"{path} is not a valid {called}", advice=advice)
@@ -74,9 +93,26 @@ def validate_content(model: type[AnyModel], content: object, complaint: str, *, 
         raise CaptureError(f"{complaint}: {error}{advice}") from error
 
 
-def write_model(path: str | Path, model: BaseModel, *, format: str, version: int, overwrite: bool) -> None:
-    """Write a model with format and version as indented JSON, completely or not; raises OutputError if that fails."""
-    content = {"format": format, "version": version} | model.model_dump(mode="json")
+def write_model(path: str | Path, model: BaseModel, *, file_format: str, version: int, overwrite: bool) -> None:
+    """Write a model as indented JSON, completely or not at all.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    model
+        Content.
+    file_format, version
+        Values of the keys "format" and "version".
+    overwrite
+        Replace an existing file.
+
+    Raises
+    ------
+    OutputError
+        The file exists and ``overwrite`` is not set, or cannot be written.
+    """
+    content = {"format": file_format, "version": version} | model.model_dump(mode="json")
     with write_atomically(path, overwrite=overwrite) as aside:
         aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
@@ -132,7 +168,7 @@ def _brief(value: object) -> str:
     return text if len(text) <= _BRIEF else f"{text[:_BRIEF]}..."
 
 
-def json_text(content: object, *, indent: int | None = None, ascii: bool = True) -> str:
-    """Return JSON text, for a model that of its set fields; raises ValueError for numbers that are not finite."""
+def json_text(content: object, *, indent: int | None = None, only_ascii: bool = True) -> str:
+    """Return JSON text, for a model of its set fields only; raises ValueError for numbers that are not finite."""
     plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
-    return json.dumps(plain, indent=indent, ensure_ascii=ascii, allow_nan=False) + "\n"
+    return json.dumps(plain, indent=indent, ensure_ascii=only_ascii, allow_nan=False) + "\n"

@@ -132,7 +132,19 @@ def read_text(
     """Read a regular file of text in UTF-8, without byte order mark.
 
     Raises ``error`` like `open_regular`, or if the content is not text.
-    ``foreign`` is the beginning of the message for other content, by default "is not a" and ``called``.
+
+    Parameters
+    ----------
+    path
+        File to read.
+    most_bytes
+        Largest permitted size.
+    error
+        Type of the exceptions.
+    called
+        Name of the expected content in messages.
+    foreign
+        Beginning of the message for other content; by default "is not a" and ``called``.
     """
     content = read_bytes(path, most_bytes=most_bytes, error=error, called=called)
     try:

@@ -40,12 +40,16 @@ class OtherWriterError(OutputError):
 def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
     """Give the body a temporary file to write; move it to `path` when the body ends without an exception.
 
-    The temporary file is in the folder of `path`, as a rename is atomic only within a file system, and has the same
-    suffix, from which some libraries choose the format. It is removed if an exception leaves the body, and an existing
-    file at `path` is untouched until the new one is complete. Without ``overwrite`` an existing file is refused, before
-    the body runs and again at the end. A symbolic link is followed. Raises OutputError if the folder is missing or not
-    writable, the file exists, is an input of the running command or is being written by another process, `path` is a
-    folder or a device, or the disk is full: for any OSError.
+    The temporary file is in the folder of `path`, because a rename is atomic only within a file system. It has the same
+    suffix, because some libraries choose the format from it. It is removed if an exception leaves the body, and an
+    existing file at `path` is untouched until the new one is complete. Without ``overwrite`` an existing file is
+    refused, before the body runs and again at the end. A symbolic link is followed.
+
+    Raises
+    ------
+    OutputError
+        The folder is missing or not writable, `path` is a folder or a device, or the disk is full: for any OSError. The
+        file exists, is an input of the running command, or is being written by another process.
     """
     require_possible_name(Path(path))
     target = Path(os.path.realpath(path))

@@ -39,9 +39,9 @@ _FACING = 0.15
 """Least cosine (81 deg) between a normal and the viewing direction; a sensor sees little of steeper surfaces."""
 
 LEAST_INFORMATION = 5.0
-"""Information on a motion, relative to that produced by noise of normals, below which the motion is undetermined."""
+"""Least information on a determined motion, relative to the information that noise of the normals alone produces."""
 _ROUNDING = 1e-9
-"""Information relative to that on the best determined motion, below which it is rounding noise."""
+"""Least information above rounding noise, relative to the information on the best determined motion."""
 
 
 @dataclass(frozen=True, eq=False)

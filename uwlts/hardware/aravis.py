@@ -114,7 +114,7 @@ def _text(value: bytes | None) -> str:
 
 
 _ANSWER_S = 0.1
-"""Time limit of the answer of a camera on this machine, which takes a few ms."""
+"""Time limit for the answer of a camera on this machine; it takes a few ms."""
 _HEARTBEAT_S = 4.0
 """The heartbeat timeout of GigE Vision is 3 s unless a program has changed it."""
 _SOCKET_BYTES = 2**23

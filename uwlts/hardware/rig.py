@@ -30,7 +30,7 @@ START_MS = 1.0
 """First exposure: in the middle of the usual range, on a logarithmic scale."""
 _FEW_SHARE = 0.01
 _FEWEST_LINES = 3
-"""Fewer lines than this fraction and number are attributed to a reflection or noise."""
+"""Smallest fraction and number of lines with a stripe; fewer are attributed to a reflection or noise."""
 _DIM_SHARE = 0.05
 """Lines below this fraction of the brightest one are dark."""
 _MANY_SHARE = 0.05
@@ -44,7 +44,7 @@ _STEPS = 12
 _DOWN = 1 / 16
 """Factor after a saturated image, whose excess is unknown."""
 _UP = 30.0
-"""Largest factor after a dark image, where noise limits the estimate."""
+"""Largest factor after a dark image, because noise limits the estimate."""
 
 
 def get_stripe(seen: Seen, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:
@@ -151,7 +151,23 @@ _RUN_UP_MM = 1.0
 def add_provenance(
     header: CaptureHeader, plan: RigPlan, camera: CameraDevice, *, source: str, stage: str, **more: JsonValue
 ) -> CaptureHeader:
-    """Return the header of a capture with the provenance of its images."""
+    """Return the header of a capture with the provenance of its images.
+
+    Parameters
+    ----------
+    header
+        Header without provenance.
+    plan
+        Plan of the recording.
+    camera
+        Camera that takes the images.
+    source
+        Kind of the recording, such as "scan".
+    stage
+        Name of the stage's controller.
+    **more
+        Further entries.
+    """
     provenance = {
         "source": source,
         "title": plan.title,
@@ -198,8 +214,8 @@ LaserStage = GrblStage | HandSwitchedLaser
 class Rig:
     """Camera, stage and laser that take the images of a plan one by one.
 
-    A switched laser is on only while the camera exposes. If a frame is late, the laser is switched off while waiting,
-    and the frame is accepted if its time stamp shows that it was exposed in the light.
+    A switched laser is on only while the camera exposes. If a frame is late, the laser is switched off while waiting.
+    The frame is accepted if its time stamp shows that it was exposed in the light.
 
     ``ahead`` is the direction of motion towards every position, 1 or -1, to eliminate backlash.
     ``repeated`` counts images that were taken again because their frames were lost or damaged.

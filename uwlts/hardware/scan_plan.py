@@ -85,9 +85,27 @@ class RigPlan(Description):
     def capture_header(
         self, name: str, sensor: Sensor, *, medium: str, direction: Vector, zero_dn: int = 0, **shown: Table | None
     ) -> CaptureHeader:
-        """Return the header of a capture of a ``target`` or ``artefact``; raises DescriptionError if one is not valid.
+        """Return the header of a capture.
 
-        ``zero_dn`` is the grey value of zero difference in images with a subtracted background.
+        Parameters
+        ----------
+        name
+            Name of the capture.
+        sensor
+            Description of the sensor.
+        medium
+            Name of one of its media.
+        direction
+            Unit vector of the stage's motion in the OCS.
+        zero_dn
+            Grey value of zero difference in images with a subtracted background.
+        **shown
+            Description of the ``target`` or ``artefact`` in the images.
+
+        Raises
+        ------
+        DescriptionError
+            Target or artefact is not valid.
         """
         table = {
             "name": name,

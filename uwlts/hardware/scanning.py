@@ -91,11 +91,30 @@ def record_scan(
     between: Callable[[], None] = lambda: None,
     recorded: Callable[[Frame, int], None] = lambda frame, number: None,
 ) -> ScanProgress:
-    """Record a scan with an open camera and a stage that may move.
+    """Record a scan with an open camera and a stage that may move. The errors are those of `uwlts.desk.scan.scan`.
 
-    Parameters and errors are those of `uwlts.desk.scan.scan`, with two more callbacks. ``between`` is called before
-    every image, with the laser off: it may wait, or end the scan by an exception. ``recorded`` is called with every
-    image that is in the file, and its number.
+    Parameters
+    ----------
+    plan
+        Plan of the scan.
+    out
+        Capture to write.
+    camera
+        Open camera.
+    stage
+        Stage with laser, homed.
+    resume
+        Continue an interrupted capture.
+    overwrite
+        Replace an existing capture.
+    progress
+        Called as ``progress(done, total)`` after every image.
+    report, warn
+        Receive lines of output, and warnings.
+    between
+        Called before every image, with the laser off. It may wait, or end the scan by an exception.
+    recorded
+        Called with every image that is in the file, and its number.
     """
     positions_mm = plan.stage.positions_mm()
     shots = list(product(positions_mm, plan.images()))
@@ -315,7 +334,7 @@ class _Taking:
         unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
         slip_mm, error_mm = relief.measure_slip(select_centres(get_stripe(image, self._sensor, background=unlit)))
         if not np.isfinite(slip_mm):
-            seen = "shows no stripe where it was; or the laser has failed since the last image"
+            seen = "shows no stripe at its earlier place; or the laser has failed since the last image"
         elif relief.is_significant(slip_mm, error_mm):
             seen = f"shows a displacement of the stage of {slip_mm:+.2f} mm (std {error_mm:.2f} mm)"
         else:

@@ -278,7 +278,19 @@ class Inspection(Brief, RecordFile):
 def plain_value(
     kind: FeatureKind, name: str, value: float, random: float, systematic: float | None, *, least: float = -np.inf
 ) -> FeatureValue:
-    """Return a value with a symmetric interval, cut off at the least possible value."""
+    """Return a value with a symmetric interval, cut off at the least possible value.
+
+    Parameters
+    ----------
+    kind, name
+        Kind of the feature, and name of the value.
+    value
+        Measured value.
+    random, systematic
+        Standard uncertainties, in the unit of the value; the systematic one is None if unknown.
+    least
+        Least possible value.
+    """
     half = COVERAGE_FACTOR * float(np.hypot(random, systematic or 0.0))
     low, high = max(value - half, least), max(value + half, least)
     unit = DEFINITIONS[kind][name].unit
@@ -289,10 +301,21 @@ def plain_value(
 def amplitude_value(
     kind: FeatureKind, name: str, vector: np.ndarray, random: np.ndarray, systematic: np.ndarray | None, *, scale: float
 ) -> FeatureValue:
-    """Return the length of a vector (2,) with covariances (2, 2), times a scale.
+    """Return the length of a vector, times a scale.
 
     Noise increases the squared length of a vector by the trace of its covariance, which is subtracted (Rice, Bell
     System Technical Journal 24, 1945, section 3.10). The interval reaches zero if the vector is not significant.
+
+    Parameters
+    ----------
+    kind, name
+        Kind of the feature, and name of the value.
+    vector : (2,)
+        Vector whose length is measured.
+    random, systematic : (2, 2)
+        Covariances of the vector; the systematic one is None if unknown.
+    scale
+        Factor of the length.
     """
     total = random if systematic is None else random + systematic
     length = float(np.linalg.norm(vector))

@@ -254,7 +254,7 @@ class Calibration(Brief, Description):
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the calibration as JSON, completely or not at all; OutputError if that fails."""
-        write_model(path, self, format=FORMAT, version=VERSION, overwrite=overwrite)
+        write_model(path, self, file_format=FORMAT, version=VERSION, overwrite=overwrite)
 
     def figures(self, step: str) -> Table:
         """Return the figures of a calibration step; an empty table if there are none."""

@@ -151,7 +151,7 @@ class Mount(Brief, Description):
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the mount as JSON, completely or not at all; OutputError if that fails."""
-        write_model(path, self, format=FORMAT, version=VERSION, overwrite=overwrite)
+        write_model(path, self, file_format=FORMAT, version=VERSION, overwrite=overwrite)
 
     def transform(self) -> np.ndarray:
         """Return ``T_platform_sensor`` as an array (4, 4), mm."""

@@ -6,8 +6,8 @@ away from the laser, and ``v_px`` along it. The triangulation angle is the angle
 axes. The camera's window is normal to the camera's axis. The laser's window does not turn the sheet, because the sheet
 contains the normal of that window.
 
-A ray of slope (p, e) = (u, v) s / f in air has the slope (p, e) / sqrt(n^2 + (n^2 - 1) (p^2 + e^2)) in a medium of
-index n, by Snell's law. With it, the thesis's formulas for air hold exactly behind a window.
+In air a ray has the slope (p, e) = (u, v) s / f. By Snell's law, in a medium of index n the slope is
+(p, e) / sqrt(n^2 + (n^2 - 1) (p^2 + e^2)). With it, the thesis's formulas for air hold exactly behind a window.
 """
 
 import math
@@ -256,8 +256,18 @@ def speckle_limit_um(
     Herrmann 1994, Applied Optics 33:1306). From the object, the pupil of diameter f / N appears under the half-angle u.
 
     The uncertainty along the laser's axis is larger by 1 / sin theta_t. The thesis's 16 um at 250 mm is the value
-    across the axis for a contrast of 1; its value in depth is 28 um. Behind a window, ``distance_mm`` is the apparent
-    distance.
+    across the axis for a contrast of 1; its value in depth is 28 um.
+
+    Parameters
+    ----------
+    wavelength_nm
+        Wavelength of the laser.
+    focal_length_mm, f_number
+        Lens of the camera.
+    distance_mm
+        Distance of the object from the pupil; behind a window, the apparent distance.
+    contrast
+        Speckle contrast C.
     """
     _require_positive(
         wavelength_nm=wavelength_nm,
@@ -283,6 +293,19 @@ def window_thickness_mm(
     The thesis prints 5.53 mm for 1 MPa without A, K_w and S_f. Its Figure 34 lists only fused silica (60 MPa). With
     f_s = 4, the diameter A is then 49.5 mm if clamped and 40.4 mm if not. The bore of 63 mm would need 7.0 mm if
     clamped.
+
+    Parameters
+    ----------
+    pressure_mpa
+        Pressure difference dP.
+    unsupported_diameter_mm
+        Diameter A of the opening.
+    strength_mpa
+        Fracture strength S_f of the glass.
+    support
+        Factor K_w of the edge: clamped or simply supported.
+    safety
+        Safety factor f_s.
     """
     _require_positive(
         pressure_mpa=pressure_mpa,
@@ -341,8 +364,8 @@ def nominal_setup(sensor: Sensor, medium: Medium) -> tuple[Triangulation, float]
     Raises
     ------
     DesignError
-        The sheet does not cross the camera's axis beyond the window, the stripe runs along the other side of the image,
-        or the medium is not air and the camera's window is not mounted.
+        The sheet does not cross the camera's axis beyond the window, or the stripe runs along the other side of the
+        image. The medium is not air, but the camera's window is not mounted.
     """
     camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
     pose, index = laser_pose(sensor), medium.refractive_index(wavelength)

@@ -5,8 +5,8 @@ component b (1 - cos a) across the sheet. Let t be the angle between the sheet a
 Refraction divides the component of a ray along the window's face by the medium's index n (Snell's law).
 
 Let r be the distance of a point from the rays' apparent origin, and z its component along the axis. The fraction w of z
-is in the medium. With q = r cos a and q^2 = n^2 z^2 - (n^2 - 1) r^2, the sheet in the medium deviates from a plane by
-(b (r - q) + t w (z - q)) / n. The window turns that plane by t (1 - 1 / n). This is exact to first order in b and t;
+is in the medium. The sheet in the medium deviates from a plane by (b (r - q) + t w (z - q)) / n. Here q = r cos a and
+q^2 = n^2 z^2 - (n^2 - 1) r^2. The window turns that plane by t (1 - 1 / n). This is exact to first order in b and t;
 the offset by the glass is neglected.
 """
 

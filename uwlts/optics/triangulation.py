@@ -105,7 +105,21 @@ def reconstruct_pixels(
     stage_mm: np.ndarray | float,
     stage_direction: np.ndarray,
 ) -> MeasuredPoints:
-    """Reconstruct points in the OCS from pixels (N, 2), (u, v) in px; the rest is as for `reconstruct_profile`."""
+    """Reconstruct points in the OCS at stage position 0 from pixels. Errors are those of `reconstruct_profile`.
+
+    Parameters
+    ----------
+    calibration
+        Calibration of the sensor.
+    pixels : (N, 2)
+        Image positions (u, v), px.
+    medium_index
+        Refractive index of the medium relative to air.
+    stage_mm : float or (N,)
+        Stage position of each pixel.
+    stage_direction : (3,)
+        Direction of the sensor at growing positions, in the OCS.
+    """
     found = points_on_sheet(calibration, pixels, medium_index=medium_index)
     points = to_object(calibration, found.points_mm, stage_mm=stage_mm, stage_direction=stage_direction)
     return MeasuredPoints(points, found.status)
@@ -210,7 +224,20 @@ def reconstruct_by_polynomials(
     """Reconstruct points in the OCS at stage position 0 from stripe centres, with polynomials.
 
     X is 0 plus the stage's travel. The status is OUTSIDE_CALIBRATION if a line is not calibrated, or if a centre is
-    outside the calibrated range of its line. Parameters are as for `reconstruct_profile`.
+    outside the calibrated range of its line.
+
+    Parameters
+    ----------
+    calibration
+        Polynomials of each profile line.
+    lines : (N,)
+        Profile lines.
+    centres_px : (N,)
+        Stripe centres on these lines.
+    stage_mm : float or (N,)
+        Stage position of each centre.
+    stage_direction : (3,)
+        Direction of the sensor at growing positions, in the OCS.
 
     Raises
     ------

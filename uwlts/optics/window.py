@@ -191,9 +191,9 @@ def trace_derivatives(
 ) -> RayDerivatives | None:
     """Trace rays (3, N) as `trace_window`, with derivatives; return None if a ray does not reach the medium.
 
-    The derivatives are with respect to the c parameters of ``rays_by`` (c, 3, N), then the window's distance, the two
-    slopes of its normal, the thickness and index of the glass, and the medium's index. At a face, index times direction
-    changes only along the normal (Snell's law): n' r' = n r + (root - n cosine) normal, with
+    The derivatives are with respect to the c parameters of ``rays_by`` (c, 3, N), then those of window and media: the
+    window's distance, the two slopes of its normal, thickness and index of the glass, the medium's index. At a face,
+    index times direction changes only along the normal (Snell's law): n' r' = n r + (root - n cosine) normal, with
     root^2 = n'^2 - n^2 + (n cosine)^2.
     """
     count = len(rays_by)

@@ -110,9 +110,25 @@ HTML = (".html", ".htm")
 def write_page(
     path: str | Path, text: str, *, beside: str | None = None, kind: str = "", overwrite: bool = False
 ) -> None:
-    """Write a page, and optionally a JSON text beside it (`json_beside`), each completely or not at all.
+    """Write a page, and optionally a JSON text beside it, each completely or not at all.
 
-    Raises OutputError if a file exists and ``overwrite`` is not set, or cannot be written.
+    Parameters
+    ----------
+    path
+        Page to write.
+    text
+        Content of the page.
+    beside
+        Content of the JSON file (`json_beside`); None: no such file.
+    kind
+        Kind in the name of the JSON file.
+    overwrite
+        Replace existing files.
+
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not set, or cannot be written.
     """
     with ExitStack() as stack:
         if beside is not None:
@@ -201,7 +217,17 @@ def new_figure(
     height_ratios: list[float] | None = None,
     width_ratios: list[float] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
+    """Return a matplotlib figure in the pages' style, and its axes row by row.
+
+    Parameters
+    ----------
+    width, height
+        Size of the figure, inches.
+    rows, columns
+        Number of axes.
+    height_ratios, width_ratios
+        Relative heights of the rows and widths of the columns; by default equal.
+    """
     import matplotlib
 
     figure = make_figure(width, height)

@@ -66,14 +66,14 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
         )
     there, back = (frames[np.argsort(stage_mm[frames])] for frames in (there, back))
     surface = _Surface.from_centres(stage_mm[there], centre_px[there])
+    backward = _Surface.from_centres(stage_mm[back], centre_px[back])
     speed = float(np.median(speed_mm_per_s[there]) - np.median(speed_mm_per_s[back])) / 2
-    seen, position = centre_px[back], stage_mm[back]
     # A backward frame at x shows the same as the forward pass at x - 2 v latency.
     step = surface.step_mm / 2
     reach = int(np.ceil(2 * speed * _LARGEST_S / step))
     ways = step * np.arange(-reach, reach + 1)
     ways = ways[np.argsort(np.abs(ways), kind="stable")]
-    costs, relief = np.array([_cost(surface, position, seen, way) for way in ways]).T
+    costs, relief = np.array([_cost(surface, backward, way) for way in ways]).T
     # Without relief, flat areas match at any shift.
     comparable = relief >= _LEAST_RELIEF * relief.max()
     if not relief.max() > 0:
@@ -82,29 +82,30 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
             "in both directions"
         )
     shift = float(ways[np.argmin(np.where(comparable, costs, np.inf))])
-    away = slope = np.empty(0)
+    away = slope = other = np.empty(0)
     for _ in range(_ROUNDS):
-        away, slope = surface.evaluate(position - shift, seen)
+        away, slope, other = surface.compare(backward, shift)
         scatter = robust_std(away - np.median(away)) if len(away) else 0.0
         near = np.abs(away) <= max(_OUTLIER * scatter, 1e-6)
-        if np.count_nonzero(near) < _FEWEST or not (slope[near] ** 2).sum() > 0:
+        if np.count_nonzero(near) < _FEWEST or not (slope[near] * other[near]).sum() > 0:
             raise EvaluationError(
                 "the surface has too little relief along the motion to determine the latency: scan a surface with "
                 "slopes, such as a sphere, or give latency_ms"
             )
-        away, slope = away[near], slope[near]
-        # away = c_back(x) - c_there(x - shift); a further shift d changes it by slope d.
-        further = -float((slope * away).sum() / (slope**2).sum())
+        away, slope, other = away[near], slope[near], other[near]
+        # away = c_back(x) - c_there(x - shift); a further shift d changes it by slope d. The slope of the backward pass
+        # is an instrumental variable: errors of the slope and of the value of the forward pass are correlated.
+        further = -float((other * away).sum() / (other * slope).sum())
         shift += further
         if abs(further) < 1e-6:
             break
-    std = _GRAIN * float(np.std(away)) / float(np.sqrt((slope**2).sum()))
+    std = _GRAIN * float(np.std(away)) * float(np.sqrt((other**2).sum()) / (other * slope).sum())
     return Latency(shift / (2 * speed), std / (2 * speed))
 
 
-def _cost(surface: "_Surface", position: np.ndarray, seen: np.ndarray, shift: float) -> tuple[float, float]:
+def _cost(surface: "_Surface", backward: "_Surface", shift: float) -> tuple[float, float]:
     """Return the mean capped distance, px, of the backward pass at a shift, and the sum of squared slopes."""
-    away, slope = surface.evaluate(position - shift, seen)
+    away, slope, _ = surface.compare(backward, shift)
     if len(away) < _FEWEST:
         return np.inf, 0.0
     return float(np.mean(np.minimum(np.abs(away), _FAR_PX))), float((slope**2).sum())
@@ -135,11 +136,13 @@ class _Surface:
         """Median distance between frames, mm."""
         return float(np.median(np.diff(self.position)))
 
-    def evaluate(self, places: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distances (K,), px, of centres ``seen`` (M, L) at places (M,), and slopes (K,), px/mm.
+    def compare(self, other: "_Surface", shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Compare the centres of another pass at x with those of this pass at x - shift.
 
-        Only places between two visible neighbours are returned.
+        Returns the distances (K,), px, and the slopes (K,) of this and of the other pass, px/mm. Only places between
+        two visible neighbours are returned.
         """
+        places = other.position - shift
         left = np.clip(np.searchsorted(self.position, places) - 1, 0, len(self.position) - 2)
         gap = self.position[left + 1] - self.position[left]
         t = ((places - self.position[left]) / gap)[:, None]
@@ -147,6 +150,6 @@ class _Surface:
         a, b, da, db = self.centre[left], self.centre[left + 1], self.slope[left] * h, self.slope[left + 1] * h
         value = a + t * da + t**2 * (3 * (b - a) - 2 * da - db) + t**3 * (2 * (a - b) + da + db)
         slope = (da + 2 * t * (3 * (b - a) - 2 * da - db) + 3 * t**2 * (2 * (a - b) + da + db)) / h
-        away = seen - value
-        good = np.isfinite(away) & ((t >= 0) & (t <= 1))
-        return away[good], slope[good]
+        away = other.centre - value
+        good = np.isfinite(away) & np.isfinite(other.slope) & ((t >= 0) & (t <= 1))
+        return away[good], slope[good], other.slope[good]

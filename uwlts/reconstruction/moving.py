@@ -1,8 +1,8 @@
 """Scans from a moving platform: sensor poses from a mount and a trajectory, and their uncertainty.
 
 Pose errors move all points of an image together. They may be independent between images. Navigation errors, however,
-are correlated along the path. The correlation of a filter's errors before and after a time step or an update is the
-square root of the ratio of the smaller to the larger variance. A prediction adds independent noise; for an update,
+are correlated along the path. A filter's errors before and after a time step or an update have a correlation. It is
+the square root of the ratio of the smaller to the larger variance. A prediction adds independent noise; for an update,
 Cov(e+, e-) = P+ (J. A. Farrell, Aided Navigation, 2008, section 5.4). Over many steps the correlation is the product.
 The correlation of any two times therefore follows from the stated covariances.
 """
@@ -67,7 +67,18 @@ def find_platform_poses(
     clock_offset_s: float | None,
     clock_drift_ppm: float = 0.0,
 ) -> PlatformPoses:
-    """Return the poses of the platform at all images, from the trajectory or from the capture.
+    """Return the poses of the platform at all images.
+
+    Parameters
+    ----------
+    capture
+        Capture of the moving sensor.
+    trajectory
+        Trajectory of the platform; None: the poses stored in the capture.
+    mount
+        Mount, which may state the scale of a robot's lengths.
+    clock_offset_s, clock_drift_ppm
+        Lead of the platform's clock at the first laser image, by default that of the mount, and its drift.
 
     Raises
     ------

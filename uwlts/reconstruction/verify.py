@@ -108,8 +108,8 @@ def verify(
     Raises
     ------
     EvaluationError
-        The capture names no artefact with a calibrated size or does not show it, or there is neither a limit nor a
-        joint calibration, which states the uncertainty of the measurement.
+        The capture names no artefact with a calibrated size, or does not show it. There is neither a limit nor a joint
+        calibration, which states the uncertainty of the measurement.
     RangeError
         The limit is not positive.
     CalibrationError, CaptureError

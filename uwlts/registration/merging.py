@@ -11,7 +11,7 @@ from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, NO_INDEX, PointCloud, 
 
 _BLOCK = 50_000
 _LEFT_OUT = 1e-4
-"""Largest fraction of the patterns' total variance that omitted patterns may hold; 1 % of the rms shift."""
+"""Largest fraction of the patterns' total variance in omitted patterns; it is 1 % of the rms shift."""
 
 
 def merge_clouds(

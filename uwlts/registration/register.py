@@ -46,7 +46,7 @@ _ROUNDED = 1e-6
 _PART = 0.1
 """Least component of a scan in an undetermined direction, relative to the largest, that is reported."""
 _NO_TURN = 0.05
-"""Share of a motion's rms shift caused by its rotation, below which the motion counts as a pure translation."""
+"""Smallest fraction of a motion's rms shift by rotation; below it, the motion counts as a pure translation."""
 
 
 @dataclass(frozen=True)

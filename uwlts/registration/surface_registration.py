@@ -250,9 +250,20 @@ def register_to_surface(
 def shape_registration(
     points_mm: np.ndarray, near: Nearest, *, sized: bool, uncertainty: PointUncertainty | None, frame: np.ndarray | None
 ) -> Registration:
-    """Return the uncertainty of a shape that was fitted to points (N, 3) by least squares, as a zero registration.
+    """Return the uncertainty of a shape that was fitted to points by least squares, as a zero registration.
 
-    With ``sized``, the radius was fitted too.
+    Parameters
+    ----------
+    points_mm : (N, 3)
+        Points to which the shape was fitted.
+    near
+        Distances of the points from the shape, and its normals.
+    sized
+        True if the radius was fitted too.
+    uncertainty
+        Uncertainty of the points; None if unknown.
+    frame : (N,) or None
+        Image of each point.
     """
     middle = points_mm.mean(axis=0)
     by = _motion_derivatives(points_mm, near.normals, middle, sized=sized)

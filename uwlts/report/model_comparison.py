@@ -169,7 +169,7 @@ def write_models(path: str | Path, comparison: Comparison, *, overwrite: bool = 
         A file exists and ``overwrite`` is not given, or cannot be written.
     """
     content = make_content(comparison)
-    write_page(path, models_page(content), beside=json_text(content, indent=2, ascii=False), overwrite=overwrite)
+    write_page(path, models_page(content), beside=json_text(content, indent=2, only_ascii=False), overwrite=overwrite)
 
 
 def models_page(content: ModelComparisonContent) -> str:

@@ -480,7 +480,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: Residu
 def window_curves(
     calibrations: Mapping[str, Calibration], ax: Axes | None = None, *, true_mm: float | None = None
 ) -> Axes:
-    """Draw the step height error over the tried window distance, for all calibrations (by name) that contain it.
+    """Draw the step height error against the tried window distance, for all calibrations (by name) that contain it.
 
     A diamond marks each estimate, and a dashed line the true distance, if given.
 

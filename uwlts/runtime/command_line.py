@@ -62,9 +62,20 @@ def command_from(
     """Make a command from a public function of a package; the decorated function is the body and names the command.
 
     The body takes a `Call`, and the command's additional options as parameters. Parameters without an annotation are
-    taken from the function, or from one of the functions ``also``, with default and description. The function is
-    imported when the command is run or its own help is shown. ``summary`` replaces the prose of the function's
-    docstring.
+    taken from ``function`` or ``also``, with default and description.
+
+    Parameters
+    ----------
+    app
+        Program that gets the command.
+    package, function
+        Package and name of the public function. It is imported when the command is run or its own help is shown.
+    also
+        Further functions (package, name) whose parameters the body may have.
+    shortcuts
+        Annotations of options, by the names of parameters.
+    summary
+        Replacement of the prose of the function's docstring in the help.
     """
 
     def register(body: Callable[..., None]) -> DerivedCommand:

@@ -16,14 +16,14 @@ from uwlts.model.polynomial_calibration import (
 class _Known(TypedDict):
     """Properties that identify a file of calibrations."""
 
-    format: str
+    file_format: str
     version: int
     called: str
 
 
-_CALIBRATION: _Known = {"format": FORMAT, "version": VERSION, "called": "calibration"}
+_CALIBRATION: _Known = {"file_format": FORMAT, "version": VERSION, "called": "calibration"}
 _POLYNOMIALS: _Known = {
-    "format": POLYNOMIALS_FORMAT,
+    "file_format": POLYNOMIALS_FORMAT,
     "version": POLYNOMIALS_VERSION,
     "called": "polynomial calibration",
 }

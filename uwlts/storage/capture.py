@@ -211,7 +211,7 @@ class Capture(AbstractContextManager["Capture"]):
         except DAMAGE as error:
             raise CaptureError(f"{self.path} is not a capture, or is truncated: {_what_is_wrong(error)}") from error
         try:
-            self.header = read_label(self.file, CaptureHeader, path=self.path, format=FORMAT, version=VERSION)
+            self.header = read_label(self.file, CaptureHeader, path=self.path, file_format=FORMAT, version=VERSION)
             self._read_frames(unfinished=unfinished)
         except DAMAGE as error:
             self.file.close()
@@ -275,7 +275,7 @@ class Capture(AbstractContextManager["Capture"]):
             self.pose_covariance = covariances
         finite = np.isfinite(self.pose).reshape(self._count, 16)
         if (finite.any(axis=1) != finite.all(axis=1)).any():
-            raise CaptureError(f"{self.path} holds poses of which only some elements are known")
+            raise CaptureError(f"{self.path} holds poses with only some of their elements")
         if not is_rigid(self.pose[finite.all(axis=1)], within=POSE_ROUNDED):
             raise CaptureError(f"{self.path} holds poses that are no rotation with a shift")
         if (self.exposure_ms < 0).any():
@@ -312,7 +312,7 @@ class Capture(AbstractContextManager["Capture"]):
 
     @property
     def finished(self) -> bool:
-        """Whether the recording was finished, rather than interrupted."""
+        """True if the recording was finished, false if it was interrupted."""
         return self.path.suffix != ".part"
 
     def plan(self) -> Table | None:

@@ -134,7 +134,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         try:
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 self._claim_space()
-                write_label(self._file, format=FORMAT, version=self._version(), header=self.header)
+                write_label(self._file, file_format=FORMAT, version=self._version(), header=self.header)
                 if self._plan is not None:
                     write_plan(self._file, self._plan)
                 # The checksum detects damage that would otherwise be decompressed to another image.
@@ -183,8 +183,8 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             The frame has another size or type than the capture, or is an image with the laser on in a capture of centre
             lines.
         CaptureError
-            Stage position, exposure, time or pose is not finite, the exposure is negative, the time is before that of
-            the last frame, or the pose is not a rotation with a shift (4, 4).
+            Stage position, exposure, time or pose is not finite, or the exposure is negative. The time is before that
+            of the last frame. The pose is not a rotation with a shift (4, 4).
         OutputError
             Writing fails; earlier frames are kept.
         """

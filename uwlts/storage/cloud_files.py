@@ -78,9 +78,9 @@ def write_cloud(
     - ``.ply``, ``.h5``: mm, with all attributes. In HDF5 the datasets have the names in `PointCloud` and
       `PointUncertainty`, plus systematic_mm2 (N, 6). In PLY, binary and little-endian, the vertex properties are x, y,
       z (double), intensity, deviation (float), frame, line (int), and optionally time (double, s). If the uncertainty
-      is known, further properties are the covariances in mm2, random_xx to random_zz and systematic_xx to
-      systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on, and optionally pose0_x to
-      pose5_z (`PointUncertainty`). The metadata is JSON in numbered comments that every reader accepts.
+      is known (`PointUncertainty`), there are the covariances random_xx to random_zz and systematic_xx to systematic_zz
+      in mm2. Shared errors in mm are position_x to position_z, pattern0_x, pattern0_y and so on, and optionally pose0_x
+      to pose5_z. The metadata is JSON in numbered comments that every reader accepts.
     - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan if unknown) of every point, with all
       digits.
     - ``.laz``, ``.las``: LAS 1.4, point format 6, or 7 with colours, metres in steps of 1e-7 m. The standard intensity
@@ -100,8 +100,8 @@ def write_cloud(
     Raises
     ------
     OutputError
-        The ending is unknown, the file exists and `overwrite` is not set, the folder is missing, the disk is full, or
-        the format cannot hold such a cloud or colours.
+        The ending is unknown, or the format cannot hold such a cloud or colours. The file exists and `overwrite` is not
+        set, the folder is missing, or the disk is full.
     SetupError
         The format's library is not installed.
     """
@@ -304,7 +304,7 @@ def _with_shared(cloud: PointCloud) -> Table:
 
 
 def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Table, PointUncertainty | None]:
-    """Separate metadata from shared errors; raises CaptureError if the latter do not match the uncertainty."""
+    """Separate metadata from shared errors; raises CaptureError if the errors do not match the uncertainty."""
     if _SHARED not in metadata:
         return metadata, known
     rest = {name: each for name, each in metadata.items() if name != _SHARED}
@@ -458,7 +458,7 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     # Written in memory first: HDF5 does not survive a full disk.
     content = BytesIO()
     with h5py.File(content, "w", libver="latest") as file:
-        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
+        write_label(file, file_format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
         for name, data in arrays.items():
             file.create_dataset(name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True)
     with write_atomically(path, overwrite=overwrite) as aside:
@@ -470,7 +470,7 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     names = _UNCERTAINTY
     try:
         with h5py.File(path, "r") as file:
-            header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
+            header = read_label(file, _CloudHeader, path=path, file_format=FORMAT, version=VERSION)
             points = find_dataset(file, "points_mm", path=path)
             total = 0 if points is None or not points.ndim else len(points)
             chosen = rows(total)

@@ -33,13 +33,32 @@ def write_e57(
     time_s: np.ndarray | None = None,
     further: dict[str, np.ndarray] | None = None,
 ) -> None:
-    """Write points (N, 3), columns (N,) by their names in the standard, times (N,) and further fields as one scan.
+    """Write points as one scan.
 
     Coordinates and real numbers have 32 bits, times 64. A time is the sum of ``acquisitionStart``, the whole second
-    before all of them, and a positive ``timeStamp``. Further fields are ``uwlts:NAME``. ``to`` is the final name of the
-    file.
+    before all of them, and a positive ``timeStamp``.
 
-    Raises OutputError if writing fails; SetupError if pye57 is not installed.
+    Parameters
+    ----------
+    path
+        File to write.
+    points_mm : (N, 3)
+        Points.
+    columns
+        Columns (N,) by their names in the standard.
+    to
+        Final name of the file.
+    time_s : (N,), optional
+        Times of the points.
+    further
+        Further fields (N,), stored as ``uwlts:NAME``.
+
+    Raises
+    ------
+    OutputError
+        Writing fails.
+    SetupError
+        pye57 is not installed.
     """
     pye57 = load_library("pye57", "E57")
     lib = pye57.libe57

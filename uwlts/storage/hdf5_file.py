@@ -33,19 +33,40 @@ _LARGEST_CHUNK = 2**23
 """Largest chunk in bytes, which is read as a whole. HDF5 makes chunks of up to 1 MiB, the program smaller ones."""
 
 
-def write_label(file: h5py.File, *, format: str, version: int, header: Description) -> None:
+def write_label(file: h5py.File, *, file_format: str, version: int, header: Description) -> None:
     """Label a file that is open for writing."""
-    file.attrs["format"] = np.bytes_(format.encode())
+    file.attrs["format"] = np.bytes_(file_format.encode())
     file.attrs["version"] = version
     file.attrs["header"] = np.bytes_(header.model_dump_json().encode())
 
 
-def read_label(file: h5py.File, model: type[AnyHeader], *, path: str | Path, format: str, version: int) -> AnyHeader:
-    """Return the header of a file; raises CaptureError if the file is foreign, newer or damaged."""
+def read_label(
+    file: h5py.File, model: type[AnyHeader], *, path: str | Path, file_format: str, version: int
+) -> AnyHeader:
+    """Return the header of a file.
+
+    Parameters
+    ----------
+    file
+        Open file.
+    model
+        Type of the header.
+    path
+        Name of the file in messages.
+    file_format
+        Expected format.
+    version
+        Newest version that can be read.
+
+    Raises
+    ------
+    CaptureError
+        The file is foreign, newer or damaged.
+    """
     found = _text(file, "format")
-    if found != format:
+    if found != file_format:
         called = "it has no format" if found is None else f"its format is {found!r}"
-        raise CaptureError(f"{path} is HDF5, but not what is expected here: {called}, expected '{format}'")
+        raise CaptureError(f"{path} is HDF5, but not what is expected here: {called}, expected '{file_format}'")
     number = _number(file, "version")
     if number is None or number < 1:
         found = "no number" if number is None else number

@@ -40,8 +40,20 @@ def encode_las(
 ) -> bytes:
     """Return the content of a LAS or LAZ file.
 
-    ``points_mm`` is (N, 3), ``intensity``, the ``fields`` and ``time_s`` are (N,), and ``colours`` is red, green and
-    blue (N, 3) uint8.
+    Parameters
+    ----------
+    points_mm : (N, 3)
+        Points.
+    intensity : (N,)
+        Intensities; stored as integers of 16 bits.
+    fields
+        Extra fields (N,) by name.
+    time_s : (N,), optional
+        Times of the points.
+    colours : (N, 3) uint8, optional
+        Red, green and blue.
+    compressed
+        Make a LAZ file.
     """
     laspy = load_library("laspy", "LAZ" if compressed else "LAS")
     if compressed:
@@ -129,9 +141,9 @@ def unwanted_points(found: Any) -> dict[str, np.ndarray]:
     }
 
 
-def load_library(name: Literal["laspy", "lazrs", "copclib", "pye57"], format: str) -> ModuleType:
+def load_library(name: Literal["laspy", "lazrs", "copclib", "pye57"], file_format: str) -> ModuleType:
     """Import a library for clouds; raises SetupError if it is not installed."""
-    return optional_library(name, needed_by=format, extra="clouds", instead=", or write PLY or XYZ")
+    return optional_library(name, needed_by=file_format, extra="clouds", instead=", or write PLY or XYZ")
 
 
 def shorten_error(error: BaseException) -> str:

@@ -96,8 +96,8 @@ class SurfaceMesh(Brief):
         Raises
         ------
         OutputError
-            The ending is unknown, the file exists and ``overwrite`` is not set, the mesh is too far from the origin for
-            STL, or the file cannot be written.
+            The ending is unknown, or the mesh is too far from the origin for STL. The file exists and ``overwrite`` is
+            not set, or it cannot be written.
         """
         path = Path(path)
         match path.suffix.lower():

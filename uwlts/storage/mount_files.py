@@ -73,7 +73,7 @@ def read_mount_evidence(
     profiles: str | Path | Sequence[np.ndarray],
     poses: str | Path | np.ndarray | None,
     *,
-    artefact: Artefact,
+    artefact: Artefact | None,
     radius_mm: float | None,
     height_mm: float | None,
     pose_format: str,
@@ -85,25 +85,74 @@ def read_mount_evidence(
     profile_times_s: np.ndarray | None,
     pose_times_s: np.ndarray | None,
 ) -> MountEvidence:
-    """Read and check profiles and poses from arrays or files; raises DescriptionError if they do not match."""
+    """Read and check profiles and poses from arrays or files.
+
+    Parameters
+    ----------
+    profiles
+        Folder, CSV file or TOML description of the profiles, or arrays.
+    poses
+        File or array of the platform's poses; None with a TOML description.
+    artefact
+        Kind of the artefact.
+    radius_mm, height_mm
+        Known size of the artefact.
+    pose_format
+        Format of the poses (`read_poses`).
+    profile_unit, pose_unit
+        Units of files without a unit in the names of their columns.
+    axis
+        Direction of the sensor's frame nearest to the axis of a rotary table.
+    scale, time
+        Estimate the scale of the robot's lengths, and the offset of its clock.
+    profile_times_s, pose_times_s : (N,), optional
+        Times of profiles and poses, if these are arrays.
+
+    Raises
+    ------
+    DescriptionError
+        Profiles and poses do not match, or one of them is not valid.
+    """
     digests: dict[str, str] = {}
     names: list[str] | None = None
     if isinstance(profiles, str | Path) and Path(profiles).suffix == ".toml":
         path = Path(profiles)
         if poses is not None:
             raise DescriptionError(f"{path} names the poses already: leave the other ones out")
+        options = {
+            "artefact": artefact,
+            "radius_mm": radius_mm,
+            "height_mm": height_mm,
+            "pose_format": None if pose_format == "matrix" else pose_format,
+            "profile_unit": profile_unit,
+            "pose_unit": pose_unit,
+            "axis": axis,
+            "scale": scale or None,
+            "time": time or None,
+        }
+        if beside := [name for name, value in options.items() if value is not None]:
+            raise DescriptionError(
+                f"{path} describes the artefact, the formats and the unknowns: leave out "
+                f"{', '.join(f'`{name}`' for name in beside)}, or change the file"
+            )
         given = validate_description(MountDescription, read_table(path), path)
         profiles, poses = path.parent / given.profiles, path.parent / given.poses
         artefact, radius_mm, height_mm = given.artefact, given.radius_mm, given.height_mm
         pose_format = given.pose_format
         profile_unit, pose_unit, scale, time = given.profile_unit, given.pose_unit, given.scale, given.time
         axis = given.axis
+    artefact = artefact or "sphere"
     if artefact not in get_args(Artefact):
         raise DescriptionError(f"the artefact is {artefact!r}; expected one of {', '.join(get_args(Artefact))}")
     for name, size in (("radius", radius_mm), ("height", height_mm)):
         if size is not None and not (np.isfinite(size) and size > 0 and _SIZES.get(artefact) == name):
             kinds = " or ".join(kind for kind, own in _SIZES.items() if own == name)
             raise DescriptionError(f"{name}_mm is {size:g} for a {artefact}; expected the positive {name} of a {kinds}")
+    if artefact == "ring" and radius_mm is None:
+        raise DescriptionError(
+            "the radius of the ring is missing: give `radius_mm`, that of the wall which the sheet meets. From its "
+            "profiles alone it cannot be told from another wall"
+        )
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):
@@ -248,4 +297,4 @@ def _points_of(table: NumberTable, unit: Unit | None) -> np.ndarray:
 
 def read_mount(path: str | Path) -> Mount:
     """Read a mount; raises CaptureError if the file is missing, foreign, newer or damaged."""
-    return read_model(path, Mount, format=FORMAT, version=VERSION, called="mount")
+    return read_model(path, Mount, file_format=FORMAT, version=VERSION, called="mount")

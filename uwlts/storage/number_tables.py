@@ -59,7 +59,7 @@ _COMMENTS = (b"#", b"//", b"%", b"!")
 
 @dataclass(frozen=True, eq=False)
 class NumberTable:
-    """Columns (N,) by name, the units that their names state, and notes on doubtful readings.
+    """Columns (N,) by name, the units that their names state, and notes on uncertain readings.
 
     Times are in s. Other columns are in the unit that their name states.
     """

@@ -48,9 +48,11 @@ def read_poses(
     Names decide the order of columns where they say it: x, y, z; qw, qx, qy, qz; roll, pitch, yaw or rx, ry, rz. Units
     in names (``x_m``, ``yaw [deg]``) are obeyed; without them positions are in ``unit``, by default mm.
 
-    Raises DescriptionError if names or their units contradict the format or ``unit``, and for a wrong number of
-    columns, numbers that are not finite, matrices that are not rigid, quaternions that are not of unit length, and
-    angles in rad that look like degrees.
+    Raises
+    ------
+    DescriptionError
+        Names or their units contradict the format or ``unit``, or the number of columns is wrong. Numbers are not
+        finite, matrices not rigid, quaternions not of unit length, or angles in rad look like degrees.
     """
     table = read_number_table(Path(path), digests, named=False)
     return _poses(table, pose_format, unit)
@@ -59,8 +61,8 @@ def read_poses(
 def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None) -> Trajectory:
     """Read the trajectory of a platform from a file like that of `read_poses`, with a column ``time_s``.
 
-    With the format ``tum``, of the RGB-D benchmark of TU Munich, each line has the time in s, the position in m and the
-    quaternion x y z w, separated by blanks and without names. Columns named ``cov_00`` to ``cov_55`` are the upper
+    The format ``tum`` is that of the RGB-D benchmark of TU Munich: each line has the time in s, the position in m and
+    the quaternion x y z w, separated by blanks and without names. Columns named ``cov_00`` to ``cov_55`` are the upper
     triangles of the covariances (`Trajectory`), in the unit of the positions and rad. With the format ``ros`` the file
     is a bag of ROS 1 or ROS 2; ``ros:/TOPIC`` or ``ros:PARENT>CHILD`` names the poses or transforms in it
     (`uwlts.storage.ros_bags`).

@@ -72,7 +72,7 @@ def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrit
     """Write a truth file completely or not at all; raises OutputError if that fails."""
     # HDF5's latest format protects all its metadata by checksums.
     with write_atomically(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
-        write_label(file, format=FORMAT, version=VERSION, header=header)
+        write_label(file, file_format=FORMAT, version=VERSION, header=header)
         for name, values in vars(truth).items():
             if values is None:
                 continue
@@ -84,7 +84,7 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     require_regular_file(path, called="truth file")
     try:
         with h5py.File(path, "r") as file:
-            header = read_label(file, TruthHeader, path=path, format=FORMAT, version=VERSION)
+            header = read_label(file, TruthHeader, path=path, file_format=FORMAT, version=VERSION)
             pose = _array(file, _POSE, path, dimensions=3) if _POSE in file else None
             truth = Truth(**{name: _array(file, name, path) for name in _DIMENSIONS}, pose=pose)
     except DAMAGE as error:

@@ -63,7 +63,7 @@ class _ClosedView(io.FileIO):
         return super().seek(offset + self._end) if whence == os.SEEK_END else super().seek(offset, whence)
 
     def readinto(self, buffer: "Buffer", /) -> int:
-        """Read with the corrected superblock instead of the stored one, and zeros where nothing is written yet."""
+        """Read bytes; the superblock is the corrected one, and bytes that are not written yet are zero."""
         place, position = memoryview(buffer).cast("B"), self.tell()
         count = super().readinto(place)
         place[count:] = bytes(len(place) - count)

@@ -138,8 +138,8 @@ def fuse_exposures(
 ) -> tuple[np.ndarray, float]:
     """Fuse K images (H, W) of one place, and return the float32 image and its grey value of saturation.
 
-    ``exposure_ms`` (K,) is increasing. A pixel with grey value y at exposure t corresponds to o + (y - o) T / t at the
-    longest exposure T, where o is the grey value without light.
+    ``exposure_ms`` (K,) is increasing. Let o be the grey value without light. A pixel with grey value y at exposure t
+    corresponds to o + (y - o) T / t at the longest exposure T.
 
     The pixels are averaged with the weights t^2, which are optimal for the constant noise of faint pixels (Robertson,
     Borman and Stevenson, "Dynamic range improvement through multiple exposures", ICIP 1999, eq. 7). The weight falls to

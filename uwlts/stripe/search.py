@@ -161,9 +161,20 @@ def search_all(
 def mark_rivals(
     profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, known: np.ndarray, rules: SearchRules
 ) -> np.ndarray:
-    """Return a mask (M,) of the lines that have a block of high contrast left in the board ``left``.
+    """Return a mask (M,) of the lines that have a block of high contrast left.
 
-    Spikes are ignored. Lines with ``known`` (M,) rivals are not examined.
+    Parameters
+    ----------
+    profiles : (N, L)
+        Grey values of all lines.
+    left : (N, B + 2 MARGIN)
+        Contrasts of the remaining blocks of all lines; spikes are ignored.
+    lines : (M,)
+        Profile lines to examine.
+    known : (M,)
+        Lines that are marked already and not examined.
+    rules
+        Rules of the search.
     """
     found = known.copy()
     _mark_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)

@@ -9,10 +9,20 @@ from pkgutil import iter_modules
 
 from uwlts.targets.charuco import CharucoTarget
 from uwlts.targets.chessboard import ChessboardTarget
+from uwlts.targets.circle_grid import CircleGridTarget
 from uwlts.targets.circles import CircleTarget
 from uwlts.targets.target import Patch, Target, TargetView, parse_target
 
-__all__ = ["CharucoTarget", "ChessboardTarget", "CircleTarget", "Patch", "Target", "TargetView", "parse_target"]
+__all__ = [
+    "CharucoTarget",
+    "ChessboardTarget",
+    "CircleGridTarget",
+    "CircleTarget",
+    "Patch",
+    "Target",
+    "TargetView",
+    "parse_target",
+]
 
 for _module in iter_modules(__path__):
     if not _module.ispkg:

@@ -1,6 +1,6 @@
 """The circle target: a lattice of circles, numbered from three circles with a dot."""
 
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -8,6 +8,9 @@ from pydantic import Field, model_validator
 from uwlts.errors import TargetError
 from uwlts.model.sensor import Positive
 from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
+
+if TYPE_CHECKING:
+    from uwlts.targets.detection import Ellipses
 
 Place = tuple[int, int]
 
@@ -93,8 +96,8 @@ class CircleTarget(Target):
 
     def patches(self) -> list[Patch]:
         dots = self.points_at(np.array(self.marked()))
-        return [_disc(point, self.diameter_mm) for point in self.points_mm] + [
-            _disc(point, self.marker_diameter_mm, ink=False) for point in dots
+        return [disc(point, self.diameter_mm) for point in self.points_mm] + [
+            disc(point, self.marker_diameter_mm, ink=False) for point in dots
         ]
 
     def detect(self, image: np.ndarray) -> TargetView:
@@ -119,23 +122,28 @@ class CircleTarget(Target):
                 f"found circles from place ({low[0]}, {low[1]}) to ({high[0]}, {high[1]}), {outside} of {len(indices)} "
                 f"outside the described {self.columns} x {self.rows}; {advice}"
             )
-        circles, indices = circles[inside], indices[inside]
-        order = np.lexsort((indices[:, 0], indices[:, 1]))
-        circles, indices = circles[order], indices[order]
-        return TargetView(
-            pixels=circles.centres,
-            points_mm=self.points_at(indices),
-            indices=indices,
-            quality={
-                "residual_px": circles.residual_px,
-                "contrast": circles.contrast,
-                "sharpness": circles.sharpness,
-                "radius_px": np.sqrt(np.linalg.det(circles.shapes)),
-            },
-        )
+        return collect_circles(self, circles[inside], indices[inside])
 
 
-def _disc(point: np.ndarray, diameter_mm: float, *, ink: bool = True) -> Patch:
+def collect_circles(target: Target, circles: "Ellipses", indices: np.ndarray) -> TargetView:
+    """Return the view of a target from the images (N) of its circles and their indices (N, 2), sorted by row."""
+    order = np.lexsort((indices[:, 0], indices[:, 1]))
+    circles, indices = circles[order], indices[order]
+    return TargetView(
+        pixels=circles.centres,
+        points_mm=target.points_at(indices),
+        indices=indices,
+        quality={
+            "residual_px": circles.residual_px,
+            "contrast": circles.contrast,
+            "sharpness": circles.sharpness,
+            "radius_px": np.sqrt(np.linalg.det(circles.shapes)),
+        },
+    )
+
+
+def disc(point: np.ndarray, diameter_mm: float, *, ink: bool = True) -> Patch:
+    """Return the print of a circle at a point (3,) of the target."""
     (x, y), radius = point[:2].tolist(), diameter_mm / 2
     return Patch(x - radius, y - radius, x + radius, y + radius, round=True, ink=ink)
 

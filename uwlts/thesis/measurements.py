@@ -91,7 +91,7 @@ def _calibrate_polynomials(target: Path) -> PolynomialCalibration:
 
 _SIZE_PX = 5
 _SEARCHED_PX = 8
-"""Half width of the search for the peak about the stripe's position."""
+"""Half width of the window around the stripe in which its peak is searched."""
 
 
 def thesis_stripes(

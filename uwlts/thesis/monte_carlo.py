@@ -1,9 +1,9 @@
 """Uncertainty of the sphere spacing by propagation of distributions through the whole pipeline (JCGM 101:2008).
 
-Each trial draws every input of the calibration and of the measurement from its known distribution, calibrates camera,
-sheet and window again, reconstructs the spheres and measures their spacing. The inputs are perturbed about the observed
-values: circle centres, stripes, stage positions, the target's lattice, its tilt and bow, the step's height, the
-window's tilt and the water's index. The sheet's bow is not included: the model has a plane.
+Each trial draws every input of the calibration and of the measurement from its known distribution. It calibrates
+camera, sheet and window again, reconstructs the spheres and measures their spacing. The inputs are perturbed about the
+observed values: circle centres, stripes, stage positions, the target's lattice, its tilt and bow, the step's height,
+the window's tilt and the water's index. The sheet's bow is not included: the model has a plane.
 """
 
 from collections.abc import Callable, Mapping, Sequence

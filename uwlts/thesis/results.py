@@ -14,7 +14,7 @@ Points = list[tuple[float, float]]
 """Y and Z of points on a profile, mm."""
 
 JointMethod = Literal["joint_same_evidence", "joint_with_target_in_water", "joint_with_scans"]
-"""Joint calibrations by their evidence: that of the thesis's two methods, also the target in water, also scans."""
+"""Joint calibrations by their evidence: that of the thesis's two methods, with a target in water, with scans too."""
 
 Method = Literal["one_refraction", "two_refractions"] | JointMethod
 """Calibrations of the joint comparison."""

@@ -15,6 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.oracles import fermat
+from tests.oracles.drawings import equidistant
 from tests.virtual_sensors import (
     altered,
     camera_axes,
@@ -32,6 +33,7 @@ from twin.light.renderer import Renderer
 from twin.light.sheet import Sheet
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
+from uwlts.storage.import_.equidistant import convert_equidistant
 
 RAY_MM = 3e-4
 
@@ -158,6 +160,18 @@ def test_the_lens_inverts_opencvs_distortion(thesis, distortion):
     np.testing.assert_allclose(opencv_pixels(camera, rays), pixels, rtol=0, atol=1e-3)
     np.testing.assert_allclose(rays, opencv_directions(camera, pixels), rtol=0, atol=4e-7)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, rtol=0, atol=2e-7)
+
+
+def test_a_wide_equidistant_lens_is_followed_to_its_corners(thesis):
+    """Corners are 65 deg from the axis; the rays of the drawing share no formula with the rational model."""
+    focal, centre = 720.0, (639.5, 511.5)
+    distortion = convert_equidistant(np.zeros(4), corner=819.0 / focal, focal_px=focal, source="test").model_dump()
+    size_um = thesis.camera.pixel_size_um
+    changes = {"distortion": distortion, "focal_length_mm": 1e-3 * focal * size_um, "principal_point_px": centre}
+    camera, pixels = altered(thesis, {"camera": changes}).camera, image_points(thesis.camera)
+    rays = to_numpy(LensRays(camera).directions(to_jit(mi.Float, pixels[:, 0]), to_jit(mi.Float, pixels[:, 1])))
+    # 0.02 px by the conversion, of 720 px.
+    np.testing.assert_allclose(rays, equidistant(focal, centre)(pixels), rtol=0, atol=3e-5)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ def test_samples_are_even_along_every_axis_and_their_own_mirror_image(count: int
 
 @pytest.mark.parametrize("count", [3, 16, 17, 64])
 def test_samples_have_no_first_moment(count: int):
-    """Neither along the pixel nor along the pupil, nor any odd one of pixel and pupil together."""
+    """Odd moments of the coordinates in pixel and pupil vanish, single and combined."""
     points = make_lattice(count, 5) - 0.5
     for factors in ([0], [1], [2], [3], [4], [0, 1, 2], [0, 2, 3], [1, 1, 3]):
         assert abs(np.prod(points[factors], axis=0).mean()) < 1e-12, factors

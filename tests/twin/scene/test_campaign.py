@@ -78,8 +78,8 @@ def dumped(take: Take) -> dict[str, Any]:
 def assert_spread(values: Any, std: float) -> None:
     """Independent draws (N, ...) about 0 have a standard deviation.
 
-    That of N normal draws is itself uncertain by 1 / sqrt(2 N), their mean by 1 / sqrt(N) of it: 4.5 times either. Of
-    evenly spread draws both are known better.
+    For N normal draws it has the relative uncertainty 1 / sqrt(2 N), and the mean has 1 / sqrt(N): 4.5 times either.
+    For evenly spread draws both uncertainties are smaller.
     """
     values = np.ravel(values)
     assert len(values) >= SEEDS

@@ -154,6 +154,28 @@ def test_waves_have_their_height_and_die_out_below():
     assert 0.15 < below[:, 0].std() / surface[:, 0].std() < 0.4
 
 
+@pytest.mark.parametrize("heading_deg", [0.0, 120.0])
+def test_a_gyro_bias_bends_the_path_to_the_side_of_the_heading_error(heading_deg: float):
+    """A positive heading error rotates the velocity to the left: the position error is its integral."""
+    heading = np.radians(heading_deg)
+
+    def poses(times: np.ndarray) -> np.ndarray:
+        straight = np.tile(np.eye(4), (len(times), 1, 1))
+        straight[:, :2, 3] = 200 * times[:, None] * [np.cos(heading), np.sin(heading)]
+        return straight
+
+    navigation = Navigation(gyro_bias_deg_per_s=0.005)
+    drift = simulate_drift(navigation, poses, lead_s=1.0, lasting_s=100.0, rng=np.random.default_rng(1))
+    times, left = np.linspace(0, 100.0, 1001), np.array([-np.sin(heading), np.cos(heading)])
+    error, covariance = drift.errors(times), drift.covariance(times[-1:])[0]
+    aside = np.trapezoid(200 * error[:, 5], times)
+    assert abs(aside) > 1.0
+    np.testing.assert_allclose(error[-1, :2] - error[0, :2], aside * left, atol=0.02 * abs(aside))
+    cross = covariance[:2, 5]
+    np.testing.assert_allclose(cross, (cross @ left) * left, atol=1e-6 * abs(cross @ left))
+    assert cross @ left > 0
+
+
 @pytest.mark.slow
 def test_the_navigation_states_the_covariance_of_its_errors():
     """Chi-square of the errors of 200 vehicles after 100 s with the stated covariance, 6 degrees of freedom each.

@@ -17,12 +17,13 @@ from twin.recording.sensor_simulator import with_window
 from twin.scene.description import TargetPlate
 from twin.scene.finish import draw_print_errors, pattern_texture, register_pattern
 from uwlts.model.sensor import Sensor
-from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, Target
+from uwlts.targets import CharucoTarget, ChessboardTarget, CircleGridTarget, CircleTarget, Target
 
 BOARD = ChessboardTarget(columns=7, rows=6, square_mm=10.0)
 CHARUCO = CharucoTarget(columns=7, rows=6, square_mm=10.0, marker_mm=7.5)
 CIRCLES = CircleTarget(diameter_mm=5.0, marker_diameter_mm=2.0, columns=9, rows=8, origin=(3, 4))
-TARGETS = [BOARD, CHARUCO, CIRCLES]
+GRID = CircleGridTarget(columns=4, rows=7, pitch_mm=8.0, diameter_mm=6.0, asymmetric=True)
+TARGETS = [BOARD, CHARUCO, CIRCLES, GRID]
 GROUND, INK = 0.8, 0.1
 
 
@@ -113,7 +114,8 @@ def test_the_print_about_each_point_is_off_by_its_error(target):
         kind="target_plate", target=target, reflectance=GROUND, ink_reflectance=INK, centre_std_mm=0.3, errors_seed=2
     )
     rng = np.random.default_rng(1)
-    shifts = draw_print_errors(thing).reshape(-1, 2)
+    columns, rows = target.indices.T
+    shifts = draw_print_errors(thing)[rows, columns]
     assert len(shifts) == len(target.points_mm)
     # Within a third of the spacing no other point is nearer, and with the shift the print is that about the same point.
     beside = target.spacing_mm / 3 * (2 * rng.random((200, len(shifts), 2)) - 1)

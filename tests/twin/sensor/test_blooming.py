@@ -74,7 +74,7 @@ def test_charge_is_conserved_or_drained_never_made(seed, sources, share):
         assert (after_sum <= before_sum - (1 - share) * over + 2e-7 * before_sum).all()
         assert (after_sum >= np.minimum(image, FULL).sum(axis=0, dtype=float) * (1 - 2e-7)).all()
     assert after.max() <= FULL * (1 + 1e-6)
-    assert (after >= np.minimum(image, FULL) - 1e-3).all(), "no pixel gives away what it can hold"
+    assert (after >= np.minimum(image, FULL) - 1e-3).all(), "no pixel falls below its own charge up to the full well"
     mirrored = spread_blooming(image[::-1], full_well_e=FULL, share=share)[::-1]
     np.testing.assert_allclose(mirrored, after, rtol=1e-6, atol=1e-3)
 

@@ -56,7 +56,7 @@ def test_rates_walks_and_dead_reckoning_are_found_from_the_covariance(by_heading
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.3])
-def test_a_walk_is_told_from_a_rate_that_began_before(rate: float):
+def test_a_random_walk_is_distinguished_from_an_earlier_rate(rate: float):
     times = np.linspace(0, SECONDS, 200)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, 0, 3] = times
@@ -68,7 +68,7 @@ def test_a_walk_is_told_from_a_rate_that_began_before(rate: float):
     np.testing.assert_allclose(found.walk, SECONDS / grown[-1], rtol=0.01)
 
 
-def test_a_drift_that_is_given_states_its_size_alone():
+def test_a_given_drift_states_only_its_size():
     found = choose_drift_model(navigated(by_heading=True), 300.0, 1.0)
     assert not found.stated and not found.dead_reckoned
     np.testing.assert_allclose(found.std, np.repeat([300.0, np.radians(1.0)], 3))

@@ -1,5 +1,7 @@
 """Prior of a path correction, compared with drifts simulated step by step."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -12,18 +14,20 @@ STD = np.array([30.0, 20.0, 10.0, 0.01, 0.01, 0.02])
 WALK = np.array([0.2, 0.2, 1.0, 0.05, 0.05, 0.05])
 
 
-def straight_path() -> Trajectory:
-    """Along X."""
+def straight_path(towards: Sequence[float]) -> Trajectory:
+    """Along a horizontal direction (2,)."""
     times = np.linspace(0, SECONDS, 81)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
-    poses[:, 0, 3] = SPEED_MM_S * times
+    poses[:, :2, 3] = SPEED_MM_S * times[:, None] * np.asarray(towards)
     return Trajectory(times, poses)
 
 
-def prior_of(*, correlation: float = np.inf, dead_reckoned: bool = False) -> PathPrior:
+def prior_of(
+    *, correlation: float = np.inf, dead_reckoned: bool = False, towards: Sequence[float] = (0.6, 0.8)
+) -> PathPrior:
     """With 81 even nodes."""
     drift = DriftModel(STD, WALK, correlation, dead_reckoned, True)
-    return PathPrior.from_times(np.linspace(0, SECONDS, 41), drift, straight_path(), intervals=80)
+    return PathPrior.from_times(np.linspace(0, SECONDS, 41), drift, straight_path(towards), intervals=80)
 
 
 def covariance(prior: PathPrior, times_s: np.ndarray) -> np.ndarray:
@@ -74,16 +78,23 @@ def test_closer_nodes_keep_the_correction_and_are_no_more_than_wanted():
     np.testing.assert_allclose(by_basis, closer.evaluate(values, times), atol=1e-9)
 
 
-def test_a_heading_error_adds_to_a_dead_reckoned_position():
+@pytest.mark.parametrize("heading_deg", [0.0, 53.13, 200.0])
+def test_a_heading_error_adds_to_a_dead_reckoned_position(heading_deg: float):
+    """A positive heading error rotates the travelled path to its left, seen against Z."""
+    heading = np.radians(heading_deg)
+    towards, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     at = np.array([SECONDS])
-    with_, without = (covariance(prior_of(dead_reckoned=each), at)[:, 0, :, 0] for each in (True, False))
+    with_, without = (
+        covariance(prior_of(dead_reckoned=each, towards=tuple(towards)), at)[:, 0, :, 0] for each in (True, False)
+    )
     # A heading error that grows linearly to e shifts the end sideways by e / 2 of the way, and a walk by e / sqrt(3).
     way = SPEED_MM_S * SECONDS
     aside = STD[5] ** 2 * way**2 * ((1 - WALK[5]) / 4 + WALK[5] / 3)
-    np.testing.assert_allclose(with_[1, 1] - without[1, 1], aside, rtol=0.01)
+    np.testing.assert_allclose((with_ - without)[:2, :2], aside * np.outer(left, left), atol=0.01 * aside)
     # Covariance with the heading: one half of its variance, by either.
-    np.testing.assert_allclose(with_[1, 5], STD[5] ** 2 * way / 2, rtol=0.01)
-    np.testing.assert_allclose(with_[0], without[0], atol=1e-3)
+    both = STD[5] ** 2 * way / 2
+    np.testing.assert_allclose(with_[:2, 5], both * left, atol=0.01 * both)
+    np.testing.assert_allclose(with_[2:5, :5], without[2:5, :5], atol=1e-3)
 
 
 def test_the_root_is_one_of_the_covariance():

@@ -15,7 +15,7 @@ FULL = 255
 # The log
 
 
-def test_lines_are_numbered_and_told_once():
+def test_lines_are_numbered_and_sent_once():
     board = Board("test")
     assert board.lines() == []
     before = time.time()
@@ -62,7 +62,7 @@ def test_lines_of_several_threads_have_numbers_of_their_own():
 # Progress
 
 
-def test_the_time_that_is_left_follows_from_what_was_done():
+def test_the_remaining_time_follows_from_the_progress():
     board = Board("test")
     board.phase("recording")
     assert board.progress.phase == "recording" and board.progress.total is None and board.progress.left_s is None
@@ -76,7 +76,7 @@ def test_the_time_that_is_left_follows_from_what_was_done():
     assert 8 * 0.2 / 2 <= progress.left_s <= 8 * took / 2 + 1e-3
 
 
-def test_what_was_done_before_the_phase_does_not_count_for_its_pace():
+def test_progress_before_a_phase_does_not_count_for_its_pace():
     board = Board("test")
     board.phase("recording")
     began = time.monotonic()
@@ -109,7 +109,7 @@ def shown(image: np.ndarray, **options: object) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int)
 
 
-def test_a_picture_raises_what_is_dark():
+def test_dark_images_are_brightened():
     image = np.repeat(np.array([0, 16, 64, 255], np.uint8), 40)[None].repeat(40, axis=0)
     grey = shown(image)[20, 20::40]
     # The square root of the fraction of full scale; a JPEG is accurate to some grey values.
@@ -171,7 +171,7 @@ def test_the_histogram_counts_shares():
     assert picture.histogram[[0, 32, 63]].tolist() == [0.5, 0.25, 0.25]
 
 
-def test_showing_counts_pictures():
+def test_the_number_of_shown_pictures_is_counted():
     board, picture = Board("test"), Picture(np.zeros((8, 8), np.uint8), full_dn=FULL, caption="one")
     board.show(picture)
     board.show(picture)

@@ -59,7 +59,7 @@ def test_known_files_are_listed_the_latest_first(folder):
     assert [(file.kind, file.size, file.time_s) for file in files[:2]] == [("capture", 7, 2e9), ("cloud", 0, 1e9)]
 
 
-def test_labels_tell_what_names_do_not(folder):
+def test_labels_describe_files_beyond_their_names(folder):
     none = np.full(2, -1)
     write_cloud(folder / "wall.h5", PointCloud(np.zeros((2, 3)), np.ones(2), none, none, metadata={}))
     nominal("thesis", medium="air").save(folder / "polished.json")
@@ -83,7 +83,7 @@ def test_labels_tell_what_names_do_not(folder):
     assert {file.name: file.kind for file in list_files(folder)}["other.json"] == "evaluation"
 
 
-def test_what_cannot_be_opened_is_not_listed(folder):
+def test_files_that_cannot_be_opened_are_not_listed(folder):
     os.mkfifo(folder / "fifo.h5")
     (folder / "gone.h5").symlink_to(folder / "nothing")
     (folder / "loop.h5").symlink_to(folder / "loop.h5")

@@ -47,7 +47,7 @@ def test_every_nth_of_all_points_is_kept_in_order(at_most: int, sizes: list[int]
 
 
 @given(at_most=st.integers(1, 50), sizes=PIECES)
-def test_what_is_kept_does_not_depend_on_the_pieces(at_most: int, sizes: list[int]):
+def test_the_selection_does_not_depend_on_the_pieces(at_most: int, sizes: list[int]):
     whole = filled(at_most, [2 * (sum(sizes) // 2)])
     halves = filled(at_most, [2 * (size // 2) for size in sizes])
     if whole.total == halves.total:
@@ -70,7 +70,7 @@ def test_fields_stay_with_their_points(at_most: int, sizes: list[int]):
 
 
 @given(at_most=st.integers(1, 50), sizes=PIECES, far=st.sampled_from([0.0, 1e6, -3e7]))
-def test_what_is_packed_can_be_unpacked(at_most: int, sizes: list[int], far: float):
+def test_packed_points_are_unpacked_unchanged(at_most: int, sizes: list[int], far: float):
     cloud, total = ThinnedCloud(at_most), 0
     for size in sizes:
         piece = points(total, size) + [far, 0, -far]
@@ -88,7 +88,7 @@ def test_what_is_packed_can_be_unpacked(at_most: int, sizes: list[int], far: flo
 
 
 @given(at_most=st.integers(1, 50), sizes=PIECES, thinned_by=st.integers(1, 7))
-def test_points_that_stand_for_more_are_counted_as_what_they_stand_for(at_most: int, sizes: list[int], thinned_by: int):
+def test_points_count_as_many_as_they_represent(at_most: int, sizes: list[int], thinned_by: int):
     cloud, total = ThinnedCloud(at_most), 0
     for size in sizes:
         cloud.add(points(total, size), of=size * thinned_by)
@@ -102,7 +102,7 @@ def test_an_empty_cloud_is_packed_too():
     assert origin.tolist() == [0, 0, 0] and data == b""
 
 
-def test_clearing_begins_anew():
+def test_clearing_restarts():
     cloud = filled(10, [35])
     cloud.clear()
     assert (cloud.total, len(cloud.points()), cloud.version) == (0, 0, 2)
@@ -111,7 +111,7 @@ def test_clearing_begins_anew():
     assert cloud.points()[:, 0].tolist() in (list(range(10)), list(range(0, 10, 2)))
 
 
-def test_what_was_given_out_stays_as_it_was():
+def test_earlier_results_are_not_changed():
     cloud = filled(100, [20])
     before = cloud.points()
     before[:] = 0

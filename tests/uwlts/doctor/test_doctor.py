@@ -146,7 +146,7 @@ def test_a_library_that_ends_the_process_is_named_and_the_others_are_still_tried
     assert re.fullmatch(r"jinja2 \S+, tomli-w \S+", found["required libraries"].found)
 
 
-def test_a_missing_optional_library_is_a_warning_that_says_what_for():
+def test_a_missing_optional_library_is_a_warning_that_names_its_purpose():
     purposes = {"no-such-library-of-ours": "clouds as XYZ", "Pytest": "tests"}
     missing, there = libraries.examine_optional(purposes, requirements=["no-such-library-of-ours>=2", "pytest>=8"])
     assert missing.status == "warning" and missing.found == "not installed"
@@ -156,7 +156,7 @@ def test_a_missing_optional_library_is_a_warning_that_says_what_for():
     assert old.status == "warning" and ">=999 is needed" in old.found
 
 
-def test_a_libllvm_that_is_none_is_a_warning_with_the_command_that_gets_one(tmp_path, monkeypatch):
+def test_an_invalid_libllvm_gives_a_warning_with_the_install_command(tmp_path, monkeypatch):
     (tmp_path / "libLLVM.so").write_text("not a library")
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "libLLVM.so"))
     (finding,) = examine_renderer()

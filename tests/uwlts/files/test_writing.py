@@ -40,7 +40,7 @@ def interrupted_at(step: int, target: Path) -> bool:
     return False
 
 
-def test_an_interrupt_anywhere_leaves_the_whole_file_or_nothing(tmp_path):
+def test_an_interrupt_at_any_moment_leaves_a_complete_file_or_none(tmp_path):
     steps = whole = 0
     while interrupted_at(steps + 1, target := tmp_path / f"{steps}.txt"):
         steps += 1

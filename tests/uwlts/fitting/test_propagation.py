@@ -1,4 +1,4 @@
-"""Propagation of points' errors to figures: draws and patterns against the covariance of sums of the points."""
+"""Propagation of point errors to figures: draws and patterns against the covariance of sums over the points."""
 
 import numpy as np
 

@@ -114,7 +114,7 @@ def test_indices_without_their_media_are_noticed(written):
         read_original_estimate(calibration.model_copy(update={"media": ()}), WATER)
 
 
-def test_advice_is_given_where_the_stage_is_known_exactly(thesis):
+def test_advice_is_given_for_an_exactly_known_stage(thesis):
     exact = thesis.uncertainty.model_copy(update={"stage_scale": 0.0})
     calibration = calibrated(thesis.model_copy(update={"uncertainty": exact}))
     assert StageParameter.SCALE not in calibration.joint.parameters

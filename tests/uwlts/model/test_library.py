@@ -115,7 +115,7 @@ def test_cycles_are_reported_with_their_path(tmp_path: Path, ring: int):
     refused(tmp_path / "ring0.toml", *told)
 
 
-def test_cycle_by_detours(tmp_path: Path):
+def test_a_circle_of_bases_is_refused_despite_different_paths(tmp_path: Path):
     """Paths that differ in writing, not in meaning."""
     written(tmp_path / "a" / "one.toml", 'base = "../b/two"\n')
     written(tmp_path / "b" / "two.toml", 'base = "../a/one"\n')
@@ -172,13 +172,13 @@ def test_formula_out_of_its_range_names_the_file(tmp_path: Path):
     [b"name = ", b"[camera\n", b"\xff\xfe\x00", b"name = 'a'\nname = 'b'\n", b"\x89HDF\r\n\x1a\n", b"x=" + b"[" * 9999],
     ids=["half a line", "half a table", "not UTF-8", "twice", "HDF5", "nested deeply"],
 )
-def test_what_is_no_toml(tmp_path: Path, content: bytes):
+def test_invalid_toml_is_refused(tmp_path: Path, content: bytes):
     path = tmp_path / "a.toml"
     path.write_bytes(content)
     refused(path, "a.toml is not valid TOML")
 
 
-def test_model_name_is_given_in_words():
+def test_model_names_are_shown_as_words():
     class ReferenceValues(Medium):
         pass
 
@@ -212,7 +212,7 @@ def leaves(table: dict, way: tuple = ()) -> dict:
 
 @settings(deadline=None)
 @given(base=TABLE, changes=TABLE)
-def test_merging_keeps_every_change_and_touches_nothing_else(base: dict, changes: dict):
+def test_merging_applies_all_changes_and_nothing_else(base: dict, changes: dict):
     before = repr((base, changes))
     result = merge_tables(base, changes)
     assert repr((base, changes)) == before

@@ -52,7 +52,7 @@ def test_stations_are_as_petzold_measured_them(water, a, b):
         ("harbour", (0.34, 0.41), (1.3, 1.75)),
     ],
 )
-def test_stations_in_the_red_lie_among_what_other_exponents_give(water, a, b):
+def test_red_stations_lie_between_the_curves_of_other_exponents(water, a, b):
     absorption, scattering = per_metre(sea(water=water), 635.0)
     assert a[0] < absorption < a[1]
     assert b[0] < scattering < b[1]
@@ -144,7 +144,7 @@ def test_every_water_absorbs_and_scatters_over_the_whole_range(water):
         assert ((slope > -4.6) & (slope < -0.25)).all()
 
 
-def test_pure_water_is_what_water_is_unless_named():
+def test_water_without_a_name_is_pure():
     for wavelength in (400.0, 635.0, 700.0):
         assert per_metre(sea(water="pure"), wavelength) == per_metre(sea(), wavelength)
         assert per_metre(sea(turbidity=0.0), wavelength) == per_metre(sea(), wavelength)
@@ -191,7 +191,7 @@ def test_molecules_scatter_as_molecules_and_particles_as_the_phase_says():
         assert free.scatterers(635.0) == (Scatterer(2e-3, expected),)
 
 
-def test_given_coefficients_win():
+def test_given_coefficients_replace_those_of_the_named_water():
     medium = sea(water="harbour", absorption_per_m=0.5)
     assert per_metre(medium, 635.0) == (0.5, per_metre(sea(water="harbour"), 635.0)[1])
     medium = sea(turbidity=3.0, scattering_per_m=0.25)
@@ -253,7 +253,7 @@ def test_media_survive_storage(which, share):
         ({"backscatter_share": 0.2}, "backscatter_share"),
     ],
 )
-def test_what_does_not_go_together_is_refused(wrong, message):
+def test_contradictory_entries_are_refused(wrong, message):
     with pytest.raises(ValidationError, match=message):
         sea(**wrong)
 

@@ -77,7 +77,7 @@ def test_a_table_is_kept_for_the_next_places_of_the_same_function():
     assert table(1, "waves") is not first
 
 
-def test_where_the_wider_table_would_reach_too_far_it_is_for_the_places_alone():
+def test_a_table_that_would_reach_too_far_covers_only_the_given_places():
     def up_to_500(line, place):
         return np.where(place[:, None] <= 500.0, waves(line, place), np.nan)
 
@@ -101,7 +101,7 @@ def test_the_error_is_a_share_of_each_value_where_that_is_more():
     assert (np.abs(table.values(line, place) - large(line, place)).max(axis=0) <= [1.0, 1e-8]).all()
 
 
-def test_there_is_none_of_what_is_not_smooth_or_not_everywhere():
+def test_a_function_that_is_not_smooth_or_partly_undefined_has_no_table():
     def kinked(line, place):
         return np.abs(place - 400.3)[:, None]
 

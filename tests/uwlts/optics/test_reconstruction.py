@@ -177,7 +177,7 @@ def test_the_ray_of_a_projected_point_passes_through_it_at_any_angle(window, med
 
 @settings(deadline=None, max_examples=40)
 @given(windows, st.floats(0.9, 1.8), distortions, seeds)
-def test_a_traced_pixel_is_seen_again_at_its_place(window, medium_index, distortion, seed):
+def test_a_traced_pixel_projects_back_to_its_position(window, medium_index, distortion, seed):
     model, pixels = camera(distortion=distortion), whole_image(200, seed=seed)
     rays = trace_window(directions(model, pixels), window, medium_index=medium_index)
     ok = rays.status == RayStatus.OK

@@ -170,7 +170,7 @@ def test_errors_of_each_pose_move_its_image_s_points_together():
 
 
 @pytest.mark.parametrize("kind", ["random walk", "common", "Gauss-Markov"])
-def test_errors_along_a_path_are_as_alike_as_its_covariances_say(kind):
+def test_errors_along_a_path_are_correlated_as_its_covariances_state(kind):
     """Compare the length between the first and the last images with 4000 draws of errors along the path.
 
     Variances that grow with time mean a random walk. Shapes in time contain 99 % of its variance; the rest counts as

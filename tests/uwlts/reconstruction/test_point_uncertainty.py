@@ -330,13 +330,13 @@ def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, th
     np.testing.assert_allclose(found.T @ found, expected, rtol=1e-6, atol=1e-15)
 
 
-def test_a_sequential_calibration_has_none(calibration, thesis):
+def test_a_sequential_calibration_gives_no_uncertainty(calibration, thesis):
     without = calibration.model_copy(update={"joint": None})
     with pytest.raises(CalibrationError, match="calibrate jointly"):
         read_stored_estimate(without, thesis, MEDIUM)
 
 
-def test_what_blur_and_light_beside_the_sheet_leave_moves_all_points_together(calibration, stripes, thesis, tmp_path):
+def test_residual_shifts_by_blur_and_stray_light_are_common_to_all_points(calibration, stripes, thesis, tmp_path):
     frame, line, centre = stripes
     rng = np.random.default_rng(2)
     blur, beside = rng.normal(0, 0.05, len(line)), rng.normal(0, 0.01, (len(line), 3))
@@ -375,7 +375,7 @@ def test_water_does_not_drift_before_its_own_scan(calibration, stripes, thesis, 
     assert (free - tied > 0.06**2).all()
 
 
-def test_clouds_of_one_calibration_say_what_they_share(calibration, stripes, thesis, tmp_path):
+def test_clouds_of_one_calibration_state_their_shared_errors(calibration, stripes, thesis, tmp_path):
     """Covariance between points of two scans, by the parts that their patterns share, against drawn parameters.
 
     A covariance of 400 draws is right to 5 % of both standard deviations (one sigma): five of these.

@@ -136,7 +136,7 @@ def test_both_halves_make_the_whole(path):
     assert halves.rays_by_status == whole.rays_by_status
 
 
-def test_centres_from_elsewhere_are_what_is_reconstructed(path):
+def test_given_centres_are_reconstructed(path):
     with Capture(path) as capture:
         stripes = find_stripes(capture)
         moved = replace(stripes, centre_px=stripes.centre_px + 1.5)

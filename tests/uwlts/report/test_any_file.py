@@ -91,7 +91,7 @@ def test_a_saved_evaluation_is_read_as_its_record(tmp_path: Path):
     assert isinstance(record, EvaluationRecord) and record == evaluation.record()
 
 
-def test_what_cannot_be_read_is_said_with_what_can(tmp_path: Path):
+def test_an_unreadable_file_is_refused_with_the_readable_formats(tmp_path: Path):
     (tmp_path / "a.json").write_text('{"format": "uwlts-unknown", "version": 1}')
     (tmp_path / "a.txt").write_text("words")
     with h5py.File(tmp_path / "a.h5", "w") as file:

@@ -94,7 +94,7 @@ def test_a_changed_byte_is_found(calibration, path, content, tmp_path):
     assert "is not the calibration" in check_certificate(beside, other)[0]
 
 
-def test_what_is_no_certificate_is_refused(path, tmp_path):
+def test_a_file_that_is_no_certificate_is_refused(path, tmp_path):
     with pytest.raises(CaptureError, match="not a certificate"):
         read_certificate(path)
     newer = tmp_path / "newer.json"
@@ -238,7 +238,7 @@ def test_against_another_calibration(calibration, thesis):
         compare_calibrations(calibration, calibration.model_copy(update={"camera": small}), region)
 
 
-def test_the_page_holds_everything_and_asks_nothing_of_the_network(calibration, content, thesis):
+def test_the_certificate_is_complete_and_loads_nothing_from_the_network(calibration, content, thesis):
     page = certificate_page(content, calibration, before=("drawings", nominal_calibration(thesis)))
     for words in (
         "Uncertainty of lengths",
@@ -258,7 +258,7 @@ def test_the_page_holds_everything_and_asks_nothing_of_the_network(calibration, 
     assert len(text) > 10_000 and "nan" not in text.replace("nanometre", "")
 
 
-def test_without_a_joint_estimate_it_says_that_nothing_is_known(thesis, tmp_path):
+def test_a_certificate_without_a_joint_estimate_states_no_uncertainty(thesis, tmp_path):
     path = tmp_path / "nominal.json"
     nominal_calibration(thesis).save(path)
     known = read_calibration(path)

@@ -192,7 +192,7 @@ def page(campaign):
 # Gathering
 
 
-def test_files_find_what_belongs_to_them(campaign):
+def test_related_files_are_found_by_their_names(campaign):
     found = {m.name: m for m in campaign.measurements}
     assert sorted(found) == ["spheres-far", "spheres-near", "spheres-one", "step"]
     near = found["spheres-near"]
@@ -354,7 +354,7 @@ def test_rows_hold_true_measured_error_and_published(campaign):
     assert rows["calibration-one-refraction", "interface distance (1 refraction)"] == ("-", "45.000", "-", "-", "-")
 
 
-def test_stated_uncertainties_stand_beside_what_was_measured(campaign):
+def test_stated_uncertainties_are_shown_beside_measured_errors(campaign):
     one = next(m for m in campaign.measurements if m.name == "spheres-near")
     known = {"SSE": StoredUncertainty(random_mm=0.01, systematic_mm=0.02, expanded_mm=0.0447)}
     judged = one.judged.model_copy(update={"uncertainty": known})
@@ -444,7 +444,7 @@ class Tags(HTMLParser):
 FETCHING = ("src", "href", "srcset", "data", "poster", "action", "background", "xlink:href", "formaction")
 
 
-def test_the_page_fetches_nothing(page):
+def test_the_page_loads_nothing_from_the_network(page):
     found = Tags(page)
     addresses = [value for _, attrs in found.tags for name, value in attrs.items() if name in FETCHING]
     assert len(addresses) > 10
@@ -572,7 +572,7 @@ def test_a_campaign_may_hold_a_calibration_alone(folder, tmp_path):
 # Pictures
 
 
-def test_pictures_are_written_for_what_there_is(campaign, tmp_path):
+def test_pictures_are_written_for_existing_results(campaign, tmp_path):
     written = write_pictures(tmp_path, draw_pictures(campaign))
     spheres = ("spheres-near", "spheres-far", "spheres-one")
     names = {f"{kind}-{name}.png" for name in spheres for kind in ("stripe", "cloud")}
@@ -638,7 +638,7 @@ def test_the_cloud_picture_shows_both_signs_on_their_sides():
 
 
 @pytest.mark.parametrize("colour", ["deviation", "depth", "intensity", "uncertainty"])
-def test_clouds_can_be_coloured_by_what_is_known(colour):
+def test_clouds_are_coloured_by_any_known_attribute(colour):
     nothing = np.zeros(3, int)
     cloud = PointCloud(np.eye(3), np.array([10.0, 20.0, 30.0]), nothing, nothing)
     ax = plot.cloud(cloud, colour=colour)

@@ -35,6 +35,6 @@ def test_an_interrupt_within_a_recorded_loop_is_not_lost():
         dr.while_loop((mi.UInt32([0, 1]),), lambda i: i < 3, body)
 
 
-def test_an_error_within_a_recorded_loop_stays_what_it_is():
+def test_an_error_within_a_recorded_loop_is_raised_unchanged():
     with pytest.raises(RuntimeError, match="encountered an exception"), preserve_interrupts():
         dr.while_loop((mi.UInt32([0, 1]),), lambda i: i < 3, lambda i: (i + [],))

@@ -98,7 +98,7 @@ def test_a_bug_shows_its_traceback(capfd):
     assert "ZeroDivisionError: a bug" in capfd.readouterr().err
 
 
-def test_an_interrupt_stops_what_is_under_way_and_begins_nothing_more(tmp_path: Path, capfd):
+def test_an_interrupt_stops_running_jobs_and_starts_no_other(tmp_path: Path, capfd):
     seen = set()
 
     def interrupted(job: int) -> None:
@@ -114,7 +114,7 @@ def test_an_interrupt_stops_what_is_under_way_and_begins_nothing_more(tmp_path: 
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_does_not_end_is_killed(monkeypatch):
+def test_a_process_that_does_not_end_is_killed(monkeypatch):
     monkeypatch.setattr(workers, "_GRACE_S", 0.3)
 
     def interrupted(job: int) -> None:
@@ -130,7 +130,7 @@ def write_and_hold_on(folder, job, send):
         hold_on(job, send)
 
 
-def test_what_does_not_end_leaves_no_unfinished_files(tmp_path: Path):
+def test_a_killed_process_leaves_no_unfinished_files(tmp_path: Path):
     seen = []
 
     def interrupted(job: int) -> None:

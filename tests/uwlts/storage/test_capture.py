@@ -394,7 +394,7 @@ def test_killed_recording_keeps_every_announced_frame_and_can_be_resumed(tmp_pat
         process.kill()
         seen = [int(first), *announced(process)]
         assert process.wait() == -signal.SIGKILL
-        assert seen == list(range(done, done + len(seen))), "a resumed run goes on with the next frame"
+        assert seen == list(range(done, done + len(seen))), "a resumed run continues with the next frame"
         process.stdout.close()
         process.stderr.close()
         assert has_writer(part_path(path))
@@ -561,7 +561,7 @@ def test_things_that_are_no_captures(tmp_path: Path, valid: bytes):
         file["frames"] = np.zeros((2, HEIGHT, WIDTH), np.uint8)
     refused(foreign, "HDF5, but .*no format.*'uwlts-capture'")
     with h5py.File(foreign, "w") as file:
-        write_label(file, format="uwlts-truth", version=1, header=a_header())
+        write_label(file, file_format="uwlts-truth", version=1, header=a_header())
     refused(foreign, "format is 'uwlts-truth', expected 'uwlts-capture'")
 
 
@@ -748,4 +748,4 @@ def test_label_is_read_without_the_rest(tmp_path: Path, valid: bytes):
     path = tmp_path / "a.h5"
     path.write_bytes(valid)
     with h5py.File(path, "r") as file:
-        assert read_label(file, CaptureHeader, path=path, format="uwlts-capture", version=1) == a_header()
+        assert read_label(file, CaptureHeader, path=path, file_format="uwlts-capture", version=1) == a_header()

@@ -422,7 +422,7 @@ def test_rotated(tmp_path: Path):
 
 def test_another_depth_in_the_middle(tmp_path: Path):
     folder = three(tmp_path, l2=stripe_image().astype(np.uint16))
-    refused(folder, tmp_path, ImageError, "l2.png is of uint16, the images before it of uint8")
+    refused(folder, tmp_path, ImageError, "l2.png contains uint16, the images before it contain uint8")
 
 
 def test_all_black(tmp_path: Path):

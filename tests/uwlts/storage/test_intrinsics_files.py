@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from uwlts.errors import DescriptionError
+from uwlts.model.calibration import CameraModel
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Distortion
+from uwlts.optics.camera import directions, project
 from uwlts.storage.import_ import KnownCamera, read_intrinsics, set_intrinsics
 
 MATRIX = np.array([[2451.25, 0.0, 640.5], [0.0, 2450.75, 511.25], [0.0, 0.0, 1.0]])
@@ -111,10 +113,7 @@ def test_longer_models_pass_where_they_say_no_more(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (
-            ROS.replace("plumb_bob", "equidistant"),
-            "another lens model, distortion_model: equidistant; this program's camera is a pinhole",
-        ),
+        (ROS.replace("plumb_bob", "equidistant"), "an equidistant lens has 4 coefficients, k1 to k4; found 5"),
         (
             ROS.replace("plumb_bob", "rational_polynomial").replace("0.03125]", "0.03125, 0, 0, 0, 0.1, 0, 0, 0]"),
             "12 coefficients .thin prism or tilted sensor",
@@ -164,19 +163,16 @@ def test_a_file_of_kalibr(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (KALIBR.replace("radtan", "equidistant"), "another lens model, distortion_model: equidistant"),
-        (KALIBR.replace("radtan", "equi"), "another lens model, distortion_model: equi"),
         (KALIBR.replace("radtan", "fov"), "another lens model, distortion_model: fov"),
         (KALIBR.replace("pinhole", "omni"), "another lens model, camera_model: omni"),
         (KALIBR.replace("pinhole", "ds"), "another lens model, camera_model: ds"),
         (KALIBR.replace("pinhole", "eucm"), "another lens model, camera_model: eucm"),
         (KALIBR + KALIBR.replace("cam0:", "cam1:"), "has 2 cameras .cam0, cam1.; expected one"),
         (KALIBR.replace("[2451.25, ", "[0.5, 2451.25, "), "there are 5 intrinsics; expected fx, fy, cx, cy"),
-        (ROS + "fisheye_model: 1\n", "another lens model, fisheye_model: 1"),
-        (ROS + "fisheye: true\n", "another lens model, fisheye: True"),
-        (ROS.replace("plumb_bob", "fisheye"), "another lens model, distortion_model: fisheye"),
+        (ROS + "fisheye_model: 1\n", "two lens models, distortion_model: plumb_bob and fisheye_model: 1"),
+        (ROS + "fisheye: true\n", "two lens models, distortion_model: plumb_bob and fisheye: True"),
         (ROS.replace("plumb_bob", "Inverse Brown Conrady"), "distortion_model: Inverse Brown Conrady"),
-        (ROS + "model: OPENCV_FISHEYE\n", "another lens model, model: OPENCV_FISHEYE"),
+        (ROS + "model: OPENCV_FISHEYE\n", "two lens models, distortion_model: plumb_bob and model: OPENCV_FISHEYE"),
         (ROS + "Camera.type: KannalaBrandt8\n", "another lens model, Camera.type: KannalaBrandt8"),
         (ROS + "xi: 1.2\n", "another lens model, xi: 1.2"),
     ],
@@ -191,8 +187,65 @@ def test_a_foreign_lens_model_is_refused_by_its_name(tmp_path: Path, text: str, 
 def test_the_fisheye_mark_of_opencv(tmp_path: Path, suffix: str):
     entries = {"K": MATRIX, "D": COEFFICIENTS, "image_width": 1280, "image_height": 1024}
     assert read_intrinsics(written(tmp_path / f"pinhole.{suffix}", entries | {"fisheye_model": 0})) == KNOWN
-    with pytest.raises(DescriptionError, match="another lens model, fisheye_model: 1"):
+    with pytest.raises(DescriptionError, match="an equidistant lens has 4 coefficients, k1 to k4; found 5"):
         read_intrinsics(written(tmp_path / f"fisheye.{suffix}", entries | {"fisheye_model": 1}))
+    fisheye = read_intrinsics(written(tmp_path / f"four.{suffix}", entries | {"D": FISHEYE, "fisheye_model": 1}))
+    _images_like_opencvs_fisheye(fisheye, FISHEYE)
+
+
+FISHEYE = np.array([-0.0081, 0.042, -0.039, 0.0071])
+OF_FISHEYE = ROS.replace("[-0.125, 0.0625, 0.001, -2.0e-03, 0.03125]", str(FISHEYE.tolist()))
+WIDE = OF_FISHEYE.replace("2451.25", "720.5").replace("2450.75", "720.5")
+
+
+def _images_like_opencvs_fisheye(known: KnownCamera, coefficients: np.ndarray) -> None:
+    """Points of all angles in the image, projected by `cv2.fisheye` and by the converted camera."""
+    width, height = known.size_px or (1280, 1024)
+    matrix = np.array([[known.fx_px, 0, known.cx_px], [0, known.fy_px, known.cy_px], [0, 0, 1.0]])
+    pixels = np.stack(np.meshgrid(np.linspace(0, width - 1, 41), np.linspace(0, height - 1, 41)), axis=2).reshape(-1, 2)
+    plane = cv2.fisheye.undistortPoints(pixels[:, None], matrix, coefficients)[:, 0]
+    points = np.column_stack([plane, np.ones(len(plane))])
+    seen = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
+    camera = CameraModel(width_px=width, height_px=height, **_focal(known), distortion=known.distortion)
+    assert np.linalg.norm(seen - pixels, axis=1).max() < 0.01
+    assert np.linalg.norm(project(camera, points) - seen, axis=1).max() < 0.025
+    rays = directions(camera, seen)
+    np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], plane, rtol=1e-3, atol=1e-6)
+
+
+def _focal(known: KnownCamera) -> dict[str, float]:
+    return {name: getattr(known, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        WIDE.replace("plumb_bob", "equidistant"),
+        WIDE.replace("plumb_bob", "fisheye"),
+        WIDE.replace("distortion_model: plumb_bob", "model: OPENCV_FISHEYE"),
+        KALIBR.replace("radtan", "equidistant").replace("[-0.125, 0.0625, 0.001, -0.002]", str(FISHEYE.tolist())),
+    ],
+    ids=["ros", "ros-fisheye", "colmap", "kalibr"],
+)
+def test_equidistant_lenses_are_converted(tmp_path: Path, text: str):
+    """Also one whose corners are 69 deg from the axis."""
+    (tmp_path / "camera.yaml").write_text(text)
+    _images_like_opencvs_fisheye(read_intrinsics(tmp_path / "camera.yaml"), FISHEYE)
+
+
+@pytest.mark.parametrize(
+    ("focal", "words"),
+    [
+        ("600.0", "corners at 78 deg from the axis.* departs from it by .* px, at most 0.02 px"),
+        ("300.0", "images angles up to 89 deg, and the image's"),
+    ],
+)
+def test_equidistant_lenses_wider_than_the_model_are_refused(tmp_path: Path, focal: str, words: str):
+    text = WIDE.replace("plumb_bob", "equidistant").replace("720.5", focal)
+    text = text.replace(str(FISHEYE.tolist()), "[0.0, 0.0, 0.0, 0.0]")
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(DescriptionError, match=words):
+        read_intrinsics(tmp_path / "camera.yaml")
 
 
 @pytest.mark.parametrize("more", ["camera_model: acA1920-40gm", "model: Pinhole", "type: mono", "fisheye: false"])

@@ -105,7 +105,7 @@ def test_files_that_are_no_truth(tmp_path: Path, path: Path):
         file["status"] = np.zeros((2, 2))
     refused(other, "no format")
     with h5py.File(other, "w") as file:
-        write_label(file, format="uwlts-capture", version=1, header=a_header())
+        write_label(file, file_format="uwlts-capture", version=1, header=a_header())
     refused(other, "format is 'uwlts-capture', expected 'uwlts-truth'")
 
 

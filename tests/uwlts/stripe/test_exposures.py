@@ -1,4 +1,4 @@
-"""Brackets of exposures: grouping of images, and their fused image."""
+"""Exposure brackets: grouping and fusion of images."""
 
 from types import SimpleNamespace
 

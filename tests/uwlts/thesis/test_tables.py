@@ -122,7 +122,7 @@ def test_published_values_of_the_window_the_refractions_and_the_budget():
 @pytest.mark.parametrize(
     "keys", [("spheres", "nobody"), ("window", "near", 9), ("window", "near"), ("window", "all", 0)]
 )
-def test_what_was_not_published_is_none(keys):
+def test_unpublished_values_are_none(keys):
     assert PUBLISHED.value(*keys) is None
 
 
@@ -256,7 +256,7 @@ def test_a_position_that_was_not_measured():
     assert ("Table 6", "spheres, mean, air", "PE") in both
 
 
-def test_results_with_nothing_in_them():
+def test_results_without_measurements_are_tabulated():
     empty = campaign().model_copy(update={"measurements": [], "window": {}, "budget": {}, "line_profiles": {}})
     rows = all_rows([empty], PUBLISHED)
     assert {row.table for row in rows if row.ours} == {"Table 4", "Figure 58"}
@@ -431,7 +431,7 @@ def test_names_are_escaped(folder):
     assert "<script" not in text
 
 
-def test_figures_are_well_formed_whatever_was_measured():
+def test_figures_are_well_formed_for_all_measurements():
     rows = [
         TableRow("Figure 66", 'a & b <c> "d", water', "STD", 0.1, (0.05, 0.2)),
         TableRow("Figure 66", "nothing measured, air", "STD", 0.3, ()),

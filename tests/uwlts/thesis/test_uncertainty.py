@@ -229,7 +229,7 @@ KNOWN = {
 
 
 @pytest.mark.parametrize("name", KNOWN)
-def test_what_is_drawn_does_what_a_wrong_sensor_does(name):
+def test_drawn_deviations_act_like_a_deviating_sensor(name):
     """One standard deviation (half width) drawn shifts the spheres as views of a sensor that is wrong by it."""
     size, wrong = KNOWN[name]
     truly = abs(error_by(seen(**wrong)))
@@ -369,7 +369,7 @@ def test_whether_the_truth_is_held(shift, held):
 
 
 def failing(monkeypatch, share):
-    """Every n-th calibration of the trials fails, n = 1 / share."""
+    """Make every n-th calibration of the trials fail, with n = 1 / share."""
     calls = []
 
     def solved(evidence, **how):
@@ -394,7 +394,7 @@ def test_many_failing_trials_are_no_result(monkeypatch):
         propagate(clean()[0], [spheres()], WATER, {}, options=PLAIN, trials=30, workers=1)
 
 
-def test_a_scan_whose_spheres_are_lost_is_no_result():
+def test_a_scan_without_its_spheres_gives_no_result():
     lost = replace(spheres(), sphere=np.zeros_like(spheres().sphere))
     with pytest.raises(CalibrationError, match="20 of 20"):
         propagate(clean()[0], [lost], WATER, {}, options=PLAIN, trials=20, workers=1)

@@ -113,7 +113,7 @@ def test_the_uniform_distribution_is_as_wide_as_drawn():
     st.lists(st.tuples(st.floats(1e-6, 1e6), st.floats(1, 1e6), st.floats(-10, 10)), min_size=1, max_size=8),
     st.floats(0.5, 0.999),
 )
-def test_what_every_budget_keeps(rows, probability):
+def test_every_budget_fulfils_the_same_rules(rows, probability):
     sources = [
         UncertaintySource(name="a", standard_uncertainty=u, degrees_of_freedom=n, correction=c) for u, n, c in rows
     ]

@@ -114,7 +114,7 @@ def test_profiles_are_a_step_at_four_distances(study):
     assert len(set(np.sign(slopes))) == 1
 
 
-def test_images_that_determine_no_distance_have_none(tmp_path, scans):
+def test_images_that_determine_no_distance_give_no_result(tmp_path, scans):
     choices, _ = window_choices(campaign(tmp_path, [(0.0, 0.0)], odd_mm=STEP_MM + 4), EXACT, scans)
     found = {choice.images: choice for choice in choices}
     for name in ("far 1", "far"):

@@ -35,7 +35,7 @@ _FRONT = COLOURS[2]
 _PALE = "#c3cad2"
 """Colour of bars of designs that violate a constraint."""
 _LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
-"""Colours of the contours of bounds."""
+"""Colours of the contour lines at the constraints' bounds."""
 _SYMBOLS = (("diamond", "D"), ("circle", "o"), ("star", "*"), ("square", "s"), ("cross", "P"))
 """Symbols of highlighted designs, in plotly and in matplotlib."""
 _TEXT_PLACES = ("top right", "bottom right", "top left", "bottom left")

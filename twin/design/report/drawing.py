@@ -254,7 +254,19 @@ class _ModuleGeometry:
     def from_description(
         cls, sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray
     ) -> _ModuleGeometry:
-        """Make a module; ``rotation`` (3, 3) rotates from its frame, with z along its axis, to the camera frame."""
+        """Make the module of a described sensor.
+
+        Parameters
+        ----------
+        sensor
+            Description of the sensor, for its wavelength.
+        window, medium
+            Window of the module, and the medium outside.
+        origin : (3,)
+            Entrance pupil or origin of the rays, in the camera frame.
+        rotation : (3, 3)
+            Rotation from the module's frame, with z along its axis, to the camera frame.
+        """
         flat = (
             WindowGeometry.from_description(window, medium, sensor.laser.wavelength_nm, rotation)
             if window.mounted

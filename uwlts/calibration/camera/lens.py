@@ -28,6 +28,9 @@ BESIDES = (("p1", "p2"), ("k3",), ("p1", "p2", "k3"))
 RATIONAL_BESIDES = (("k4", "k5"), ("p1", "p2", "k4", "k5"))
 """Coefficients that are tried if k3 helps."""
 _USUAL = ("k1", "k2")
+_WIDE_USUAL = (*_USUAL, *RATIONAL_BESIDES[0])
+WIDE_DEG = 45.0
+"""Angle to the axis beyond which lenses are wide: tan > 1, so that the powers of k1 to k3 grow instead of fading."""
 _DISTORTIONS = ((), ("k1",), _USUAL, *((*_USUAL, *names) for names in BESIDES))
 _RATIONAL = tuple((*_USUAL, *names) for names in RATIONAL_BESIDES)
 _FOLDS = 5
@@ -37,6 +40,9 @@ _SOFT = 2.0  # robust standard deviations from which a point has less weight
 _OUTLIER = 5.0  # robust standard deviations from which a point is rejected
 _LARGEST_REJECTED = 0.3  # fraction of an image's points; more indicate another board or pose
 _LEAST_SCATTER_PX = 1e-6  # scatter of points; simulated ones may have none
+_FINEST_PX = 0.05
+"""Scatter of a coordinate below which points and images are not distinguished. Blur, light and print differ between
+good images by a few hundredths of a pixel; false points are off by much more. Chosen by hand, not fitted to data."""
 _MOVED = 3.0  # standard uncertainties by which one image may change a parameter
 HALVES_APART = 4.0
 """Largest difference of a parameter between two halves of the images, in its standard uncertainties."""
@@ -101,8 +107,8 @@ class LensCalibration:
     solution : solution for the used images, in their order; its covariance assumes independent points
     used, images : numbers (F,) of the used images, and these images without outliers
     left_out : number of each rejected image, and the reason
-    moved : (F,); largest change of a parameter without each used image, in its standard deviations without it; NaN if
-        the parameters are then not determined
+    moved : (F,); largest change of a parameter without each used image, in its standard deviations without it (for
+        points that scatter by at least 0.05 px); NaN if the parameters are then not determined
     rejected_share : fraction of rejected points in the used images
     halves : (2,); solutions from every second image and from the others; None if not determined
     without : (F,); solutions from all used images except one; None if not determined
@@ -131,6 +137,10 @@ class LensCalibration:
     def values(self) -> dict[str, float]:
         """Return every estimated parameter."""
         return self.solution.values()
+
+    def widest_deg(self) -> float:
+        """Return the largest angle of a target point to the camera's axis, deg."""
+        return _widest_deg(self.images, self.solution)
 
     def std(self) -> dict[str, float]:
         """Return the standard uncertainty of every estimated parameter."""
@@ -185,7 +195,8 @@ def calibrate_lens(
     choice
         Parameters to estimate. If the stage's direction is wrongly assumed to be the target's normal, this has the same
         effect as another lens. With the poses "stage-normal", "auto" therefore is k1 and k2; with both stage poses,
-        pixels are square.
+        pixels are square. Wide lenses, with points more than `WIDE_DEG` from the axis, usually have k1 k2 k4 k5: a
+        rational function follows the arctangent, which a polynomial cannot.
     progress
         Called with the number of models tried and the total.
 
@@ -212,14 +223,19 @@ def calibrate_lens(
     tried = _candidates(_DISTORTIONS, choice, poses)
     usual = tried[0] if len(tried) == 1 else _candidates((_USUAL,), replace(choice, distortion="auto"), poses)[0]
 
-    def inliers(options: CameraOptions) -> list[np.ndarray]:
+    plain = solve(images, options=usual, circles=True)
+    wide = choice.distortion == "auto" and poses != "stage-normal" and _widest_deg(images, plain) > WIDE_DEG
+    if wide:
+        usual = replace(usual, distortion=_WIDE_USUAL)
+
+    def inliers(options: CameraOptions, plain: CameraSolution | None = None) -> list[np.ndarray]:
         """Return masks (N,) of the points near their predicted positions, from a robust fit."""
-        plain = solve(images, options=options, circles=True)
+        plain = solve(images, options=options, circles=True) if plain is None else plain
         robust = solve(images, plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)), circles=True)
         return _inliers(robust)
 
     candidates: list[LensCandidate] = []
-    options, keep = usual, inliers(usual)
+    options, keep = usual, inliers(usual, None if wide else plain)
     good = [_remove_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _has_enough_inliers(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
         centred = _correct_circles(good, solve(good, options=usual, circles=True))
@@ -230,7 +246,7 @@ def calibrate_lens(
                 progress(number + 1, len(further))
             candidates = _compare_models(squares)
             options = _select_model(candidates, usual)
-            if choice.distortion != "auto" or "k3" not in options.distortion:
+            if choice.distortion != "auto" or ("k3" not in options.distortion and not wide):
                 break
     if options != usual:
         keep = inliers(options)
@@ -262,7 +278,7 @@ def calibrate_lens(
         without = _solve_subsets(centred, solution, all_but_one, solved_again)
         values, none = intrinsics.from_model(solution.model), np.full(len(intrinsics.names), np.nan)
         changes = np.array([none if s is None else intrinsics.from_model(s.model) - values for s in without])
-        others_std = np.array([none if s is None else np.sqrt(np.diag(s.covariance)) for s in without])
+        others_std = np.array([none if s is None else _expected_std(s) for s in without])
         if not np.isfinite(changes).any():
             moved = np.full(len(used), np.nan)
             break
@@ -308,6 +324,13 @@ def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Po
     return [CameraOptions(names, pixel_aspect=shape) for names in sets for shape in shapes]
 
 
+def _widest_deg(images: Sequence[TargetImage], solution: CameraSolution) -> float:
+    """Return the largest angle of a target point to the camera's axis, deg, from the points' poses."""
+    seen = [i.points_mm @ pose[:3, :3].T + pose[:3, 3] for i, pose in zip(images, solution.target_poses, strict=True)]
+    points = np.vstack(seen)
+    return float(np.degrees(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max()))
+
+
 def _scatter(solution: CameraSolution) -> float:
     """Return the robust standard deviation of one coordinate of the residuals."""
     # median distance in two coordinates, divided by the standard deviation of one
@@ -315,9 +338,15 @@ def _scatter(solution: CameraSolution) -> float:
 
 
 def _inliers(solution: CameraSolution) -> list[np.ndarray]:
-    """Return masks (N,) of points within five robust standard deviations."""
-    limit = _OUTLIER * _scatter(solution)
+    """Return masks (N,) of points within five robust standard deviations, which are at least `_FINEST_PX`."""
+    limit = _OUTLIER * max(_scatter(solution), _FINEST_PX)
     return [np.linalg.norm(residuals, axis=1) <= limit for residuals in solution.residuals_px]
+
+
+def _expected_std(solution: CameraSolution) -> np.ndarray:
+    """Return the standard deviations (P,) of the parameters, for points that scatter by at least `_FINEST_PX`."""
+    larger = max(_FINEST_PX / max(solution.sigma_px, _LEAST_SCATTER_PX), 1.0)
+    return larger * np.sqrt(np.diag(solution.covariance))
 
 
 def _has_enough_inliers(inside: np.ndarray) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from uwlts.calibration.camera.lens import (
+    WIDE_DEG,
     Distortion,
     LensCalibration,
     LensChoice,
@@ -196,7 +197,19 @@ def calibrate_camera(
         photographs[places[place]] = Photograph(name, found[place].pixels, reason)
         warnings.append(f"{name}: left out, {reason}")
     warnings += [f"{each.name}: {each.reason}" for each in photographs if not len(each.pixels)]
-    return CameraCalibration(folder, described, lens, photographs, warnings + lens.half_doubts())
+    return CameraCalibration(folder, described, lens, photographs, warnings + _doubt_wide(lens) + lens.half_doubts())
+
+
+def _doubt_wide(lens: LensCalibration) -> list[str]:
+    """Return a warning if the lens bends the image as a wide-angle lens and the model cannot follow."""
+    if not lens.widest_deg() > WIDE_DEG or lens.solution.model.distortion.is_rational():
+        return []
+    named = " ".join(lens.options.distortion) or "no distortion"
+    return [
+        f"the target is seen up to {lens.widest_deg():.0f} deg from the camera's axis: this is a wide-angle lens, "
+        f"which bends straight lines more than {named} can follow beyond {WIDE_DEG:.0f} deg; residuals are "
+        f"{lens.solution.rms_px():.2g} px: use the distortion auto, or k1 k2 k4 k5"
+    ]
 
 
 def _read_target(folder: Path, path: str | Path | None) -> Target:

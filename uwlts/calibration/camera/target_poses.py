@@ -246,8 +246,8 @@ def solve_camera(
     Raises
     ------
     CalibrationError
-        There are too few images, the stage did not move, the target is mirrored relative to the stage, the parameters
-        are not determined, or the offsets do not converge.
+        There are too few images, the stage did not move, or the target is mirrored relative to the stage. The
+        parameters are not determined, or the offsets do not converge.
     RangeError
         A circle's image is not an ellipse.
     """

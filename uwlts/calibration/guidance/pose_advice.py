@@ -469,7 +469,7 @@ def describe_missing(state: State) -> list[str]:
         )
     level = [side for side, short in zip(_SIDES, _find_missing_tilt(state), strict=True) if short > 0]
     if level:
-        said.append(f"the target's {', '.join(level)} was never farther by {np.degrees(wanted.tilt_rad):.0f} deg")
+        said.append(f"never tilted away by {np.degrees(wanted.tilt_rad):.0f} deg: the target's {', '.join(level)}")
     return said
 
 

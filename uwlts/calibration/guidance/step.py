@@ -73,7 +73,25 @@ def judge_step(
     full_dn: int,
     options: StripeOptions = StripeOptions(),
 ) -> StepQuality:
-    """Assess a laser image (H, W) of the step standard, with a calibration in air and the nominal window."""
+    """Assess a laser image of the step standard.
+
+    Parameters
+    ----------
+    image : (H, W)
+        Laser image of the step standard.
+    calibration
+        Calibration of camera and sheet in air.
+    window
+        Nominal window.
+    standard
+        Step standard in the image.
+    medium_index
+        Refractive index of the medium relative to air.
+    full_dn
+        Grey value of a saturated pixel.
+    options
+        Options of the stripe search.
+    """
     along = calibration.stripe_along
     try:
         stripe = extract_stripe(image, stripe_along=along, options=options, saturation=full_dn)

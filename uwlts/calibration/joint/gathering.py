@@ -149,6 +149,19 @@ def gather_jointly(
 ) -> Gathered:
     """Find the target, the stripes on it, and the stripes on steps and scanned surfaces in all images.
 
+    Parameters
+    ----------
+    targets
+        Captures of the target.
+    steps
+        Captures of step standards.
+    scans
+        Scans of surfaces of known shape.
+    options
+        Options of the calibration.
+    progress
+        Called as ``progress(done, total)`` in images.
+
     Raises
     ------
     CalibrationError
@@ -261,8 +274,18 @@ def build_priors(
 ) -> dict[ParameterKey, Prior]:
     """Return priors of all global parameters except lens parameters without prior knowledge.
 
-    ``window`` is as described; ``turns`` (3,) are the start values of the sheet's rotations and shift; ``heights`` are
-    those of step standards.
+    Parameters
+    ----------
+    gathered
+        Images and their sensor.
+    window
+        Window as described; None without a window.
+    turns : (3,)
+        Initial values of the sheet's rotations and shift.
+    heights
+        Priors of the heights of step standards.
+    options
+        Options of the calibration.
     """
     sensor, known = gathered.sensor, gathered.sensor.uncertainty
     priors: dict[ParameterKey, Prior] = {}

@@ -128,6 +128,19 @@ def estimate_series_start(
     The window has the distance d, thickness t and index g; the medium has the index n. In the paraxial approximation,
     they act like a pinhole at d + t - n (d + t / g) on the axis, with n times the focal length.
 
+    Parameters
+    ----------
+    series
+        Target images of each medium, with or without window.
+    sensor
+        Description of the sensor.
+    window
+        Window as described; None without a window.
+    indices
+        Refractive index of each medium relative to air.
+    options
+        Options of the calibration.
+
     Raises
     ------
     CalibrationError
@@ -358,6 +371,19 @@ def build_all_scan_evidence(
     scans: Sequence[ScanStripes], start: Calibration, sensor: Sensor, indices: Sequence[float], *, sizes_known: bool
 ) -> tuple[list[tuple[SurfaceScanEvidence, np.ndarray]], list[str]]:
     """Return the evidence of every scan with the start of its local parameters, and warnings about rejected scans.
+
+    Parameters
+    ----------
+    scans
+        Stripes of each scan.
+    start
+        Initial calibration.
+    sensor
+        Description of the sensor.
+    indices
+        Refractive index of each medium relative to air.
+    sizes_known
+        Use the stated sizes of the surfaces.
 
     Raises
     ------

@@ -31,7 +31,21 @@ def build_calibration(
     media: Sequence[Medium],
     provenance: dict[str, JsonValue],
 ) -> Calibration:
-    """Build the calibration of a joint estimate, with its evidence, for media other than air."""
+    """Build the calibration of a joint estimate, with its evidence.
+
+    Parameters
+    ----------
+    result
+        Joint estimate.
+    evidence
+        Evidence of all images.
+    sensor
+        Description of the sensor.
+    media
+        Media other than air.
+    provenance
+        Origin of the calibration.
+    """
     parameters, values = result.parameters, result.values
     sheet = parameters.sheet_model(values)
     frame = object_frame(sheet, laser_axis=parameters.sheet.axis)

@@ -117,7 +117,7 @@ INSIDE, OUTSIDE = "inside", "outside"
 Image = tuple[int, int]
 """Number of the piece of evidence, and of the image in it."""
 
-_EVERY = 4  # one of so many inner images is held out, so that enough images remain on both sides
+_EVERY = 4  # one of four inner images is held out, so that enough images remain on both sides
 _OUTER = 1 / 6  # fraction of the depth range, at either end
 _FEWEST_KEPT = 4  # images for calibration
 FEWEST_HELD = 4  # held-out images: fewer give no standard error

@@ -32,7 +32,7 @@ class Shape(ABC):
     fewest_poses: ClassVar[int]
     """Number of poses that makes the problem overdetermined, with two or three equations per pose."""
     flat: ClassVar[bool] = True
-    """Whether profiles contain nearly straight lines, which determine the rotation of a pose."""
+    """True if profiles contain nearly straight lines, which determine the rotation of a pose."""
     has_size: ClassVar[bool] = False
     place: ClassVar[int] = 3
     """Number of parameters besides the size."""
@@ -232,10 +232,9 @@ class RingShape(Shape):
         walls = sum(bool(part.any()) for part in parts)
         if walls >= _FEWEST_WALLS:
             return None
-        size = "" if self.size_mm is None else f" of radius {self.size_mm:g} mm"
         return (
-            f"{walls} of {len(parts)} profiles show a wall{size} square to the ring's face; at least {_FEWEST_WALLS} "
-            "are needed: tilt the sensor so that the sheet meets the wall"
+            f"{walls} of {len(parts)} profiles show a wall of radius {self.size_mm:g} mm square to the ring's face; at "
+            f"least {_FEWEST_WALLS} are needed: tilt the sensor so that the sheet meets the wall, and check the radius"
         )
 
     def group_parallel(self, part: np.ndarray) -> list[np.ndarray]:

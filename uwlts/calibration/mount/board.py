@@ -33,7 +33,7 @@ from uwlts.optics.fitness import check_fits
 from uwlts.optics.window import trace_window
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
-from uwlts.targets import CircleTarget, Target, parse_target
+from uwlts.targets import Target, parse_target
 from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 FEWEST_IMAGES = 4
@@ -233,11 +233,11 @@ def estimate_board_pose(
         return project_through_window(camera, window, seen, medium_index=index)
 
     pixels = view.pixels
-    if isinstance(target, CircleTarget):
+    if target.circle_diameter_mm is not None:
         bias = circle_centre_bias(
             lambda points: projected(start, points),
             view.points_mm,
-            diameter_mm=target.diameter_mm,
+            diameter_mm=target.circle_diameter_mm,
             axis_u=(1.0, 0.0, 0.0),
             axis_v=(0.0, 1.0, 0.0),
         )

@@ -40,7 +40,7 @@ def calibrate_mount(
     profiles: str | Path | Sequence[np.ndarray] | CapturedProfiles,
     poses: str | Path | np.ndarray | None = None,
     *,
-    artefact: Artefact = "sphere",
+    artefact: Artefact | None = None,
     radius_mm: float | None = None,
     height_mm: float | None = None,
     calibration: Calibration | str | Path | None = None,
@@ -67,19 +67,19 @@ def calibrate_mount(
     Parameters
     ----------
     profiles
-        Folder with one CSV file (columns x and z) for each pose, one CSV file with a column pose, a cloud whose frames
-        are the poses, or a description of everything (.toml; docs/reference/mount-files.md). With a calibration: a
-        capture of the artefact, or of a target in images with the laser off. Or one array for each pose: (N, 2)
-        with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in the order along the profile,
-        mm, NaN for missing points.
+        Folder with one CSV file (columns x and z) for each pose, or one CSV file with a column pose. A cloud whose
+        frames are the poses, or a description of everything (.toml; docs/reference/mount-files.md). With a
+        calibration: a capture of the artefact, or of a target in images with the laser off. Or one array for each pose
+        in the order along the profile, mm, NaN for missing points: (N, 2) with x along the profile and z, or (N, 3)
+        with x, y, z in the sensor's frame.
     poses
         CSV file with the pose of the platform in the base frame for each profile or target image, or
         ``T_base_platform`` (P, 4, 4), mm. Default: the poses of the capture.
     artefact
         Artefact in the profiles: a sphere, a plane, a step (two parallel faces), or a ring (a face and a perpendicular
-        cylindrical wall).
+        cylindrical wall of given radius). Default: a sphere, unless the capture or description has another.
     radius_mm
-        Radius of the sphere, or of the ring's wall. Default: it is estimated.
+        Radius of the sphere, or of the ring's wall. Default: that of a sphere is estimated.
     height_mm
         Height of the step. Default: it is estimated.
     calibration
@@ -112,7 +112,7 @@ def calibrate_mount(
     Raises
     ------
     DescriptionError
-        Files or options cannot be read or contradict each other.
+        Files or options cannot be read or contradict each other, or a ring has no radius.
     CalibrationError
         Too few profiles show the artefact, or the motions do not determine the mount. The message names the missing
         motions.
@@ -122,6 +122,11 @@ def calibrate_mount(
     >>> mount = uwlts.calibrate_mount("profiles", "poses.csv", pose_format="quaternion-wxyz", radius_mm=19.05)
     >>> mount.transform(), mount.std()
     """
+    filed = isinstance(poses, str | Path) or (poses is None and calibration is None)
+    if not filed and (pose_format != "matrix" or pose_unit is not None):
+        raise DescriptionError("`pose_format` and `pose_unit` describe a file of poses; there is none: leave them out")
+    if profile_unit is not None and (calibration is not None or not isinstance(profiles, str | Path)):
+        raise DescriptionError("`profile_unit` describes files of profiles; these are in mm: leave it out")
     if calibration is not None:
         if not isinstance(profiles, str | Path):
             raise DescriptionError("a calibration needs a capture: give the capture's path as `profiles`")
@@ -134,8 +139,10 @@ def calibrate_mount(
         assert not isinstance(table, str | Path)
         with Capture(profiles) as capture:
             if capture.header.target is not None and not capture.laser_on.all():
-                if radius_mm is not None or height_mm is not None or scale or time:
-                    raise DescriptionError("the capture shows a target: give no radius, height, scale or time")
+                if artefact or radius_mm is not None or height_mm is not None or scale or time:
+                    raise DescriptionError(
+                        "the capture shows a target: give no artefact, radius, height, scale or time"
+                    )
                 return mount_by_board(capture, known, table, axis=axis)
             profiles = reconstruct_profiles(capture, known, table, times)
     captured = None
@@ -165,7 +172,7 @@ def calibrate_mount(
 
 def _advice(evidence: MountEvidence) -> str:
     """Return advice on the usual mistakes; a wrong artefact size is tested by estimating it."""
-    if evidence.size_mm is not None:
+    if evidence.size_mm is not None and evidence.artefact != "ring":
         with suppress(CalibrationError):
             found = _Calibration(replace(evidence, size_mm=None)).make_result()
             if 2 * sum(pose.reason is None for pose in found.poses) > len(found.poses):
@@ -220,8 +227,9 @@ class _Calibration:
         state, problem = start(problem, whole.select(kept), seen, self.sheet, towards, self.rng)
         misfit = problem.rms_mm(state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
-        good = misfit < max(LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
         typical = max(float(np.median(misfit)), noise, 1e-6)
+        self._require_small(typical, state, len(misfit))
+        good = misfit < max(LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
         scatter = Scatter(max(noise, 1e-6), typical, typical, typical, 1e-3)
         # Detect the artefact again, near the place that the other profiles give, to correct errors of the first search.
         for _ in range(2):
@@ -268,16 +276,17 @@ class _Calibration:
                 "needed. Record more poses, or check artefact, size and units"
             )
 
+    def _require_small(self, wrong_mm: float, state: MountState, poses: int) -> None:
+        extent = float(np.median([np.linalg.norm(np.ptp(each, axis=0)) for each in self.flat if len(each)]))
+        if wrong_mm > _NO_FIT * (0.1 * extent if self.shape.flat else state.artefact[3]):
+            raise NoFit(
+                f"no mount fits the profiles: {poses} of {len(self.profiles)} poses would have errors of "
+                f"{wrong_mm:.3g} mm (rms)"
+            )
+
     def _require_fit(self, used: Problem, estimate: RestrictedEstimate[MountState]) -> None:
         state, scatter = estimate.state, Scatter(*estimate.scatter)
-        extent = float(np.median([np.linalg.norm(np.ptp(each, axis=0)) for each in self.flat if len(each)]))
-        limit = _NO_FIT * (0.1 * extent if self.shape.flat else state.artefact[3])
-        wrong = float(np.hypot(scatter.pose_mm, scatter.smooth_mm))
-        if wrong > limit:
-            raise NoFit(
-                f"no mount fits the profiles: {len(used.points)} of {len(self.profiles)} poses would have errors of "
-                f"{wrong:.3g} mm (rms)"
-            )
+        self._require_small(float(np.hypot(scatter.pose_mm, scatter.smooth_mm)), state, len(used.points))
         if self.shape.size_mm is None:
             return
         free = replace(used, shape=SHAPES[self.evidence.artefact]())

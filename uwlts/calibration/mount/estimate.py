@@ -8,12 +8,12 @@ from typing import Generic, Self, TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
-from scipy.stats import chi2, t
+from scipy.stats import f, t
 
 from uwlts.errors import CalibrationError
 
 _FALSE_ALARM = 1e-3
-"""Probability that any pose of a campaign without wrong poses is rejected."""
+"""Probability that any pose of a campaign without wrong poses is rejected, for normal errors."""
 LARGEST_ROUGH = 6.0
 """Multiple of the median misfit of a pose: of 45 normal poses, one in millions exceeds it."""
 _SETTLED = 0.01
@@ -22,6 +22,8 @@ _SHRINKING = 0.7
 """Ratio of successive steps with opposite signs above which steps are damped; below it the rounds suffice."""
 _MOST_ROUNDS = 60
 """Rounds after which an estimate has not converged: four halvings of the step, and ten rounds for each."""
+_SPELL = 10
+"""Rounds in which the steps must halve, or the estimate will not converge: 60 rounds make them 64 times smaller."""
 _LEAST_FRACTION = 1 / 16
 """Smallest fraction of a step: it damps steps that overshoot up to 30-fold."""
 _LEAST_EIGENVALUE = 1e-13
@@ -148,16 +150,19 @@ class RestrictedEstimate(Generic[State]):
         return found
 
     def excess(self, *, probability: float) -> np.ndarray:
-        """Return each pose's squared distance (G,) from the others' prediction, divided by its chi-square limit.
+        """Return each pose's squared distance (G,) from the others' prediction, divided by its limit.
 
-        One correct pose exceeds 1 with ``probability``.
+        One correct pose exceeds 1 with ``probability``. The limit is that of an F distribution, because the scatter is
+        estimated from as many directions as the poses have, less the parameters.
         """
         excess, bases = [], self.evidence.pose_directions(self.state)
+        freedom = max(sum(basis.shape[1] for basis in bases) - self.evidence.size, 1)
         for g, (basis, (step, covariance)) in enumerate(zip(bases, self.without_each, strict=True)):
             by = basis.T @ self.jacobian[g]
             spread = by @ covariance @ by.T + basis.T @ self._covariances[0][g] @ basis
             off = basis.T @ self.residuals[g] + by @ step
-            excess.append(float(off @ np.linalg.solve(spread, off) / chi2.isf(probability, len(off))))
+            limit = len(off) * f.isf(probability, len(off), freedom)
+            excess.append(float(off @ np.linalg.solve(spread, off) / limit))
         return np.array(excess)
 
     def coverage_factor(self, scales: np.ndarray, rows: np.ndarray) -> float:
@@ -240,6 +245,7 @@ class NotSettled(CalibrationError):
 def _iterate(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray) -> RestrictedEstimate[State]:
     """Alternate weighted least squares and maximum likelihood of the components; damp oscillating steps."""
     fraction, before, size = 1.0, np.zeros(evidence.size), 0.0
+    sizes: list[float] = []
     for _ in range(_MOST_ROUNDS):
         covariances, _ = evidence.covariance(state)(np.log(scatter))
         step = solve_step(evidence, state, covariances)
@@ -255,8 +261,12 @@ def _iterate(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray
         scatter, criterion, gain = _maximise_likelihood(evidence, state, scatter)
         if size < _SETTLED and gain < _SETTLED:
             return RestrictedEstimate(evidence, state, scatter, criterion)
+        sizes.append(size)
+        earlier, latest = sizes[-2 * _SPELL : -_SPELL], sizes[-_SPELL:]
+        if len(earlier) == _SPELL and np.median(latest) > max(np.median(earlier) / 2, _SETTLED):
+            break
     raise NotSettled(
-        f"the estimate of the mount does not converge: after {_MOST_ROUNDS} rounds it still changes by {size:.2g} "
+        f"the estimate of the mount does not converge: after {len(sizes)} rounds it still changes by {size:.2g} "
         "standard uncertainties. Record more poses, with rotations about two axes and the artefact in all parts of the "
         "profile"
     )

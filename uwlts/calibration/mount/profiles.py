@@ -16,9 +16,16 @@ _TRIALS = 400
 """Curves proposed for a profile: with a tenth of it on the artefact and neighbouring proposals, some 40 are right."""
 _REJECTED_BEYOND = 4.0
 """Robust standard deviations; of normal noise, six points in a hundred thousand exceed it."""
-_DOUBLINGS = 3
-"""Doublings of the inlier distance, up to 30 times the noise; smooth errors of profilers are smaller."""
-_FEW_MORE = 1.1  # ratio of the numbers of inliers below which a wider distance adds no points of the curve
+_LEAST_TOLERANCE_MM = 1e-4
+"""Smallest distance of a point from its curve; no profiler resolves less."""
+_WIDEST = 0.02
+"""Largest distance of a point from its curve, relative to the profile: of an arc as wide as its radius, with noise of a
+30th of it, half of the points are still within."""
+_LARGER = 1.25
+"""Largest radius of a proposed circle, relative to the sphere's: a smooth error of 2 % of the height of the shortest
+arc changes its radius by 2 %, and three single points vary more."""
+_REFINED = 5
+"""Best supported circles that are refined until one is an arc of the sphere."""
 _LEAST_ARC = np.radians(30)
 """Shorter arcs are like straight lines; their centres shift by more than the noise along the sagitta."""
 LEAST_WALL = 6
@@ -73,56 +80,63 @@ class ProfileLine(Detection):
         return replace(self, members=self.members | (others > 0), part=np.where(others > 0, others, self.part))
 
 
-def estimate_noise(points: np.ndarray) -> float:
-    """Estimate the noise of a profile (N, 2) from second differences, robust against edges, mm."""
-    depth = points[:, 1] - np.interp(points[:, 0], points[[0, -1], 0], points[[0, -1], 1])
-    # variance of a second difference: 1 + 4 + 1 times that of a point
-    second = np.diff(depth, 2)
-    return robust_std(second - np.median(second)) / 6**0.5
-
-
 def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generator) -> ProfileArc | None:
     """Find the best supported arc of a sphere's section in an ordered profile (N, 2), mm, or None.
 
     Circles through three points are scored by the number of points near them (RANSAC). Circles larger than the sphere
-    are excluded, or larger than the profile if the radius is unknown.
+    are excluded, or larger than arcs within the profile can be if the radius is unknown.
     """
     count = len(points)
     if count < LEAST_POINTS:
         return None
-    tolerance = max(_REJECTED_BEYOND * estimate_noise(points), 1e-4)
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    largest = extent if radius_mm is None else radius_mm + 2 * tolerance
-    span = rng.integers(LEAST_POINTS // 2, max(count // 2, LEAST_POINTS // 2 + 1), size=_TRIALS)
+    largest = extent / (2 * np.sin(_LEAST_ARC / 2)) if radius_mm is None else _LARGER * radius_mm
+    # Short arcs among scattered points need short spans, long ones long spans: every octave has as many.
+    widest = max(count // 2, LEAST_POINTS // 2 + 1)
+    span = np.exp(rng.uniform(np.log(LEAST_POINTS // 2), np.log(widest), size=_TRIALS)).astype(int)
     first = (rng.random(_TRIALS) * np.maximum(count - 2 * span, 1)).astype(int)
     picked = points[np.minimum(first[:, None] + span[:, None] * np.arange(3), count - 1)]
     centres, radii = circles_through(picked)
-    fits = np.isfinite(radii) & (radii < largest) & (radii > 10 * tolerance)
+    fits = np.isfinite(radii) & (radii < largest)
     if not fits.any():
         return None
     centres, radii = centres[fits], radii[fits]
     off = np.abs(np.linalg.norm(points - centres[:, None], axis=2) - radii[:, None])
-    tolerance = _widen_tolerance(off, tolerance)
-    if radius_mm is not None:
-        largest = radius_mm + 2 * tolerance
-    for best in np.argsort(-np.count_nonzero(off < tolerance, axis=1))[:5]:
+    tolerance = _choose_tolerance(off, extent)
+    for best in np.argsort(-np.count_nonzero(off < tolerance, axis=1))[:_REFINED]:
         arc = _refine_arc(points, off[best] < tolerance, tolerance)
-        if arc is not None and arc.radius_mm < largest:
+        if arc is not None and (radius_mm is None or _fits_radius(arc, points, radius_mm, tolerance)):
             return arc
     return None
 
 
-def _widen_tolerance(off: np.ndarray, tolerance: float) -> float:
-    """Widen the tolerance until this adds few points; ``off`` (M, N) are distances from the proposed curves.
+def _choose_tolerance(off: np.ndarray, extent_mm: float) -> float:
+    """Return the distance within which points are on a curve; ``off`` (M, N) are distances from the proposed curves.
 
-    The smooth error of a profiler shifts points by more than their noise.
+    The distance is doubled until the best supported curve becomes less significant. The logarithm of the probability
+    that k scattered points are all within a distance d is k log(2 d / extent). No noise is estimated beforehand, which
+    scattered points would enlarge, and neither rounding nor the smooth error of a profiler matters.
     """
-    for _ in range(_DOUBLINGS):
-        near, wider = (int(np.count_nonzero(off < each, axis=1).max()) for each in (tolerance, 2 * tolerance))
-        if wider < _FEW_MORE * near:
+
+    def support(within: float) -> int:
+        return int(np.count_nonzero(off < within, axis=1).max())
+
+    tolerance = _LEAST_TOLERANCE_MM
+    while (wider := 2 * tolerance) < _WIDEST * extent_mm:
+        near = support(tolerance)
+        if near >= LEAST_POINTS and support(wider) * np.log(2 * wider / extent_mm) >= near * np.log(wider / extent_mm):
             break
-        tolerance *= 2
+        tolerance = wider
     return tolerance
+
+
+def _fits_radius(arc: ProfileArc, points: np.ndarray, radius_mm: float, tolerance: float) -> bool:
+    """Return whether an arc of a sphere's largest section fits as well: by the heights of both above their chord."""
+    half = float(np.linalg.norm(np.ptp(points[arc.members], axis=0))) / 2
+    if arc.radius_mm <= radius_mm or half >= radius_mm:
+        return arc.radius_mm < radius_mm + 2 * tolerance
+    own, largest = (radius - np.sqrt(radius**2 - half**2) for radius in (arc.radius_mm, radius_mm))
+    return largest - own < 2 * tolerance
 
 
 def circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -148,7 +162,7 @@ def _refit_inliers(
             return None
         away = np.abs(off(members))
         std = robust_std(away[members])
-        before, members = members, away < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
+        before, members = members, away < min(max(_REJECTED_BEYOND * std, _LEAST_TOLERANCE_MM), 2 * tolerance)
         if np.array_equal(before, members):
             break
     return (members, std) if np.count_nonzero(members) >= LEAST_POINTS else None
@@ -164,6 +178,12 @@ def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Pr
     members, std = found
     centre, radius = _fit_circle(points[members])
     if _arc_angle(points[members] - centre) < _LEAST_ARC:
+        return None
+    # Scattered points fill the band of 2 tolerances evenly: their robust standard deviation is 1.5 tolerances, that of
+    # an arc at most 0.9. They are as dense beside the circle, in a band twice as wide.
+    away = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+    chance = np.count_nonzero((away > 2 * tolerance) & (away < 4 * tolerance)) / 2
+    if std > tolerance or np.count_nonzero(members) < LEAST_POINTS + chance + _REJECTED_BEYOND * np.sqrt(chance):
         return None
     part = np.zeros(len(points), dtype=int)
     return ProfileArc(members=members, part=part, std_mm=std, centre_mm=centre, radius_mm=radius)
@@ -194,14 +214,13 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
     """Find the best supported straight line in an ordered profile (N, 2), mm, or None."""
     if len(points) < LEAST_POINTS:
         return None
-    tolerance = max(_REJECTED_BEYOND * estimate_noise(points), 1e-4)
     first, second = rng.integers(len(points), size=(2, _TRIALS))
     along = points[second] - points[first]
     length = np.linalg.norm(along, axis=1)
     proper = length > 0
     normals = np.column_stack([-along[:, 1], along[:, 0]])[proper] / length[proper, None]
     off = np.abs(points @ normals.T - np.sum(points[first[proper]] * normals, axis=1)).T
-    tolerance = _widen_tolerance(off, tolerance)
+    tolerance = _choose_tolerance(off, float(np.linalg.norm(np.ptp(points, axis=0))))
     members = off[np.argmax(np.count_nonzero(off < tolerance, axis=1))] < tolerance
 
     def line(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -282,7 +301,9 @@ def find_walls(points: np.ndarray, near: np.ndarray) -> np.ndarray:
             along, off = (centred @ np.linalg.svd(centred, full_matrices=False)[2].T).T
             curve = np.vander(along / max(np.ptp(along), 1e-9), 3)
             off = off - curve @ np.linalg.lstsq(curve, off, rcond=None)[0]
-            kept = np.abs(off) <= max(_REJECTED_BEYOND * MAD_TO_STD * float(np.median(np.abs(off))), 1e-4)
+            kept = np.abs(off) <= max(
+                _REJECTED_BEYOND * MAD_TO_STD * float(np.median(np.abs(off))), _LEAST_TOLERANCE_MM
+            )
             if kept.all():
                 number += 1
                 walls[run] = number

@@ -214,7 +214,7 @@ def _start_of_plane(
 def _start_of_step(
     problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
-    """Estimate a state from the lines of a step: as for a plane from the first face, then the height."""
+    """Estimate a state from the lines of a step: the plane of the first face, then the height."""
     first = [points[part == 0] for points, part in zip(problem.points, problem.part, strict=True)]
     none = [np.zeros(len(points), dtype=int) for points in first]
     state = _start_of_plane(replace(problem, points=first, part=none, shape=PlaneShape()), lines, sheet, rng)
@@ -252,13 +252,12 @@ def _start_of_ring(
     heights = np.sort(height[beside])
     alike = np.searchsorted(heights, height[beside] + reach) - np.searchsorted(heights, height[beside] - reach)
     beside = rng.choice(beside, _JUDGED, p=1 / alike / np.sum(1 / alike)) if len(beside) else beside
-    circle = _find_circle(base[beside] @ axes.T, shape.size_mm, reach, rng)
-    if circle is None:
+    assert shape.size_mm is not None
+    centre = _find_circle(base[beside] @ axes.T, shape.size_mm, reach, rng)
+    if centre is None:
         require_surfaces(problem)
-    assert circle is not None
-    state = replace(
-        state, artefact=np.concatenate([normal, circle[:2] @ axes + distance * normal, [shape.size_mm or circle[2]]])
-    )
+    assert centre is not None
+    state = replace(state, artefact=np.concatenate([normal, centre @ axes + distance * normal, [shape.size_mm]]))
     flat = to_sheet(whole.points, sheet)
     for narrower in (1.0, 3.0, 9.0):
         problem = whole.select_detected(whole.detect_again(state, flat, max(reach / narrower, 5 * noise), rng))
@@ -268,22 +267,19 @@ def _start_of_ring(
 
 
 def require_surfaces(problem: Problem) -> None:
-    """Raise CalibrationError if too few profiles show a surface; `NoFit` if the given size may be wrong."""
+    """Raise NoFit if too few profiles show a surface."""
     if (words := problem.shape.describe_missing(problem.part)) is not None:
-        raise CalibrationError(words) if problem.shape.size_mm is None else NoFit(words)
+        raise NoFit(words)
 
 
-def _find_circle(
-    points: np.ndarray, radius_mm: float | None, reach_mm: float, rng: np.random.Generator
-) -> np.ndarray | None:
-    """Find the circle (3,) (centre, radius) with most points (N, 2) near it, less those inside and outside."""
+def _find_circle(points: np.ndarray, radius_mm: float, reach_mm: float, rng: np.random.Generator) -> np.ndarray | None:
+    """Find the centre (2,) of the circle with most points (N, 2) near it, less those inside and outside."""
     if not len(points):
         return None
     tried = points[rng.integers(len(points), size=(_CIRCLES, 3))]
     centres, radii = circles_through(tried)
     proper = np.isfinite(radii) & (radii > _CLEAR * reach_mm) & (radii < np.linalg.norm(np.ptp(points, axis=0)))
-    if radius_mm is not None:
-        proper &= np.abs(radii - radius_mm) < max(0.03 * radius_mm, reach_mm)
+    proper &= np.abs(radii - radius_mm) < max(0.03 * radius_mm, reach_mm)
     if not proper.any():
         return None
     off = np.abs(np.linalg.norm(points - centres[proper, None], axis=2) - radii[proper, None])
@@ -291,7 +287,7 @@ def _find_circle(
     near, beside = (np.count_nonzero(off < reach, axis=1) for reach in (reach_mm, 3 * reach_mm))
     score = 1.5 * near - 0.5 * beside
     best = int(np.argmax(score))
-    return np.append(centres[proper][best], radii[proper][best]) if score[best] > 0 else None
+    return centres[proper][best] if score[best] > 0 else None
 
 
 def _solve_robustly(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -115,7 +115,7 @@ def fit_sheet(
     Raises
     ------
     CalibrationError
-        The points do not determine a plane or are not on one, its normal is far from the nominal one, or its distance
+        The points do not determine a plane or are not on one, or its normal is far from the nominal one. Its distance
         from the camera differs from ``nominal_offset_mm`` by a factor that indicates wrong units.
     """
     try:

@@ -104,8 +104,8 @@ class StandardTurn:
                 "the laser, or let the stage move the sensor across the stripe between three or more images"
             )
         return (
-            f"{said} {np.degrees(angle):.1f} +- {np.degrees(self.std):.1f}° about the stripe and so {higher}, which is "
-            "taken into account: make it face the laser"
+            f"{said} {np.degrees(angle):.1f} +- {np.degrees(self.std):.1f}° about the stripe, so that it {higher}. "
+            "This is taken into account; to avoid it, make the standard face the laser"
         )
 
 

@@ -91,10 +91,20 @@ def solve_window(
 ) -> WindowSolution:
     """Find the window distance that minimises the mean square height error over all step images.
 
-    A coarse scan finds the valley, and Gauss-Newton steps within the bounds find the minimum. Only the calibration's
-    camera, sheet and OCS are used. ``window`` gives all window parameters except the distance. ``bounds_mm`` (low,
-    high) are the distances to search (default: 0.2 to 2.5 times the nominal one). ``known`` is the uncertainty of
-    heights without a certificate.
+    A coarse scan finds the valley, and Gauss-Newton steps within the bounds find the minimum.
+
+    Parameters
+    ----------
+    calibration
+        Calibration in air; only its camera, sheet and OCS are used.
+    window
+        Window with all parameters except the distance.
+    steps
+        Images of step standards.
+    bounds_mm
+        Lowest and highest distance to search; by default 0.2 to 2.5 times the nominal one.
+    known
+        Uncertainty of heights without a certificate.
 
     Raises
     ------

@@ -29,7 +29,21 @@ class Screen(Protocol):
     def live(
         self, image: np.ndarray, *, full_dn: int, points: np.ndarray | None, stripe: np.ndarray | None, remark: str
     ) -> None:
-        """Show an image (H, W) with the target's points (N, 2) and the stripe's pixels (N, 2) found in it."""
+        """Show an image with the target and the stripe found in it.
+
+        Parameters
+        ----------
+        image : (H, W)
+            Latest image.
+        full_dn
+            Grey value of a saturated pixel.
+        points : (N, 2) or None
+            Points of the target in the image, px.
+        stripe : (N, 2) or None
+            Pixels of the stripe in the image.
+        remark
+            Text below the image.
+        """
 
     def show_coverage(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
         """Show the coverage, with the points (N, 2) of each image."""

@@ -53,10 +53,26 @@ def guide(
     report: Callable[[str], None] = print,
     answers: int | None = None,
 ) -> GuidedRecording:
-    """Lead through the images of a calibration on a screen; parameters and errors are those of `uwlts.record_guided`.
+    """Lead through the images of a calibration on a screen. The errors are those of `uwlts.record_guided`.
 
-    Camera and stage are the plan's. ``answers`` is a file descriptor for the operator's answers, by default standard
-    input.
+    Parameters
+    ----------
+    plan
+        Plan of the images, with camera and stage.
+    out
+        File of the calibration; the captures are written beside it.
+    screen
+        Display and buttons for the operator.
+    refractions, distortion
+        Window model and lens coefficients of the calibration that judges the images.
+    resume
+        Continue interrupted captures.
+    overwrite
+        Replace existing captures, unless they are continued.
+    report
+        Receives each line of output.
+    answers
+        File descriptor of the operator's answers; by default standard input.
     """
     camera = plan.camera_address()
     options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=CameraOptions(distortion=distortion))

@@ -15,6 +15,7 @@ from uwlts.errors import DescriptionError
 from uwlts.files.reading import MOST_DEPTH, read_text, require_plain, shorten
 from uwlts.model.library import merge_tables, validate_description
 from uwlts.model.sensor import Distortion, Sensor
+from uwlts.storage.import_.equidistant import convert_equidistant
 
 # Alternative names, compared without case and underscores.
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "m1")
@@ -22,6 +23,8 @@ _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "di
 _BROWN_CONRADY = ("", "plumbbob", "rationalpolynomial", "radtan", "radialtangential", "brownconrady")
 _BROWN_CONRADY += ("opencv", "fullopencv")
 _PINHOLES = ("pinhole", "perspective", "none")
+_EQUIDISTANT = ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4", "kb4")
+"""Names of the model of `cv2.fisheye` in ROS, Kalibr, COLMAP and others."""
 _MODELS = ("distortionmodel", "distortiontype", "projectionmodel", "lensmodel")
 """Names that state nothing but the lens model, so that an unknown value is a foreign model."""
 _MAYBE_MODELS = ("cameramodel", "cameratype", "model", "modeltype", "type", "projection", "lens", "lenstype")
@@ -66,15 +69,16 @@ class KnownCamera:
 def read_intrinsics(path: Path) -> KnownCamera:
     """Read a camera from an OpenCV file (YAML, XML or JSON), a ROS CameraInfo or a Kalibr file of one camera (YAML).
 
-    Raises DescriptionError if the file is missing or damaged, lacks camera matrix or distortion, or the camera is not a
-    pinhole with Brown-Conrady or rational distortion.
+    An equidistant lens becomes the rational one that it equals in the image. Raises DescriptionError if the file is
+    missing or damaged, lacks camera matrix or distortion, or the camera has neither Brown-Conrady, rational nor
+    equidistant distortion.
     """
     text = read_text(
         path, most_bytes=_MOST_BYTES, error=DescriptionError, called="intrinsics", foreign="is not a file of intrinsics"
     )
     # OpenCV's own parser hangs or terminates the process on some damaged files.
     entries = _xml(text, path) if text.lstrip().startswith("<?xml") else _yaml(text, path)
-    _refuse_foreign_models(entries, path)
+    equidistant = _is_equidistant(entries, path)
     known = _unpack_kalibr({_plain_name(key): value for key, value in entries.items()}, path)
     matrix, coefficients = _numbers(known, _MATRIX, path), _numbers(known, _COEFFICIENTS, path)
     if matrix.size != 9:
@@ -84,7 +88,16 @@ def read_intrinsics(path: Path) -> KnownCamera:
         raise DescriptionError(
             f"{path}: the camera matrix is {matrix.tolist()}; expected fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy"
         )
-    return KnownCamera(fx, fy, cx, cy, _distortion(coefficients, path), _size(known, path))
+    size = _size(known, path)
+    if not equidistant:
+        return KnownCamera(fx, fy, cx, cy, _distortion(coefficients, path), size)
+    if len(coefficients) != 4:
+        raise DescriptionError(f"{path}: an equidistant lens has 4 coefficients, k1 to k4; found {len(coefficients)}")
+    # Without a size, the principal point is taken as the image's centre.
+    width, height = size or (2.0 * cx + 1.0, 2.0 * cy + 1.0)
+    corner = float(np.hypot(max(cx, width - 1.0 - cx) / fx, max(cy, height - 1.0 - cy) / fy))
+    converted = convert_equidistant(coefficients, corner=corner, focal_px=max(fx, fy), source=str(path))
+    return KnownCamera(fx, fy, cx, cy, converted, size)
 
 
 def set_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor:
@@ -174,24 +187,37 @@ def _plain_name(name: object) -> str:
     return re.sub("[^a-z0-9]", "", str(name).rpartition(".")[2].lower())
 
 
-def _refuse_foreign_models(entries: dict[str, object], path: Path) -> None:
-    """Raise DescriptionError if any entry, also in nested tables, states a lens model that the sensor does not have."""
+def _is_equidistant(entries: dict[str, object], path: Path) -> bool:
+    """Return True if an entry, also in nested tables, states the model of `cv2.fisheye`.
+
+    Raises DescriptionError if one states a lens model that the sensor does not have.
+    """
+    stated: dict[bool, str] = {}
     for key, value in _named_values(entries):
-        name, model = _plain_name(key), _plain_name(value)
-        foreign = model not in (*_BROWN_CONRADY, *_PINHOLES)
+        name, model, entry = _plain_name(key), _plain_name(value), f"{key}: {shorten(str(value))}"
+        foreign = model not in (*_BROWN_CONRADY, *_PINHOLES, *_EQUIDISTANT)
+        equidistant = name in (*_MODELS, *_MAYBE_MODELS) and model in _EQUIDISTANT
         if name in _MODELS:
             refused = foreign and value is not None
         elif name in _MAYBE_MODELS:
             refused = foreign and _FOREIGN.search(model) is not None
         else:
-            # OpenCV writes fisheye_model: 1, and xi for its omnidirectional model.
-            refused = ("fisheye" in name or name == "xi") and str(value).lower() not in _NO
+            # OpenCV writes xi for its omnidirectional model, and fisheye_model: 1 for the equidistant one.
+            refused = name == "xi" and str(value).lower() not in _NO
+            equidistant = "fisheye" in name and str(value).lower() not in _NO
         if refused:
             raise DescriptionError(
-                f"{path} has another lens model, {key}: {shorten(str(value))}; this program's camera is a pinhole with "
-                "k1, k2, p1, p2, k3 (plumb_bob) or with k4, k5, k6 as well (rational_polynomial): calibrate with one "
-                "of these"
+                f"{path} has another lens model, {entry}; this program's camera is a pinhole with k1, k2, p1, p2, k3 "
+                "(plumb_bob), with k4, k5, k6 as well (rational_polynomial), or with k1 to k4 of an equidistant lens "
+                "(fisheye): calibrate with one of these"
             )
+        if equidistant or (name in _MODELS and model and model in _BROWN_CONRADY):
+            stated.setdefault(equidistant, entry)
+    if len(stated) > 1:
+        raise DescriptionError(
+            f"{path} states two lens models, {' and '.join(stated.values())}; expected one: remove the wrong one"
+        )
+    return True in stated
 
 
 def _named_values(value: object) -> Iterator[tuple[str, object]]:

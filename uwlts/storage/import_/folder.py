@@ -313,7 +313,7 @@ class _Reader:
         given = self._given
         raw = read_image(self._folder / name, accept=partial(self._require_size, name))
         if self.dtype not in (np.void, raw.dtype):
-            raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self.dtype}")
+            raise ImageError(f"{name} contains {raw.dtype}, the images before it contain {self.dtype}")
         channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
         # A header does not state the bits, and the grey values of an exported capture fit in it.
         bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)

@@ -125,10 +125,29 @@ def read_description(path: Path) -> ImportDescription:
 def capture_header(
     given: ImportDescription, sensor: Sensor, *, beside: Path, name: str, saturation_dn: int, remarks: Table
 ) -> CaptureHeader:
-    """Return the capture's header; ``name`` and ``remarks`` (provenance) are defaults.
+    """Return the header of an imported capture.
 
-    Files named in the description are relative to the folder ``beside``. Raises DescriptionError if medium, target,
-    direction or header are missing, unknown or not valid, and EvaluationError if the artefact is not valid.
+    Parameters
+    ----------
+    given
+        Description of the folder.
+    sensor
+        Description of the sensor.
+    beside
+        Folder of the files that the description names.
+    name
+        Name of the capture, if the description has none.
+    saturation_dn
+        Grey value of a saturated pixel.
+    remarks
+        Provenance, if the description has none.
+
+    Raises
+    ------
+    DescriptionError
+        Medium, target, direction or header are missing, unknown or not valid.
+    EvaluationError
+        The artefact is not valid.
     """
     # A description with its own provenance must not hide that there is no stage.
     mark: Table = {"stage": NO_STAGE} if given.stage.free else {}

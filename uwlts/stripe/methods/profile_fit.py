@@ -105,8 +105,8 @@ def centres(peak: PeakWindow) -> np.ndarray:
     """Fit a Gaussian profile and return its centre (M,) float32, px from the window's first pixel.
 
     The model is f = A exp(-u^2 / 2) with u = (x - c) / s, above the line through the peak's flanks. The variance of a
-    pixel is v = r^2 + (C f)^2, with the noise floor r of detector and surroundings and the speckle contrast C, which
-    includes shot noise. Both are estimated from all lines together: r beside the stripes, C from the residuals of a
+    pixel is v = r^2 + (C f)^2. The noise floor r is that of detector and surroundings; the speckle contrast C includes
+    shot noise. Both are estimated from all lines together: r beside the stripes, C from the residuals of a
     first fit.
 
     Each step solves sum (y - f) df/dp / v = 0, linearised in p = (ln A, c / s, ln s), with v of the previous step. This

@@ -20,8 +20,8 @@ def centres(peak: PeakWindow) -> np.ndarray:
     repeated about its own vertex, because a Gaussian is no parabola and pixels further out on one side would bias the
     vertex.
 
-    With Sk = sum w u^k and Tk = sum w f u^k, the normal equations of f = a0 + a1 u + a2 u^2 give a1 and a2. The vertex
-    is -a1 / (2 a2).
+    The sums Sk = sum w u^k and Tk = sum w f u^k form the normal equations of f = a0 + a1 u + a2 u^2. The vertex is
+    -a1 / (2 a2).
     """
     half = np.float32(0.5 * FWHM_PER_SIGMA) * peak.kernel_sigma()
     centre = peak.middle.copy()

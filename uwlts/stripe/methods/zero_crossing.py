@@ -12,7 +12,7 @@ from uwlts.stripe.peak_window import PeakWindow, gaussian_moments
 def centres(peak: PeakWindow) -> np.ndarray:
     """Compute the zero of the profile's correlation with the derivative of a Gaussian as wide as the stripe.
 
-    With t = (x - c) / s and g = exp(-t^2 / 2), F(c) = sum f t g is proportional to the derivative at c of the profile f
+    Let t = (x - c) / s and g = exp(-t^2 / 2). F(c) = sum f t g is proportional to the derivative at c of the profile f
     smoothed with g. A kernel as wide as the stripe is the matched filter. Its zero is the least-squares position of a
     Gaussian, with the least variance in white noise. The kernel is evaluated at a real-valued c0, the midpoint of the
     half-height crossings, instead of interpolating between pixels.

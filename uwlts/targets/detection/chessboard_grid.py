@@ -1,6 +1,7 @@
 """Grid of a chessboard's corners: an array (rows, columns, 2) of pixels with NaN for missing corners."""
 
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -20,15 +21,21 @@ class GridRule:
     sigma_px : float
         Blur before squares are compared, px.
     residual : float
-        Largest rms distance of the corners from an even grid, in side lengths of a square.
+        Largest rms distance of the corners from even grids of `neighbourhood` corners, in side lengths of a square.
+    neighbourhood : int
+        Corners along each side of a part of the board that must be an even grid in perspective. Over two squares of
+        11 deg each, an equidistant lens departs from perspective by less than 1 % of a square.
     alternating : float
         Least fraction of neighbouring squares that are dark and bright as expected.
-    sample_offset : float
-        Distance of the sampled places in squares from their corner, in side lengths: away from the edges.
+    reaches : tuple of float
+        Distances from a corner of the places where its squares are compared, in side lengths, tried in order: near the
+        middles of whole squares, and within outer squares that the board's rim cuts to half or a fifth of their width.
+    far : float
+        Distance beyond a side's corners, in side lengths, where outer squares that are not cut still alternate.
     unlike : float
         Largest difference between opposite squares, as a fraction of that between dark and bright squares.
     window : float
-        Half side of the window for the refinement of a corner, in side lengths: without the next corner.
+        Half side of the window for the refinement of a corner, in reaches: its own corners are within the squares too.
     least_window_px : int
         Least half side, px: five pixels contain an edge in focus.
     most_window_px : int
@@ -45,10 +52,12 @@ class GridRule:
 
     sigma_px: float = 1.5
     residual: float = 1 / 30
+    neighbourhood: int = 3
     alternating: float = 0.9
-    sample_offset: float = 0.3
+    reaches: tuple[float, ...] = (0.45, 0.3, 0.15)
+    far: float = 0.85
     unlike: float = 0.6
-    window: float = 0.3
+    window: float = 2 / 3
     least_window_px: int = 2
     most_window_px: int = 20
     smoothing_px: float = 0.8
@@ -66,30 +75,21 @@ def remove_doubtful(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     there = np.argwhere(np.isfinite(grid[..., 0]))
     doubtful = np.delete(there, select_agreeing(grid[tuple(there.T)], there), axis=0)
     grid[tuple(doubtful.T)] = np.nan
-    grid[_square_contrast(grey, grid) == 0] = np.nan
+    grid[_compare_squares(grey, grid)[1] == 0] = np.nan
     return grid
 
 
 def find_chessboard_fault(grey: np.ndarray, board: np.ndarray) -> str | None:
     """Return why corners (rows, columns, 2) are not those of a chessboard in an image (H, W), or None.
 
-    The residual of a homography and a cubic for the lens distortion must be small. Neighbouring squares must be dark
-    and bright in turn, and the pattern must not continue beyond the board. Missing corners are NaN.
+    Every part of it must be an even grid in perspective; over the whole board, the lens may bend its lines.
+    Neighbouring squares must be dark and bright in turn. The pattern must not continue beyond the board, except by
+    squares that its rim cuts. Missing corners are NaN.
     """
     rows, columns = board.shape[:2]
-    there = np.isfinite(board[..., 0])
-    j, i = np.nonzero(there)
-    flat, pixels = np.stack([i, j], axis=1).astype(np.float64), board[there]
-    sides, several = _side_lengths(board), min(len(set(i)), len(set(j))) > 1 and len(flat) > 5
-    homography = cv2.findHomography(flat, pixels)[0] if several and len(sides) else None
-    if homography is None:
+    share = _measure_unevenness(board)
+    if share is None:
         return "too few corners are in view"
-    off = pixels - cv2.perspectiveTransform(flat[:, None], homography)[:, 0]
-    x, y = (2.0 * flat / (columns - 1, rows - 1) - 1.0).T
-    terms = np.stack([x**a * y**b for a in range(4) for b in range(4 - a)], axis=1)
-    if len(flat) > 2 * terms.shape[1]:
-        off = off - terms @ np.linalg.lstsq(terms, off, rcond=None)[0]
-    share = np.sqrt(np.mean(np.sum(off**2, axis=1))) / np.median(sides)
     if not share < _RULE.residual:
         return f"its corners deviate from an even grid by {100 * share:.0f} % of a square"
     centres = (board[:-1, :-1] + board[1:, 1:] + board[:-1, 1:] + board[1:, :-1]) / 4
@@ -101,22 +101,69 @@ def find_chessboard_fault(grey: np.ndarray, board: np.ndarray) -> str | None:
     turns = np.concatenate([each[np.isfinite(each)] for each in changes])
     if len(turns) and (np.sign(turns) == np.sign(np.median(turns))).mean() < _RULE.alternating:
         return "its squares are not dark and bright in turn"
-    if _has_more_corners(grey, board):
-        return f"the board has more corners than {columns} x {rows}"
-    return None
+    return f"the board has more corners than {columns} x {rows}" if has_more_corners(grey, board) else None
 
 
-def _has_more_corners(grey: np.ndarray, board: np.ndarray) -> bool:
-    """Return True if the pattern continues beyond a side of a board (rows, columns, 2)."""
-    usual = np.median(_square_contrast(grey, board)[np.isfinite(board[..., 0])])
+def _measure_unevenness(board: np.ndarray) -> float | None:
+    """Return the rms distance of corners (rows, columns, 2) from even grids in perspective, in side lengths.
+
+    Each grid is a homography of a part of the board. None if no part has enough corners.
+    """
+    size, square, freedom = _RULE.neighbourhood, 0.0, 0
+    starts = [range(0, max(length - size, 0) + 1) for length in board.shape[:2]]
+    for top, left in product(*starts):
+        part = board[top : top + size, left : left + size]
+        j, i = np.nonzero(np.isfinite(part[..., 0]))
+        sides = _side_lengths(part)
+        if min(len(set(i)), len(set(j))) < 2 or len(i) < 6 or not len(sides):
+            continue
+        flat, pixels = np.stack([i, j], axis=1).astype(np.float64), part[j, i]
+        homography = cv2.findHomography(flat, pixels)[0]
+        if homography is None:
+            continue
+        off = (pixels - cv2.perspectiveTransform(flat[:, None], homography)[:, 0]) / np.median(sides)
+        square, freedom = square + float(np.sum(off**2)), freedom + 2 * len(i) - 8
+    return float(np.sqrt(2.0 * square / freedom)) if freedom else None
+
+
+def has_more_corners(grey: np.ndarray, board: np.ndarray) -> bool:
+    """Return True if a pattern continues beyond the sides of a board (rows, columns, 2).
+
+    Squares at the rim that are cut do not count, if the opposite side shows which corners are meant: beyond it there
+    are such squares too, or whole ones and no more.
+    """
+    usual = np.median(_compare_squares(grey, board)[1][np.isfinite(board[..., 0])])
+    continues, whole = np.zeros(4, bool), np.zeros(4, bool)
     for turn in range(4):
         turned = np.rot90(board, turn)
         next_row = 2.0 * turned[:1] - turned[1:2]
         inside = np.all((next_row > 0) & (next_row < np.array(grey.shape[::-1]) - 1), axis=2)[0]
-        further = _square_contrast(grey, np.concatenate([next_row, turned]))[0]
-        if inside.sum() > 2 and (further[inside] > usual / 2).mean() > 0.5:
+        further = _compare_squares(grey, np.concatenate([next_row, turned]))[1][0]
+        continues[turn] = inside.sum() > 2 and (further[inside] > usual / 2).mean() > 0.5
+        if continues[turn] and _are_whole(grey, next_row[0], turned[0]):
             return True
-    return False
+        whole[turn] = _are_whole(grey, turned[0], turned[1])
+    opposite = np.roll(continues, 2) | np.roll(whole, 2)
+    return bool((continues & ~opposite).any())
+
+
+def _are_whole(grey: np.ndarray, corners: np.ndarray, before: np.ndarray) -> bool:
+    """Return True if the squares beyond a row of corners (K, 2) alternate over their whole width."""
+    near, far = (
+        _measure_alternation(grey, corners + reach * (corners - before)) for reach in (_RULE.reaches[-1], _RULE.far)
+    )
+    return bool(far > near / 2)
+
+
+def _measure_alternation(grey: np.ndarray, places: np.ndarray) -> float:
+    """Return the mean change of grey level, with alternating sign, along the middles of places (K, 2); 0 if unknown."""
+    middles = (places[1:] + places[:-1]) / 2
+    inside = np.isfinite(middles[:, 0]) & ((middles > 0) & (middles < np.array(grey.shape[::-1]) - 1)).all(axis=1)
+    levels = np.full(len(middles), np.nan)
+    levels[inside] = sample_levels(grey, middles[inside])
+    changes = np.diff(levels) * np.where(np.arange(len(levels) - 1) % 2, -1.0, 1.0)
+    known = changes[np.isfinite(changes)]
+    return float(abs(known.mean())) if len(known) else 0.0
 
 
 def refine_corners(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -128,15 +175,16 @@ def refine_corners(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
     found, sides = np.full_like(grid, np.nan), _side_lengths(grid)
     if not len(sides):
         return found
-    half = int(np.clip(_RULE.window * sides.min(), _RULE.least_window_px, _RULE.most_window_px))
-    rim = half + 3
+    most = int(np.clip(_RULE.window * _RULE.reaches[0] * sides.min(), _RULE.least_window_px, _RULE.most_window_px))
+    rim = most + 3
     until = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _RULE.passes, _RULE.settled_px
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _RULE.smoothing_px)
-    levels = _square_levels(smooth, grid)
+    levels, _, reaches = _compare_squares(smooth, grid)
     dark, bright = np.sort((levels[:2] + levels[2:]) / 2, axis=0)
     smooth = cv2.copyMakeBorder(smooth, rim, rim, rim, rim, cv2.BORDER_REPLICATE)
     for place in np.argwhere(bright > dark):
         at = tuple(place)
+        half = int(np.clip(_RULE.window * reaches[at] * sides.min(), _RULE.least_window_px, most))
         column, row = nearest = np.rint(grid[at]).astype(int)
         window = smooth[row : row + 2 * rim + 1, column : column + 2 * rim + 1]
         middle, span = (dark[at] + bright[at]) / 2, _RULE.cut_off * (bright[at] - dark[at])
@@ -159,26 +207,28 @@ def count_corners(board: np.ndarray) -> int:
     return int(np.isfinite(board[..., 0]).sum())
 
 
-def _square_levels(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return grey levels (4, J, I) of the four squares around each corner, in cyclic order; NaN if unknown."""
-    down, right = (_steps(grid, axis) for axis in (0, 1))
-    signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-    places = np.stack([grid + _RULE.sample_offset * (x * right + y * down) for x, y in signs])
-    known = np.isfinite(places).all(axis=(0, 3))
-    levels = np.full(places.shape[:3], np.nan)
-    levels[:, known] = sample_levels(grey, places[:, known].reshape(-1, 2)).reshape(4, -1)
-    return levels
+def _compare_squares(grey: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return levels (4, J, I) of the four squares around each corner, their contrast (J, I), and the reach (J, I).
 
-
-def _square_contrast(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return the difference (J, I) between the dark and the bright squares around each corner.
-
-    It is zero if opposite squares differ, as at a board's rim or below a stripe, and if squares are unknown.
+    Levels are in cyclic order, NaN if unknown. The contrast is the difference of the dark and the bright squares. It is
+    zero if opposite squares differ at every reach, as at a board's outline or below a stripe, and if squares are
+    unknown. The reach is the first one where opposite squares are alike.
     """
-    levels = _square_levels(grey, grid)
-    difference = np.abs(levels[0] + levels[2] - levels[1] - levels[3]) / 2
-    unlike = np.maximum(np.abs(levels[0] - levels[2]), np.abs(levels[1] - levels[3]))
-    return np.where(unlike < _RULE.unlike * difference, difference, 0.0)
+    down, right = (_steps(grid, axis) for axis in (0, 1))
+    levels, contrast = np.full((4, *grid.shape[:2]), np.nan), np.zeros(grid.shape[:2])
+    reaches = np.full(grid.shape[:2], _RULE.reaches[0])
+    known = np.isfinite(grid + down + right).all(axis=2)
+    at, along, across = grid[known], right[known], down[known]
+    for reach in _RULE.reaches:
+        places = [at + reach * (x * along + y * across) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+        here = np.full_like(levels, np.nan)
+        here[:, known] = sample_levels(grey, np.concatenate(places)).reshape(4, -1)
+        difference = np.abs(here[0] + here[2] - here[1] - here[3]) / 2
+        unlike = np.maximum(np.abs(here[0] - here[2]), np.abs(here[1] - here[3]))
+        alike = (contrast == 0) & (unlike < _RULE.unlike * difference)
+        levels = np.where(alike | (reach == _RULE.reaches[0]), here, levels)
+        contrast, reaches = np.where(alike, difference, contrast), np.where(alike, reach, reaches)
+    return levels, contrast, reaches
 
 
 def _steps(grid: np.ndarray, axis: int) -> np.ndarray:

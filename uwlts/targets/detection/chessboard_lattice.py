@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.targets.detection.chessboard_grid import count_corners, remove_doubtful, sample_levels
+from uwlts.targets.detection.chessboard_grid import count_corners, has_more_corners, remove_doubtful, sample_levels
 from uwlts.targets.detection.lattice import LATTICE_RULE, STEPS
 
 
@@ -229,7 +229,7 @@ def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
                 piece = corners.grow(seed, steps, tree)
                 tried.update(piece.values())
                 found = max(found, piece, key=len)
-        board = _complete_board(_arrange_piece(found, corners), columns, rows, small.shape)
+        board = _complete_board(_arrange_piece(found, corners), columns, rows, corners.grey)
         if board is not None and (best is None or count_corners(board) > count_corners(best)):
             best = (board + 0.5) / scale - 0.5
         if best is not None and count_corners(best) == columns * rows:
@@ -257,27 +257,37 @@ def _trim(piece: np.ndarray) -> np.ndarray:
     return piece[down[0] : down[-1] + 1, right[0] : right[-1] + 1]
 
 
-def _complete_board(piece: np.ndarray, columns: int, rows: int, shape: tuple[int, ...]) -> np.ndarray | None:
+def _complete_board(piece: np.ndarray, columns: int, rows: int, grey: np.ndarray) -> np.ndarray | None:
     """Return the board (rows, columns, 2) that contains a piece (J, I, 2); None if its place is ambiguous."""
     boards = []
     for turned in (piece, np.rot90(piece)):
-        board = _place_piece(_crop_to_board(turned, columns, rows), columns, rows, shape) if turned.size else None
-        if board is not None:
-            boards.append(board)
+        if turned.size:
+            board = _place_piece(_crop_to_board(turned, columns, rows, grey), columns, rows, grey.shape)
+            boards += [] if board is None else [board]
     counts = [count_corners(board) for board in boards]
-    # The place of a piece that fits in both orientations is ambiguous, except for a complete square board.
-    if not boards or (len(boards) == 2 and counts[0] == counts[1] and not (columns == rows and counts[0] == rows**2)):
-        return None
-    return boards[int(np.argmax(counts))]
+    if len(boards) == 2 and counts[0] == counts[1]:
+        if columns == rows and counts[0] == rows**2:
+            return boards[0]
+        # A piece that fits in both orientations has its place only if it has further corners in one of them.
+        boards = [board for board in boards if not has_more_corners(grey, board)]
+        return boards[0] if len(boards) == 1 else None
+    return boards[int(np.argmax(counts))] if boards else None
 
 
-def _crop_to_board(piece: np.ndarray, columns: int, rows: int) -> np.ndarray:
-    """Return the part of a piece (J, I, 2), at most as large as the board, with most corners."""
+def _crop_to_board(piece: np.ndarray, columns: int, rows: int, grey: np.ndarray) -> np.ndarray:
+    """Return the part of a piece (J, I, 2), at most as large as the board, with most corners.
+
+    Of equal parts, it is the one beyond which there are only squares cut by the board's rim.
+    """
     there = np.isfinite(piece[..., 0])
     height, width = (min(size, most) for size, most in zip(there.shape, (rows, columns), strict=True))
     starts = product(range(there.shape[0] - height + 1), range(there.shape[1] - width + 1))
-    top, left = max(starts, key=lambda at: there[at[0] : at[0] + height, at[1] : at[1] + width].sum())
-    return _trim(piece[top : top + height, left : left + width])
+    parts = [_trim(piece[top : top + height, left : left + width]) for top, left in starts]
+    counts = [count_corners(part) for part in parts]
+    fullest = [part for part, count in zip(parts, counts, strict=True) if count == max(counts)]
+    if len(fullest) == 1:
+        return fullest[0]
+    return next((part for part in fullest if min(part.shape) > 1 and not has_more_corners(grey, part)), fullest[0])
 
 
 def _place_piece(piece: np.ndarray, columns: int, rows: int, shape: tuple[int, ...]) -> np.ndarray | None:

@@ -210,7 +210,7 @@ def test_tilts_are_those_of_the_poses():
 
 
 def led(setting: Setting, wanted: CompletionLimits, rng: np.random.Generator, *, most: int) -> State:
-    """Follow the requests as by hand: to about 3 deg and 5 mm."""
+    """Follow the requests like a hand, with errors of about 3 deg and 5 mm."""
     poses: list[np.ndarray] = []
     state = solve_state([], setting, wanted)
     while describe_missing(state) and len(poses) < most:
@@ -306,7 +306,7 @@ def test_what_is_missing_is_said(setting):
     square = [target_pose(middle_mm=(x, 0.0, z)) for x, z in ((-20, 300), (0, 330), (20, 360))]
     said = " ".join(describe_missing(solve_state(recorded(setting, square, np.random.default_rng(0)), setting)))
     assert "3 images, at least 8" in said and "% of the image is covered" in said
-    assert "right side, left side, lower side, upper side was never farther by 12 deg" in said
+    assert "never tilted away by 12 deg: the target's right side, left side, lower side, upper side" in said
 
 
 def test_a_sheet_without_stripes_is_missing(setting):

@@ -49,8 +49,8 @@ def test_95_percent_intervals_hold_the_truth(measured, quantity):
 def test_errors_are_as_large_as_stated(measured, quantity):
     """The mean square of error over standard uncertainty is one.
 
-    Uncertainties wrong by a factor of two either way make it 4 or 0.25; the interval reaches from 0.4 to 1.9. That of
-    pairs of diameters scatters no more than that of as many single ones.
+    Uncertainties wrong by a factor of two either way make it 4 or 0.25; the interval reaches from 0.4 to 1.9. The mean
+    square of pairs of diameters scatters no more than that of as many single ones.
     """
     scans = 2 * (WET + DRY)
     square = np.mean([(m.error_mm / m.std_mm) ** 2 for m in measured[quantity]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwlts.calibration.joint.estimate import estimate_noise
-from uwlts.calibration.joint.residuals import TARGET, Residuals
+from uwlts.calibration.joint.residuals import STRIPE, TARGET, Residuals
 
 IMAGES = 9
 
@@ -45,3 +45,21 @@ def test_independent_residuals_say_as_much_as_they_are():
     rng = np.random.default_rng(0)
     at = lattice(10, 10)
     assert 1.0 <= together([(at, rng.normal(0, 0.1, at.shape)) for _ in range(IMAGES)]) < 1.8
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.8])
+def test_neighbouring_residuals_of_a_stripe_count_as_fewer(correlation):
+    """The variance of the mean of a first-order autoregressive process is (1 + r) / (1 - r) times that of white noise.
+
+    For 16 images of 2000 lines, the estimate has a standard error of about 3 %. Correlations below 0.05 are left out,
+    which makes it 4 to 5 % smaller.
+    """
+    rng = np.random.default_rng(4)
+    parts = []
+    for number in range(16):
+        values = rng.standard_normal(2000)
+        for line in range(1, len(values)):
+            values[line] = correlation * values[line - 1] + np.sqrt(1 - correlation**2) * values[line]
+        parts.append(Residuals(STRIPE, values, np.empty((2000, 0)), np.empty((2000, 0)), np.arange(0), number))
+    factor = estimate_noise(STRIPE, parts, []).together
+    assert factor == pytest.approx((1 + correlation) / (1 - correlation), rel=0.15)

@@ -22,7 +22,7 @@ def problem(thesis):
 
 @pytest.fixture(scope="module")
 def pixels(problem):
-    """Thousands of pixels on whole lines, about the stripes of the target."""
+    """Return thousands of pixels with integer line numbers, near the stripes of the target."""
     at_px = np.tile(np.rint(problem.evidence[0].pixels), (12, 1))
     at_px[:, 1] += np.random.default_rng(5).uniform(-1.0, 1.0, len(at_px))
     assert len(at_px) >= FEWEST

@@ -235,7 +235,7 @@ def shot(sensor, pose, view, spoilt):
 
 @pytest.mark.slow
 def test_the_advised_shot_does_what_was_predicted(from_water, in_water, thesis):
-    """Predicted uncertainty within 20 %, as noise, and so the weights, is estimated again from all residuals."""
+    """The prediction is within 20 %, because the noise and the weights are estimated again from all residuals."""
     outlooks = rank_next_shots(from_water)
     best = outlooks[0]
     assert best.pose is not None

@@ -125,6 +125,22 @@ def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differe
     assert_derivatives(evidence, model, global_values, local, within=1e-4)
 
 
+def test_light_from_beside_the_sheet_comes_from_a_surface_beside_it():
+    """Points moved by a vector lie on the plane that is moved by the same vector, not by the opposite one."""
+    model, global_values = parameters()
+    evidence, _ = evidence_of("plane", stage_mm=STAGE[::4])
+    local = true_own("plane", evidence)
+    for key, slope in zip(SLOPES, SLOPE, strict=True):
+        global_values[model.keys.index(key)] = slope
+    beside = np.array([0.02, -0.01, 0.05])
+    plane = evidence.surface
+    normal = plane.normal + plane.across.T @ local[:2]
+    local[2] += normal @ beside / np.linalg.norm(normal)
+    moved = replace(evidence, beside_mm=np.tile(beside[:, None], (1, len(evidence.pixels))))
+    found = moved.residuals(model, global_values, local)
+    assert max(np.abs(part.values).max() for part in found) < 1e-6
+
+
 def test_known_sizes_are_off_by_their_standard_uncertainties():
     """Diameters of unknown uncertainty do not count, nor does anything of the same spheres of unknown size."""
     evidence, _ = evidence_of("spheres", artefact=STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.02}))

@@ -232,7 +232,7 @@ def test_the_page_and_the_lines_tell_every_model(plain_choice):
         "thesis <as built>", ["target.h5"], plain_choice, None, "no polynomials here", ["a warning"]
     )
     content = make_content(comparison)
-    text = json_text(content, indent=2, ascii=False)
+    text = json_text(content, indent=2, only_ascii=False)
     assert ModelComparisonContent.model_validate_json(text) == content
     usual = json.loads(text)["models"][0]
     assert list(usual) == ["model", "parameters", "inside", "outside", "as_good"]

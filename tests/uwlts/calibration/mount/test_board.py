@@ -179,8 +179,12 @@ def test_wrong_evidence_is_refused(thesis, capture_path):
         uwlts.calibrate_mount(capture_path, np.linalg.inv(poses), calibration=calibration)
     with pytest.raises(CalibrationError, match="insufficient rotation|T_base_platform"):
         uwlts.calibrate_mount(capture_path, np.tile(poses[0], (7, 1, 1)), calibration=calibration)
-    with pytest.raises(DescriptionError, match="shows a target: give no radius"):
+    with pytest.raises(DescriptionError, match="shows a target: give no artefact"):
         uwlts.calibrate_mount(capture_path, calibration=calibration, radius_mm=3.0)
+    with pytest.raises(DescriptionError, match="shows a target: give no artefact"):
+        uwlts.calibrate_mount(capture_path, calibration=calibration, artefact="plane")
+    with pytest.raises(DescriptionError, match="`pose_unit` describe a file of poses; there is none"):
+        uwlts.calibrate_mount(capture_path, calibration=calibration, pose_unit="m")
 
 
 def test_a_target_s_pose_follows_the_sensor(thesis, capture_path):

@@ -187,7 +187,7 @@ def test_stage_against_the_header(sensor, evidence):
         fit_polynomials(evidence, header_of(sensor, direction=(0.0, 0.0, -1.0)), degree=6)
 
 
-def test_missing_lines_borrow(sensor):
+def test_missing_lines_take_values_of_neighbours(sensor):
     """Lines hidden at all depths are interpolated; a gap wider than a tenth of the lines remains."""
     hidden, hole = np.arange(300, 360), np.arange(700, 900)
     found = fit_polynomials(evidence_of(sensor, without=np.r_[hidden, hole]), header_of(sensor), degree=6).calibration
@@ -228,7 +228,7 @@ def test_kinked_laser_line_is_reported(sensor, evidence):
 # --- nothing is extrapolated
 
 
-def test_no_number_outside(sensor, result):
+def test_no_value_is_outside_the_range(sensor, result):
     calibration = result.calibration
     low, high = calibration.domains()[500]
     lines = np.array([500 + calibration.first_line] * 4 + [calibration.first_line - 1, 5000, -3])
@@ -325,7 +325,7 @@ def test_stripe_beside_the_plate(sensor, evidence):
 
 
 def test_plate_map_takes_out_the_offsets_of_circles(sensor):
-    """Circles of 5 mm seen through lens and water: centroids by the shoelace formula of Fermat's rims.
+    """Centroids of 5 mm circles through lens and water are those of rims by Fermat's principle (shoelace formula).
 
     The offsets reach 0.1 px, 0.015 mm; the map's own degree leaves 1 to 2 um.
     """
@@ -472,7 +472,7 @@ def on_plane(sensor, depth):
 
 
 def lamp_image(sensor, depth):
-    """Bright circles on a dark plate, soft by a pixel; plate axes are the OCS's Y, -X turned so that z runs away."""
+    """Return bright circles on a dark plate, blurred by a pixel; the plate's x and y are Y and -X of the OCS."""
     x, y = np.moveaxis(on_plane(sensor, depth) @ turn(z=np.pi / 2)[:2, :2], -1, 0)
     i, j = np.rint(x / 9.375), np.rint(y / 9.372)
     radius = np.hypot(x - 9.375 * i, y - 9.372 * j)

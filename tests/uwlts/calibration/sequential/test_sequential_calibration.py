@@ -201,9 +201,9 @@ def test_contradictory_captures_are_refused(files, air_frames, tmp_path):
         run(write(tmp_path / "untold.h5", frames=air_frames[:1]))
     with pytest.raises(CalibrationError, match="found in no image"):
         run(write(tmp_path / "dark.h5", frames=[(np.zeros(SHAPE, np.uint8), 0.0, False)], target=PLATE))
-    aside = write(tmp_path / "aside.h5", frames=air_frames[:2], target=PLATE, stage_direction=(1.0, 0.0, 0.0))
+    sideways = write(tmp_path / "sideways.h5", frames=air_frames[:2], target=PLATE, stage_direction=(1.0, 0.0, 0.0))
     with pytest.raises(CalibrationError, match="along the laser's axis"):
-        run(aside)
+        run(sideways)
     away = write(tmp_path / "away.h5", frames=air_frames[:3], target=PLATE, stage_direction=(0.0, 0.0, -1.0))
     with pytest.raises(CalibrationError, match="mirrored relative to the stage"):
         run(away)

@@ -58,7 +58,7 @@ def test_a_turn_about_the_stripe_shows_along_the_stage_and_is_taken_into_account
         assert image.lengthened_std == pytest.approx(np.tan(TURN) * np.radians(0.58), rel=0.1)
     assert said.startswith("step.h5: the standard does not face the laser: it is rotated by ")
     assert float(said.split("rotated by ")[1].split(" ")[0]) == pytest.approx(6.0, abs=0.5)
-    assert "about the stripe and so appears higher by 0.5" in said
+    assert "about the stripe, so that it appears higher by 0.5" in said
     assert said.count("taken into account") == 1
 
 
@@ -94,7 +94,7 @@ def test_a_standard_that_faces_the_laser_is_not_doubted():
     ids=["the stage stood", "two images", "the standard was moved"],
 )
 def test_one_profile_shows_the_other_turn_only(steps):
-    """Seen from the slope of the faces; the turn about the stripe is taken to be as large, and doubles nothing else."""
+    """The slope of the faces shows the rotation; the one about the stripe is assumed to be as large."""
     images, (said,) = labelled(turned_step("step.h5", aside=-0.05, **steps))
     assert "rotated by 2.9° about the sheet's normal" in said
     assert "appears higher by 0.13 % or 0.029 mm" in said

@@ -1,0 +1,108 @@
+"""Mounts from sets that share nothing with the product: arcs among scattered points, and plain least squares."""
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import uwlts
+from tests.oracles.profilers import Kind, draw_set
+from tests.uwlts.drawn_mounts import differences, least_squares_mount, mount_of, rms_mm
+from uwlts.calibration.mount.profiles import find_arc
+from uwlts.errors import CalibrationError
+
+HARD: dict[str, Any] = {
+    "points": 2000,
+    "noise_mm": 0.009,
+    "smooth_mm": 0.07,
+    "robot_mm": 0.05,
+    "scattered": 0.15,
+    "background": False,
+    "steepest": np.radians(32),
+}
+"""A sphere of which a profiler sees 60 deg, with scattered points around and within it, and a smooth error."""
+
+
+def test_plain_least_squares_finds_the_mount_of_perfect_sets():
+    kinds: tuple[Kind, ...] = ("sphere", "plane", "step", "ring")
+    for kind in kinds:
+        given = draw_set(3, kind, noise_mm=1e-6, smooth_mm=0.0, robot_mm=0.0, turn_rad=0.0, poses=24, points=200)
+        mount, rms = least_squares_mount(given, size_known=True)
+        # A micrometre divided by the sine of the steepest view, and less than that from 24 poses.
+        assert rms < 3e-6 and np.abs(mount - given.mount).max() < 1e-5
+
+
+@pytest.mark.parametrize("options", [{}, HARD, HARD | {"points": 600, "scattered": 0.4}])
+@pytest.mark.parametrize("radius_known", [True, False])
+def test_arcs_among_scattered_points_are_found(options, radius_known):
+    """At most one arc in 30 is missed: those of less than 30 deg, of which the drawing makes some one in 100."""
+    found = wrong = count = 0
+    for seed in (200, 201, 202):
+        given = draw_set([seed, 0], "sphere", poses=16, **options)
+        for profile, surface in zip(given.profiles, given.surface, strict=True):
+            seen = np.isfinite(profile).all(axis=1)
+            on = surface[seen] == 0
+            arc = find_arc(profile[seen], given.size_mm if radius_known else None, np.random.default_rng(0))
+            count += 1
+            if arc is not None:
+                own = np.count_nonzero(arc.members & on)
+                right = own > 0.8 * on.sum() and np.count_nonzero(arc.members & ~on) < 0.1 * on.sum()
+                found, wrong = found + right, wrong + (not right)
+    assert count == 48 and found >= 46 and wrong == 0
+
+
+def test_scattered_points_alone_are_rarely_an_arc(rng):
+    found = 0
+    for _ in range(40):
+        depth = rng.uniform(150, 250, rng.choice([100, 300, 1000, 2000]))
+        points = np.column_stack([np.tan(np.linspace(-0.3, 0.3, len(depth))) * depth, depth])
+        found += find_arc(points, None, rng) is not None
+    # One in ten, measured on 120 others; more than 13 of 40 once in 10,000 runs.
+    assert found <= 13
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(8)
+
+
+CASES = [("sphere", True), ("sphere", False), ("plane", True), ("step", False)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "size_known", "seed"),
+    [
+        ("sphere", False, 300),
+        *(pytest.param(*case, seed, marks=pytest.mark.slow) for case in CASES for seed in (301, 302, 303)),
+    ],
+)
+def test_the_scatter_is_that_of_plain_least_squares(kind, size_known, seed):
+    given = draw_set([seed, 1], kind)
+    mount = mount_of(given, size_known=size_known)
+    # Plain least squares has the smallest scatter by definition; weights that suit the errors add some per cent.
+    assert rms_mm(given, mount) < 1.1 * least_squares_mount(given, size_known=size_known)[1]
+    assert (np.abs(differences(mount.transform(), given.mount)) < 5 * mount.std()).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [310, 311])
+def test_halves_agree_within_what_they_state(seed):
+    """The form error is the same in all profiles; halves cannot show it, but each must state its own scatter."""
+    given = draw_set([seed, 0], "sphere", poses=32, fixed_mm=0.03, **HARD)
+    one, other = (mount_of(given.select(slice(k, None, 2))) for k in (0, 1))
+    apart = differences(one.transform(), other.transform())
+    spread = np.array(one.covariance) + np.array(other.covariance)
+    assert apart @ np.linalg.solve(spread, apart) < chi2.isf(1e-4, 6)
+
+
+def test_poses_that_do_not_belong_are_refused_quickly():
+    """Poses in another order: once they took 60 rounds, twice; the limit is 4 times what a mount takes."""
+    given = draw_set(4, "sphere", poses=16, points=300)
+    begun = time.process_time()
+    mount_of(given)
+    usual, begun = time.process_time() - begun, time.process_time()
+    with pytest.raises(CalibrationError, match="no mount fits|do not determine|does not converge|and agree"):
+        uwlts.calibrate_mount(given.profiles, given.poses[::-1], radius_mm=given.size_mm)
+    assert time.process_time() - begun < 4 * max(usual, 1.0)

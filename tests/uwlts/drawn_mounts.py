@@ -1,0 +1,60 @@
+"""Mounts of the sets of `tests.oracles.profilers`, their errors and scatter, and plain least squares beside them."""
+
+import numpy as np
+from scipy.optimize import least_squares
+
+import uwlts
+from tests.oracles.profilers import ProfilerSet, pose_of, scatter_mm, turn_between, turn_by
+from uwlts.model.mount import Mount, PlaneFound, RingFound, SphereFound, StepFound
+
+
+def mount_of(given: ProfilerSet, *, size_known: bool = True) -> Mount:
+    """Calibrate the mount of a set."""
+    radius_mm = given.size_mm if size_known and given.kind in ("sphere", "ring") else None
+    height_mm = given.size_mm if size_known and given.kind == "step" else None
+    return uwlts.calibrate_mount(
+        given.profiles, given.poses, artefact=given.kind, radius_mm=radius_mm, height_mm=height_mm
+    )
+
+
+def rms_mm(given: ProfilerSet, mount: Mount) -> float:
+    """Root mean square distance of all true points of the artefact, of all poses, from the artefact as found."""
+    found = mount.artefact
+    if isinstance(found, SphereFound):
+        place, axis, size = np.array(found.centre_mm), np.zeros(3), found.radius_mm
+    elif isinstance(found, RingFound):
+        place, axis, size = np.array(found.centre_mm), np.array(found.axis), found.radius_mm
+    elif isinstance(found, StepFound):
+        # Its first face is the nearer one, which is the upper one of a drawn step.
+        axis = np.array(found.normal)
+        place, size = axis * (found.distance_mm + found.height_mm), -found.height_mm
+    else:
+        assert isinstance(found, PlaneFound)
+        axis = np.array(found.normal)
+        place, size = axis * found.distance_mm, 0.0
+    return float(np.sqrt(np.mean(scatter_mm(given, mount.transform(), place, axis, size) ** 2)))
+
+
+def differences(mount: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Differences (6,) of two mounts (4, 4): shift, mm, and rotation about the platform's axes, rad."""
+    return np.append(mount[:3, 3] - other[:3, 3], turn_between(other[:3, :3], mount[:3, :3]))
+
+
+def least_squares_mount(given: ProfilerSet, *, size_known: bool) -> tuple[np.ndarray, float]:
+    """Return the mount (4, 4) by plain least squares from the true values, and the rms distance of the points, mm."""
+    axes = given.artefact[:3, :3]
+    # Along a plane, or about an axis, nothing changes: these steps are not parameters.
+    free = {"sphere": (0, 1, 2), "ring": (0, 1, 2, 3, 4), "plane": (2, 3, 4), "step": (2, 3, 4)}[given.kind]
+    sized = given.kind != "plane" and not size_known
+
+    def moved(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        step = np.zeros(5)
+        step[list(free)] = values[6 : 6 + len(free)]
+        mount = given.mount @ pose_of(turn_by(values[3:6]), values[:3])
+        axis = axes @ turn_by(np.array([step[3], step[4], 0.0])) @ [0, 0, 1]
+        return mount, given.artefact[:3, 3] + axes @ step[:3], axis, given.size_mm + (values[-1] if sized else 0.0)
+
+    solution = least_squares(
+        lambda values: scatter_mm(given, *moved(values)), np.zeros(6 + len(free) + sized), x_scale="jac"
+    )
+    return moved(solution.x)[0], float(np.sqrt(np.mean(solution.fun**2)))
