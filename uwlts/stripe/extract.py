@@ -14,7 +14,7 @@ from uwlts.model.stripe import Stripe, StripeCandidates, StripeStatus
 from uwlts.stripe.block_contrast import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
 from uwlts.stripe.direct import direct_stripe
 from uwlts.stripe.learned import find_learned
-from uwlts.stripe.methods import amplitudes, place_centre
+from uwlts.stripe.methods import amplitudes, method_names, place_centre
 from uwlts.stripe.options import LEARNED, PeakRule, StripeOptions
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
 from uwlts.stripe.search import MARGIN, SearchRules, mark_rivals, measure_at, search_all, search_profiles, search_rules
@@ -181,7 +181,8 @@ def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOp
     beside = 0.3 * (lines % 20 < 10)
     seen = [share * np.exp(-0.5 * np.square((place - at * half) / 2.0)) for share, at in ((1.0, 2), (beside, 5))]
     image = np.broadcast_to(100.0 * sum(seen), (_RULE.warm_lines, 8 * half)).astype(dtype)
-    for method in (options.method, "quadratic"):
+    # The default method uses all others for some images.
+    for method in (options.method, *method_names()):
         extract_stripe(image, stripe_along="height", options=replace(options, method=method))
     rivals = replace(options, peak=PeakRule.DIRECT)
     direct_stripe_in(image, stripe_along="height", options=rivals, saturation=_LARGEST[image.dtype])
