@@ -59,15 +59,13 @@ def chessboard(
 
 def circles(centres_mm: np.ndarray, diameter_mm: float, *, bright: bool = False, edge_mm: float = 10.0) -> Print:
     """Return equal circles on a plate that ends ``edge_mm`` beyond their centres."""
-    from scipy.spatial import KDTree
-
-    tree = KDTree(centres_mm)
     low, high = centres_mm.min(axis=0) - edge_mm, centres_mm.max(axis=0) + edge_mm
     circle, plate = (0.85, 0.08) if bright else (0.08, 0.85)
 
     def levels(places: np.ndarray) -> np.ndarray:
         on_plate = ((places >= low) & (places <= high)).all(axis=1)
-        inside = tree.query(np.where(on_plate[:, None], places, 1e6))[0] <= diameter_mm / 2
+        near, inside = places[on_plate], np.zeros(len(places), bool)
+        inside[on_plate] = np.any([np.hypot(*(near - centre).T) <= diameter_mm / 2 for centre in centres_mm], axis=0)
         return np.where(inside, circle, np.where(on_plate, plate, 0.3))
 
     return levels

@@ -4,7 +4,6 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.signal import fftconvolve
 
 from uwlts.errors import TargetError
 from uwlts.model.sensor import Positive
@@ -64,7 +63,7 @@ class CircleGridTarget(Target):
 
     @property
     def spacing_mm(self) -> float:
-        return float(np.min(self.pitch_mm)) * (np.sqrt(2.0) if self.asymmetric else 1.0)
+        return float(np.min(self.pitch_mm)) * (2.0**0.5 if self.asymmetric else 1.0)
 
     @property
     def circle_diameter_mm(self) -> float | None:
@@ -92,6 +91,9 @@ class CircleGridTarget(Target):
 
     def _place(self, numbers: np.ndarray, centres: np.ndarray, found: int) -> np.ndarray:
         """Return the indices (N, 2) of numbered circles, by the only turn and shift that fits most of them."""
+        # Imported late: a description does not need it.
+        from scipy.signal import fftconvolve
+
         here, fits = _mask(self.indices), []
         for _ in range(4):
             numbers = np.column_stack([-numbers[:, 1], numbers[:, 0]])
