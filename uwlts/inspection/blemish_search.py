@@ -6,13 +6,18 @@ surroundings. This is a matched filter that does not need complete sampling.
 Divided by its local scatter, the depth on an undamaged surface is a random field of unit variance. The probability that
 it exceeds a level anywhere is the expected Euler characteristic of the excursion set (Adler and Taylor, Random Fields
 and Geometry, 2007; Worsley et al., Human Brain Mapping 4, 1996, Table I). The threshold follows from this probability.
+
+Means of a few points have a normal distribution only if the points' own has no heavy tails. Deviations of points from
+the median of their neighbours are therefore limited before the search (Huber, Robust Statistics, 1981, 1.7). The
+remaining tail is measured on the map of the smallest size without the indications. Only indications that are
+significant for this tail remain.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import fft, ndimage, optimize, stats
@@ -48,14 +53,25 @@ class BlemishSearchRule:
         Largest radius as a fraction of the area's shorter side: larger bells leave no surroundings.
     most_cells : int
         Most cells of a map, limited by memory.
+    cells_at_a_time : int
+        Cells whose bells are fitted together, limited by memory: 400 bytes each.
+    points_at_a_time : int
+        Points whose neighbours are searched for together, limited by memory: 400 bytes each.
     rounds : int
         Most rounds of searching and removing indications.
     fewest_points : int
         Fewest points of an indication; twice as many are needed around it.
+    tail : float
+        Probability of the outer quantile that determines the tail. Nearer quantiles depend little on the tail.
+    fewest_beyond : int
+        Fewest independent places beyond this quantile; it is nearer on small surfaces.
     neighbours : int
         Nearest points that each point is compared with to find outliers.
     outlier : float
         Distance of an outlier from the median of its neighbours, in robust standard deviations.
+    most_deviation : float
+        Limit of a point's deviation from this median, in the same unit: 1 % of the efficiency for normal noise is lost.
+        Deviations in a pit of the smallest size stay below it, because its slopes increase the standard deviation.
     enlargements : int
         Most enlargements of the window around a peak, while its region reaches the window's edge.
     enlargement : float
@@ -76,10 +92,15 @@ class BlemishSearchRule:
     scatter_block: float = 24.0
     largest_size: float = 1 / 6
     most_cells: int = 4_000_000
+    cells_at_a_time: int = 250_000
+    points_at_a_time: int = 250_000
     rounds: int = 10
     fewest_points: int = 6
+    tail: float = 1e-3
+    fewest_beyond: int = 4
     neighbours: int = 9
     outlier: float = 6.0
+    most_deviation: float = 2.0
     enlargements: int = 3
     enlargement: float = 1.7
     core: float = 0.8
@@ -135,7 +156,7 @@ class Indication:
     false_alarm : float
         Probability that noise exceeds ``z`` anywhere.
     noise_mm : float
-        Standard deviation of independent point noise that explains the scatter of local means.
+        Standard deviation of independent point noise that explains the scatter of local means of the heights.
     points : (K,) int
         Points of the indication.
     """
@@ -189,7 +210,7 @@ class BlemishSearch:
     false_alarm: float
 
 
-def search_blemishes(surface: UnrolledSurface, *, false_alarm: float) -> BlemishSearch:
+def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm: float = np.inf) -> BlemishSearch:
     """Find significant departures of a surface from its shape.
 
     The most significant indications are taken first. Their points are removed before the next round, until no
@@ -201,6 +222,8 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float) -> Blemish
         Points on the unrolled surface.
     false_alarm
         Probability of any indication, inwards or outwards, on an undamaged surface.
+    largest_mm
+        Limit of the largest radius.
 
     Raises
     ------
@@ -213,18 +236,20 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float) -> Blemish
             f"{len(places)} points are too few to search for blemishes; "
             f"{20 * SEARCH_RULE.points_in_smallest} are needed"
         )
-    outliers = _find_outliers(surface, tree)
+    surface, outliers, wider = _limit_deviations(surface, tree)
     smallest = float(
         np.median(tree.query(places[:: max(1, len(places) // 2000)], k=SEARCH_RULE.points_in_smallest)[0][:, -1])
     )
-    largest = max(SEARCH_RULE.largest_size * float(np.min(np.ptp(places, axis=0))), smallest)
+    largest = min(SEARCH_RULE.largest_size * float(np.min(np.ptp(places, axis=0))), largest_mm)
+    largest = max(largest, smallest)
     # The smallest size is larger if its map would not fit into memory.
     area = float(np.prod(np.ptp(places, axis=0)))
     smallest = max(smallest, SEARCH_RULE.cells_per_radius * float(np.sqrt(area / SEARCH_RULE.most_cells)))
     radii = smallest * SEARCH_RULE.size_ratio ** np.arange(
         1 + max(0, int(np.log(largest / smallest) / np.log(SEARCH_RULE.size_ratio)))
     )
-    undamaged, found, unresolved = ~outliers, [], []
+    undamaged = ~outliers
+    found: list[_Candidate] = []
     maps: list[_BellMap] = []
     threshold = np.inf
     for number in range(SEARCH_RULE.rounds + 1):
@@ -240,29 +265,127 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float) -> Blemish
             try:
                 if number == SEARCH_RULE.rounds:
                     raise EvaluationError(f"{SEARCH_RULE.rounds} rounds of the search found it again each time")
-                found.append(_delimit(surface, undamaged, tree, maps, peak, smallest))
-                points = found[-1].points
+                outcome = _delimit(surface, undamaged, tree, maps, peak, smallest)
+                points = outcome.points
             except EvaluationError as error:
-                unresolved.append(UnresolvedDeparture(int(tree.query(peak.place)[1]), peak.height, str(error)))
-                points = tree.query_ball_point(peak.place, peak.radius)
+                outcome = UnresolvedDeparture(int(tree.query(peak.place)[1]), peak.height, str(error))
+                points = np.array(tree.query_ball_point(peak.place, peak.radius), int)
+            found.append(_Candidate(peak, outcome, points[undamaged[points]]))
             undamaged[points] = False
     level, noise = np.full(len(places), np.nan), np.full(len(places), np.nan)
     if maps:
-        level = threshold * maps[0].level_at(places)
+        tail, found = _confirm(surface, undamaged, maps[0], threshold, found)
+        level = tail.scatter_at(threshold) * maps[0].level_at(places)
         noise = maps[0].noise_at(places)
-    known = tuple(found), tuple(unresolved), outliers, undamaged, level, noise
+    kept: list[Indication] = []
+    for peak, outcome, _ in found:
+        if isinstance(outcome, Indication):
+            chance = min(1.0, sum(each.false_alarms(peak.z) for each in maps))
+            kept.append(replace(outcome, z=peak.z, false_alarm=chance, noise_mm=wider * outcome.noise_mm))
+    departures = tuple(each.outcome for each in found if isinstance(each.outcome, UnresolvedDeparture))
+    known = tuple(kept), departures, outliers, undamaged, level, wider * noise
     return BlemishSearch(*known, smallest, false_alarm)
 
 
-def _find_outliers(surface: UnrolledSurface, tree: KDTree) -> np.ndarray:
-    """Return a mask (N,) of points far from their neighbours, relative to the neighbours' scatter."""
-    found: Any = tree.query(surface.places, k=SEARCH_RULE.neighbours + 1)
-    nearest = found[1][:, 1:]
-    beside = surface.heights[nearest]
-    middle = np.median(beside, axis=1)
-    spread = MAD_TO_STD * np.median(np.abs(beside - middle[:, None]), axis=1)
-    usual = float(np.median(spread))
-    return np.abs(surface.heights - middle) > SEARCH_RULE.outlier * np.maximum(spread, usual)
+@dataclass(frozen=True)
+class _Tail:
+    """Distribution of a map without indications: Student's, of the freedom that explains its outer quantiles."""
+
+    freedom: float
+
+    @classmethod
+    def of_map(cls, clean: _BellMap) -> _Tail:
+        """Determine the tail by the side of the smaller quantile, because weak blemishes remain on the other one."""
+        z = clean.z[np.isfinite(clean.z)]
+        share = max(SEARCH_RULE.tail, SEARCH_RULE.fewest_beyond * np.pi * SEARCH_RULE.cells_per_radius**2 / len(z))
+        if share > 0.1:
+            return cls(np.inf)
+        ratio = min(np.quantile(z, 1 - share), -np.quantile(z, share)) / np.median(np.abs(z))
+
+        def excess(inverse: float) -> float:
+            return float(stats.t.isf(share, 1 / inverse) / stats.t.ppf(0.75, 1 / inverse) - ratio)
+
+        if excess(1e-3) >= 0:
+            return cls(np.inf)
+        inverse: Any = optimize.brentq(excess, 1e-3, 0.5) if excess(0.5) > 0 else 0.5
+        return cls(1 / float(inverse))
+
+    @property
+    def _scale(self) -> float:
+        """Scale that gives the median absolute value of a standard normal variable."""
+        return float(stats.norm.ppf(0.75) / stats.t.ppf(0.75, self.freedom))
+
+    def normalise(self, strength: float) -> float:
+        """Return the standard normal variable of equal probability for a height in robust standard deviations."""
+        return float(_normal_of_log_tail(_log_tail_of_t(np.array(strength / self._scale), np.array(self.freedom))))
+
+    def scatter_at(self, z: float) -> float:
+        """Return the height, in robust standard deviations, for a standard normal variable."""
+        return float(self._scale * stats.t.isf(stats.norm.sf(z), self.freedom))
+
+
+class _Candidate(NamedTuple):
+    """Significant peak, the indication or departure at its place, and the points (K,) removed with it."""
+
+    peak: _Peak
+    outcome: Indication | UnresolvedDeparture
+    points: np.ndarray
+
+
+def _confirm(
+    surface: UnrolledSurface, undamaged: np.ndarray, smallest: _BellMap, threshold: float, found: list[_Candidate]
+) -> tuple[_Tail, list[_Candidate]]:
+    """Return the tail of the noise and the candidates that are significant for it.
+
+    Other candidates are noise: their points become undamaged again, and the tail is determined with them.
+    """
+    while True:
+        tail = _Tail.of_map(smallest)
+        kept = []
+        for peak, outcome, points in found:
+            z = min(peak.z, tail.normalise(peak.strength))
+            if z > threshold:
+                kept.append(_Candidate(replace(peak, z=z), outcome, points))
+            else:
+                undamaged[points] = True
+        if len(kept) == len(found):
+            return tail, kept
+        found = kept
+        smallest = _fit_bells(surface, undamaged, smallest.radius)
+
+
+def _limit_deviations(surface: UnrolledSurface, tree: KDTree) -> tuple[UnrolledSurface, np.ndarray, float]:
+    """Limit the deviations of the points from the medians of their neighbours.
+
+    Returns
+    -------
+    surface : UnrolledSurface
+        Surface with limited deviations.
+    outliers : (N,) bool
+        Points far from their neighbours, relative to the neighbours' scatter.
+    ratio : float
+        Standard deviation of the other points from the medians, divided by that of the limited deviations.
+    """
+    nearest = np.empty((len(surface.places), SEARCH_RULE.neighbours), np.int32)
+    middle, spread = np.empty(len(nearest)), np.empty(len(nearest))
+    parts = [
+        slice(start, start + SEARCH_RULE.points_at_a_time)
+        for start in range(0, len(nearest), SEARCH_RULE.points_at_a_time)
+    ]
+    for part in parts:
+        nearest[part] = tree.query(surface.places[part], k=SEARCH_RULE.neighbours + 1)[1][:, 1:]
+        beside = surface.heights[nearest[part]]
+        middle[part] = np.median(beside, axis=1)
+        spread[part] = MAD_TO_STD * np.median(np.abs(beside - middle[part, None]), axis=1)
+    usually = float(np.median(spread))
+    # Wild points nearby increase the scatter of one place, a blemish that of many.
+    spread = np.concatenate([np.median(spread[nearest[part]], axis=1) for part in parts])
+    spread = np.maximum(spread, usually)
+    off, most = surface.heights - middle, SEARCH_RULE.most_deviation * spread
+    outliers, limited = np.abs(off) > SEARCH_RULE.outlier * spread, np.clip(off, -most, most)
+    usual = ~outliers & (spread <= 2 * usually)
+    ratio = float(np.std(off[usual]) / max(np.std(limited[usual]), 1e-300)) if usual.any() else 1.0
+    return replace(surface, heights=middle + limited), outliers, max(ratio, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,28 +462,37 @@ def _fit_bells(surface: UnrolledSurface, undamaged: np.ndarray, radius: float) -
     axis = np.arange(-reach, reach + 1) / SEARCH_RULE.cells_per_radius
     u, v = np.meshgrid(axis, axis, indexing="ij")
     window = (np.hypot(u, v) <= SEARCH_RULE.window).astype(float)
-    bell = np.square(np.maximum(1 - u**2 - v**2, 0))
-    padded = [fft.next_fast_len(length + 2 * reach, real=True) for length in shape]
-    base = [window, window * u, window * v, bell]
-    spectra: list[Any] = [fft.rfft2(each, padded) for each in (mass, load)]
-
-    def correlated(spectrum: Any, kernel: np.ndarray) -> np.ndarray:
-        whole: Any = fft.irfft2(spectrum * fft.rfft2(kernel[::-1, ::-1], padded), padded)
-        return whole[reach : reach + shape[0], reach : reach + shape[1]]
-
-    normal = np.empty((*shape, 4, 4))
-    pairs = {(i, j): base[i] * base[j] for i in range(4) for j in range(i, 4)}
-    for (i, j), kernel in pairs.items():
-        normal[..., i, j] = normal[..., j, i] = correlated(spectra[0], kernel)
-    right = np.stack([correlated(spectra[1], kernel) for kernel in base], axis=-1)
-    # In a nearly empty window neither the plane nor the bell is determined.
-    ridge = 1e-9 * (normal[..., 0, 0] + 1e-9)
-    inner = normal[..., :3, :3] + ridge[..., None, None] * np.eye(3)
-    filled = normal[..., 0, 0] > 1e-6
-    inner[~filled] = np.eye(3)
-    solved = np.linalg.solve(inner, np.stack([normal[..., :3, 3], right[..., :3]], axis=-1))
-    information = normal[..., 3, 3] - np.einsum("...i,...i->...", normal[..., :3, 3], solved[..., 0])
-    amplitude = right[..., 3] - np.einsum("...i,...i->...", normal[..., :3, 3], solved[..., 1])
+    base = [window, window * u, window * v, np.square(np.maximum(1 - u**2 - v**2, 0))]
+    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
+    mass, load = np.pad(mass, reach), np.pad(load, reach)
+    rows = int(np.clip(SEARCH_RULE.cells_at_a_time // shape[1], 1, shape[0]))
+    padded = [fft.next_fast_len(length + 2 * reach, real=True) for length in (rows, shape[1])]
+    spectra: list[Any] = [
+        fft.rfft2(each[::-1, ::-1], padded) for each in (*(base[i] * base[j] for i, j in pairs), *base)
+    ]
+    amplitude, information = np.empty(shape), np.empty(shape)
+    filled = np.empty(shape, bool)
+    for start in range(0, shape[0], rows):
+        here = slice(start, min(start + rows, shape[0]))
+        parts: list[Any] = [fft.rfft2(each[start : here.stop + 2 * reach], padded) for each in (mass, load)]
+        sums = [
+            np.asarray(fft.irfft2(parts[number >= len(pairs)] * kernel, padded))[
+                2 * reach : 2 * reach + here.stop - start, 2 * reach : 2 * reach + shape[1]
+            ]
+            for number, kernel in enumerate(spectra)
+        ]
+        filled[here] = sums[0] > 1e-6
+        normal = np.empty((*sums[0].shape, 4, 4))
+        for (i, j), each in zip(pairs, sums, strict=False):
+            normal[..., i, j] = normal[..., j, i] = each
+        right = np.stack(sums[len(pairs) :], axis=-1)
+        # In a nearly empty window neither the plane nor the bell is determined.
+        inner = normal[..., :3, :3] + 1e-9 * (sums[0] + 1e-9)[..., None, None] * np.eye(3)
+        inner[~filled[here]] = np.eye(3)
+        solved = np.linalg.solve(inner, np.stack([normal[..., :3, 3], right[..., :3]], axis=-1))
+        by_plane = np.einsum("...i,...ij->...j", normal[..., :3, 3], solved)
+        information[here] = normal[..., 3, 3] - by_plane[..., 0]
+        amplitude[here] = right[..., 3] - by_plane[..., 1]
     seen = filled & (information > 1e-9)
     usual = float(np.median(information[seen])) if seen.any() else np.inf
     seen &= information > SEARCH_RULE.least_information * usual
