@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from tests.oracles.pipes import Bump, Noise, ScannedPipe, contaminated_noise, scan_pipe, student_noise
-from uwlts.inspection.blemish_search import BlemishSearch, UnrolledSurface, search_blemishes
+from uwlts.inspection.bell_maps import UnrolledSurface
+from uwlts.inspection.blemish_search import BlemishSearch, search_blemishes
 
 NOISES = {"t4": student_noise(4), "t3": student_noise(3), "five percent of fivefold": contaminated_noise(0.05, 5)}
 FALSE_ALARM = 0.05
@@ -28,7 +29,7 @@ def short_pipe(seed: int, noise: Noise, bumps: list[Bump]) -> ScannedPipe:
 
 
 def test_false_alarms_stay_rare_in_heavy_tails() -> None:
-    """At 5 % each, four or more of nine pipes have a false alarm 6 times in 10,000 (all nine with normal theory)."""
+    """At 5 % each, four or more of nine pipes have a false alarm 6 times in 10,000; with normal theory most do."""
     alarms = [
         bool((found := searched(short_pipe(seed, noise, []))).indications or found.unresolved)
         for noise in NOISES.values()
