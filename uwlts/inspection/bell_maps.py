@@ -151,7 +151,8 @@ def limit_deviations(surface: UnrolledSurface, tree: KDTree) -> tuple[UnrolledSu
         for start in range(0, len(nearest), SEARCH_RULE.points_at_a_time)
     ]
     for part in parts:
-        nearest[part] = tree.query(surface.places[part], k=SEARCH_RULE.neighbours + 1)[1][:, 1:]
+        found: Any = tree.query(surface.places[part], k=SEARCH_RULE.neighbours + 1)
+        nearest[part] = found[1][:, 1:]
         beside = surface.heights[nearest[part]]
         middle[part] = np.median(beside, axis=1)
         spread[part] = MAD_TO_STD * np.median(np.abs(beside - middle[part, None]), axis=1)

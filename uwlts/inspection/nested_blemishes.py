@@ -48,6 +48,10 @@ class NestedRule:
         Height of the dent's surface, as a fraction of its largest, below which long indications follow its rim.
     compact : float
         Least part of the circle around an indication that its points fill if it does not follow a rim.
+    significant : float
+        Least height of an indication, in errors of the smooth surface.
+    worst : float
+        Quantile of these errors: edges cover a few percent of the window, other pits less than one.
     """
 
     bandwidth: float = 0.35
@@ -57,6 +61,8 @@ class NestedRule:
     fewest_points: int = 12
     rim: float = 0.3
     compact: float = 0.3
+    significant: float = 3.0
+    worst: float = 0.99
 
 
 _RULE = NestedRule()
@@ -70,8 +76,6 @@ class LargeBlemish:
     ----------
     own : Indication
         The large one, with the points of those inside it.
-    bare : UnrolledSurface
-        Whole surface without those inside it, whose points have the height of the large one's surface.
     chosen : (n,) int
         Points of the window.
     surface : UnrolledSurface
@@ -85,7 +89,6 @@ class LargeBlemish:
     """
 
     own: Indication
-    bare: UnrolledSurface
     chosen: np.ndarray
     surface: UnrolledSurface
     height_mm: np.ndarray
@@ -112,19 +115,35 @@ class LargeBlemish:
         taken = np.concatenate([np.zeros(0, int), *kept])
         return [each for each in self.search.indications if not np.isin(self.chosen[each.points], taken).any()]
 
+    def is_form(self, indication: Indication) -> bool:
+        """Return whether an indication of the window belongs to the form of the large one.
+
+        It follows its rim, or is not larger than the errors of a smooth surface elsewhere: those at sharp edges.
+        """
+        places = self.surface.places[indication.points]
+        middle = places.mean(axis=0)
+        reach = float(np.max(np.hypot(*(places - middle).T)))
+        density = len(self.chosen) / float(np.prod(np.ptp(self.surface.places, axis=0)))
+        below = self.height_mm[indication.points] / (np.abs(self.height_mm).max() * np.sign(self.own.height_mm))
+        if np.median(below) < _RULE.rim and len(places) < _RULE.compact * density * np.pi * reach**2:
+            return True
+        elsewhere = np.hypot(*(self.surface.places - middle).T) > reach + 2 * self.largest_mm
+        error = float(np.quantile(self.std_mm[elsewhere], _RULE.worst)) if elsewhere.any() else np.inf
+        return abs(indication.height_mm) < _RULE.significant * error
+
+    def without(self, surface: UnrolledSurface, points: np.ndarray) -> UnrolledSurface:
+        """Return the whole surface with the heights of the large one at the given points (N,) bool."""
+        inside, bare = points[self.chosen], surface.heights.copy()
+        bare[self.chosen[inside]] = self.height_mm[inside]
+        return replace(surface, heights=bare)
+
     def measure(
         self, indication: Indication, errors: PointErrors, *, diameter_mm: float, wall_mm: float | None
     ) -> Blemish:
         """Measure an indication of the window; a pit in a dent also has its total depth.
 
-        ``errors`` are those of all points. EvaluationError as `measure_blemish`, and for a rim.
+        ``errors`` are those of all points. EvaluationError as `measure_blemish`.
         """
-        places = self.surface.places[indication.points]
-        reach = float(np.max(np.hypot(*(places - places.mean(axis=0)).T)))
-        density = len(self.chosen) / float(np.prod(np.ptp(self.surface.places, axis=0)))
-        below = self.height_mm[indication.points] / (np.abs(self.height_mm).max() * np.sign(self.own.height_mm))
-        if np.median(below) < _RULE.rim and len(places) < _RULE.compact * density * np.pi * reach**2:
-            raise EvaluationError("it follows the rim of a larger one")
         found = measure_blemish(
             self.surface, self.search, indication, errors[self.chosen], diameter_mm=diameter_mm, wall_mm=wall_mm
         )
@@ -168,21 +187,14 @@ def search_within(surface: UnrolledSurface, search: BlemishSearch, large: Indica
         found = search_blemishes(relative, false_alarm=search.false_alarm, largest_mm=0.5 * bandwidth)
     except EvaluationError:
         return None
-    inside = np.zeros(len(chosen), bool)
-    for each in found.indications:
-        inside[each.points] = True
-    inside &= np.isin(chosen, large.points)
-    bare = surface.heights.copy()
-    bare[chosen[inside]] = smooth[inside]
-    known = replace(surface, heights=bare), chosen, relative, smooth, np.abs(correction), found, 0.5 * bandwidth
-    return LargeBlemish(large, *known)
+    return LargeBlemish(large, chosen, relative, smooth, np.abs(correction), found, 0.5 * bandwidth)
 
 
 def _estimate_surface(window: UnrolledSurface, bandwidth: float) -> np.ndarray:
     """Return the heights (n,) of a surface of local quadratics at the points of a window."""
     tree, places = KDTree(window.places), window.places
     low, high = places.min(axis=0), places.max(axis=0)
-    counts = np.maximum(np.ceil((high - low) / bandwidth * _RULE.nodes).astype(int) + 1, 4)
+    counts: Any = np.maximum(np.ceil((high - low) / bandwidth * _RULE.nodes).astype(int) + 1, 4)
     sides = [np.linspace(a, b, count) for a, b, count in zip(low, high, counts, strict=True)]
     values = np.full(counts, np.nan)
     for i, j in np.ndindex(*counts):
@@ -198,4 +210,4 @@ def _estimate_surface(window: UnrolledSurface, bandwidth: float) -> np.ndarray:
     if unknown.all():
         return np.zeros(len(places))
     nearest: Any = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
-    return RectBivariateSpline(*sides, values[tuple(nearest)]).ev(*places.T)
+    return RectBivariateSpline(sides[0], sides[1], values[tuple(nearest)]).ev(*places.T)

@@ -237,8 +237,8 @@ def _blemish_features(
         angle = np.mod(form.angle[chosen] - middle + np.pi, 2 * np.pi) - np.pi
         return replace(flat, places=np.column_stack([flat.places[:, 0], form.radius_mm * angle])), middle
 
-    def measure(indication: Indication, points: np.ndarray, middle: float, measured_by: Callable[[], Blemish]) -> None:
-        """Add the blemish or a note; ``points`` are those of the indication."""
+    def measure(indication: Indication, points: np.ndarray, middle: float, measured_by: Callable[[], Blemish]) -> bool:
+        """Add the blemish, or a note and return False; ``points`` are those of the indication."""
         try:
             blemish = measured_by()
             for value in blemish.values:
@@ -246,8 +246,9 @@ def _blemish_features(
                     raise EvaluationError(f"it is not significant relative to its surroundings: {value.text()}")
         except EvaluationError as error:
             notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
-        else:
-            measured.append((blemish, middle, indication.false_alarm))
+            return False
+        measured.append((blemish, middle, indication.false_alarm))
+        return True
 
     large: list[tuple[LargeBlemish, float]] = []
     for indication in sorted(search.indications, key=lambda each: abs(each.height_mm), reverse=True):
@@ -257,17 +258,18 @@ def _blemish_features(
                 large.append((whole, middle))
     taken = np.zeros(len(chosen), bool)
     for whole, middle in large:
-        measure(
-            whole.own,
-            whole.own.points,
-            middle,
-            partial(measure_blemish, whole.bare, search, whole.own, errors, **sizes),
-        )
-        for part in whole.parts_beside(search.indications):
+        parts = whole.parts_beside(search.indications)
+        formed = [abs(part.height_mm) for part in parts if whole.is_form(part)]
+        if formed:
+            reason = f"{len(formed)} departures of up to {max(formed):.2g} mm from a smooth surface belong to its form"
+            notes.append(_note_large(cloud, chosen[whole.own.points], whole.own.height_mm, reason))
+        for part in parts:
             points = whole.chosen[part.points]
-            if not taken[points].any():
-                measure(part, points, middle, partial(whole.measure, part, errors, **sizes))
-            taken[points] = True
+            if not taken[points].any() and not whole.is_form(part):
+                taken[points] = measure(part, points, middle, partial(whole.measure, part, errors, **sizes))
+        bare = whole.without(unroll_about(whole.own)[0], taken)
+        own = partial(measure_blemish, bare, search, whole.own, errors, **sizes)
+        measure(whole.own, whole.own.points, middle, own)
     for indication in search.indications:
         if not any(whole.explains(indication) for whole, _ in large):
             surface, middle = unroll_about(indication)
@@ -293,6 +295,12 @@ def _note_omission(cloud: PointCloud, points: np.ndarray, height_mm: float, reas
     """Return a note on an omitted indication at some points."""
     x, y, z = cloud.points_mm[points].mean(axis=0)
     return f"an indication of {height_mm:.2g} mm at ({x:.1f}, {y:.1f}, {z:.1f}) mm is omitted: {reason}"
+
+
+def _note_large(cloud: PointCloud, points: np.ndarray, height_mm: float, text: str) -> str:
+    """Return a note on a large blemish at some points."""
+    x, y, z = cloud.points_mm[points].mean(axis=0)
+    return f"in the indication of {height_mm:.2g} mm at ({x:.1f}, {y:.1f}, {z:.1f}) mm, {text}"
 
 
 def _note_limits(cloud: PointCloud, form: PipeForm, search: BlemishSearch) -> list[str]:

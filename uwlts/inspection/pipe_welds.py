@@ -7,6 +7,7 @@ surroundings in nearly all cells along it, which no blemish is.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -89,9 +90,9 @@ def find_welds(form: PipeForm, chosen: np.ndarray) -> list[PipeWeld]:
 
     def add(is_girth: bool, across: np.ndarray, length: np.ndarray, ridges: list[tuple[float, float]]) -> None:
         for middle, half in ridges:
-            places = [whole.copy(), whole.copy()]
-            places[0][chosen], places[1][chosen] = across - middle, length
-            found.append(PipeWeld(is_girth, *places, half))
+            off, at = whole.copy(), whole.copy()
+            off[chosen], at[chosen] = across - middle, length
+            found.append(PipeWeld(is_girth, off, at, half))
 
     around = form.radius_mm * angle
     add(True, straight, around, _find_ridges(straight, around, heights, _RULE.spacings * spacing))
@@ -148,10 +149,10 @@ def _find_ridges(across: np.ndarray, length: np.ndarray, heights: np.ndarray, ce
     least = np.full(len(mean), -np.inf)
     wide = seen > 0.5 * np.median(seen)
     least[wide] = np.nanquantile(mean[wide], 1 - _RULE.share, axis=1)
-    labels, count = ndimage.label(least > _RULE.significant * std)
+    labelled: Any = ndimage.label(least > _RULE.significant * std)
     found = []
-    for number in range(1, count + 1):
-        own = np.flatnonzero(labels == number)
+    for number in range(1, labelled[1] + 1):
+        own = np.flatnonzero(labelled[0] == number)
         crest = np.nanmedian(mean[own], axis=1)
         core = own[crest > 0.5 * crest.max()]
         # A parabola is 1.4 times as wide at its foot as at half its height, and cells widen it at most by one.

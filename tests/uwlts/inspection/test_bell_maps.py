@@ -1,5 +1,7 @@
 """Noise of bell maps: expected number of excursions, and the uncertainty of a scatter from few places."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import fft, ndimage
@@ -19,10 +21,11 @@ def test_excursions_are_as_frequent_as_expected() -> None:
     filtered = np.exp(-2 * np.square(np.pi * width * frequency))
     count = 0
     for _ in range(400):
-        spectrum = fft.fft2(rng.standard_normal((2 * side, 2 * side))) * np.outer(filtered, filtered)
+        spectrum: Any = fft.fft2(rng.standard_normal((2 * side, 2 * side))) * np.outer(filtered, filtered)
         # Only a quarter is used, so that its sides are not periodic.
-        field = np.real(fft.ifft2(spectrum))[:side, :side] * 2 * np.sqrt(np.pi) * width
-        count += ndimage.label(np.abs(field) > 3.2)[1]
+        whole: Any = fft.ifft2(spectrum)
+        labelled: Any = ndimage.label(np.abs(whole.real[:side, :side]) * 2 * np.sqrt(np.pi) * width > 3.2)
+        count += labelled[1]
     moments, nothing = np.full(2, 1 / (np.sqrt(2) * width)), np.zeros((1, 1))
     sides = np.full(2, float(side))
     clean = BellMap(1.0, np.zeros(2), 1.0, nothing, nothing, nothing, nothing, float(side**2), moments, sides)
