@@ -1,28 +1,84 @@
-"""Scans of pipes with pits and bumps of known position and depth, with NumPy only.
+"""Scans of pipes with pits, bumps and welds of known position and size, in noise of any distribution, with NumPy only.
 
 The pipe is generated about its own axis, then turned and moved as a whole, so findings do not depend on the axis.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal, Protocol
 
 import numpy as np
+
+PROFILES = {
+    "cosine": lambda t: 0.5 * (1 + np.cos(np.pi * np.minimum(t, 1))),
+    "paraboloid": lambda t: np.maximum(1 - t * t, 0),
+    "bell": lambda t: np.exp(-4.5 * t * t),
+    "pan": lambda t: np.clip(2 * (1 - t), 0, 1),
+}
+"""Heights by the distance from the middle, in radii. A bell never ends, a paraboloid has a sharp rim, a pan is flat."""
+
+
+class Relief(Protocol):
+    """Anything with heights above the plain pipe."""
+
+    def heights(self, along_mm: np.ndarray, angle: np.ndarray, radius_mm: float) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bump:
-    """A raised cosine on a pipe: middle (mm along, rad around), diameter and height; a pit has a negative height."""
+    """A round bump on a pipe: middle (mm along, rad around), diameter and height; a pit has a negative height."""
 
     along_mm: float
     angle: float
     diameter_mm: float
     height_mm: float
+    profile: Literal["cosine", "paraboloid", "bell", "pan"] = "cosine"
 
     def heights(self, along_mm: np.ndarray, angle: np.ndarray, radius_mm: float) -> np.ndarray:
         """Return heights (N,) above the plain pipe at positions along and around it."""
         around = radius_mm * (np.mod(angle - self.angle + np.pi, 2 * np.pi) - np.pi)
         away = np.hypot(along_mm - self.along_mm, around) / (0.5 * self.diameter_mm)
-        return np.where(away < 1, 0.5 * self.height_mm * (1 + np.cos(np.pi * np.minimum(away, 1))), 0.0)
+        return self.height_mm * PROFILES[self.profile](away)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeldBead:
+    """A bead of parabolic section: around the pipe at ``along_mm``, or along it at ``angle`` (the other one is None).
+
+    A girth weld's plane may be inclined, so that its place varies by ``lean_mm`` around the pipe. The bead's height
+    varies by ``ripple_mm`` along its length.
+    """
+
+    height_mm: float
+    width_mm: float
+    along_mm: float | None = None
+    angle: float | None = None
+    lean_mm: float = 0.0
+    ripple_mm: float = 0.0
+
+    def heights(self, along_mm: np.ndarray, angle: np.ndarray, radius_mm: float) -> np.ndarray:
+        """Return heights (N,) above the plain pipe at positions along and around it."""
+        if self.along_mm is not None:
+            across, length = along_mm - self.along_mm - self.lean_mm * np.cos(angle), radius_mm * angle
+        else:
+            across = radius_mm * (np.mod(angle - self.angle + np.pi, 2 * np.pi) - np.pi)
+            length = along_mm
+        crest = self.height_mm + self.ripple_mm * np.sin(2 * np.pi * length / 6.0)
+        return crest * np.maximum(1 - np.square(2 * across / self.width_mm), 0)
+
+
+Noise = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]
+
+
+def student_noise(freedom: float) -> Noise:
+    """Return Student's distribution, scaled to unit variance."""
+    return lambda rng, shape: rng.standard_t(freedom, shape) / np.sqrt(freedom / (freedom - 2))
+
+
+def contaminated_noise(share: float, ratio: float) -> Noise:
+    """Return a normal distribution, with a share of the values of a larger standard deviation, at unit variance."""
+    size = np.sqrt(1 - share + share * ratio**2)
+    return lambda rng, shape: rng.standard_normal(shape) * np.where(rng.random(shape) < share, ratio, 1.0) / size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,15 +129,16 @@ def scan_pipe(
     arc: float = 2 * np.pi,
     spacing_mm: float = 1.2,
     noise_mm: float = 0.02,
-    bumps: Sequence[Bump] = (),
+    noise: Noise = np.random.Generator.standard_normal,
+    bumps: Sequence[Relief] = (),
     holes: Sequence[tuple[float, float, float]] = (),
     lost: float = 0.02,
 ) -> ScannedPipe:
     """Scan a pipe along an axis, with a random roll and place.
 
     ``arc`` is the visible part of the circumference, from angle 0. ``noise_mm`` is the standard deviation along the
-    normals, half of it in common with the next line. ``holes`` are discs (mm along, rad around, mm diameter) without
-    points, and ``lost`` is the fraction of points that are lost at random.
+    normals, half of it in common with the next line. ``noise`` draws it at unit variance. ``holes`` are discs (mm
+    along, rad around, mm diameter) without points, and ``lost`` is the fraction of points that are lost at random.
     """
     count = max(8, round(arc * radius_mm / spacing_mm))
     angles = arc * (np.arange(count) + 0.5) / count
@@ -90,16 +147,15 @@ def scan_pipe(
     frame, line = np.indices(along.shape)
     # Points are not aligned between stripes: each stripe has its own phase.
     angle = angle + (rng.uniform(-0.5, 0.5, len(places)) * spacing_mm / radius_mm)[:, None]
-    drawn = rng.standard_normal((len(places), count + 1))
-    noise = noise_mm * (drawn[:, 1:] + drawn[:, :-1]) / np.sqrt(2)
-    height = noise + sum((bump.heights(along, angle, radius_mm) for bump in bumps), np.zeros(along.shape))
+    drawn = noise(rng, (len(places), count + 1))
+    moved = noise_mm * (drawn[:, 1:] + drawn[:, :-1]) / np.sqrt(2)
+    height = moved + sum((bump.heights(along, angle, radius_mm) for bump in bumps), np.zeros(along.shape))
     size = radius_mm + height
     own = np.stack([size * np.cos(angle), size * np.sin(angle), along], axis=-1)
     kept = rng.random(along.shape) >= lost
     for at, around, diameter in holes:
-        kept &= (
-            Bump(along_mm=at, angle=around, diameter_mm=diameter, height_mm=1.0).heights(along, angle, radius_mm) == 0
-        )
+        hole = Bump(along_mm=at, angle=around, diameter_mm=diameter, height_mm=1.0)
+        kept &= hole.heights(along, angle, radius_mm) == 0
     turn, shift = turn_towards(axis, rng.uniform(-np.pi, np.pi)), rng.uniform(-200, 200, 3)
     return ScannedPipe(
         points_mm=own[kept] @ turn.T + shift,

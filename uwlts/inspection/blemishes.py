@@ -24,7 +24,8 @@ from scipy.spatial import KDTree
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import fit_biweight
 from uwlts.fitting.propagation import PointErrors
-from uwlts.inspection.blemish_search import SEARCH_RULE, BlemishSearch, Indication, UnrolledSurface
+from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
+from uwlts.inspection.blemish_search import BlemishSearch, Indication
 from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, SEED, FeatureKind, FeatureValue, plain_value
 
 

@@ -52,6 +52,7 @@ _UNDERCUT = "ISO 5817, 5011"
 _B31G = "ASME B31G"
 _BLEMISH = {
     "depth": Definition("mm", "greatest depth below the undamaged surface, interpolated from around it", _B31G + ", d"),
+    "total depth": Definition("mm", "depth in a dent below the form of the undamaged pipe", "this project"),
     "edge depth": Definition("mm", "depth of the contour that bounds length, width and area", "this project"),
     "length": Definition("mm", "extent of the contour along the pipe's axis", _B31G + ", L"),
     "width": Definition("mm", "extent of the contour along the circumference", "POF 100, width"),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -11,11 +13,14 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors
-from uwlts.inspection.blemish_search import BlemishSearch, Indication, UnrolledSurface, search_blemishes
+from uwlts.inspection.bell_maps import UnrolledSurface
+from uwlts.inspection.blemish_search import BlemishSearch, Indication, search_blemishes
 from uwlts.inspection.blemishes import Blemish, measure_blemish
 from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, Inspection
+from uwlts.inspection.nested_blemishes import LargeBlemish, search_within
 from uwlts.inspection.pipe_form import FORM_RULE, LARGEST_OVALITY, PipeForm, fit_pipe, pipe_features, refit_pipe
-from uwlts.storage.cloud import PointCloud
+from uwlts.inspection.pipe_welds import PipeWeld, find_welds, measure_weld
+from uwlts.storage.cloud import FOOTPRINT, PointCloud
 from uwlts.storage.cloud_files import load_cloud
 
 _OVERLAP = 0.6
@@ -96,19 +101,24 @@ def inspect_pipe(
     of_size = _check_size(2 * form.radius_mm, wall_mm)
     chosen = np.flatnonzero(np.abs(form.distance_mm) < FORM_RULE.off_pipe * form.radius_mm)
     off = _note_points_off(form, chosen)
+    welds = find_welds(form, chosen)
+    on_weld = np.any([weld.covers for weld in welds], axis=0) if welds else np.zeros(len(cloud), bool)
+    chosen = chosen[~on_weld[chosen]]
     search = _search_form(cloud, form, chosen, false_alarm)
-    if search.indications:
-        # Fit again without the damaged points, which bias the form.
+    if search.indications or welds:
+        # Fit again without the damaged points and the welds, which bias the form.
         damaged = np.ones(len(cloud), bool)
         damaged[chosen[search.undamaged]] = False
         form = refit_pipe(cloud, form, left_out=damaged)
     features, of_sections = pipe_features(cloud, form, section_mm=section_mm)
+    of_welds, on_welds = _weld_features(cloud, form, welds)
     blemishes, of_blemishes = _blemish_features(cloud, form, chosen, search, wall_mm)
     deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
-    notes = *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *of_blemishes
-    return Inspection("pipe", (*features, *blemishes), deviation, level, notes).count_steps(cloud)
+    notes = *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *of_blemishes
+    found = Inspection("pipe", (*features, *of_welds, *blemishes), deviation, level, notes)
+    return found.count_steps(cloud)
 
 
 def _check_size(diameter_mm: float, wall_mm: float | None) -> list[str]:
@@ -142,7 +152,7 @@ def _search_form(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, false_al
         first, last = np.flatnonzero(angle < _OVERLAP), np.flatnonzero(angle > 2 * np.pi - _OVERLAP)
         copied = np.concatenate([copied, first, last])
         angle = np.concatenate([angle, angle[first] + 2 * np.pi, angle[last] - 2 * np.pi])
-    errors = PointErrors.along_normals(cloud, chosen, form.outwards[chosen])[copied]
+    errors = PointErrors.along_normals(cloud, chosen, form.frame.normals_at(form.angle[chosen]))[copied]
     surface = _unroll(cloud, form, chosen[copied], angle, errors)
     search = search_blemishes(surface, false_alarm=false_alarm)
     beyond = np.abs(surface.places[:, 1] / form.radius_mm - np.pi) - np.pi
@@ -156,14 +166,14 @@ def _search_form(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, false_al
 def _join_copies(search: BlemishSearch, copied: np.ndarray, count: int) -> BlemishSearch:
     """Return the search result for ``count`` points from the one on their copies (N,); originals come first.
 
-    Indications on both sides of the cut are joined if they have the same sign and share half of their points.
+    Indications on both sides of the cut are joined if they have the same sign and share points.
     """
     joined: list[Indication] = []
     for indication in sorted(search.indications, key=lambda each: len(each.points), reverse=True):
         own = replace(indication, points=np.unique(copied[indication.points]))
         for number, other in enumerate(joined):
-            shared = np.count_nonzero(np.isin(own.points, other.points, assume_unique=True))
-            if own.height_mm * other.height_mm > 0 and shared > 0.5 * len(own.points):
+            # An indication removes its points from the search: only copies are in two of them.
+            if own.height_mm * other.height_mm > 0 and np.isin(own.points, other.points, assume_unique=True).any():
                 joined[number] = replace(other, points=np.union1d(own.points, other.points))
                 break
         else:
@@ -188,35 +198,88 @@ def _unroll(
     heights = form.distance_mm[chosen]
     spread = max(robust_std(heights - np.median(heights)), 1e-9)
     std = errors.single_mm if np.all(errors.single_mm > 0) else np.full(len(heights), spread)
-    axis = np.broadcast_to(form.frame.axes[2], (len(chosen), 3))
-    tangents = np.stack([axis, np.cross(axis, form.outwards[chosen])], axis=1)
     places = np.column_stack([form.along_mm[chosen], form.radius_mm * angle])
-    return UnrolledSurface(places, heights, std, *project_footprint(cloud, chosen, tangents))
+    footprint, footprint_std = np.zeros(places.shape), 0.0
+    if FOOTPRINT in cloud.metadata:
+        axis = np.broadcast_to(form.frame.axes[2], (len(chosen), 3))
+        tangents = np.stack([axis, np.cross(axis, form.frame.normals_at(form.angle[chosen]))], axis=1)
+        footprint, footprint_std = project_footprint(cloud, chosen, tangents)
+    return UnrolledSurface(places, heights, std, footprint, footprint_std)
+
+
+def _weld_features(cloud: PointCloud, form: PipeForm, welds: list[PipeWeld]) -> tuple[list[Feature], list[str]]:
+    """Return the welds as features, and notes on them."""
+    features, notes = [], []
+    for weld in welds:
+        kind = "girth weld" if weld.is_girth else "seam weld"
+        name = f"{kind} {1 + sum(each.name.startswith(kind) for each in features)}"
+        wide = f"{np.ptp(weld.across_mm[weld.covers]):.3g} mm"
+        notes.append(f"no blemishes are searched for on the {name}, over a width of {wide}: inspect it as a weld")
+        try:
+            features.append(measure_weld(cloud, form, weld, name))
+        except EvaluationError as error:
+            notes.append(f"the {kind} is not measured: {error}")
+    return features, notes
 
 
 def _blemish_features(
     cloud: PointCloud, form: PipeForm, chosen: np.ndarray, search: BlemishSearch, wall_mm: float | None
 ) -> tuple[list[Feature], list[str]]:
     """Return the blemishes as features, and a note on each omitted indication."""
-    errors = PointErrors.along_normals(cloud, chosen, form.outwards[chosen])
+    errors = PointErrors.along_normals(cloud, chosen, form.frame.normals_at(form.angle[chosen]))
     flat = _unroll(cloud, form, chosen, form.angle[chosen], errors)
     measured: list[tuple[Blemish, float, float]] = []
     notes = [_note_omission(cloud, chosen[[each.point]], each.height_mm, each.reason) for each in search.unresolved]
-    for indication in search.indications:
-        # Unroll the pipe about the indication, so that it is not cut.
+    sizes = {"diameter_mm": 2 * form.radius_mm, "wall_mm": wall_mm}
+
+    def unroll_about(indication: Indication) -> tuple[UnrolledSurface, float]:
+        """Return the surface unrolled about an indication, so that it is not cut, and its angle."""
         middle = float(np.angle(np.mean(np.exp(1j * form.angle[chosen[indication.points]]))))
         angle = np.mod(form.angle[chosen] - middle + np.pi, 2 * np.pi) - np.pi
-        surface = replace(flat, places=np.column_stack([flat.places[:, 0], form.radius_mm * angle]))
+        return replace(flat, places=np.column_stack([flat.places[:, 0], form.radius_mm * angle])), middle
+
+    def measure(indication: Indication, points: np.ndarray, middle: float, measured_by: Callable[[], Blemish]) -> bool:
+        """Add the blemish, or a note and return False; ``points`` are those of the indication."""
         try:
-            blemish = measure_blemish(
-                surface, search, indication, errors, diameter_mm=2 * form.radius_mm, wall_mm=wall_mm
-            )
-            if (size := blemish.values[0]).low <= 0:
-                raise EvaluationError(f"it is not significant relative to its surroundings: {size.text()}")
+            blemish = measured_by()
+            for value in blemish.values:
+                if value.name in ("depth", "height", "length", "width") and value.low <= 0:
+                    raise EvaluationError(f"it is not significant relative to its surroundings: {value.text()}")
         except EvaluationError as error:
-            notes.append(_note_omission(cloud, chosen[indication.points], indication.height_mm, str(error)))
-        else:
-            measured.append((blemish, middle, indication.false_alarm))
+            notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
+            return False
+        measured.append((blemish, middle, indication.false_alarm))
+        return True
+
+    large: list[tuple[LargeBlemish, float]] = []
+    for indication in sorted(search.indications, key=lambda each: abs(each.height_mm), reverse=True):
+        if not any(whole.explains(indication) for whole, _ in large):
+            surface, middle = unroll_about(indication)
+            if (whole := search_within(surface, search, indication)) is not None:
+                large.append((whole, middle))
+    taken = np.zeros(len(chosen), bool)
+    for whole, middle in large:
+        parts = whole.parts_beside(search.indications)
+        formed = [abs(part.height_mm) for part in parts if whole.is_form(part)]
+        if formed:
+            reason = f"{len(formed)} departures of up to {max(formed):.2g} mm from a smooth surface belong to its form"
+            notes.append(_note_large(cloud, chosen[whole.own.points], whole.own.height_mm, reason))
+        for part in parts:
+            points = whole.chosen[part.points]
+            if not taken[points].any() and not whole.is_form(part):
+                taken[points] = measure(part, points, middle, partial(whole.measure, part, errors, **sizes))
+        bare = whole.without(unroll_about(whole.own)[0], taken)
+        own = partial(measure_blemish, bare, search, whole.own, errors, **sizes)
+        measure(whole.own, whole.own.points, middle, own)
+    for indication in search.indications:
+        if not any(whole.explains(indication) for whole, _ in large):
+            surface, middle = unroll_about(indication)
+            measure(
+                indication,
+                indication.points,
+                middle,
+                partial(measure_blemish, surface, search, indication, errors, **sizes),
+            )
     measured.sort(key=lambda each: each[0].extent_mm[2], reverse=True)
     features, numbers = [], dict.fromkeys(FeatureKind, 0)
     for blemish, middle, chance in measured:
@@ -233,6 +296,12 @@ def _note_omission(cloud: PointCloud, points: np.ndarray, height_mm: float, reas
     """Return a note on an omitted indication at some points."""
     x, y, z = cloud.points_mm[points].mean(axis=0)
     return f"an indication of {height_mm:.2g} mm at ({x:.1f}, {y:.1f}, {z:.1f}) mm is omitted: {reason}"
+
+
+def _note_large(cloud: PointCloud, points: np.ndarray, height_mm: float, text: str) -> str:
+    """Return a note on a large blemish at some points."""
+    x, y, z = cloud.points_mm[points].mean(axis=0)
+    return f"in the indication of {height_mm:.2g} mm at ({x:.1f}, {y:.1f}, {z:.1f}) mm, {text}"
 
 
 def _note_limits(cloud: PointCloud, form: PipeForm, search: BlemishSearch) -> list[str]:

@@ -21,6 +21,7 @@ from uwlts.fitting.least_squares import MAD_TO_STD, fit_biweight, fit_robustly, 
 from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors
 from uwlts.fitting.shapes import fit_plane
+from uwlts.inspection.bead_profiles import NO_WEIGHT, BeadProfiles, interpolation_rows, profile_rows
 from uwlts.inspection.features import (
     COVERAGE_FACTOR,
     DEFINITIONS,
@@ -64,6 +65,9 @@ class WeldRule:
         Half window of a local quadratic, in bead widths: narrower than an undercut.
     spacings_in_bandwidth : float
         Least half window of a local quadratic, in point spacings.
+    gap_spacings : float
+        Point spacing divided by the typical gap between points across the bead: they are equal for evenly distributed
+        points, and the gap is larger if images run along the bead.
     flank_low : float
         Lower end of the flank, as a fraction of the bead's height. A line through the flank gives toe and toe angle.
     flank_high : float
@@ -97,6 +101,7 @@ class WeldRule:
     points_in_section: int = 80
     bandwidth: float = 0.04
     spacings_in_bandwidth: float = 3.0
+    gap_spacings: float = 0.6
     flank_low: float = 0.1
     flank_high: float = 0.5
     width_from_crown: float = 1.9
@@ -111,9 +116,6 @@ class WeldRule:
 
 
 _RULE = WeldRule()
-
-_NO_WEIGHT = 1e-9
-"""Sum of absolute weights that counts as zero: rounding errors are smaller."""
 
 
 def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: float | None = None) -> Inspection:
@@ -150,7 +152,7 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
         )
     bead, notes = _prepare_bead(cloud, section_mm)
     errors = PointErrors.along_normals(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
-    values, extent, left_out = _measure_values(bead, errors)
+    values, extent, left_out = measure_bead(bead, errors)
     feature = Feature(FeatureKind.WELD, "weld", values, bead.middle_mm, bead.axes, extent, bead.chosen[bead.on_bead])
     deviation = np.full(len(cloud), np.nan)
     deviation[bead.chosen] = bead.heights_mm
@@ -166,56 +168,7 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
 
 
 @dataclass(frozen=True, eq=False)
-class _Profiles:
-    """Linear operators from point heights to profiles on a grid across each of S sections, G places each.
-
-    Attributes
-    ----------
-    across_mm : (G,) float64
-        Places of the grid across the weld.
-    sections : int
-        Number of sections S.
-    smooth : (S G, n) sparse
-        Local quadratics through the points.
-    plates : two pairs of (n, 3) and (3, n) float64
-        For each plate: design of its level and slopes, weighted with its part in the reference, and its least-squares
-        rows.
-    seen : (n, S G) sparse
-        Heights that points with their footprints measure on given profiles.
-    sharp : (n, S G) sparse
-        Heights that points without a footprint would measure.
-    """
-
-    across_mm: np.ndarray
-    sections: int
-    smooth: sparse.csr_array
-    plates: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-    seen: sparse.csr_array
-    sharp: sparse.csr_array
-
-    def subtract_plates(self, heights: np.ndarray) -> np.ndarray:
-        """Return heights (n,) of the points above the plates."""
-        return heights - sum(base @ (rows @ heights) for base, rows in self.plates)
-
-    def evaluate(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
-        """Return the profiles (S, G) for point heights (n,).
-
-        Smoothing is corrected ``steps`` times. ``share`` scales the footprints' part in this correction.
-        """
-        left = self.subtract_plates(heights)
-        profiles = self.smooth @ left
-        known = np.isfinite(profiles)
-        # Next to missing lines the correction is unknown.
-        whole = abs(self.seen) @ ~known < _NO_WEIGHT
-        for _ in range(steps):
-            filled = np.where(known, profiles, 0.0)
-            there = share * (self.seen @ filled) + (1 - share) * (self.sharp @ filled)
-            profiles = profiles + self.smooth @ np.where(whole, left - there, 0.0)
-        return profiles.reshape(self.sections, len(self.across_mm))
-
-
-@dataclass(frozen=True, eq=False)
-class _Bead:
+class Bead:
     """Bead with its plates.
 
     Attributes
@@ -238,7 +191,7 @@ class _Bead:
         Length of the bead.
     noise_mm : (n,) float64
         Standard deviation of independent point noise that explains the scatter of local means.
-    profiles : _Profiles
+    profiles : BeadProfiles
     footprint_std : float
         Relative standard uncertainty of the squared footprints.
     """
@@ -252,19 +205,58 @@ class _Bead:
     half_mm: float
     length_mm: float
     noise_mm: np.ndarray
-    profiles: _Profiles
+    profiles: BeadProfiles
     footprint_std: float
 
 
-def _prepare_bead(cloud: PointCloud, section_mm: float | None) -> tuple[_Bead, list[str]]:
+def _prepare_bead(cloud: PointCloud, section_mm: float | None) -> tuple[Bead, list[str]]:
     """Return the highest bead with its plates and profiles, and notes on other beads."""
     axes, middle, half, ends, others = _locate_bead(cloud.points_mm)
     notes = [f"{others} other beads beside the highest one are not measured: crop the cloud to measure them"] * (
         others > 0
     )
     local = (cloud.points_mm - middle) @ axes.T
-    reach = half * (1 + 2 * _RULE.plate_width)
-    chosen = np.flatnonzero((np.abs(local[:, 1]) < reach) & (local[:, 0] >= ends[0]) & (local[:, 0] <= ends[1]))
+    local[(local[:, 0] < ends[0]) | (local[:, 0] > ends[1])] = np.inf
+    tangents = np.broadcast_to(axes[:2], (len(cloud), 2, 3))
+    return build_bead(cloud, local, axes, middle, tangents, half_mm=half, section_mm=section_mm), notes
+
+
+def build_bead(
+    cloud: PointCloud,
+    local: np.ndarray,
+    axes: np.ndarray,
+    middle: np.ndarray,
+    tangents: np.ndarray,
+    *,
+    half_mm: float,
+    section_mm: float | None = None,
+) -> Bead:
+    """Return a bead with its plates and profiles.
+
+    Parameters
+    ----------
+    cloud
+        Cloud of N points.
+    local : (N, 3)
+        Places of the points along the bead, across it and their heights, mm; not finite for points that do not count.
+    axes : (3, 3)
+        Unit vectors along the bead, across it and outwards in its middle.
+    middle : (3,)
+        Middle of the bead, mm.
+    tangents : (N, 2, 3)
+        Unit vectors along the bead and across it at the points.
+    half_mm
+        Approximate half width of the bead.
+    section_mm
+        Length of a section along the bead.
+
+    Raises
+    ------
+    EvaluationError
+        The points do not show the plates on both sides of the bead.
+    """
+    half, reach = half_mm, half_mm * (1 + 2 * _RULE.plate_width)
+    chosen = np.flatnonzero(np.isfinite(local).all(axis=1) & (np.abs(local[:, 1]) < reach))
     along, across, raw = local[chosen].T
     sides = [across < -_RULE.plate_from * half, across > _RULE.plate_from * half]
     if min(map(np.count_nonzero, sides)) < _RULE.fewest_beside:
@@ -281,34 +273,44 @@ def _prepare_bead(cloud: PointCloud, section_mm: float | None) -> tuple[_Bead, l
     if section_mm is not None:
         count = max(1, int(length / section_mm))
     section = np.clip(((along - along.min()) / length * count).astype(int), 0, count - 1)
-    spacing = 2 * reach * count / len(along)
+    spacing = max(2 * reach * count / len(along), _RULE.gap_spacings * _typical_gap(across, section))
     bandwidth = max(_RULE.bandwidth * 2 * half, _RULE.spacings_in_bandwidth * spacing)
     edge = half * (1 + 2 * _RULE.groove_outside) + bandwidth
     grid = np.linspace(-edge, edge, int(np.ceil(6 * edge / bandwidth)) + 1)
-    smooth = _profile_rows(across, section, count, grid, bandwidth)
+    smooth = profile_rows(across, section, count, grid, bandwidth)
     part = share[:, None]
     plates = (design * (1 - part), rows[0]), (design * part, rows[1])
-    size, footprint_std = project_footprint(cloud, chosen, np.broadcast_to(axes[:2], (len(chosen), 2, 3)))
-    sharp = _interpolation_rows(across, section, count, grid)
+    size, footprint_std = project_footprint(cloud, chosen, tangents[chosen])
+    sharp = interpolation_rows(across, section, count, grid)
     parts = [
-        weight * _interpolation_rows(across + node * size[:, 1], section, count, grid)
+        weight * interpolation_rows(across + node * size[:, 1], section, count, grid)
         for node, weight in ((-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6))
     ]
-    profiles = _Profiles(grid, count, smooth, plates, sparse.csr_array(sum(parts[1:], parts[0])), sharp)
+    profiles = BeadProfiles(grid, count, smooth, plates, sparse.csr_array(sum(parts[1:], parts[0])), sharp)
     beside = np.abs(np.tile(grid, count)) > half * (1 + _RULE.groove_outside)
     means = profiles.evaluate(raw, steps=0).ravel()[beside]
     expected = np.sqrt(np.asarray(smooth.power(2).sum(axis=1)).ravel()[beside])
+    if not np.isfinite(means).any():
+        raise EvaluationError(f"none of the {count} sections across the bead has enough points for a profile")
     seen = MAD_TO_STD * float(np.nanmedian(np.abs(means) / expected))
     scatter = _local_scatter(profiles, raw, across, bandwidth)
     seen = seen * np.maximum(scatter / float(np.median(scatter[np.abs(across) > half * (1 + _RULE.groove_outside)])), 1)
     on_bead = np.abs(across) < half
-    return _Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles, footprint_std), notes
+    return Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles, footprint_std)
 
 
-def _local_scatter(profiles: _Profiles, raw: np.ndarray, across: np.ndarray, bandwidth: float) -> np.ndarray:
+def _typical_gap(across: np.ndarray, section: np.ndarray) -> float:
+    """Return the gap between points of a section that contains the median place across."""
+    order = np.lexsort((across, section))
+    gaps = np.diff(across[order])[np.diff(section[order]) == 0]
+    gaps = np.sort(gaps)
+    return float(gaps[np.searchsorted(np.cumsum(gaps), 0.5 * gaps.sum())])
+
+
+def _local_scatter(profiles: BeadProfiles, raw: np.ndarray, across: np.ndarray, bandwidth: float) -> np.ndarray:
     """Estimate the scatter (n,) of the points about the profiles, by their place across the weld."""
     depths = profiles.evaluate(raw).ravel()
-    whole = abs(profiles.sharp) @ ~np.isfinite(depths) < _NO_WEIGHT
+    whole = abs(profiles.sharp) @ ~np.isfinite(depths) < NO_WEIGHT
     off = np.abs(profiles.subtract_plates(raw) - profiles.sharp @ np.nan_to_num(depths))
     cell = ((across - across.min()) / (2 * bandwidth)).astype(int)
     spread = np.full(cell.max() + 1, np.nan)
@@ -354,58 +356,6 @@ def _locate_bead(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.
     return axes, middle, half, ends, len(beads) - 1
 
 
-def _profile_rows(
-    across: np.ndarray, section: np.ndarray, count: int, grid: np.ndarray, bandwidth: float
-) -> sparse.csr_array:
-    """Return rows (S G, n) that give local quadratics across each section as products with heights.
-
-    Rows without enough points are NaN.
-    """
-    order = np.lexsort((across, section))
-    starts = np.searchsorted(section[order], np.arange(count + 1))
-    columns, values, lengths = [], [], [0]
-    for k in range(count):
-        own = order[starts[k] : starts[k + 1]]
-        place = across[own]
-        nothing = own[:1] if len(own) else order[:1]
-        first, last = np.searchsorted(place, grid - bandwidth), np.searchsorted(place, grid + bandwidth)
-        for middle, a, b in zip(grid, first, last, strict=True):
-            u = (place[a:b] - middle) / bandwidth
-            row = _quadratic_row(u)
-            columns.append(own[a:b] if row is not None else nothing)
-            values.append(row if row is not None else np.array([np.nan]))
-            lengths.append(lengths[-1] + len(values[-1]))
-    parts = np.concatenate(values), np.concatenate(columns), np.array(lengths)
-    return sparse.csr_array(parts, shape=(count * len(grid), len(across)))
-
-
-def _interpolation_rows(across: np.ndarray, section: np.ndarray, count: int, grid: np.ndarray) -> sparse.csr_array:
-    """Return rows (n, S G) that interpolate profiles at places (n,) of given sections.
-
-    Cubic convolution, exact for quadratics (Keys 1981, Eq. 15).
-    """
-    cell = (across - grid[0]) / (grid[1] - grid[0])
-    at = np.floor(cell).astype(int)[:, None] + np.arange(-1, 3)
-    away = np.abs(cell[:, None] - at)
-    weight = np.where(away <= 1, (1.5 * away - 2.5) * away**2 + 1, ((-0.5 * away + 2.5) * away - 4) * away + 2)
-    weight = np.where((at >= 0) & (at < len(grid)), weight, 0.0)
-    columns = section[:, None] * len(grid) + np.clip(at, 0, len(grid) - 1)
-    rows = np.repeat(np.arange(len(across)), 4)
-    return sparse.csr_array((weight.ravel(), (rows, columns.ravel())), shape=(len(across), count * len(grid)))
-
-
-def _quadratic_row(u: np.ndarray) -> np.ndarray | None:
-    """Return the weights of values at places u of the value at 0 of a local quadratic; None if undetermined."""
-    if len(u) < 5 or u.min() > -0.2 or u.max() < 0.2:
-        return None
-    weight = np.maximum(1 - u * u, 0)
-    design = np.stack([np.ones(len(u)), u, u * u], axis=1)
-    normal = (design * weight[:, None]).T @ design
-    if np.linalg.cond(normal) > 1e6:
-        return None
-    return np.linalg.solve(normal, np.eye(3)[0]) @ (design * weight[:, None]).T
-
-
 _NAMES = (
     "height", "largest height", "width", "undercut left", "undercut right", "largest undercut", "toe angle left",
     "toe angle right", "misalignment",
@@ -432,7 +382,7 @@ class _Figures:
     grooves: tuple[np.ndarray, np.ndarray]
 
 
-def _measure_values(bead: _Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray, list[str]]:
+def measure_bead(bead: Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray, list[str]]:
     """Return the values, the extent (3,) in mm, and notes on omitted sections and values."""
     profiles = bead.profiles.evaluate(bead.raw_mm)
     tops = _find_tops(bead, profiles)
@@ -519,25 +469,25 @@ def _widen_interval(name: str, value: float, top: Largest, fixed: float, shared:
     )
 
 
-def _mask_beside_bead(bead: _Bead, profiles: np.ndarray) -> np.ndarray:
+def _mask_beside_bead(bead: Bead, profiles: np.ndarray) -> np.ndarray:
     """Return the profiles (S, G) with -inf outside the toes."""
     inside = np.isfinite(profiles) & (np.abs(bead.profiles.across_mm) < bead.half_mm)
     return np.where(inside, profiles, -np.inf)
 
 
-def _find_tops(bead: _Bead, profiles: np.ndarray) -> np.ndarray:
+def _find_tops(bead: Bead, profiles: np.ndarray) -> np.ndarray:
     """Return the largest height (S,) of each profile between the toes; -inf if it is unknown."""
     return np.max(_mask_beside_bead(bead, profiles), axis=1)
 
 
-def _find_toes(bead: _Bead, profiles: np.ndarray, whole: np.ndarray) -> np.ndarray:
+def _find_toes(bead: Bead, profiles: np.ndarray, whole: np.ndarray) -> np.ndarray:
     """Return places of the left and right toe and slopes of both flanks (W, 4), for sections ``whole`` (W,)."""
     peaks = np.argmax(_mask_beside_bead(bead, profiles), axis=1)
     return np.array([_fit_flanks(bead.profiles.across_mm, profiles[k], int(peaks[k])) for k in whole])
 
 
 def _evaluate_figures(
-    bead: _Bead, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray, *, steps: int = 1, share: float = 1.0
+    bead: Bead, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray, *, steps: int = 1, share: float = 1.0
 ) -> _Figures:
     """Evaluate the profiles for point heights (n,) in the sections ``whole`` (W,).
 
@@ -561,7 +511,7 @@ def _evaluate_figures(
     return _Figures(values, crest, (grooves[0], grooves[1]))
 
 
-def _find_undercuts(bead: _Bead, profiles: np.ndarray, toes: np.ndarray, side: int) -> np.ndarray:
+def _find_undercuts(bead: Bead, profiles: np.ndarray, toes: np.ndarray, side: int) -> np.ndarray:
     """Return undercut depths (W,) of profiles (W, G) near the toes (W,) of a side; NaN if lines are missing."""
     beyond = (-1.0, 1.0)[side] * (bead.profiles.across_mm - toes[:, None]) / (2 * bead.half_mm)
     groove = (beyond > -_RULE.groove_inside) & (beyond < _RULE.groove_outside)

@@ -192,7 +192,7 @@ def register_to_surface(
     known = None if uncertainty is None else uncertainty[chosen]
     image = None if frame is None else frame[chosen]
     centroid = moved.mean(axis=0) if len(moved) else np.zeros(3)
-    transform, rounds = np.eye(4), 0
+    transform, rounds, reference = np.eye(4), 0, surface.uncertainty
     while True:
         middle = (transform @ np.append(centroid, 1.0))[:3]
         near = surface.nearest(moved, reach_mm=reach_mm)
@@ -206,7 +206,11 @@ def register_to_surface(
                 "Check that both have the same frame and unit"
             )
         rotation = transform[:3, :3]
-        variance = _variance_along(known, near.normals @ rotation, options.least_variance_mm2)[used]
+        # Distances also contain the noise of the reference, which the scatter would count again.
+        of_reference = np.zeros(np.count_nonzero(used))
+        if reference is not None:
+            of_reference = project_variance(reference.random_mm2[near.index[used]], near.normals[used])
+        variance = of_reference + _variance_along(known, near.normals @ rotation, options.least_variance_mm2)[used]
         by = _motion_derivatives(moved[used], near.normals[used], middle)
         found = _solve_step(
             by, near.distance_mm[used], variance, size=_rms_radius(moved, middle), open_share=options.open_share
@@ -223,7 +227,6 @@ def register_to_surface(
         None if known is None else known[used], normals @ transform[:3, :3], None if image is None else image[used]
     )
     index = near.index[used]
-    reference = surface.uncertainty
     reference_side = _CorrelatedErrors(
         None if reference is None else reference[index],
         -normals,
@@ -234,7 +237,9 @@ def register_to_surface(
         + cloud_side.position_covariance(found.answer)
         + reference_side.position_covariance(found.answer)
     )
+    # The step's covariance takes the reference's noise as independent.
     covariance += reference_side.noise_covariance(found.answer, index)
+    covariance -= reference_side.noise_covariance(found.answer, np.arange(len(index)))
     return Registration(
         transform,
         covariance,

@@ -18,7 +18,8 @@ from scipy.stats import norm
 import uwlts
 from uwlts.cli import app
 from uwlts.errors import EvaluationError
-from uwlts.inspection.blemish_search import UnrolledSurface, search_blemishes
+from uwlts.inspection.bell_maps import UnrolledSurface
+from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
 from uwlts.inspection.flat import _fit_circle
 from uwlts.inspection.inspect import inspect_cloud

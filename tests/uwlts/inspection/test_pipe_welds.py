@@ -1,0 +1,47 @@
+"""Girth and seam welds of pipes are welds, with height, width and place; pits beside them remain.
+
+Pipes are those of `tests.oracles.pipes`. Gates on heights are 4.5 standard uncertainties, exceeded by a normal error 7
+times in a million.
+"""
+
+import numpy as np
+import pytest
+
+import uwlts
+from tests.oracles.pipes import Bump, WeldBead, scan_pipe
+from uwlts.inspection.features import FeatureKind
+from uwlts.storage.cloud import PointCloud
+
+GATE, RADIUS_MM = 4.5, 80.0
+SEEDS = [31, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(32, 36))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", ["girth", "seam"])
+def test_a_weld_of_a_pipe_is_a_weld(kind: str, seed: int) -> None:
+    """Beads of 1 to 2.5 mm; the plane of a girth weld is inclined by up to 3 deg, and its crest is rippled."""
+    rng = np.random.default_rng([seed, 7])
+    height, width = float(rng.uniform(1, 2.5)), float(rng.uniform(8, 14))
+    along, angle = float(rng.uniform(-20, 20)), float(rng.uniform(-np.pi, np.pi))
+    if kind == "girth":
+        bead = WeldBead(height_mm=height, width_mm=width, along_mm=along, lean_mm=float(rng.uniform(0, 4)))
+    else:
+        bead = WeldBead(height_mm=height, width_mm=width, angle=angle)
+    pit = Bump(along_mm=along - 25 * np.sign(along), angle=angle + 1.0, diameter_mm=10.0, height_mm=-0.6)
+    pipe = scan_pipe(rng, axis=(0.2, 1, 0.1), radius_mm=RADIUS_MM, length_mm=110.0, spacing_mm=1.4, bumps=[bead, pit])
+    found = uwlts.inspect_pipe(PointCloud(pipe.points_mm, np.ones(len(pipe.points_mm)), pipe.frame, pipe.line))
+    (weld,) = found.select(FeatureKind.WELD)
+    assert weld.name == f"{kind} weld 1"
+    # The largest height of a profile is above the mean crest by its noise; lines are 1.4 mm apart.
+    assert weld["height"].value == pytest.approx(height, abs=GATE * weld["height"].uncertainty + 0.01 * height)
+    assert weld["height"].uncertainty < 0.05 * height
+    # The line through a parabola's flank ends 1 % beyond its foot, and lines 1.4 mm apart see both ends.
+    assert weld["width"].value == pytest.approx(1.01 * width, abs=1.4 / np.sqrt(12) * 2)
+    place, around = pipe.own_places(weld.place_mm)
+    if kind == "girth":
+        assert place[0] == pytest.approx(along + bead.lean_mm * np.cos(around[0]), abs=2.0)
+    else:
+        assert RADIUS_MM * np.angle(np.exp(1j * (around[0] - angle))) == pytest.approx(0.0, abs=1.0)
+    (own,) = found.select(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
+    assert pipe.distance_mm(pit, own.place_mm) < 1.5
+    assert own["depth"].value == pytest.approx(0.6, abs=GATE * own["depth"].uncertainty)

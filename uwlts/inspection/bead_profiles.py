@@ -1,0 +1,112 @@
+"""Profiles across a weld bead as linear functions of the heights of points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+NO_WEIGHT = 1e-9
+"""Sum of absolute weights that counts as zero: rounding errors are smaller."""
+
+
+@dataclass(frozen=True, eq=False)
+class BeadProfiles:
+    """Linear operators from point heights to profiles on a grid across each of S sections, G places each.
+
+    Attributes
+    ----------
+    across_mm : (G,) float64
+        Places of the grid across the weld.
+    sections : int
+        Number of sections S.
+    smooth : (S G, n) sparse
+        Local quadratics through the points.
+    plates : two pairs of (n, 3) and (3, n) float64
+        For each plate: design of its level and slopes, weighted with its part in the reference, and its least-squares
+        rows.
+    seen : (n, S G) sparse
+        Heights that points with their footprints measure on given profiles.
+    sharp : (n, S G) sparse
+        Heights that points without a footprint would measure.
+    """
+
+    across_mm: np.ndarray
+    sections: int
+    smooth: sparse.csr_array
+    plates: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    seen: sparse.csr_array
+    sharp: sparse.csr_array
+
+    def subtract_plates(self, heights: np.ndarray) -> np.ndarray:
+        """Return heights (n,) of the points above the plates."""
+        return heights - sum(base @ (rows @ heights) for base, rows in self.plates)
+
+    def evaluate(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
+        """Return the profiles (S, G) for point heights (n,).
+
+        Smoothing is corrected ``steps`` times. ``share`` scales the footprints' part in this correction.
+        """
+        left = self.subtract_plates(heights)
+        profiles = self.smooth @ left
+        known = np.isfinite(profiles)
+        # Next to missing lines the correction is unknown.
+        whole = abs(self.seen) @ ~known < NO_WEIGHT
+        for _ in range(steps):
+            filled = np.where(known, profiles, 0.0)
+            there = share * (self.seen @ filled) + (1 - share) * (self.sharp @ filled)
+            profiles = profiles + self.smooth @ np.where(whole, left - there, 0.0)
+        return profiles.reshape(self.sections, len(self.across_mm))
+
+
+def profile_rows(
+    across: np.ndarray, section: np.ndarray, count: int, grid: np.ndarray, bandwidth: float
+) -> sparse.csr_array:
+    """Return rows (S G, n) that give local quadratics across each section as products with heights.
+
+    Rows without enough points are NaN.
+    """
+    order = np.lexsort((across, section))
+    starts = np.searchsorted(section[order], np.arange(count + 1))
+    columns, values, lengths = [], [], [0]
+    for k in range(count):
+        own = order[starts[k] : starts[k + 1]]
+        place = across[own]
+        nothing = own[:1] if len(own) else order[:1]
+        first, last = np.searchsorted(place, grid - bandwidth), np.searchsorted(place, grid + bandwidth)
+        for middle, a, b in zip(grid, first, last, strict=True):
+            u = (place[a:b] - middle) / bandwidth
+            row = _quadratic_row(u)
+            columns.append(own[a:b] if row is not None else nothing)
+            values.append(row if row is not None else np.array([np.nan]))
+            lengths.append(lengths[-1] + len(values[-1]))
+    parts = np.concatenate(values), np.concatenate(columns), np.array(lengths)
+    return sparse.csr_array(parts, shape=(count * len(grid), len(across)))
+
+
+def interpolation_rows(across: np.ndarray, section: np.ndarray, count: int, grid: np.ndarray) -> sparse.csr_array:
+    """Return rows (n, S G) that interpolate profiles at places (n,) of given sections.
+
+    Cubic convolution, exact for quadratics (Keys 1981, Eq. 15).
+    """
+    cell = (across - grid[0]) / (grid[1] - grid[0])
+    at = np.floor(cell).astype(int)[:, None] + np.arange(-1, 3)
+    away = np.abs(cell[:, None] - at)
+    weight = np.where(away <= 1, (1.5 * away - 2.5) * away**2 + 1, ((-0.5 * away + 2.5) * away - 4) * away + 2)
+    weight = np.where((at >= 0) & (at < len(grid)), weight, 0.0)
+    columns = section[:, None] * len(grid) + np.clip(at, 0, len(grid) - 1)
+    rows = np.repeat(np.arange(len(across)), 4)
+    return sparse.csr_array((weight.ravel(), (rows, columns.ravel())), shape=(len(across), count * len(grid)))
+
+
+def _quadratic_row(u: np.ndarray) -> np.ndarray | None:
+    """Return the weights of values at places u of the value at 0 of a local quadratic; None if undetermined."""
+    if len(u) < 5 or u.min() > -0.2 or u.max() < 0.2:
+        return None
+    weight = np.maximum(1 - u * u, 0)
+    design = np.stack([np.ones(len(u)), u, u * u], axis=1)
+    normal = (design * weight[:, None]).T @ design
+    if np.linalg.cond(normal) > 1e6:
+        return None
+    return np.linalg.solve(normal, np.eye(3)[0]) @ (design * weight[:, None]).T

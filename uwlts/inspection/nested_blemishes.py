@@ -1,0 +1,213 @@
+"""Blemishes within and beside a large one, whose own surface is estimated and taken out of the heights.
+
+A search for departures from the undamaged surface joins a pit with the dent around it, and finds the shallow rest of a
+dent again. Relative to the dent's own surface, a pit in it is a departure like any other, and the rest is none. This
+surface consists of local quadratics with Tukey's biweight, which gives a pit no weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+from scipy.interpolate import RectBivariateSpline
+from scipy.spatial import KDTree
+
+from uwlts.errors import EvaluationError
+from uwlts.fitting.least_squares import fit_biweight, thin_evenly
+from uwlts.fitting.propagation import PointErrors
+from uwlts.inspection.bell_maps import UnrolledSurface
+from uwlts.inspection.blemish_search import BlemishSearch, Indication, search_blemishes
+from uwlts.inspection.blemishes import Blemish, measure_blemish
+from uwlts.inspection.features import FeatureKind, plain_value
+
+
+@dataclass(frozen=True, kw_only=True)
+class NestedRule:
+    """Numbers of the surface of a large blemish.
+
+    Chosen by hand with the reasons below. Results are checked on the pipes of tests/oracles/pipes.py.
+
+    Attributes
+    ----------
+    bandwidth : float
+        Radius of a local quadratic, in radii of the large blemish. Blemishes of up to half this radius cover a quarter
+        of its points, which the biweight tolerates.
+    window : float
+        Width of the surroundings, in radii of the large blemish, to where a bell that it may be part of has ended.
+    nodes : int
+        Nodes of the surface per bandwidth.
+    most_points : int
+        Most points of a local quadratic; more of them would not change it.
+    fewest_points : int
+        Fewest points of a local quadratic: twice its terms.
+    rim : float
+        Height of the dent's surface, as a fraction of its largest, below which long indications follow its rim.
+    compact : float
+        Least part of the circle around an indication that its points fill if it does not follow a rim.
+    significant : float
+        Least height of an indication, in errors of the smooth surface.
+    worst : float
+        Quantile of these errors: edges cover a few percent of the window, other pits less than one.
+    """
+
+    bandwidth: float = 0.35
+    window: float = 1.2
+    nodes: int = 2
+    most_points: int = 400
+    fewest_points: int = 12
+    rim: float = 0.3
+    compact: float = 0.3
+    significant: float = 3.0
+    worst: float = 0.99
+
+
+_RULE = NestedRule()
+
+
+@dataclass(frozen=True, eq=False)
+class LargeBlemish:
+    """Large blemish with those inside and beside it.
+
+    Attributes
+    ----------
+    own : Indication
+        The large one, with the points of those inside it.
+    chosen : (n,) int
+        Points of the window.
+    surface : UnrolledSurface
+        Window with heights relative to the large blemish's surface.
+    height_mm, std_mm : (n,) float64
+        Height of that surface above the undamaged one, and its standard uncertainty by the smoothing.
+    search : BlemishSearch
+        Search in the window.
+    largest_mm : float
+        Largest radius of this search.
+    """
+
+    own: Indication
+    chosen: np.ndarray
+    surface: UnrolledSurface
+    height_mm: np.ndarray
+    std_mm: np.ndarray
+    search: BlemishSearch
+    largest_mm: float
+
+    def explains(self, other: Indication) -> bool:
+        """Return whether an indication of the first search was searched for again, or is the rest of the large one."""
+        if other is self.own:
+            return True
+        if np.mean(np.isin(other.points, self.chosen)) < 0.5:
+            return False
+        own, radius = self.surface.places[np.isin(self.chosen, self.own.points)], other.radius_mm
+        around = self.surface.places[np.isin(self.chosen, other.points)]
+        middle = own.mean(axis=0)
+        encloses = bool(np.all(around.min(axis=0) < middle) and np.all(around.max(axis=0) > middle))
+        is_rest = encloses and other.height_mm * self.own.height_mm > 0
+        return radius <= self.largest_mm or is_rest
+
+    def parts_beside(self, others: Sequence[Indication]) -> list[Indication]:
+        """Return the indications of the window, without those at larger ones of the first search, ``others``."""
+        kept = [each.points for each in others if not self.explains(each)]
+        taken = np.concatenate([np.zeros(0, int), *kept])
+        return [each for each in self.search.indications if not np.isin(self.chosen[each.points], taken).any()]
+
+    def is_form(self, indication: Indication) -> bool:
+        """Return whether an indication of the window belongs to the form of the large one.
+
+        It follows its rim, or is not larger than the errors of a smooth surface elsewhere: those at sharp edges.
+        """
+        places = self.surface.places[indication.points]
+        middle = places.mean(axis=0)
+        reach = float(np.max(np.hypot(*(places - middle).T)))
+        density = len(self.chosen) / float(np.prod(np.ptp(self.surface.places, axis=0)))
+        below = self.height_mm[indication.points] / (np.abs(self.height_mm).max() * np.sign(self.own.height_mm))
+        if np.median(below) < _RULE.rim and len(places) < _RULE.compact * density * np.pi * reach**2:
+            return True
+        elsewhere = np.hypot(*(self.surface.places - middle).T) > reach + 2 * self.largest_mm
+        error = float(np.quantile(self.std_mm[elsewhere], _RULE.worst)) if elsewhere.any() else np.inf
+        return abs(indication.height_mm) < _RULE.significant * error
+
+    def without(self, surface: UnrolledSurface, points: np.ndarray) -> UnrolledSurface:
+        """Return the whole surface with the heights of the large one at the given points (N,) bool."""
+        inside, bare = points[self.chosen], surface.heights.copy()
+        bare[self.chosen[inside]] = self.height_mm[inside]
+        return replace(surface, heights=bare)
+
+    def measure(
+        self, indication: Indication, errors: PointErrors, *, diameter_mm: float, wall_mm: float | None
+    ) -> Blemish:
+        """Measure an indication of the window; a pit in a dent also has its total depth.
+
+        ``errors`` are those of all points. EvaluationError as `measure_blemish`.
+        """
+        found = measure_blemish(
+            self.surface, self.search, indication, errors[self.chosen], diameter_mm=diameter_mm, wall_mm=wall_mm
+        )
+        points, deepest = self.chosen[indication.points], int(KDTree(self.surface.places).query(found.place)[1])
+        depth, by_smoothing = found.values[0], float(self.std_mm[indication.points].max())
+        random = float(np.hypot(depth.random, by_smoothing))
+        values = [plain_value(found.kind, depth.name, depth.value, random, depth.systematic, least=0.0)]
+        if found.kind != FeatureKind.PROTRUSION and np.mean(np.isin(points, self.own.points)) > 0.5:
+            # The sum of both depths does not depend on the surface between them.
+            total = depth.value - float(self.height_mm[deepest])
+            values.append(plain_value(found.kind, "total depth", total, depth.random, depth.systematic))
+        return replace(found, values=(*values, *found.values[1:]), points=points)
+
+
+def search_within(surface: UnrolledSurface, search: BlemishSearch, large: Indication) -> LargeBlemish | None:
+    """Search for blemishes within and beside a large one; None if it has no room for them.
+
+    ``surface`` and ``search`` are those of the whole pipe, cut open far from the large blemish.
+    """
+    own = surface.places[large.points]
+    low, high = own.min(axis=0), own.max(axis=0)
+    radius = 0.25 * float(np.sum(high - low))
+    bandwidth = _RULE.bandwidth * radius
+    if 0.5 * bandwidth < search.smallest_mm:
+        return None
+    low, high = low - _RULE.window * radius, high + _RULE.window * radius
+    chosen = np.flatnonzero(np.all((surface.places > low) & (surface.places < high), axis=1) & ~search.outliers)
+    window = UnrolledSurface(
+        surface.places[chosen],
+        surface.heights[chosen],
+        surface.std[chosen],
+        surface.footprint_mm[chosen],
+        surface.footprint_std,
+    )
+    smooth = _estimate_surface(window, bandwidth)
+    # Twicing: the residuals contain what was smoothed away, and the size of this correction is its uncertainty.
+    correction = _estimate_surface(replace(window, heights=window.heights - smooth), bandwidth)
+    smooth = smooth + correction
+    relative = replace(window, heights=window.heights - smooth)
+    try:
+        found = search_blemishes(relative, false_alarm=search.false_alarm, largest_mm=0.5 * bandwidth)
+    except EvaluationError:
+        return None
+    return LargeBlemish(large, chosen, relative, smooth, np.abs(correction), found, 0.5 * bandwidth)
+
+
+def _estimate_surface(window: UnrolledSurface, bandwidth: float) -> np.ndarray:
+    """Return the heights (n,) of a surface of local quadratics at the points of a window."""
+    tree, places = KDTree(window.places), window.places
+    low, high = places.min(axis=0), places.max(axis=0)
+    counts: Any = np.maximum(np.ceil((high - low) / bandwidth * _RULE.nodes).astype(int) + 1, 4)
+    sides = [np.linspace(a, b, count) for a, b, count in zip(low, high, counts, strict=True)]
+    values = np.full(counts, np.nan)
+    for i, j in np.ndindex(*counts):
+        node = np.array([sides[0][i], sides[1][j]])
+        near = thin_evenly(np.array(tree.query_ball_point(node, bandwidth), int), _RULE.most_points)
+        if len(near) < _RULE.fewest_points:
+            continue
+        u, v = (places[near] - node).T / bandwidth
+        design = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=1)
+        rows = fit_biweight(design, window.heights[near], np.ones(len(near), bool))[0]
+        values[i, j] = rows[0] @ window.heights[near]
+    unknown = ~np.isfinite(values)
+    if unknown.all():
+        return np.zeros(len(places))
+    nearest: Any = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    return RectBivariateSpline(sides[0], sides[1], values[tuple(nearest)]).ev(*places.T)
