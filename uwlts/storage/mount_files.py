@@ -158,7 +158,7 @@ def read_mount_evidence(
     if artefact == "ring" and radius_mm is None:
         raise DescriptionError(
             "the radius of the ring is missing: give `radius_mm`, that of the wall which the sheet meets. From its "
-            "profiles alone it cannot be told from another wall"
+            "profiles alone it cannot be distinguished from another wall"
         )
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")

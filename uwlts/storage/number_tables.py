@@ -57,7 +57,7 @@ _UNIT_IN_COMMENT = re.compile(
 )
 _NUMBER = re.compile(rb"[+-]?\d*(?:[.,](\d*))?")
 _FIRST, _FEWEST = 200, 10
-"""Rows of which the decimals are counted, and fewest rows that show them."""
+"""Number of rows whose decimals are counted, and fewest rows that show them."""
 _COMMENTS = (b"#", b"//", b"%", b"!")
 
 

@@ -27,14 +27,14 @@ _ACROSS_RATIO = 3
 side has a ratio of about 0.2, from its steep places."""
 
 _REFUSED = {
-    StripeStatus.AMBIGUOUS: "show several stripes, of which none is certainly the laser's own: remove or cover what "
+    StripeStatus.AMBIGUOUS: "show several stripes, and none is certainly the laser's own: remove or cover what "
     "reflects, or choose one by the setting peak",
     StripeStatus.BORDER: "show a stripe cut off by the image's border: move the sensor or the object",
     StripeStatus.SATURATED: "are saturated over more than the width of a stripe: reduce the exposure",
     StripeStatus.END: "show pieces of a stripe shorter than the ends that are left out: increase the exposure, or "
     "reduce the setting end_lines",
 }
-"""What lines without a centre show although there is light on them, and advice."""
+"""Content of lines with light but without a centre, and advice."""
 
 
 def find_stripes(

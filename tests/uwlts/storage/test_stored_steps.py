@@ -14,7 +14,7 @@ OFFSET_MM = np.array([4e6, 5.4e6, 0.0])
 
 
 def plate(rng: np.random.Generator, *, missing_mm: float = 0.0) -> np.ndarray:
-    """A plate of 60 x 60 mm with noise, of which a corner of 17.5 x 17.5 mm (8.5 %) is lower."""
+    """A plate of 60 x 60 mm with noise; a corner of 17.5 x 17.5 mm (8.5 %) is lower."""
     x, y = (each.ravel() for each in np.meshgrid(*[np.arange(0, 60, 0.5)] * 2))
     x, y = x + rng.uniform(-0.2, 0.2, x.size), y + rng.uniform(-0.2, 0.2, x.size)
     z = 400 + rng.normal(0, 0.01, x.size) + missing_mm * ((x < 17.5) & (y < 17.5))

@@ -224,7 +224,7 @@ def compare_estimates(
     """Compare two estimates (P,) with covariances (P, P), both with the same prior knowledge ``shared`` (P, P).
 
     With the normal matrices N of a half and S of the shared knowledge, an estimate is C (N a + S b), C = (N + S)^-1.
-    Two differ with the covariance C1 N1 C1 + C2 N2 C2 + D S D, where D is C1 - C2 and C N C is C - C S C.
+    The difference of two has the covariance `C1 N1 C1 + C2 N2 C2 + D S D` with `D = C1 - C2`. Here `C N C = C - C S C`.
     """
     one, other = values
     first, second = covariances

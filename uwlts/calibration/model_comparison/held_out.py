@@ -117,7 +117,7 @@ INSIDE, OUTSIDE = "inside", "outside"
 Image = tuple[int, int]
 """Number of the piece of evidence, and of the image in it."""
 
-_EVERY = (4, 3, 2)  # one of so many inner images is held out: the first that holds out enough
+_EVERY = (4, 3, 2)  # one of 4, 3 or 2 inner images is held out: the first number that holds out enough
 _OUTER = (1 / 6, 1 / 4, 1 / 3)  # fraction of the depth range, at either end: likewise
 _FEWEST_KEPT = 4  # images for calibration
 FEWEST_HELD = 4  # held-out images: fewer give no standard error

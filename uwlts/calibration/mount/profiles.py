@@ -114,7 +114,7 @@ def _choose_tolerance(off: np.ndarray, extent_mm: float) -> float:
     """Return the distance within which points are on a curve; ``off`` (M, N) are distances from the proposed curves.
 
     The distance is doubled until the best supported curve becomes less significant. The logarithm of the probability
-    that k scattered points are all within a distance d is k log(2 d / extent). No noise is estimated beforehand, which
+    that k scattered points are all within a distance d is k log(2 d / extent). No noise is estimated first, which
     scattered points would enlarge, and neither rounding nor the smooth error of a profiler matters.
     """
 

@@ -487,8 +487,8 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
 def _uncertainty_warnings(camera: CameraSolution, sheet: SheetSolution, sensor: Sensor) -> list[str]:
     """Return warnings if sheet or focal length are too uncertain for the described measuring volume.
 
-    If the sheet turns about the middle of the volume, a point at the volume's end moves along the camera's axis by the
-    sheet's shift there, divided by the normal's component along that axis. The focal length scales all lengths.
+    Let the sheet turn about the middle of the volume. A point at the volume's end then moves along the camera's axis,
+    by the sheet's shift there divided by the normal's component along that axis. The focal length scales all lengths.
     """
     warnings, depth = [], sensor.volume.far_mm - sensor.volume.near_mm
     shift = float(np.tan(sheet.normal_std_rad) * depth / 2 / abs(sheet.model.normal[2]))

@@ -212,7 +212,7 @@ def _compare_squares(grey: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np
 
     Levels are in cyclic order, NaN if unknown. The contrast is the difference of the dark and the bright squares. It is
     zero if opposite squares differ at every reach, as at a board's outline or below a stripe, and if squares are
-    unknown. The reach is the first one where opposite squares are alike.
+    unknown. The reach is the first one where opposite squares are equal.
     """
     down, right = (_steps(grid, axis) for axis in (0, 1))
     levels, contrast = np.full((4, *grid.shape[:2]), np.nan), np.zeros(grid.shape[:2])

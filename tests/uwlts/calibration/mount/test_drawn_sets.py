@@ -22,7 +22,7 @@ HARD: dict[str, Any] = {
     "background": False,
     "steepest": np.radians(32),
 }
-"""A sphere of which a profiler sees 60 deg, with scattered points around and within it, and a smooth error."""
+"""Sphere with a visible arc of 60 deg, with scattered points around and within it, and a smooth error."""
 
 
 def test_plain_least_squares_finds_the_mount_of_perfect_sets():
@@ -37,7 +37,7 @@ def test_plain_least_squares_finds_the_mount_of_perfect_sets():
 @pytest.mark.parametrize("options", [{}, HARD, HARD | {"points": 600, "scattered": 0.4}])
 @pytest.mark.parametrize("radius_known", [True, False])
 def test_arcs_among_scattered_points_are_found(options, radius_known):
-    """At most one arc in 30 is missed: those of less than 30 deg, of which the drawing makes some one in 100."""
+    """At most one arc in 30 is missed: those of less than 30 deg, about one in 100 drawn arcs."""
     found = wrong = count = 0
     for seed in (200, 201, 202):
         given = draw_set([seed, 0], "sphere", poses=16, **options)
