@@ -15,8 +15,8 @@ _PASSES = 20
 """Passes of the weighted linear fit; the weights settle in less than ten."""
 _LARGEST_MISS_PX = 0.02
 """Largest difference of both models in the image, less than half the error of a good corner. For f = 436 px, lenses
-with k = 0 and with three sets of coefficients of real size differ by 0.003 px up to 70 deg. The difference is 0.02 px at
-75 deg, and 0.1 px at 80 deg."""
+with k = 0 and with three sets of coefficients of real size differ by 0.003 px up to 70 deg. The difference is 0.02 px
+at 75 deg, and 0.1 px at 80 deg."""
 
 
 def convert_equidistant(coefficients: np.ndarray, *, corner: float, focal_px: float, source: str) -> Distortion:
