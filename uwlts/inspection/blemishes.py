@@ -137,7 +137,7 @@ def measure_blemish(
     # Noise of independent points that explains the scatter of local means.
     noise = indication.noise_mm * surface.std[field.near] / float(np.median(surface.std))
     rng, own = np.random.default_rng(SEED), errors[field.near]
-    moves = replace(own, single_mm=noise).draw(_RULE.draws, rng)
+    moves = list(replace(own, single_mm=noise).draw(_RULE.draws, rng))
     inside = np.arange(len(noise)) < len(indication.points)
     scale = np.where(inside, field.scatter_ratio(heights, moves[: _RULE.depth_draws], inside), 1.0)
     moves = [scale * each for each in moves]
