@@ -22,6 +22,11 @@ def altered(sensor: Sensor, changes: dict[str, Any]) -> Sensor:
     return Sensor.model_validate(merge_tables(sensor.model_dump(), changes))
 
 
+def with_fine_target(sensor: Sensor) -> Sensor:
+    """Return the sensor with a matt target whose scale is known to 2e-5, as for a chromium mask on glass."""
+    return altered(sensor, {"uncertainty": {"target_stretch": 2e-5, "target_stripe_px": 0.02}})
+
+
 def cropped(sensor: Sensor, width_px: int, height_px: int) -> Sensor:
     """The sensor reading out only the middle of its image."""
     return altered(sensor, {"camera": {"width_px": width_px, "height_px": height_px}})

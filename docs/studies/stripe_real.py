@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 
 from uwlts.storage.image_file import read_image
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe, method_names
@@ -66,4 +67,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    App(help=__doc__, help_format="plaintext", default_command=main)()

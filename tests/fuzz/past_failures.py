@@ -174,7 +174,8 @@ PAST: dict[str, tuple[str, Build]] = {
         "calibration",
         _edited("calibration", lambda content: content.update(camera_from_object=[None] * 400_000)),
     ),
-    **{f"pipe as {each}": (each, lambda path: os.mkfifo(path)) for each in READERS},
+    # A pipe in place of the record of a verification is ignored, as if there were no record.
+    **{f"pipe as {each}": (each, lambda path: os.mkfifo(path)) for each in READERS if each != "verification"},
     **{
         f"device as {each}": (each, lambda path: path.symlink_to("/dev/zero"))
         for each in ("sensor", "image-png", "joint")

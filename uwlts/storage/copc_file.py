@@ -41,6 +41,8 @@ _DEEPEST = 7
 _MOST_LEVELS = 16
 _INFO, _INFO_BYTES, _ENTRY, _EXTENDED = 429, 160, 32, 60
 """Place and size of the description of the octree, and sizes of its entries and of an extended record's header."""
+_LAYERS = {6: (30, 9), 7: (36, 10), 8: (38, 11)}
+"""Bytes of a point, and compressed layers of a node, by point format (LAS 1.4, 2.6); each extra byte is one more."""
 _LARGEST_RATIO = 10_000
 """Largest number of points in a byte; equal points have 600. Higher ones are damage, and exhaust the memory."""
 _FIELDS: dict[str, type] = {"amplitude": np.float32, "frame": np.int32, "line": np.int32, "deviation_mm": np.float32}
@@ -223,10 +225,14 @@ def _require_sound_octree(file: BufferedReader) -> None:
     start = file.read(_INFO + _INFO_BYTES)
     if len(start) < _INFO + _INFO_BYTES or start[:4] != b"LASF":
         raise ValueError("its header is incomplete")
-    points_begin, records = struct.unpack("<II", start[96:START_BYTES])
+    points_begin, records, point_format, point_bytes = struct.unpack("<IIBH", start[96 : START_BYTES + 3])
     extended, extended_count, total = struct.unpack("<QIQ", start[235:255])
     if points_begin > size or records * RECORD_BYTES > points_begin or extended + _EXTENDED * extended_count > size:
         raise ValueError("its header declares more records than it has")
+    bytes_of_format, layers = _LAYERS.get(point_format & 0x3F, (0, 0))
+    if not layers or point_bytes < bytes_of_format:
+        raise ValueError("its point format is none of 6, 7 and 8")
+    layers += point_bytes - bytes_of_format
     pages, seen, found = [struct.unpack("<QQ", start[_INFO + 40 : _INFO + 56])], set(), 0
     while pages:
         offset, length = pages.pop()
@@ -241,6 +247,15 @@ def _require_sound_octree(file: BufferedReader) -> None:
                 continue
             if stored < 0 or place + stored > size or count > _LARGEST_RATIO * stored:
                 raise ValueError("a node of its octree is outside the file, or holds too many points")
+            if count:
+                # A node starts with a whole point, the number of points, and the sizes of its layers.
+                file.seek(place)
+                node = file.read(point_bytes + 4 + 4 * layers)
+                if len(node) < point_bytes + 4 + 4 * layers:
+                    raise ValueError("a node of its octree is incomplete")
+                stated, *sizes = struct.unpack_from(f"<{layers + 1}I", node, point_bytes)
+                if stated != count or len(node) + sum(sizes) > stored:
+                    raise ValueError("a node of its octree declares more points or bytes than it has")
             found += count
     if found != total:
         raise ValueError(f"its octree has {found} points and its header {total}")

@@ -12,6 +12,7 @@ from tests.system.in_process import uwlts
 from tests.uwlts import drawn_stripes
 from tests.uwlts.calibration_views import STEP_MM, built_sensor
 from tests.uwlts.joint_views import Noise, gathered, lit_points, seen, target_series
+from tests.virtual_sensors import with_fine_target
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.observability import compute_mesh_lengths, list_regions, read_region_estimate
@@ -55,7 +56,7 @@ def calibrated(described, sensor=BUILT, *, seed=4, columns=15):
 
 @pytest.fixture(scope="module")
 def earlier(thesis):
-    return calibrated(thesis)
+    return calibrated(with_fine_target(thesis))
 
 
 @cache
@@ -131,7 +132,8 @@ def test_water_whose_steps_are_left_out_is_not_said_to_be_measured(earlier, thes
 
 
 def test_steps_near_and_far_bring_lengths_back(earlier, thesis):
-    result = refreshed(earlier, steps(thesis, depths_mm=(-45.0, -15.0, 15.0, 60.0, 85.0)), index_std=POORLY_KNOWN)
+    near_and_far = steps(with_fine_target(thesis), depths_mm=(-45.0, -15.0, 15.0, 60.0, 85.0))
+    result = refreshed(earlier, near_and_far, index_std=POORLY_KNOWN)
     change = result.changes[0]
     assert abs(change.index - INDEX) < 3 * change.std < 1e-3
     # With other noise up to 0.49 times.

@@ -9,6 +9,7 @@ import pytest
 from tests.uwlts.calibration_views import WATER
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, target_series
 from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, square_sensor, stage_direction
+from tests.virtual_sensors import with_fine_target
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.gathering import scan_stripes
@@ -383,7 +384,8 @@ def test_a_wrong_size_without_a_stated_uncertainty_does_no_harm_and_is_told(thes
 def test_what_only_a_known_size_contradicts_it_is_the_cause_of(thesis, target_in_water, monkeypatch):
     """A pipe found 4.5 standard uncertainties too small is a doubt, but not where nothing else explains a misfit."""
     scan = scanned("pipe along", diameter_mm=220.16, **CERTIFIED["pipe along"])
-    warnings = solved(thesis, target_in_water, scan).warnings
+    fine = with_fine_target(thesis)
+    warnings = solved(fine, target_in_water, scan).warnings
     assert warnings[0].startswith("pipe along.h5: diameter of the pipe found 220.0")
     as_described = JointProblem._judged_as_described
 
@@ -394,7 +396,7 @@ def test_what_only_a_known_size_contradicts_it_is_the_cause_of(thesis, target_in
 
     monkeypatch.setattr(JointProblem, "_judged_as_described", misfitting)
     with pytest.raises(CalibrationError, match=r"itself: pipe along.h5: diameter .* off\): most .*; a misfit"):
-        solved(thesis, target_in_water, scan)
+        solved(fine, target_in_water, scan)
 
 
 def test_images_of_a_scan_are_left_out_as_long_as_enough_agree(thesis, target_in_water):
