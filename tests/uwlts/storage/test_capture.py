@@ -640,7 +640,7 @@ CONTRADICTIONS = {
     "one chunk": (replaced("frames", np.zeros((4, HEIGHT, WIDTH), np.uint8), chunks=(4, HEIGHT, WIDTH)), "chunks"),
     "no chunks": (replaced("frames", np.zeros((4, HEIGHT, WIDTH), np.uint8)), "chunks of None"),
     "poses of 3 x 3": (replaced("pose", np.zeros((4, 3, 3))), "'pose'"),
-    "half a pose": (lambda file: file["pose"].__setitem__((2, 0), 1.0), "only some elements"),
+    "half a pose": (lambda file: file["pose"].__setitem__((2, 0), 1.0), "only some of their elements"),
     "stage nowhere": (lambda file: file["stage_mm"].__setitem__(1, np.nan), "not finite"),
     "endless exposure": (lambda file: file["exposure_ms"].__setitem__(1, np.inf), "not finite"),
     "no time": (lambda file: file["time_s"].__setitem__(1, np.nan), "not finite"),
