@@ -41,6 +41,7 @@ _DEEPEST = 7
 _MOST_LEVELS = 16
 _INFO, _INFO_BYTES, _ENTRY, _EXTENDED = 429, 160, 32, 60
 """Place and size of the description of the octree, and sizes of its entries and of an extended record's header."""
+_ITEMS = 32  # place of the number of items in the record of LASzip
 _LAYERS = {6: (30, 9), 7: (36, 10), 8: (38, 11)}
 """Bytes of a point, and compressed layers of a node, by point format (LAS 1.4, 2.6); each extra byte is one more."""
 _LARGEST_RATIO = 10_000
@@ -201,6 +202,7 @@ def read_copc(
         with open_regular(path, called="cloud") as file:
             _require_sound_octree(file)
             reader = laspy.CopcReader(file)
+            _require_sound_items(reader.laszip_vlr.record_data, reader.header.point_format.size)
             total = int(reader.header.point_count)
             box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
             found = _query(reader, box, at_most)
@@ -260,6 +262,14 @@ def _require_sound_octree(file: BufferedReader) -> None:
     if found != total:
         raise ValueError(f"its octree has {found} points and its header {total}")
     file.seek(0)
+
+
+def _require_sound_items(record: bytes, point_bytes: int) -> None:
+    """Raise ValueError if the items of a LASzip record, on which memory depends, are not those of a point."""
+    (count,) = struct.unpack_from("<H", record, _ITEMS)
+    sizes = [size for _, size, _ in struct.iter_unpack("<3H", record[_ITEMS + 2 :])]
+    if len(sizes) != count or sum(sizes) != point_bytes or not all(sizes):
+        raise ValueError(f"its compressed points have items of {sizes} bytes, and points of {point_bytes}")
 
 
 def _query(reader: Any, box: Any, at_most: int | None) -> Any:
