@@ -10,7 +10,6 @@ import argparse
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -18,18 +17,8 @@ from scipy.stats import chi2
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.oracles.profilers import Kind, draw_set, scatter_mm
-from tests.uwlts.drawn_mounts import differences, least_squares_mount, mount_of, rms_mm
+from tests.uwlts.drawn_mounts import SHORT_ARCS, differences, least_squares_mount, mount_of, rms_mm
 from uwlts.errors import CalibrationError
-
-SHORT_ARCS: dict[str, Any] = {
-    "points": 2000,
-    "noise_mm": 0.009,
-    "smooth_mm": 0.07,
-    "robot_mm": 0.05,
-    "scattered": 0.15,
-    "background": False,
-    "steepest": np.radians(32),
-}
 
 
 def measure(

@@ -1,11 +1,24 @@
 """Mounts of the sets of `tests.oracles.profilers`, their errors and scatter, and plain least squares beside them."""
 
+from typing import Any
+
 import numpy as np
 from scipy.optimize import least_squares
 
 import uwlts
 from tests.oracles.profilers import ProfilerSet, pose_of, scatter_mm, turn_between, turn_by
 from uwlts.model.mount import Mount, PlaneFound, RingFound, SphereFound, StepFound
+
+SHORT_ARCS: dict[str, Any] = {
+    "points": 2000,
+    "noise_mm": 0.009,
+    "smooth_mm": 0.07,
+    "robot_mm": 0.05,
+    "scattered": 0.15,
+    "background": False,
+    "steepest": np.radians(32),
+}
+"""Options of a sphere with a visible arc of 60 deg, scattered points around and within it, and a smooth error."""
 
 
 def mount_of(given: ProfilerSet, *, size_known: bool = True) -> Mount:

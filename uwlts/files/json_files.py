@@ -138,8 +138,8 @@ def model_from_json(
         log_warnings(path, [f"it has no seal ({SEAL}), as from older versions: edited numbers cannot be noticed"])
     if EDITED in content:
         log_warnings(path, ["it was edited after it was written, and is trusted all the same"])
-    if EDITED in content and isinstance(provenance := content.get("provenance"), dict):
-        content["provenance"] = provenance | {EDITED: content.pop(EDITED)}
+        if isinstance(provenance := content.get("provenance"), dict):
+            content["provenance"] = provenance | {EDITED: content.pop(EDITED)}
     return validate_content(model, content, f"{path} is not a valid {called}", advice=advice)
 
 

@@ -252,8 +252,13 @@ def _blemish_features(
         return True
 
     large: list[tuple[LargeBlemish, float]] = []
+
+    def is_explained(indication: Indication) -> bool:
+        """Return whether an indication is part of a large blemish."""
+        return any(whole.explains(indication) for whole, _ in large)
+
     for indication in sorted(search.indications, key=lambda each: abs(each.height_mm), reverse=True):
-        if not any(whole.explains(indication) for whole, _ in large):
+        if not is_explained(indication):
             surface, middle = unroll_about(indication)
             if (whole := search_within(surface, search, indication)) is not None:
                 large.append((whole, middle))
@@ -272,14 +277,10 @@ def _blemish_features(
         own = partial(measure_blemish, bare, search, whole.own, errors, **sizes)
         measure(whole.own, whole.own.points, middle, own)
     for indication in search.indications:
-        if not any(whole.explains(indication) for whole, _ in large):
+        if not is_explained(indication):
             surface, middle = unroll_about(indication)
-            measure(
-                indication,
-                indication.points,
-                middle,
-                partial(measure_blemish, surface, search, indication, errors, **sizes),
-            )
+            alone = partial(measure_blemish, surface, search, indication, errors, **sizes)
+            measure(indication, indication.points, middle, alone)
     measured.sort(key=lambda each: each[0].extent_mm[2], reverse=True)
     features, numbers = [], dict.fromkeys(FeatureKind, 0)
     for blemish, middle, chance in measured:

@@ -423,10 +423,11 @@ def _medium(capture: GatheredCapture) -> str:
 
 
 def _index(measurement: GatheredMeasurement) -> str | None:
-    """Return the index used for the points, which may differ from that of the description."""
+    """Return the index used for the points, by which calibration: it may differ from that of the description."""
     recorded = {} if measurement.cloud is None else measurement.cloud.metadata
     index = measurement.judged.medium_index if measurement.judged is not None else recorded.get("medium_index")
-    return f"points calculated with n = {index:.5f} relative to air" if is_number(index) else None
+    by = "" if measurement.calibration is None else f" ({measurement.calibration.name})"
+    return f"points calculated with n = {index:.5f} relative to air{by}" if is_number(index) else None
 
 
 def _origin(capture: GatheredCapture) -> str:

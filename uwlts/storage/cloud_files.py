@@ -260,14 +260,16 @@ def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -
 
     Raises CaptureError if its file states another unit.
     """
-    own = _in_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
-    stated = unit_of(path) if own or unit_of(path) == "m" else None
-    if Path(path).suffix.lower() not in (*TEXT_FORMATS, ".pcd"):
+    ending = Path(path).suffix.lower()
+    # The readers of text and PCD have converted theirs.
+    if ending not in (*TEXT_FORMATS, ".pcd"):
+        own = _in_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
+        stated = unit_of(path) if own or ending in _IN_METRES else None
         if unit is not None and stated not in (None, unit):
             raise CaptureError(
                 f"{path} is in {stated}, as its format prescribes, but the unit {unit} was given: omit it"
             )
-        if Path(path).suffix.lower() == ".ply":
+        if ending == ".ply":
             scale, step = MM_PER_UNIT[check_unit(unit or "mm")], find_float_step(cloud.points_mm)
             cloud = note_step(replace(cloud, points_mm=scale * cloud.points_mm), scale * step)
     log_warnings(path, cloud.warnings)

@@ -43,7 +43,7 @@ _INFO, _INFO_BYTES, _ENTRY, _EXTENDED = 429, 160, 32, 60
 """Place and size of the description of the octree, and sizes of its entries and of an extended record's header."""
 _ITEMS = 32  # place of the number of items in the record of LASzip
 _LAYERS = {6: (30, 9), 7: (36, 10), 8: (38, 11)}
-"""Bytes of a point, and compressed layers of a node, by point format (LAS 1.4, 2.6); each extra byte is one more."""
+"""Bytes of a point (LAS 1.4, 2.6) and compressed layers of a node, by point format; each extra byte is one more."""
 _LARGEST_RATIO = 10_000
 """Largest number of points in a byte; equal points have 600. Higher ones are damage, and exhaust the memory."""
 _FIELDS: dict[str, type] = {"amplitude": np.float32, "frame": np.int32, "line": np.int32, "deviation_mm": np.float32}
@@ -235,6 +235,7 @@ def _require_sound_octree(file: BufferedReader) -> None:
     if not layers or point_bytes < bytes_of_format:
         raise ValueError("its point format is none of 6, 7 and 8")
     layers += point_bytes - bytes_of_format
+    bytes_before_layers = point_bytes + 4 + 4 * layers
     pages, seen, found = [struct.unpack("<QQ", start[_INFO + 40 : _INFO + 56])], set(), 0
     while pages:
         offset, length = pages.pop()
@@ -252,8 +253,8 @@ def _require_sound_octree(file: BufferedReader) -> None:
             if count:
                 # A node starts with a whole point, the number of points, and the sizes of its layers.
                 file.seek(place)
-                node = file.read(point_bytes + 4 + 4 * layers)
-                if len(node) < point_bytes + 4 + 4 * layers:
+                node = file.read(bytes_before_layers)
+                if len(node) < bytes_before_layers:
                     raise ValueError("a node of its octree is incomplete")
                 stated, *sizes = struct.unpack_from(f"<{layers + 1}I", node, point_bytes)
                 if stated != count or len(node) + sum(sizes) > stored:

@@ -1,7 +1,4 @@
-"""Counts of an encoder whose counter starts again at the end of its range.
-
-A module of its own, as recordings and imported tables need it.
-"""
+"""Counts of an encoder whose counter starts again at the end of its range."""
 
 import numpy as np
 
@@ -37,13 +34,13 @@ def unwrap_counts(counts: np.ndarray, bits: int | None = None) -> np.ndarray:
         over = np.abs(steps) > span / 2
         if extent >= span or not over.any():
             continue
-        continued = steps - span * np.round(steps / span)
+        continued = np.unwrap(counts, period=span)
         others = np.abs(steps[~over]).max(initial=0)
-        if bits is None and not np.abs(continued[over]).max() <= _PLAIN * others:
+        if bits is None and not np.abs(np.diff(continued)[over]).max() <= _PLAIN * others:
             place = int(np.argmax(over))
             raise DescriptionError(
                 f"the encoder jumps from {counts[place]:.0f} to {counts[place + 1]:.0f}: give the width of its counter "
                 "(encoder_bits), such as 16 or 32"
             )
-        return counts[0] + np.concatenate([[0.0], np.cumsum(continued)])
+        return continued
     return counts

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,34 +26,46 @@ _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
 # Possessive, as backtracking in long runs of digits or blanks would take minutes.
 _N, _NEXT = r"([+-]?(?:\d++(?:\.\d*+)?+|\.\d++)(?:[eE][+-]?\d++)?+)", r"\s*+,\s*+"
-_ROBOTS: dict[str, tuple[re.Pattern[str], str, Unit, str]] = {
-    # ABB RAPID: robtarget [[x, y, z], [q1, q2, q3, q4], ...]
-    "abb": (
+
+
+class _RobotProgram(NamedTuple):
+    """Poses in the text of a robot's program: their form and pattern, format, unit, and the start of a comment."""
+
+    form: str
+    pattern: re.Pattern[str]
+    pose_format: str
+    unit: Unit
+    comment: str
+
+
+_ROBOTS = {
+    # ABB RAPID: robtarget
+    "abb": _RobotProgram(
+        "[[x, y, z], [q1, q2, q3, q4], ...]",
         re.compile(rf"\[\s*+\[\s*+{_NEXT.join([_N] * 3)}\s*+\]{_NEXT}\[\s*+{_NEXT.join([_N] * 4)}\s*+\]"),
         "quaternion-wxyz",
         "mm",
         "!",
     ),
-    # KUKA KRL: POS, E6POS or FRAME {X .., Y .., Z .., A .., B .., C ..}; A, B and C turn about the moved z, y and x.
-    "kuka": (
+    # KUKA KRL: POS, E6POS or FRAME; A, B and C turn about the moved z, y and x.
+    "kuka": _RobotProgram(
+        "{X .., Y .., Z .., A .., B .., C ..}",
         re.compile(r"\b" + _NEXT.join(rf"{axis}\s*+[=:]?+\s*+{_N}" for axis in "XYZABC"), re.IGNORECASE),
         "euler-ZYX-deg",
         "mm",
         ";",
     ),
-    # Universal Robots, URScript: p[x, y, z, rx, ry, rz]
-    "ur": (re.compile(rf"\bp\s*+\[\s*+{_NEXT.join([_N] * 6)}\s*+\]"), "rotvec-rad", "m", "#"),
-}
-"""Text of robot programs: pattern of a pose, its format, its unit, and the character that begins a comment."""
-_FORMS = {
-    "abb": "[[x, y, z], [q1, q2, q3, q4], ...]",
-    "kuka": "{X .., Y .., Z .., A .., B .., C ..}",
-    "ur": "p[x, y, z, rx, ry, rz]",
+    # Universal Robots, URScript
+    "ur": _RobotProgram(
+        "p[x, y, z, rx, ry, rz]", re.compile(rf"\bp\s*+\[\s*+{_NEXT.join([_N] * 6)}\s*+\]"), "rotvec-rad", "m", "#"
+    ),
 }
 _MOST_PROGRAM_BYTES = 64 * 2**20
 _EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
-_FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
-_FORMATS += ", abb, kuka, ur (text of robot programs)"
+_FORMATS = (
+    "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg, "
+    "abb, kuka, ur (text of robot programs)"
+)
 _MOST_POSES = 1_000_000
 _LATEST_S = 1e11
 """Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns."""
@@ -94,18 +107,20 @@ def read_poses(
 
 def _read_program(path: Path, robot: str, unit: Unit | None, digests: dict[str, str] | None) -> np.ndarray:
     """Read the poses (P, 4, 4) in mm in the text of a robot's program; raises DescriptionError without any."""
-    pattern, pose_format, own, comment = _ROBOTS[robot]
-    if unit not in (None, own):
-        raise DescriptionError(f"the poses of the format {robot} are in {own}, but the unit {unit} was given: omit it")
+    program = _ROBOTS[robot]
+    if unit not in (None, program.unit):
+        raise DescriptionError(
+            f"the poses of the format {robot} are in {program.unit}, but the unit {unit} was given: omit it"
+        )
     content = read_bytes(path, most_bytes=_MOST_PROGRAM_BYTES, error=DescriptionError, called="poses")
     if digests is not None:
         digests[path.name] = hash_file(path)
-    lines = (line.partition(comment)[0] for line in content.decode("latin-1").splitlines())
-    rows = np.array([[float(each) for each in found] for found in pattern.findall("\n".join(lines))])
+    lines = (line.partition(program.comment)[0] for line in content.decode("latin-1").splitlines())
+    rows = np.array([[float(each) for each in found] for found in program.pattern.findall("\n".join(lines))])
     if not len(rows):
-        raise DescriptionError(f"{path} has no pose in the form of {robot} ({_FORMS[robot]})")
-    poses = poses_from_rows(rows, pose_format, path)
-    poses[:, :3, 3] *= MM_PER_UNIT[own]
+        raise DescriptionError(f"{path} has no pose in the form of {robot} ({program.form})")
+    poses = poses_from_rows(rows, program.pose_format, path)
+    poses[:, :3, 3] *= MM_PER_UNIT[program.unit]
     return poses
 
 

@@ -12,7 +12,7 @@ from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 FORMAT, VERSION = "uwlts-verification", 1
 ENDING = ".verification.json"
 _VALID = timedelta(days=1)
-"""Validity of a verification, and of a new calibration: standards for such sensors ask for a check each day of use."""
+"""Validity of a verification, and of a new calibration: one day of use. Chosen by hand."""
 
 
 class VerificationRecord(BaseModel):

@@ -182,7 +182,7 @@ def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOp
     seen = [share * np.exp(-0.5 * np.square((place - at * half) / 2.0)) for share, at in ((1.0, 2), (beside, 5))]
     image = np.broadcast_to(100.0 * sum(seen), (_RULE.warm_lines, 8 * half)).astype(dtype)
     # The default method uses all others for some images.
-    for method in (options.method, *method_names()):
+    for method in dict.fromkeys((options.method, *method_names())):
         extract_stripe(image, stripe_along="height", options=replace(options, method=method))
     rivals = replace(options, peak=PeakRule.DIRECT)
     direct_stripe_in(image, stripe_along="height", options=rivals, saturation=_LARGEST[image.dtype])

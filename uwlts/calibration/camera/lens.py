@@ -225,15 +225,15 @@ def calibrate_lens(
     wide = choice.distortion == "auto" and poses != "stage-normal" and _widest_deg(images, plain) > WIDE_DEG
     if wide:
         usual = replace(usual, distortion=_WIDE_USUAL)
+        plain = solve(images, options=usual, circles=True)
 
-    def inliers(options: CameraOptions, plain: CameraSolution | None = None) -> list[np.ndarray]:
-        """Return masks (N,) of the points near their predicted positions, from a robust fit."""
-        plain = solve(images, options=options, circles=True) if plain is None else plain
+    def inliers(options: CameraOptions, plain: CameraSolution) -> list[np.ndarray]:
+        """Return masks (N,) of the points near their predicted positions, from a robust fit near a plain one."""
         robust = solve(images, plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)), circles=True)
         return _inliers(robust)
 
     candidates: list[LensCandidate] = []
-    options, keep = usual, inliers(usual, None if wide else plain)
+    options, keep = usual, inliers(usual, plain)
     good = [_remove_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _has_enough_inliers(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
         centred = _correct_circles(good, solve(good, options=usual, circles=True))
@@ -247,7 +247,7 @@ def calibrate_lens(
             if choice.distortion != "auto" or ("k3" not in options.distortion and not wide):
                 break
     if options != usual:
-        keep = inliers(options)
+        keep = inliers(options, solve(images, options=options, circles=True))
     left_out = {
         number: f"{100 * (1 - inside.mean()):.0f} % of its points are not where the other images predict them"
         for number, inside in enumerate(keep)

@@ -1,6 +1,6 @@
 """Joint calibration from any mix of captures: target images in air and in water, stripes on targets, steps, scans."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Self
@@ -40,7 +40,7 @@ from uwlts.calibration.joint.subsets import (
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
-from uwlts.model.parameter_keys import LensParameter, TargetParameter
+from uwlts.model.parameter_keys import LensParameter, ParameterKey, TargetParameter
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
@@ -137,13 +137,13 @@ class JointProblem:
         start |= {LensParameter.FX: start.get(LensParameter.F, start.get(LensParameter.FX))}
         start |= {LensParameter.F: start[LensParameter.FX]}
         start |= {LensParameter.FY: start.get(LensParameter.FY, start[LensParameter.F])}
-        return replace(
-            self,
-            parameters=parameters,
-            evidence=[e.with_stripes(_TRIAL_LINES) if isinstance(e, TargetEvidence) else e for e in self.evidence],
-            global_values=np.array([start.get(key, 0.0) for key in parameters.keys]),
-            local=near.local,
-        )
+        evidence = [e.with_stripes(_TRIAL_LINES) if isinstance(e, TargetEvidence) else e for e in self.evidence]
+        return replace(self.with_parameters(parameters, start), evidence=evidence, local=near.local)
+
+    def with_parameters(self, parameters: Parameters, start: Mapping[ParameterKey, float]) -> Self:
+        """Return the problem with other parameters; those without a start value begin at zero."""
+        values = np.array([start.get(key, 0.0) for key in parameters.keys])
+        return replace(self, parameters=parameters, global_values=values)
 
     def solve_and_check(self) -> tuple[Estimate, Findings]:
         """Return the estimate and the findings against it; errors as `estimate`.

@@ -108,9 +108,7 @@ def apply_candidate(problem: JointProblem, candidate: Candidate) -> JointProblem
     known_before = {key: prior for key, prior in priors.items() if not isinstance(key, LensParameter)}
     priors = {key: replace(prior, std=0.0) if key in held else prior for key, prior in known_before.items()}
     parameters = replace(known, intrinsics=intrinsics, window=window, priors=priors)
-    start = dict(zip(known.keys, problem.global_values, strict=True))
-    global_values = np.array([start.get(key, 0.0) for key in parameters.keys])
-    return replace(problem, parameters=parameters, global_values=global_values)
+    return problem.with_parameters(parameters, dict(zip(known.keys, problem.global_values, strict=True)))
 
 
 INSIDE, OUTSIDE = "inside", "outside"

@@ -1,7 +1,6 @@
 """Mounts from sets that share nothing with the product: arcs among scattered points, and plain least squares."""
 
 import time
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,20 +8,9 @@ from scipy.stats import chi2
 
 import uwlts
 from tests.oracles.profilers import Kind, draw_set
-from tests.uwlts.drawn_mounts import differences, least_squares_mount, mount_of, rms_mm
+from tests.uwlts.drawn_mounts import SHORT_ARCS, differences, least_squares_mount, mount_of, rms_mm
 from uwlts.calibration.mount.profiles import find_arc
 from uwlts.errors import CalibrationError
-
-HARD: dict[str, Any] = {
-    "points": 2000,
-    "noise_mm": 0.009,
-    "smooth_mm": 0.07,
-    "robot_mm": 0.05,
-    "scattered": 0.15,
-    "background": False,
-    "steepest": np.radians(32),
-}
-"""Sphere with a visible arc of 60 deg, with scattered points around and within it, and a smooth error."""
 
 
 def test_plain_least_squares_finds_the_mount_of_perfect_sets():
@@ -34,7 +22,7 @@ def test_plain_least_squares_finds_the_mount_of_perfect_sets():
         assert rms < 3e-6 and np.abs(mount - given.mount).max() < 1e-5
 
 
-@pytest.mark.parametrize("options", [{}, HARD, HARD | {"points": 600, "scattered": 0.4}])
+@pytest.mark.parametrize("options", [{}, SHORT_ARCS, SHORT_ARCS | {"points": 600, "scattered": 0.4}])
 @pytest.mark.parametrize("radius_known", [True, False])
 def test_arcs_among_scattered_points_are_found(options, radius_known):
     """At most one arc in 30 is missed: those of less than 30 deg, about one in 100 drawn arcs."""
@@ -99,7 +87,7 @@ def test_the_scatter_is_that_of_plain_least_squares(kind, size_known, seed):
 @pytest.mark.parametrize("seed", [pytest.param(310, marks=OPEN["halves", 310]), 311])
 def test_halves_agree_within_what_they_state(seed):
     """The form error is the same in all profiles; halves cannot show it, but each must state its own scatter."""
-    given = draw_set([seed, 0], "sphere", poses=32, fixed_mm=0.03, **HARD)
+    given = draw_set([seed, 0], "sphere", poses=32, fixed_mm=0.03, **SHORT_ARCS)
     one, other = (mount_of(given.select(slice(k, None, 2))) for k in (0, 1))
     apart = differences(one.transform(), other.transform())
     spread = np.array(one.covariance) + np.array(other.covariance)
