@@ -113,13 +113,18 @@ class _LinearisedFit:
         return result
 
 
-def _linearise_sphere(points: np.ndarray, used: np.ndarray, radius_mm: float | None) -> _LinearisedFit:
-    """Linearise the fit of a sphere of free or known radius: parameters are the centre and the free radius."""
+def _linearise_sphere(
+    points: np.ndarray, used: np.ndarray, radius_mm: float | None
+) -> tuple[np.ndarray, _LinearisedFit]:
+    """Return the centre (3,) of a sphere of free or known radius, and its linearised fit.
+
+    The parameters are the centre and the free radius.
+    """
     fit = fit_sphere(points[used], radius_mm)
     outward = points[used] - fit.centre_mm
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     free = np.ones((len(used), 1 if radius_mm is None else 0))
-    return _LinearisedFit(used, outward, np.hstack([outward, free]), fit.residuals_mm)
+    return fit.centre_mm, _LinearisedFit(used, outward, np.hstack([outward, free]), fit.residuals_mm)
 
 
 def _flat_design(fit: FlatFit, points: np.ndarray) -> np.ndarray:
@@ -216,12 +221,10 @@ class LinearisedSpheres:
         radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
         off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
         members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
-        self._free = [_linearise_sphere(points, own, None) for own in members]
-        self._known = [_linearise_sphere(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
-        self._centres = [fit_sphere(points[own]).centre_mm for own in members]
-        self._known_centres = [
-            fit_sphere(points[own], d / 2).centre_mm for own, d in zip(members, diameters, strict=True)
-        ]
+        free = [_linearise_sphere(points, own, None) for own in members]
+        known = [_linearise_sphere(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
+        self._centres, self._free = [centre for centre, _ in free], [fit for _, fit in free]
+        self._known_centres, self._known = [centre for centre, _ in known], [fit for _, fit in known]
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
         """Return the evaluation's figures after shifts (N, 3) of all points."""
@@ -260,7 +263,7 @@ class LinearisedSpheres:
                 case Quantity.SPACING_ERROR_KNOWN_RADIUS:
                     found[key.name] = self._spacing_gradient(key.spheres, self._known, self._known_centres)
                 case _:
-                    pass
+                    pass  # ranges and standard deviations are not linear in the points
         return found
 
     def _spacing_gradient(
