@@ -26,8 +26,10 @@ _LEAST_RELIEF = 0.5
 """Least relief common to both passes, relative to its maximum over all shifts, for a shift to be compared."""
 _FAR_PX = 20.0
 """Largest distance of a mismatch; above it, the cost is constant."""
-_ROUNDS = 8
-"""Largest number of rounds of outlier rejection."""
+_ROUNDS = 30
+"""Largest number of rounds of outlier rejection; steps are short while slopes are mostly noise."""
+_LEAST_COMMON = 0.5
+"""Least product of the slopes of both passes, relative to the square of those of one: less is mostly noise."""
 _OUTLIER = 4.0
 """Outlier limit in standard deviations; one in 16,000 Gaussian distances exceeds it."""
 
@@ -82,24 +84,27 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
             "in both directions"
         )
     shift = float(ways[np.argmin(np.where(comparable, costs, np.inf))])
-    away = slope = other = np.empty(0)
+    away = slope = weight = np.empty(0)
     for _ in range(_ROUNDS):
         away, slope, other = surface.compare(backward, shift)
         scatter = robust_std(away - np.median(away)) if len(away) else 0.0
         near = np.abs(away) <= max(_OUTLIER * scatter, 1e-6)
-        if np.count_nonzero(near) < _FEWEST or not (slope[near] * other[near]).sum() > 0:
+        if np.count_nonzero(near) < _FEWEST or not (slope[near] ** 2).sum() > 0:
             raise EvaluationError(
                 "the surface has too little relief along the motion to determine the latency: scan a surface with "
                 "slopes, such as a sphere, or give latency_ms"
             )
-        away, slope, other = away[near], slope[near], other[near]
+        away, slope, weight = away[near], slope[near], np.nan_to_num(other[near])
         # away = c_back(x) - c_there(x - shift); a further shift d changes it by slope d. The slope of the backward pass
-        # is an instrumental variable: errors of the slope and of the value of the forward pass are correlated.
-        further = -float((other * away).sum() / (other * slope).sum())
+        # is an instrumental variable: errors of the slope and of the value of the forward pass are correlated. Slopes
+        # that are mostly noise are no instrument.
+        if (weight * slope).sum() < _LEAST_COMMON * (slope**2).sum():
+            weight = slope
+        further = -float((weight * away).sum() / (weight * slope).sum())
         shift += further
         if abs(further) < 1e-6:
             break
-    std = _GRAIN * float(np.std(away)) * float(np.sqrt((other**2).sum()) / (other * slope).sum())
+    std = _GRAIN * float(np.std(away)) * float(np.sqrt((weight**2).sum()) / (weight * slope).sum())
     return Latency(shift / (2 * speed), std / (2 * speed))
 
 
@@ -140,7 +145,7 @@ class _Surface:
         """Compare the centres of another pass at x with those of this pass at x - shift.
 
         Returns the distances (K,), px, and the slopes (K,) of this and of the other pass, px/mm. Only places between
-        two visible neighbours are returned.
+        two visible neighbours of this pass are returned; the slope of the other pass may be NaN.
         """
         places = other.position - shift
         left = np.clip(np.searchsorted(self.position, places) - 1, 0, len(self.position) - 2)
@@ -151,5 +156,5 @@ class _Surface:
         value = a + t * da + t**2 * (3 * (b - a) - 2 * da - db) + t**3 * (2 * (a - b) + da + db)
         slope = (da + 2 * t * (3 * (b - a) - 2 * da - db) + 3 * t**2 * (2 * (a - b) + da + db)) / h
         away = other.centre - value
-        good = np.isfinite(away) & np.isfinite(other.slope) & ((t >= 0) & (t <= 1))
+        good = np.isfinite(away) & ((t >= 0) & (t <= 1))
         return away[good], slope[good], other.slope[good]
