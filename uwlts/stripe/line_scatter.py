@@ -9,6 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
+from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import WINDOW_RULE, PeakWindow
 
 
@@ -98,18 +99,40 @@ def _measure_scatters(
     ``rows`` (R, K) are the lines of R runs. The distances are NaN if too few lines belong to a smooth stripe.
     """
     some = peak.select(rows.ravel())
-    middle = (some.start + some.middle).reshape(rows.shape)
-    apart = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(middle)), 2 * _RULE.reach, axis=1).max(axis=2)
-    smooth = apart <= _RULE.jump * peak.window.shape[1]
-    if np.count_nonzero(smooth) < _RULE.fewest:
-        return math.nan, [math.nan for _ in others]
+    middle = (some.start + some.middle).reshape(rows.shape).astype(float)
+    jump_px, weights = _RULE.jump * peak.window.shape[1], _residual_weights(_RULE.reach)
     scatters = []
     for values in (centre[rows.ravel()], *(other.centres(some) for other in others)):
         place = (some.start + values.astype(float)).reshape(rows.shape)
-        near = np.lib.stride_tricks.sliding_window_view(place, 2 * _RULE.reach + 1, axis=1)
-        distance = np.minimum(np.abs(near @ _residual_weights(_RULE.reach))[smooth], _RULE.largest_px)
-        scatters.append(math.sqrt(np.mean(np.square(distance))))
+        total, count = _sum_squares(middle, place, weights, jump_px, _RULE.largest_px)
+        scatters.append(math.sqrt(total / count) if count >= _RULE.fewest else math.nan)
     return scatters[0], scatters[1:]
+
+
+@compiled
+def _sum_squares(
+    middle: np.ndarray, place: np.ndarray, weights: np.ndarray, jump_px: float, largest_px: float
+) -> tuple[float, int]:
+    """Return the sum of the squared, limited residuals of places (R, K), and the number of lines on smooth stripes.
+
+    The residual of a line is the sum of its neighbours' places with the weights (2 reach + 1,). A stripe is smooth if
+    the middles (R, K) of neighbouring lines are nowhere farther apart than ``jump_px``.
+    """
+    reach, total, count = weights.size // 2, 0.0, 0
+    for row in range(place.shape[0]):
+        broken = -1
+        for line in range(1, place.shape[1]):
+            if abs(middle[row, line] - middle[row, line - 1]) > jump_px:
+                broken = line
+            at = line - reach
+            if at < reach or broken > at - reach:
+                continue
+            residual = 0.0
+            for k in range(weights.size):
+                residual += weights[k] * place[row, at - reach + k]
+            total += min(abs(residual), largest_px) ** 2
+            count += 1
+    return total, count
 
 
 def _select_runs(count: int) -> np.ndarray:
