@@ -377,8 +377,11 @@ def _cross_validate(images: list[TargetImage], solve: Callable[[Sequence[TargetI
     return squares
 
 
-def compare_models(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandidate]:
-    """Compare models by their mean square errors (F,); empty if no model has any."""
+def compare_models(squares: dict[CameraOptions, np.ndarray], *, least_gain: float = _LEAST_GAIN) -> list[LensCandidate]:
+    """Compare models by their mean square errors (F,); empty if no model has any.
+
+    A gain below the fraction ``least_gain`` of the mean square is no gain.
+    """
     means = {options: float(each.mean()) for options, each in squares.items()}
     least = np.nanmin([*means.values(), np.inf])
     if np.isinf(least):
@@ -388,7 +391,7 @@ def compare_models(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandida
     for options, each in squares.items():
         apart = each - best
         error = float(np.std(apart, ddof=1)) / np.sqrt(len(apart))
-        small = means[options] - least <= _LEAST_GAIN * least
+        small = means[options] - least <= least_gain * least
         worse = 0.0 if small else np.inf if np.isnan(means[options]) else float(np.mean(apart)) / error
         found.append(LensCandidate(options, float(np.sqrt(means[options])), worse))
     return found

@@ -46,6 +46,9 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
 
 _ROUNDS_LEFT_OUT = 3
+_LEAST_GAIN = 0.0
+"""Relative gain of a coefficient in predicted mean squares: any that is significant, since the uncertainties of other
+coefficients do not contain what a missing one does to them."""
 _CLEARLY_LESS = 0.9  # scatter with free pixel shape, relative to that without
 _MOST_WIDENED = 10.0
 """Largest factor of a target's stated uncertainty for its observed form or size; more is another target."""
@@ -368,15 +371,14 @@ class _Attempt:
         odd = any(isinstance(each.key, LensParameter) for each in deviations(self.result, least=_NOTICED))
         odd |= bool(self.against.all_against() or self.against.form or self._undetermined())
         free_pixels = choice.pixels == "auto" and self.options.poses == "free"
-        if odd:
-            chosen = self._select_lens([replace(camera, distortion=names) for names in DISTORTIONS])
-            if "k3" in chosen.distortion:
-                chosen = self._select_lens([chosen, *(replace(camera, distortion=names) for names in RATIONAL)])
+        # All are compared at once: pixels that are not square hide the gain of a coefficient.
+        shapes = dict.fromkeys((camera.pixel_aspect, None) if free_pixels else (camera.pixel_aspect,))
+        known = DISTORTIONS if odd else (camera.distortion,)
+        if len(lenses := [replace(camera, distortion=d, pixel_aspect=shape) for shape in shapes for d in known]) > 1:
+            chosen = self._select_lens(lenses)
+            if "k3" in chosen.distortion and odd:
+                chosen = self._select_lens([chosen, *(replace(chosen, distortion=names) for names in RATIONAL)])
             best = self._with_lens(chosen) or self if chosen != camera else self
-        if free_pixels and camera.pixel_aspect is not None:
-            square = best.options.camera
-            free = best._select_lens([square, replace(square, pixel_aspect=None)])
-            best = best._with_lens(free) or best if free != square else best
         if choice.pixels == "auto" and not free_pixels:
             if best.against.misfits:
                 free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
@@ -412,7 +414,7 @@ class _Attempt:
             return self.options.camera
         noise = min((result for _, result in tried.values()), key=_scatter).noise
         squares = {options: held.squares(noise) for options, (held, _) in tried.items()}
-        return select_model(compare_models(squares), self.options.camera)
+        return select_model(compare_models(squares, least_gain=_LEAST_GAIN), self.options.camera)
 
     def _describe_lens(self, before: CameraOptions) -> "_Attempt":
         """Add warnings on changes of the lens, and on coefficients that remain undetermined."""

@@ -52,9 +52,15 @@ class HeldOut:
     parameters: int
 
     def squares(self, noise: dict[str, Noise]) -> np.ndarray:
-        """Return the mean square (F,) of each image's errors relative to a noise, with clipped outliers."""
+        """Return the mean square (F,) of each image's errors relative to a noise, with clipped outliers.
+
+        An image whose points are all outliers of the estimate counts as clipped.
+        """
         found = []
         for values, kinds in self.images:
+            if not len(values):
+                found.append(_CLIPPED**2)
+                continue
             sigma = np.array([noise[kind].sigma_px for kind in kinds])
             weight = np.array([noise[kind].sigma_px / noise[kind].effective_px() for kind in kinds]) ** 2
             squares = np.minimum(np.square(values / sigma), _CLIPPED**2)

@@ -65,6 +65,6 @@ def test_the_covariance_is_that_of_the_errors(outcomes):
     that factor 1.5.
     """
     pulls = np.concatenate([outcome.pulls for outcome in outcomes])
-    assert len(pulls) == 20 * WET + 18 * DRY
+    assert len(pulls) == 21 * WET + 19 * DRY
     lowest, highest = chi2.ppf([BY_CHANCE, 1 - BY_CHANCE], len(pulls)) / len(pulls)
     assert lowest < np.mean(pulls**2) < highest

@@ -7,6 +7,7 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor, inside, lattice
 from tests.uwlts.joint_views import TARGET, Noise, gathered, lit_points, seen, step_views, target_series
+from tests.virtual_sensors import altered, with_fine_target
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
 from uwlts.calibration.joint.gathering import Series
@@ -50,8 +51,9 @@ def from_steps(thesis, *, height_mm):
     """A target in air and steps in water; the laser's window is square to the sheet, as the step views need it."""
     laser = BUILT.laser.model_copy(update={"window": BUILT.laser.window.model_copy(update={"tilt_y_deg": 0.0})})
     sensor = BUILT.model_copy(update={"laser": laser})
-    known = thesis.uncertainty.model_copy(update={"step_height_mm": height_mm, "window_tilt_deg": 0.01})
-    described = thesis.model_copy(update={"uncertainty": known})
+    described = with_fine_target(
+        altered(thesis, {"uncertainty": {"step_height_mm": height_mm, "window_tilt_deg": 0.01}})
+    )
     air = target_series(sensor, window=False, positions=np.arange(6) * 46.0 - 200.0, noise=noise(2), columns=15)
     # The standards face the laser, so that the uncertainty of their heights is the stated one.
     steps = step_views(sensor, noise=noise(3), tilts=(0.0, 0.0, 0.0))

@@ -24,7 +24,7 @@ from uwlts.calibration.model_comparison.held_out import (
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
-from uwlts.files.json_files import json_text
+from uwlts.files.json_files import SEAL, compute_seal, json_text
 from uwlts.report.model_comparison import (
     ModelComparisonContent,
     compute_additional_error,
@@ -244,8 +244,10 @@ def test_the_page_and_the_lines_tell_every_model(plain_choice):
     )
     content = make_content(comparison)
     text = json_text(content, indent=2, only_ascii=False)
-    assert ModelComparisonContent.model_validate_json(text) == content
-    usual = json.loads(text)["models"][0]
+    written = json.loads(text)
+    assert written.pop(SEAL) == compute_seal(written)
+    assert ModelComparisonContent.model_validate(written) == content
+    usual = written["models"][0]
     assert list(usual) == ["model", "parameters", "inside", "outside", "as_good"]
     page, lines = models_page(content), "\n".join(format_lines(content))
     assert "<svg" in page and "thesis &lt;as built&gt;" in page
