@@ -226,11 +226,40 @@ def test_the_whole_way_of_a_first_time_operator(desk, page, served):
     says(page, "disconnected")
 
 
+def test_state_picture_and_log_agree(desk, page, served):
+    """Before and after homing, and after Laser off."""
+    caption = page.locator(".image")
+    press(page, "connect")
+    says(page, "connected: Grbl")
+    caption.get_by_text("live, lamp").wait_for()
+    lit = len(served.controller.lights)
+    press(page, "laser")
+    says(page, "warning: the laser stays off: the stage has to be homed")
+    page.wait_for_timeout(1000)
+    assert len(served.controller.lights) == lit
+    assert "laser off" in page.locator("header").inner_text() and "live, lamp" in caption.inner_text()
+    tab(page, "Stage")
+    press(page, "home")
+    says(page, "homing done")
+    tab(page, "Connect")
+    press(page, "laser")
+    shows(page, "laser ON for images")
+    caption.get_by_text("live, laser").wait_for()
+    says(page, "live images with laser")
+    assert len(served.controller.lights) > lit
+    press(page, "Laser off")
+    caption.get_by_text("not live, laser").wait_for()
+    shows(page, "laser off")
+    says(page, "switched off by hand")
+    assert dark(served)
+
+
 @pytest.mark.slow
 def test_a_scan_is_paused_stopped_and_continued(desk, page, served):
     scanning(page)
     press(page, "pause")
     says(page, "paused, the laser is off")
+    shows(page, "laser off")
     assert dark(served)
     done = re.findall(r"(\d+) of 60", page.locator("header").inner_text())
     page.wait_for_timeout(1500)
