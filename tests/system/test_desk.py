@@ -358,6 +358,29 @@ class LaserOff:
         kept(self.page, f"off-{self.page.viewport_size['width']}-{state}")
         self.states.append(state)
 
+    def works_zoomed(self) -> None:
+        """Zoom in by pinching, and press where the button is on the screen."""
+        light(self.controller)
+        session = self.page.context.new_cdp_session(self.page)
+        session.send("Emulation.setPageScaleFactor", {"pageScaleFactor": 3})
+        self.page.wait_for_function("visualViewport.scale === 3")
+        # In the page's pixels from the corner of the visible part, as the protocol sends touches.
+        left, top, right, bottom, width, height = self.page.evaluate(
+            """() => {
+              const { left, top, right, bottom } = document.getElementById("laser-off").getBoundingClientRect();
+              const { offsetLeft: x, offsetTop: y, width, height } = visualViewport;
+              return [left - x, top - y, right - x, bottom - y, width, height];
+            }"""
+        )
+        assert left >= 0 and right <= width and top >= 0 and bottom <= height
+        assert 3 * (right - left) >= 44 and 3 * (bottom - top) >= 44
+        place = {"x": (left + right) / 2, "y": (top + bottom) / 2}
+        session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [place]})
+        session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        assert within(5.0, lambda: not self.controller.state().laser_on)
+        session.send("Emulation.setPageScaleFactor", {"pageScaleFactor": 1})
+        session.detach()
+
 
 def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
     page = sized
@@ -394,6 +417,8 @@ def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
         os.kill(desk.process.pid, signal.SIGCONT)
     press(page, "close")
     off.works("dialog-closed")
+    if page.viewport_size["width"] < 1000:
+        off.works_zoomed()
     # Before the page's scripts are loaded.
     page.route(re.compile("nicegui.js"), lambda route: held.append(route))
     held: list[Route] = []
