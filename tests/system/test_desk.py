@@ -226,11 +226,40 @@ def test_the_whole_way_of_a_first_time_operator(desk, page, served):
     says(page, "disconnected")
 
 
+def test_state_picture_and_log_agree(desk, page, served):
+    """Before and after homing, and after Laser off."""
+    caption = page.locator(".image")
+    press(page, "connect")
+    says(page, "connected: Grbl")
+    caption.get_by_text("live, lamp").wait_for()
+    lit = len(served.controller.lights)
+    press(page, "laser")
+    says(page, "warning: the laser stays off: the stage has to be homed")
+    page.wait_for_timeout(1000)
+    assert len(served.controller.lights) == lit
+    assert "laser off" in page.locator("header").inner_text() and "live, lamp" in caption.inner_text()
+    tab(page, "Stage")
+    press(page, "home")
+    says(page, "homing done")
+    tab(page, "Connect")
+    press(page, "laser")
+    shows(page, "laser ON for images")
+    caption.get_by_text("live, laser").wait_for()
+    says(page, "live images with laser")
+    assert len(served.controller.lights) > lit
+    press(page, "Laser off")
+    caption.get_by_text("not live, laser").wait_for()
+    shows(page, "laser off")
+    says(page, "switched off by hand")
+    assert dark(served)
+
+
 @pytest.mark.slow
 def test_a_scan_is_paused_stopped_and_continued(desk, page, served):
     scanning(page)
     press(page, "pause")
     says(page, "paused, the laser is off")
+    shows(page, "laser off")
     assert dark(served)
     done = re.findall(r"(\d+) of 60", page.locator("header").inner_text())
     page.wait_for_timeout(1500)
@@ -329,6 +358,29 @@ class LaserOff:
         kept(self.page, f"off-{self.page.viewport_size['width']}-{state}")
         self.states.append(state)
 
+    def works_zoomed(self) -> None:
+        """Zoom in by pinching, and press where the button is on the screen."""
+        light(self.controller)
+        session = self.page.context.new_cdp_session(self.page)
+        session.send("Emulation.setPageScaleFactor", {"pageScaleFactor": 3})
+        self.page.wait_for_function("visualViewport.scale === 3")
+        # In the page's pixels from the corner of the visible part, as the protocol sends touches.
+        left, top, right, bottom, width, height = self.page.evaluate(
+            """() => {
+              const { left, top, right, bottom } = document.getElementById("laser-off").getBoundingClientRect();
+              const { offsetLeft: x, offsetTop: y, width, height } = visualViewport;
+              return [left - x, top - y, right - x, bottom - y, width, height];
+            }"""
+        )
+        assert left >= 0 and right <= width and top >= 0 and bottom <= height
+        assert 3 * (right - left) >= 44 and 3 * (bottom - top) >= 44
+        place = {"x": (left + right) / 2, "y": (top + bottom) / 2}
+        session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [place]})
+        session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        assert within(5.0, lambda: not self.controller.state().laser_on)
+        session.send("Emulation.setPageScaleFactor", {"pageScaleFactor": 1})
+        session.detach()
+
 
 def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
     page = sized
@@ -365,6 +417,8 @@ def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
         os.kill(desk.process.pid, signal.SIGCONT)
     press(page, "close")
     off.works("dialog-closed")
+    if page.viewport_size["width"] < 1000:
+        off.works_zoomed()
     # Before the page's scripts are loaded.
     page.route(re.compile("nicegui.js"), lambda route: held.append(route))
     held: list[Route] = []

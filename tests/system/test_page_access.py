@@ -13,6 +13,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from urllib.parse import parse_qs, urlencode, urlsplit
 
@@ -420,6 +421,7 @@ def test_the_desk_shows_bystanders_no_control_and_gives_out_nothing_but_its_fold
     (folder / "secret.txt").write_text("secret", encoding="utf-8")
     (tmp_path / "outside.html").write_text("outside", encoding="utf-8")
     (folder / "link.html").symlink_to(tmp_path)
+    (folder / "leak.html").symlink_to(tmp_path / "outside.html")
     desk = subprocess.Popen(
         [sys.executable, "-m", "uwlts", "desk", str(folder), "--port", "0"],
         stdout=subprocess.PIPE,
@@ -440,8 +442,9 @@ def test_the_desk_shows_bystanders_no_control_and_gives_out_nothing_but_its_fold
         assert report.status == 200 and report.body == b"<p>report</p>"
         policy = report.headers["content-security-policy"]
         assert policy.startswith("sandbox") and "same-origin" not in policy
-        for name in ("secret.txt", "../outside.html", "..%2foutside.html", "link.html", "none.html", "%00.html"):
-            answer = asked(served, f"/files/{name}")
+        links, outside = ("link.html", "leak.html"), ("../outside.html", "..%2foutside.html")
+        for name, own in product(("secret.txt", *outside, *links, "none.html", "%00.html"), ("", kept)):
+            answer = asked(served, f"/files/{name}", **({"Cookie": own} if own else {}))
             assert b"outside" not in answer.body and b"secret\n" not in answer.body
             assert answer.status == 404 or b"<title>desk: tank" in answer.body, name
         # A browser that is still there is no reason to complain.

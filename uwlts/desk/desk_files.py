@@ -1,4 +1,7 @@
-"""Files of the desk's folder: plans, captures, calibrations, clouds and reports."""
+"""Files of the desk's folder: plans, captures, calibrations, clouds and reports.
+
+Symbolic links are not followed, because a link could publish a file from outside the folder.
+"""
 
 import os
 from contextlib import suppress
@@ -39,10 +42,11 @@ def list_files(folder: Path) -> list[ListedFile]:
     except OSError as error:
         raise DescriptionError(f"the folder {folder} cannot be read: {error.strerror}") from error
     for entry in entries:
-        # Files that were renamed or removed meanwhile, and circular links, are skipped.
+        # Files that were renamed or removed meanwhile are skipped.
         with suppress(OSError):
-            if guess_kind(entry.name) and not entry.name.startswith(".") and entry.is_file():
-                about = entry.stat()
+            is_file = entry.is_file(follow_symlinks=False)
+            if is_file and guess_kind(entry.name) and not entry.name.startswith("."):
+                about = entry.stat(follow_symlinks=False)
                 if kind := _kind_by_content(entry.path, about.st_mtime_ns):
                     found.append(ListedFile(entry.name, kind, about.st_size, about.st_mtime))
     return sorted(found, key=lambda file: file.time_s, reverse=True)[:_SHOWN]
@@ -86,7 +90,7 @@ def _kind_by_content(path: str, changed_ns: int) -> str:
 def find_file(folder: Path, name: str) -> Path:
     """Return a listed file's path; raises DescriptionError if the name is not that of a regular file in the folder."""
     path = folder / name
-    if not _is_plain(name) or not guess_kind(name) or not is_regular_file(path):
+    if not _is_plain(name) or not guess_kind(name) or not is_regular_file(path) or path.is_symlink():
         raise DescriptionError(f"'{name}' is not a file of the folder {folder}")
     return path
 

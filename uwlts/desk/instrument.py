@@ -12,7 +12,7 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -84,6 +84,7 @@ class Instrument:
         self._screen: BoardScreen | None = None
         self._rig: Rig | None = None
         self._darkened, self._lost = False, 0
+        self._live: Picture | None = None
         self.exposure_ms: dict[Light, float] = {"laser": START_MS, "lamp": START_MS}
         self._thread = threading.Thread(target=self._run, name="instrument", daemon=True)
         self._thread.start()
@@ -106,6 +107,16 @@ class Instrument:
         darken(connected.stage, self._board)
         self._show_laser()
         self._ask(self._after_darkening)
+
+    def show_light(self, light: Light | None) -> None:
+        """Show live images in a light, or none; the laser is refused while no stage can switch it."""
+        if light == "laser" and self.state != InstrumentState.READY:
+            self._board.say(f"the laser stays off: {self.state}", "warning")
+        elif light == "laser" and not self._switches_laser():
+            self._board.say("the laser stays off: no stage is connected that could switch it", "warning")
+        else:
+            self.light = light
+            self._board.say("live images end" if light is None else f"live images with {light}")
 
     @property
     def laser_in_use(self) -> bool:
@@ -247,14 +258,28 @@ class Instrument:
         elif stage.laser_power > 0:
             self._board.laser = "on"
         else:
-            self._board.laser = "flashing" if self.light == "laser" or self.state == InstrumentState.SCANNING else "off"
+            previewed = self.state == InstrumentState.READY and self.light == "laser"
+            used = not self._darkened and (previewed or self.state == InstrumentState.SCANNING)
+            self._board.laser = "flashing" if used else "off"
+
+    def _switches_laser(self) -> bool:
+        stage = None if self._connected is None else self._connected.stage
+        return isinstance(stage, GrblStage) and stage.position_known
 
     def _begin(self, phase: str) -> _Connected:
         if self._connected is None:
             raise HardwareError("nothing is connected: connect a camera first")
         self.state = InstrumentState.BUSY
         self._board.phase(phase)
+        self._end_live()
+        self._show_laser()
         return self._connected
+
+    def _end_live(self) -> None:
+        """Change the caption of the last live picture."""
+        if self._live is not None and self._live is self._board.picture:
+            self._board.show(replace(self._live, caption=f"not {self._live.caption}"))
+        self._live = None
 
     def _connect(self, plan: ScanPlan, camera: str, port: str | None) -> None:
         self._disconnect()
@@ -284,6 +309,7 @@ class Instrument:
 
     def _disconnect(self) -> None:
         connected, self._connected, self._rig, self.light = self._connected, None, None, None
+        self._end_live()
         if connected is not None:
             self._board.position_mm = None
             try:
@@ -328,16 +354,12 @@ class Instrument:
                 connected.stage.position_mm()
         self._darkened = False
 
-    def _shown_light(self, connected: _Connected) -> Light | None:
-        """Return the light that is shown; a laser needs a stage that is not locked."""
-        switched = isinstance(connected.stage, GrblStage) and connected.stage.position_known
-        return self.light if switched else self.light and "lamp"
-
     def _find_exposure(self) -> None:
-        connected = self._begin("finding the exposure")
-        light = self._shown_light(connected)
+        light, connected = self.light, self._begin("finding the exposure")
         if light is None:
             raise HardwareError("choose first which light is shown")
+        if light == "laser":
+            self._board.laser = "flashing"
         found = self._rig_of(connected).find_exposure(light, start_ms=self.exposure_ms[light])
         if found is None:
             self._board.say(f"too dark for a {light} image even at the longest exposure", "warning")
@@ -346,12 +368,14 @@ class Instrument:
         self._board.say(f"{light}: exposed by {found:.4g} ms")
 
     def _preview(self) -> None:
-        connected = self._connected
-        if connected is None or (light := self._shown_light(connected)) is None:
-            return
-        if connected.stage.faulty:
+        connected, light = self._connected, self.light
+        if light == "laser" and not self._switches_laser():
+            # A fault, or Laser off, has locked the stage.
+            light = self.light = None
+        if connected is None or light is None or connected.stage.faulty:
             # No live image until the stage is homed or unlocked; then the rig is set up again.
-            self._rig = None
+            self._rig = None if connected is None or connected.stage.faulty else self._rig
+            self._end_live()
             return
         try:
             frame = self._rig_of(connected).frame(light, self.exposure_ms[light])
@@ -372,7 +396,8 @@ class Instrument:
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
         saturated = seen.saturated / max(seen.counted, 1)
         image = drawable_image(frame.seen, connected.sensor.camera)
-        self._board.show(Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
+        self._live = Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated)
+        self._board.show(self._live)
 
     def _scan(self, plan: ScanPlan, out: Path, calibration: Path | None, resume: bool, overwrite: bool) -> None:
         known: AnyCalibration | None = None if calibration is None else load_calibration(calibration)
@@ -456,10 +481,12 @@ class Instrument:
         """Pause or stop between two images of a scan, if requested."""
         if self._paused.is_set():
             self.state, before = InstrumentState.PAUSED, self._board.progress
+            self._show_laser()
             self._board.say("paused, the laser is off")
             while self._paused.is_set():
                 time.sleep(0.05)
             self.state, self._board.progress = InstrumentState.SCANNING, before
+            self._show_laser()
         if self._stop.is_set():
             raise Ended
         self._show_laser()

@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 from nicegui import ui
+from nicegui.elements.mixins.disableable_element import DisableableElement
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
@@ -206,7 +207,7 @@ class _OperatorPage:
     def __init__(self, desk: _Desk):
         self._desk, self._instrument, self._board = desk, desk.instrument, desk.board
         self._view = BoardView(desk.board, picked=self._show_picked)
-        self._only: list[tuple[ui.button, tuple[InstrumentState, ...]]] = []
+        self._only: list[tuple[DisableableElement, tuple[InstrumentState, ...]]] = []
         self._refreshed = 0
         self._files: tuple[object, ...] = ()
 
@@ -291,6 +292,7 @@ class _OperatorPage:
         with ui.row().classes("items-center"):
             self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
             self._light.on_value_change(lambda event: self._look(event.value))
+            self._only.append((self._light, _FREE))
             self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
         self._exposed = self._exposure_now()
         self._exposure = _Number("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
@@ -322,7 +324,7 @@ class _OperatorPage:
         wanted = None if light == "none" else "laser" if light == "laser" else "lamp"
         # The toggle follows the instrument, too.
         if wanted != self._instrument.light:
-            self._instrument.light = wanted
+            self._instrument.show_light(wanted)
 
     def _exposure_now(self) -> tuple[str | None, float]:
         light = self._instrument.light

@@ -83,11 +83,12 @@ def test_labels_describe_files_beyond_their_names(folder):
     assert {file.name: file.kind for file in list_files(folder)}["other.json"] == "evaluation"
 
 
-def test_files_that_cannot_be_opened_are_not_listed(folder):
+def test_links_and_files_that_cannot_be_opened_are_not_listed(folder):
     os.mkfifo(folder / "fifo.h5")
     (folder / "gone.h5").symlink_to(folder / "nothing")
     (folder / "loop.h5").symlink_to(folder / "loop.h5")
     (folder / "up.h5").symlink_to(folder.parent)
+    (folder / "out.h5").symlink_to(folder.parent / "outside.h5")
     assert [file.name for file in list_files(folder)] == ["scan.h5"]
 
 
@@ -128,6 +129,8 @@ def test_a_listed_file_is_found(folder):
         "..h5",
         "sub.h5",
         "up.h5",
+        "out.h5",
+        "within.h5",
         "fifo.h5",
         "gone.h5",
         "loop.h5",
@@ -148,6 +151,8 @@ def test_names_that_lead_elsewhere_or_to_no_file_are_refused(folder, name):
     (folder / "gone.h5").symlink_to(folder / "nothing")
     (folder / "loop.h5").symlink_to(folder / "loop.h5")
     (folder / "up.h5").symlink_to(folder.parent)
+    (folder / "out.h5").symlink_to(folder.parent / "outside.h5")
+    (folder / "within.h5").symlink_to(folder / "scan.h5")
     with pytest.raises(DescriptionError, match="is not a file of the folder"):
         find_file(folder, name.format(outside=folder.parent / "outside.h5"))
 
