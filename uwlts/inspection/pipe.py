@@ -327,8 +327,8 @@ def _note_merged(feature: Feature) -> list[str]:
     places = " and ".join(f"{each:.1f} mm" for each in sorted(away))
     return [
         f"{feature.name} is {len(feature.hollows_mm)} neighbours that the search joined, {places} from the deepest: "
-        "its depth is that of the deepest, its length and width those of the contour around that one; measure the others "
-        "on their own"
+        "its depth is that of the deepest, its length and width those of the contour around that one; measure the "
+        "others on their own"
     ]
 
 
