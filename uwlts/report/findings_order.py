@@ -80,7 +80,7 @@ def judge_value(value: FeatureValue, limits: FindingLimits) -> Verdict:
 def judge_feature(feature: Feature, limits: FindingLimits) -> tuple[Verdict, list[str]]:
     """Return the most severe verdict on a feature's values, and the names of the values that give it."""
     found = {value.name: judge_value(value, limits) for value in feature.values}
-    worst = min(found.values(), key=VERDICTS.index, default="no limit")
+    worst: Verdict = min(found.values(), key=VERDICTS.index, default="no limit")
     return worst, [name for name, each in found.items() if each == worst and worst != "no limit"]
 
 
@@ -120,5 +120,5 @@ def format_place(feature: Feature, whole: Feature | None, start_mm: np.ndarray, 
             f"twelve_o_clock across it; the axis is {np.round(whole.axes[2], 3).tolist()}"
         )
     about = feature.place_mm - whole.place_mm
-    minutes = round(720 * np.arctan2(about @ np.cross(axis, up), about @ up) / (2 * np.pi)) % 720
+    minutes = round(720 * float(np.arctan2(about @ np.cross(axis, up), about @ up)) / (2 * np.pi)) % 720
     return f"{minutes // 60 or 12}:{minutes % 60:02d}", f"{away @ axis:.0f}"
