@@ -330,7 +330,7 @@ def _conclude(listed: Sequence[Feature], order: FindingOrder) -> tuple[str, str]
     verdicts = [judge_feature(each, order.limits)[0] for each in listed]
     words = "exceed the limit", "undecided", "within the limit", "without a limit"
     counts = [f"{verdicts.count(each)} {word}" for each, word in zip(VERDICTS, words, strict=True) if each in verdicts]
-    worst = min(verdicts, key=VERDICTS.index, default="no limit")
+    worst = min(verdicts, key=VERDICTS.index, default=VERDICTS[-1])
     if not listed:
         return worst, "No finding."
     return worst, f"{len(listed)} findings: {', '.join(counts)}."
