@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -13,7 +13,7 @@ from uwlts.inspection.features import Feature, FeatureKind, FeatureValue
 from uwlts.model.sensor import Description, Positive, Vector
 
 Verdict = Literal["exceeds the limit", "undecided", "within the limit", "no limit"]
-VERDICTS: tuple[Verdict, ...] = ("exceeds the limit", "undecided", "within the limit", "no limit")
+VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 """Verdicts in order of severity."""
 
 
