@@ -80,7 +80,7 @@ def judge_value(value: FeatureValue, limits: FindingLimits) -> Verdict:
 def judge_feature(feature: Feature, limits: FindingLimits) -> tuple[Verdict, list[str]]:
     """Return the most severe verdict on a feature's values, and the names of the values that give it."""
     found: dict[str, Verdict] = {value.name: judge_value(value, limits) for value in feature.values}
-    worst = next((each for each in VERDICTS if each in found.values()), VERDICTS[-1])
+    worst: Verdict = VERDICTS[min(map(VERDICTS.index, found.values()), default=-1)]
     return worst, [name for name, each in found.items() if each == worst and worst != "no limit"]
 
 
