@@ -40,6 +40,22 @@ def _between_images(points_mm: np.ndarray, frame: np.ndarray) -> float:
     return float(np.median(least))
 
 
+def measure_spacing(places: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the median spacings (2,) of places (N, 2) near chosen (K,) ones, along the first and the second direction.
+
+    The next place along a direction lies within 45 deg of it: points of the same profile do not count across it.
+    """
+    sample = chosen[:: max(1, len(chosen) // _ASKED)]
+    least = np.full((len(sample), 2), np.inf)
+    for number, point in enumerate(sample):
+        away = np.abs(places - places[point])
+        for k in (0, 1):
+            ahead = away[:, k][away[:, k] > away[:, 1 - k]]
+            least[number, k] = ahead.min(initial=np.inf)
+    known = np.isfinite(least)
+    return np.array([np.median(least[known[:, k], k]) if known[:, k].any() else 0.0 for k in (0, 1)])
+
+
 def project_footprint(cloud: PointCloud, chosen: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the footprints of chosen (K,) points along tangents (K, 2, 3), and their relative uncertainty.
 

@@ -23,6 +23,7 @@ from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import fit_biweight
+from uwlts.fitting.point_spacing import measure_spacing
 from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication
@@ -61,6 +62,15 @@ class BlemishRule:
         Subdivision of cells for contours, on a cubic spline.
     dent : float
         Least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits.
+    end_std : float
+        Standard uncertainty of each end of a length, in spacings of profiles or points: rectangular distribution
+        between two of them (GUM, 4.3.7), as the form of the surface there is unknown.
+    saddle : float
+        Largest depth between neighbours in one contour, as a fraction of the shallower one's depth. Rough ground of a
+        single pit has higher saddles.
+    saddle_std : float
+        Least height of a saddle above the shallower neighbour, in standard deviations of their difference. Rare enough
+        for the dozens of peaks of noise in a contour.
     """
 
     draws: int = 120
@@ -74,6 +84,9 @@ class BlemishRule:
     cells: int = 26
     subdivision: int = 2
     dent: float = 0.1
+    end_std: float = 1 / np.sqrt(12.0)
+    saddle: float = 0.75
+    saddle_std: float = 4.0
 
 
 _RULE = BlemishRule()
@@ -88,13 +101,40 @@ _NODES = [
 
 @dataclass(frozen=True, eq=False)
 class Blemish:
-    """Measured blemish: kind, values, deepest place (2,), size along both axes and depth in mm, and its points."""
+    """Measured blemish on an unrolled surface.
+
+    Attributes
+    ----------
+    kind : FeatureKind
+    values : tuple of FeatureValue
+        Without the spacing of profiles and points (`with_spacing`).
+    place : (2,) float64
+        Deepest place.
+    extent_mm : (3,) float64
+        Size along both axes, and depth.
+    points : (K,) int
+    outline : (L, 2) float64
+        Closed contour at the edge depth.
+    hollows : (H, 2) float64
+        Deepest places of neighbours that the search joined, the deepest first; empty for a single blemish.
+    spacing_mm : (2,) float64
+        Spacing of the points along both axes.
+    """
 
     kind: FeatureKind
     values: tuple[FeatureValue, ...]
     place: np.ndarray
     extent_mm: np.ndarray
     points: np.ndarray
+    outline: np.ndarray
+    hollows: np.ndarray
+    spacing_mm: np.ndarray
+
+    def with_spacing(self) -> tuple[FeatureValue, ...]:
+        """Return the values; length and width are known no better than the spacing of the points at both ends."""
+        both_ends = np.sqrt(2) * _RULE.end_std * self.spacing_mm
+        more = dict(zip(("length", "width"), both_ends.tolist(), strict=True))
+        return tuple(value.widen(random=more[value.name]) if value.name in more else value for value in self.values)
 
 
 def measure_blemish(
@@ -180,7 +220,18 @@ def measure_blemish(
         shared = None if common is None else common[0]
         values.append(plain_value(kind, "remaining wall", wall_mm - plain[0], random[0], shared))
     extent = np.array([length, width, depth])
-    return Blemish(kind, tuple(values), field.grid[deepest], extent, indication.points)
+    level = float(np.sqrt(2) * np.median(by_noise[field.region]))
+    spacing = measure_spacing(surface.places[field.near], np.flatnonzero(inside))
+    return Blemish(
+        kind,
+        tuple(values),
+        field.grid[deepest],
+        extent,
+        indication.points,
+        field.trace_outline(depths, edge, deepest),
+        field.grid[field.find_hollows(depths, edge, std=level)],
+        spacing,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,25 +426,74 @@ class _Field:
         size = [_RULE.subdivision * (n - 1) + 1 for n in self.shape]
         return np.asarray(ndimage.zoom(self.region.reshape(self.shape), np.divide(size, self.shape), order=0))
 
-    def figures(self, depths: np.ndarray, edge: float, deepest: int) -> np.ndarray:
-        """Return the depth of cell ``deepest``, and length, width, area and lost area within the contour at an edge."""
+    def _contoured(self, depths: np.ndarray, edge: float, deepest: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return depths on the finer grid, a mask of those in and beside the contour about ``deepest``, and the cell.
+
+        The mask is empty if the deepest cell is not within the edge.
+        """
         size = [_RULE.subdivision * (n - 1) + 1 for n in self.shape]
-        cell, top = (
-            self.cell / _RULE.subdivision,
-            tuple(_RULE.subdivision * k for k in np.unravel_index(deepest, self.shape)),
-        )
+        top = tuple(_RULE.subdivision * k for k in np.unravel_index(deepest, self.shape))
         fine = np.asarray(ndimage.zoom(depths.reshape(self.shape), np.divide(size, self.shape), order=3))
         labelled: Any = ndimage.label(self.fine_region & (fine > edge), structure=np.ones((3, 3)))
-        labels, depth = labelled[0], float(depths[deepest])
-        if (label := labels[top]) == 0:
+        own = (labelled[0] == labelled[0][top]) & (labelled[0][top] > 0)
+        return fine, ndimage.binary_dilation(own, structure=np.ones((3, 3))), self.cell / _RULE.subdivision
+
+    def figures(self, depths: np.ndarray, edge: float, deepest: int) -> np.ndarray:
+        """Return the depth of cell ``deepest``, and length, width, area and lost area within the contour at an edge."""
+        fine, grown, cell = self._contoured(depths, edge, deepest)
+        depth = float(depths[deepest])
+        if not grown.any():
             return np.array([depth, 0.0, 0.0, 0.0, 0.0])
-        grown = ndimage.binary_dilation(labels == label, structure=np.ones((3, 3)))
         field = np.where(grown, fine, -np.inf)
         length, lost = _measure_section(field.max(axis=1), edge, cell)
         width, _ = _measure_section(field.max(axis=0), edge, cell)
         steep = np.maximum(np.hypot(*np.gradient(fine, cell)) * cell, 1e-9)
         share = np.clip((np.where(grown, fine, -1e9) - edge) / steep + 0.5, 0, 1)
         return np.array([depth, length, width, float(share.sum()) * cell**2, lost])
+
+    def trace_outline(self, depths: np.ndarray, edge: float, deepest: int) -> np.ndarray:
+        """Return the longest closed contour (L, 2) at an edge about cell ``deepest``, mm; empty if there is none."""
+        from skimage.measure import find_contours
+
+        fine, grown, cell = self._contoured(depths, edge, deepest)
+        # Beside the grid and the mask the depth is just below the edge.
+        field = np.pad(np.where(grown, fine, np.minimum(fine, 0.0)), 1, constant_values=min(0.0, edge))
+        found = find_contours(field, edge) if grown.any() else []
+        return self.grid[0] + cell * (max(found, key=len) - 1) if found else np.zeros((0, 2))
+
+    def find_hollows(self, depths: np.ndarray, edge: float, *, std: float) -> list[int]:
+        """Return the deepest cells of neighbours in the blemish, the deepest first; none for a single hollow.
+
+        Cells are joined from the deepest on. A hollow is one of its own if its depth exceeds that of the saddle to a
+        deeper one by a fraction, and by some standard deviations ``std`` of such a difference.
+        """
+        inside = self.region & (depths > edge)
+        top, saddles, kept = np.full(len(depths), -1), dict[int, float](), list[int]()
+
+        def root(cell: int) -> int:
+            while top[cell] != cell:
+                cell = top[cell]
+            return cell
+
+        for cell in sorted(np.flatnonzero(inside), key=lambda each: -depths[each]):
+            row, column = divmod(int(cell), self.shape[1])
+            beside = {
+                root(i * self.shape[1] + j)
+                for i in range(max(row - 1, 0), min(row + 2, self.shape[0]))
+                for j in range(max(column - 1, 0), min(column + 2, self.shape[1]))
+                if top[i * self.shape[1] + j] >= 0
+            }
+            best = max(beside, key=lambda each: depths[each], default=cell)
+            top[cell] = best
+            for other in beside - {best}:
+                top[other] = best
+                saddles[other] = float(depths[cell])
+        # Hollows that no saddle joins are separated by the edge.
+        for other in saddles | dict.fromkeys(np.flatnonzero(top == np.arange(len(top))).tolist(), 0.0):
+            drop = depths[other] - saddles.get(other, edge)
+            if drop > max((1 - _RULE.saddle) * depths[other], _RULE.saddle_std * std):
+                kept.append(other)
+        return sorted(kept, key=lambda each: -depths[each]) if len(kept) > 1 else []
 
 
 def _measure_section(profile: np.ndarray, edge: float, cell: float) -> tuple[float, float]:

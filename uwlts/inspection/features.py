@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -160,14 +160,18 @@ class FeatureValue:
         """Combined standard uncertainty of the known parts."""
         return float(np.hypot(self.random, self.systematic or 0.0))
 
-    def count_steps(self, std: float) -> FeatureValue:
-        """Return the value with another systematic standard uncertainty in addition, and a wider interval."""
-        below, above = (
-            np.hypot(side, COVERAGE_FACTOR * std) for side in (self.value - self.low, self.high - self.value)
+    def widen(self, *, random: float = 0.0, systematic: float = 0.0) -> FeatureValue:
+        """Return the value with further independent standard uncertainties, and a wider interval."""
+        more = COVERAGE_FACTOR * np.hypot(random, systematic)
+        low, high = (
+            self.value - np.hypot(self.value - self.low, more),
+            self.value + np.hypot(self.high - self.value, more),
         )
-        low, high = self.value - below, self.value + above
         low = max(low, 0.0) if self.low >= 0 else low
-        return replace(self, systematic=float(np.hypot(self.systematic or 0.0, std)), low=float(low), high=float(high))
+        common = float(np.hypot(self.systematic or 0.0, systematic)) if systematic else self.systematic
+        return replace(
+            self, random=float(np.hypot(self.random, random)), systematic=common, low=float(low), high=float(high)
+        )
 
     def text(self) -> str:
         """Return name, value and interval as text."""
@@ -197,6 +201,10 @@ class Feature:
     false_alarm : float or None
         Probability that noise gives an indication of this significance anywhere on the inspected area; None for
         features that need no detection.
+    outline_mm : (K, 3) float64
+        Closed contour of a blemish at its edge depth, in the cloud's frame; empty for other features.
+    hollows_mm : (H, 3) float64
+        Deepest (or highest) places of neighbours that the search joined, in the cloud's frame; empty for a single one.
     """
 
     kind: FeatureKind
@@ -207,6 +215,8 @@ class Feature:
     extent_mm: np.ndarray
     points: np.ndarray
     false_alarm: float | None = None
+    outline_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    hollows_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __getitem__(self, name: str) -> FeatureValue:
         """Return the value of a name; raise KeyError if it does not exist."""
@@ -242,6 +252,8 @@ class Feature:
             "extent_mm": self.extent_mm.tolist(),
             "points": len(self.points),
             "false_alarm": self.false_alarm,
+            "outline_mm": np.round(self.outline_mm, 3).tolist(),
+            "hollows_mm": np.round(self.hollows_mm, 3).tolist(),
         }
 
 
@@ -274,7 +286,7 @@ class Inspection(Brief, RecordFile):
         if not (std := rounding_std_mm(cloud)):
             return self
         features = tuple(
-            replace(each, values=tuple(v.count_steps(std) if v.unit == "mm" else v for v in each.values))
+            replace(each, values=tuple(v.widen(systematic=std) if v.unit == "mm" else v for v in each.values))
             for each in self.features
         )
         note = f"uncertainties contain {std:.2g} mm for the steps of the cloud's stored coordinates"

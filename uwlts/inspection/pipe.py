@@ -285,12 +285,51 @@ def _blemish_features(
     features, numbers = [], dict.fromkeys(FeatureKind, 0)
     for blemish, middle, chance in measured:
         numbers[blemish.kind] += 1
-        angle = np.array([blemish.place[1] / form.radius_mm + middle])
-        place, out = form.points_at(blemish.place[:1], angle)[0], form.frame.normals_at(angle)[0]
-        axes = np.array([form.frame.axes[2], np.cross(out, form.frame.axes[2]), out])
-        name, points = f"{blemish.kind} {numbers[blemish.kind]}", chosen[blemish.points]
-        features.append(Feature(blemish.kind, name, blemish.values, place, axes, blemish.extent_mm, points, chance))
-    return features, notes
+
+        def in_cloud(places: np.ndarray, middle: float = middle) -> np.ndarray:
+            """Return points (K, 3) on the pipe at places (K, 2) of the surface unrolled about an angle."""
+            return form.points_at(places[:, 0], places[:, 1] / form.radius_mm + middle)
+
+        out = form.frame.normals_at(np.array([blemish.place[1] / form.radius_mm + middle]))[0]
+        feature = Feature(
+            blemish.kind,
+            f"{blemish.kind} {numbers[blemish.kind]}",
+            blemish.with_spacing(),
+            in_cloud(blemish.place[None])[0],
+            np.array([form.frame.axes[2], np.cross(out, form.frame.axes[2]), out]),
+            blemish.extent_mm,
+            chosen[blemish.points],
+            chance,
+            in_cloud(blemish.outline),
+            in_cloud(blemish.hollows),
+        )
+        features.append(feature)
+        notes += _note_merged(feature)
+    return features, [*_note_spacing([each[0] for each in measured]), *notes]
+
+
+def _note_spacing(blemishes: list[Blemish]) -> list[str]:
+    """Return a note on the spacing that the intervals of lengths include; empty without blemishes."""
+    if not blemishes:
+        return []
+    along, around = np.median([each.spacing_mm for each in blemishes], axis=0)
+    return [
+        f"lengths and widths of findings are known no better than the spacing of profiles and points there "
+        f"({along:.2g} mm along the pipe, {around:.2g} mm around it, median): their intervals include it at both ends"
+    ]
+
+
+def _note_merged(feature: Feature) -> list[str]:
+    """Return a note on a finding that consists of several neighbours."""
+    if not len(feature.hollows_mm):
+        return []
+    away = np.linalg.norm(feature.hollows_mm[1:] - feature.hollows_mm[0], axis=1)
+    places = " and ".join(f"{each:.1f} mm" for each in sorted(away))
+    return [
+        f"{feature.name} is {len(feature.hollows_mm)} neighbours that the search joined, {places} from the deepest: "
+        "its depth is that of the deepest, its length and width those of the contour around that one; measure the "
+        "others on their own"
+    ]
 
 
 def _note_omission(cloud: PointCloud, points: np.ndarray, height_mm: float, reason: str) -> str:

@@ -4,6 +4,7 @@ import json
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,7 @@ def report_page(
         interactive=collected,
         title=campaign.folder.resolve().name,
         introduction=introduction(campaign),
+        conclusion=conclude(rows),
         key_figures=headline_tiles(campaign, reference),
         groups=_group_rows(rows),
         published=None if reference is None else reference.title,
@@ -371,6 +373,23 @@ def headline_tiles(campaign: GatheredCampaign, reference: Reference | None) -> l
         theirs = "" if published is None else ", ".join(f"{value:g} mm" for value in published.window_distance_mm)
         add("Window distance", f"{format_fixed(window.estimated)} mm", true, theirs)
     return tiles
+
+
+def conclude(rows: Sequence[Row]) -> str:
+    """Return the date, and whether errors agree with their stated expanded uncertainties (|E| / U at most 1)."""
+    ratios = {
+        f"{row.quantity} of {row.measurement}": abs(row.error) / row.stated
+        for row in rows
+        if row.error is not None and row.stated
+    }
+    today = datetime.now(UTC).date().isoformat()
+    if not ratios:
+        return f"{today}: no error has a stated uncertainty, so that none can be judged."
+    worst, within = max(ratios, key=ratios.__getitem__), sum(each <= 1 for each in ratios.values())
+    return (
+        f"{today}: {within} of {len(ratios)} errors are within their expanded uncertainty (|E| / U at most 1); the "
+        f"largest |E| / U is {ratios[worst]:.2f} ({worst})."
+    )
 
 
 def introduction(campaign: GatheredCampaign) -> list[tuple[str, str]]:

@@ -28,6 +28,7 @@ from uwlts.inspection.features import (
 )
 from uwlts.inspection.inspect import InspectionKind, inspect_cloud
 from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.library import read_table, validate_description
 from uwlts.model.sensor import Table
 from uwlts.pages.numbers import format_to_scale
 from uwlts.pages.pdf import print_pdf, refuse_unsuitable_pdf
@@ -36,6 +37,7 @@ from uwlts.pages.toolkit import (
     MISSING,
     RED,
     Tile,
+    figure_png,
     new_figure,
     png_data_uri,
     refuse_unsuitable_page,
@@ -43,6 +45,7 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import check_certificate
+from uwlts.report.findings_order import VERDICTS, FindingOrder, format_place, judge_feature, sort_by_severity
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
@@ -97,6 +100,7 @@ def write_findings(
     calibration: str | Path | None = None,
     certificate: str | Path | None = None,
     verification: Sequence[str | Path] = (),
+    order: str | Path | None = None,
     unit: Unit | None = None,
     trust_edited: bool = False,
     overwrite: bool = False,
@@ -125,6 +129,10 @@ def write_findings(
     verification
         Evaluations (JSON of uwlts evaluate) of artefacts measured with the same calibration; their figures are
         reported.
+    order
+        TOML file with client, object, operator, date, sensor, water, and the tables ``datum`` (name, place_mm,
+        direction, twelve_o_clock) and ``limits`` (depth_mm, remaining_wall_mm, ovality_percent, undercut_mm), by which
+        findings are judged.
     unit
         Unit of a cloud of another program, mm or m, if neither format nor names of columns state it; by default mm.
     trust_edited
@@ -143,7 +151,7 @@ def write_findings(
     ------
     OutputError
         A file exists and ``overwrite`` is not given, or cannot be written.
-    CaptureError, CalibrationError
+    CaptureError, CalibrationError, DescriptionError
         A file cannot be read.
     EvaluationError
         The cloud does not show such an object, or does not belong to the calibration, certificate or verification.
@@ -155,6 +163,7 @@ def write_findings(
     if pdf:
         refuse_unsuitable_pdf(page.with_suffix(".pdf"))
         refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
+    stated = FindingOrder() if order is None else validate_description(FindingOrder, read_table(Path(order)), order)
     measured = read_cloud(path, unit=unit)
     sources = _sources(path, measured, captures, calibration, certificate)
     checks = [_artefact_check(each, measured) for each in verification]
@@ -163,7 +172,7 @@ def write_findings(
     ]
     found = inspect_cloud(measured, kind, **options)
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    text = _page(found, measured, sources, checks, title=title or f"Inspection of {path.name}", made=made)
+    text = _page(found, measured, sources, checks, stated, title=title or f"Inspection of {path.name}", made=made)
     record: Table = {
         "title": title or f"Inspection of {path.name}",
         "made": made,
@@ -172,6 +181,8 @@ def write_findings(
         "verification": [
             {"artefact": artefact, "figures": [vars(each) for each in figures]} for artefact, figures in checks
         ],
+        "order": stated.model_dump(mode="json", exclude_none=True),
+        "verdicts": {each.name: judge_feature(each, stated.limits)[0] for each in found.features},
         "inspection": found.record(),
     }
     if pdf:
@@ -246,6 +257,7 @@ def _page(
     cloud: PointCloud,
     sources: list[Source],
     checks: list[tuple[str, list[_CheckedFigure]]],
+    order: FindingOrder,
     *,
     title: str,
     made: str,
@@ -253,7 +265,9 @@ def _page(
     parts = [each for each in found.features if each.kind in _BLEMISHES]
     whole = [each for each in found.features if each.kind not in (*_BLEMISHES, FeatureKind.SECTION, FeatureKind.HOLE)]
     repeated = [each for each in found.features if each.kind in (FeatureKind.SECTION, FeatureKind.HOLE)]
-    drawn = sorted(parts, key=lambda each: -each.values[0].value)[:_MOST_PICTURES]
+    limited = [each for each in whole if judge_feature(each, order.limits)[0] != "no limit"]
+    parts, listed = (sort_by_severity(each, order.limits) for each in (parts, [*parts, *limited]))
+    drawn = parts[:_MOST_PICTURES]
     kinds = list(dict.fromkeys(each.kind for each in found.features))
     return render_page(
         "uwlts.report",
@@ -261,8 +275,11 @@ def _page(
         title=title,
         made=made,
         software=f"uwlts {__version__}",
-        tiles=_tiles(whole, parts),
-        findings=_rows(parts),
+        tiles=[tile for tile in _tiles(whole, parts) if tile.accent],
+        facts=_facts(order, cloud, sources, found),
+        conclusion=_conclude(listed, order),
+        findings=_finding_rows(listed, found, cloud, order) if listed else None,
+        all_values=_rows(parts),
         whole=[(each.name, [_value_row(value) for value in each.values]) for each in whole],
         repeated=_rows(repeated),
         map=_map(found, cloud, parts),
@@ -282,6 +299,64 @@ def _page(
             if any(name in each for each in found.features if each.kind == kind)
         ],
     )
+
+
+def _facts(
+    order: FindingOrder, cloud: PointCloud, sources: Sequence[Source], found: Inspection
+) -> list[tuple[str, str]]:
+    """Return what the owner asks about an inspection, with the names of the limits."""
+    limits = [
+        f"{name.rpartition('_')[0].replace('_', ' ')} {value:g} {name.rpartition('_')[2].replace('percent', '%')}"
+        for name, value in order.limits.model_dump(exclude_none=True).items()
+    ]
+    certificates = [f"{each.name} ({each.note})" for each in sources if each.role == "certificate"]
+    on_pipe = found.kind == "pipe"
+    stated = {
+        "client": order.client,
+        "object": order.object,
+        "scanned": None if order.date is None else order.date.isoformat(),
+        "operator": order.operator,
+        "water": order.water or cloud.metadata.get("medium"),
+        "sensor": order.sensor or cloud.metadata.get("sensor"),
+        "certificate": ", ".join(certificates) or None,
+        "limits": ", ".join(limits) or None,
+        "datum": order.datum.name + (", clock read along the distance" if on_pipe else ""),
+    }
+    return [(name, str(text or "not stated")) for name, text in stated.items()]
+
+
+def _conclude(listed: Sequence[Feature], order: FindingOrder) -> tuple[str, str]:
+    """Return the most severe verdict, and the numbers of findings by verdict as a sentence."""
+    verdicts = [judge_feature(each, order.limits)[0] for each in listed]
+    words = "exceed the limit", "undecided", "within the limit", "without a limit"
+    counts = [f"{verdicts.count(each)} {word}" for each, word in zip(VERDICTS, words, strict=True) if each in verdicts]
+    worst = min(verdicts, key=VERDICTS.index, default=VERDICTS[-1])
+    if not listed:
+        return worst, "No finding."
+    return worst, f"{len(listed)} findings: {', '.join(counts)}."
+
+
+def _finding_rows(
+    listed: Sequence[Feature], found: Inspection, cloud: PointCloud, order: FindingOrder
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return headings and rows of the first page: verdict, place and size of every finding."""
+    whole = found.features[0]
+    along = cloud.points_mm @ whole.axes[2] * np.sign(whole.axes[2] @ np.array(order.datum.direction))
+    start = cloud.points_mm[int(np.argmin(along))] if whole.kind == FeatureKind.PIPE else cloud.points_mm.min(axis=0)
+    clock = "clock" if whole.kind == FeatureKind.PIPE else "place / mm"
+    rows = []
+    for each in listed:
+        verdict, names = judge_feature(each, order.limits)
+        at = format_place(each, whole, start, order.datum) if each is not whole else (MISSING, MISSING)
+        size = {value.name: _format_interval(value) for value in each.values}
+        first = next(iter(names), each.values[0].name)
+        said = f"{verdict} ({', '.join(names)})" if names else verdict
+        main = next((size[name] for name in ("depth", "height") if name in size), f"{first} {size[first]}")
+        more = tuple(size.get(name, MISSING) for name in ("remaining wall", "length", "width"))
+        joined = f"{each.name} ({len(each.hollows_mm)} neighbours)" if len(each.hollows_mm) else each.name
+        rows.append((joined, said, *at, main, *more))
+    heads = "finding", "verdict", clock, "from datum / mm", "depth or height / mm"
+    return (*heads, "remaining wall / mm", "length / mm", "width / mm"), rows
 
 
 def _format_interval(value: FeatureValue) -> str:
@@ -376,29 +451,45 @@ def _map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarra
 
 
 def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
-    """Plot a finding from above, and in a section along its length through the deepest point."""
+    """Plot a finding from above with outline, neighbours and scale, and in a section through the deepest point."""
     local = (cloud.points_mm - feature.place_mm) @ feature.axes.T
     half = np.maximum(_AROUND * feature.extent_mm[:2], 2.0)
     near = np.isfinite(found.deviation_mm) & (np.abs(local[:, :2]) < half).all(axis=1)
     # Exclude the opposite side of a pipe.
-    near &= np.abs(local[:, 2]) < max(2 * float(half.max()), 5.0)
+    deep = max(2 * float(half.max()), 5.0)
+    near &= np.abs(local[:, 2]) < deep
     local, deviation = local[near], found.deviation_mm[near]
-    figure, (above, cut) = new_figure(9.0, 3.4, columns=2)
+    figure, (above, cut) = new_figure(6.6, 3.6, columns=2)
     limit = float(np.abs(deviation).max(initial=1e-3))
-    size = float(np.clip(40_000 / max(len(local), 1), 3, 60))
+    size = float(np.clip(25_000 / max(len(local), 1), 2, 40))
     style: dict[str, Any] = {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0, "s": size}
     colours = above.scatter(local[:, 0], local[:, 1], c=deviation, **style)
-    figure.colorbar(colours, ax=above, label="deviation / mm")
-    above.set(xlabel="along its length / mm", ylabel="across / mm", aspect="equal")
+    figure.colorbar(colours, ax=above, label="deviation / mm", orientation="horizontal", shrink=0.8)
+    for other in found.select(*_BLEMISHES):
+        outline = (other.outline_mm - feature.place_mm) @ feature.axes.T
+        shown = len(outline) > 0 and bool((np.abs(outline) < [*half, deep]).all(axis=1).any())
+        if not shown:
+            continue
+        own = other is feature
+        above.plot(*outline[:, :2].T, color=RED if own else INK, linewidth=1.4 if own else 0.9)
+        if not own:
+            at = np.clip(outline[:, :2].mean(axis=0), -0.85 * half, 0.85 * half)
+            above.annotate(other.name, tuple(at), fontsize=8, ha="center", color=INK)
+    for place in (feature.hollows_mm - feature.place_mm) @ feature.axes.T:
+        above.plot(*place[:2], "+", color=RED, markersize=9)
+    bar = float(f"{half[0] / 2:.0e}")
+    left, low = -0.92 * half
+    above.plot([left, left + bar], [low, low], color=INK, linewidth=3, solid_capstyle="butt")
+    above.annotate(f"{bar:g} mm", (left, low), xytext=(0, 4), textcoords="offset points", fontsize=8, color=INK)
+    ends: dict[str, Any] = {"xlim": (-half[0], half[0]), "ylim": (-half[1], half[1])}
+    above.set(xlabel="along its length / mm", ylabel="across / mm", aspect="equal", **ends)
     width = max(0.15 * float(feature.extent_mm[1]), 0.5)
     inside = np.abs(local[:, 1]) < width
-    cut.plot(local[inside, 0], deviation[inside], ".", markersize=3, label=f"points within {width:.2g} mm of the cut")
+    cut.plot(local[inside, 0], deviation[inside], ".", markersize=3)
     cut.axhline(0, color=INK, linewidth=0.8)
     value = feature.values[0]
     sign = 1 if feature.kind == FeatureKind.PROTRUSION else -1
-    cut.axhline(
-        sign * value.value, color=RED, linewidth=1, label=f"{value.name} {_format_interval(value)} {value.unit}"
-    )
+    cut.axhline(sign * value.value, color=RED, linewidth=1)
     cut.set(xlabel="along its length / mm", ylabel="deviation / mm")
-    cut.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=2, frameon=False)
-    return png_data_uri(figure, dpi=110)
+    cut.set_title(f"{value.name} {_format_interval(value)} {value.unit}; cut ±{width:.2g} mm", fontsize=8)
+    return png_data_uri(figure_png(figure, dpi=110, few_colours=True))

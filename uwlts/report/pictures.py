@@ -99,7 +99,7 @@ def _draw_measurement(measurement: GatheredMeasurement, send: Send) -> Measureme
             view = stripe_view(capture)
     return MeasurementPictures(
         measurement.name,
-        None if view is None else figure_png(stripe_picture(view)),
+        None if view is None else figure_png(stripe_picture(view), few_colours=True),
         None if cloud is None else figure_png(plot.cloud(cloud), few_colours=True),
         None if cloud is None else svg_if_any(plot.deviation_histogram, cloud),
         None if cloud is None else svg_if_any(plot.along_stripe, cloud),

@@ -24,8 +24,8 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.pages.numbers import format_fixed, format_length, format_to_scale
 from uwlts.pages.toolkit import figure_png, figure_svg, write_page
 from uwlts.report import plot
-from uwlts.report.campaign_page import report_page
-from uwlts.report.campaign_tables import print_table, summary_table
+from uwlts.report.campaign_page import conclude, report_page
+from uwlts.report.campaign_tables import Row, print_table, summary_table
 from uwlts.report.gather import gather_campaign, load_reference
 from uwlts.report.pictures import StripeView, draw_pictures, stripe_picture, write_pictures
 from uwlts.report.summary_file import summary, write_summary
@@ -366,6 +366,17 @@ def test_stated_uncertainties_are_shown_beside_measured_errors(campaign):
     page = report_page(stating)
     assert page.count("U (k = 2)") == 2
     assert "<td>+30.0 µm</td><td>44.7 µm</td>" in page
+
+
+def test_the_conclusion_counts_errors_within_their_uncertainty():
+    rows = [
+        Row("a", "step height", error=-0.01, stated=0.02),
+        Row("b", "step height", error=0.03, stated=0.02),
+        Row("c", "step height", error=0.3),
+    ]
+    said = conclude(rows)
+    assert "1 of 2 errors" in said and "1.50 (step height of b)" in said
+    assert "none can be judged" in conclude(rows[2:])
 
 
 def test_published_values_are_found_by_the_captures_name(campaign):
