@@ -138,8 +138,14 @@ def load_triangles(path: Path) -> trimesh.Trimesh:
     except Exception as error:
         # trimesh passes on all exceptions of its parsers.
         raise CaptureError(f"{path} is not a complete mesh (such as .stl, .obj, .off or .ply): {error}") from error
-    if not len(loaded.faces) or not np.isfinite(loaded.vertices).all():
+    vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    if not len(faces) or not np.isfinite(vertices).all():
         raise CaptureError(f"{path} has no triangles, or vertices that are not finite")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise CaptureError(
+            f"{path} has {len(vertices)} vertices, and triangles of the vertices {faces.min()} to {faces.max()}: the "
+            "file is damaged or incomplete"
+        )
     return loaded
 
 
