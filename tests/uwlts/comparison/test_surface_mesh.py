@@ -196,3 +196,13 @@ def test_triangles_of_absent_vertices_are_refused(tmp_path, ending):
     for read in (read_mesh, lambda path: read_reference(path, unit=None, disc_mm=1.0)):
         with pytest.raises(CaptureError, match="damaged or incomplete|not a complete mesh"):
             read(path)
+
+
+def test_damaged_headers_and_absurd_vertices_are_refused(tmp_path):
+    """trimesh reads a PLY whose format is misspelt; plyfile does not."""
+    content = trimesh.creation.box((9.0, 9.0, 9.0)).export(file_type="ply")
+    (tmp_path / "a.ply").write_bytes(content.replace(b"binary_little_endian", b"binary_littl?_endian"))
+    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1e30 0 0\nv 0 1 0\nf 1 2 3\n")
+    for name in ("a.ply", "b.obj"):
+        with pytest.raises(CaptureError, match="not a complete mesh|beyond 1e\\+10"):
+            read_mesh(tmp_path / name)
