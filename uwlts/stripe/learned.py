@@ -133,8 +133,8 @@ def read_model_of_lines(model: str | Path) -> None:
     inputs, outputs = {each.name for each in graph.input} - held, {each.name for each in graph.output}
     if inputs != _INPUTS or not outputs >= _OUTPUTS:
         raise DescriptionError(
-            f"{model} has the inputs {sorted(map(str, inputs))} and outputs {sorted(map(str, outputs))}; expected the input "
-            f"{sorted(_INPUTS)} and the outputs {sorted(_OUTPUTS)} (docs/examples/learned_stripe)"
+            f"{model} has the inputs {sorted(map(str, inputs))} and outputs {sorted(map(str, outputs))}; expected the "
+            f"input {sorted(_INPUTS)} and the outputs {sorted(_OUTPUTS)} (docs/examples/learned_stripe)"
         )
 
 
