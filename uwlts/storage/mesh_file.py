@@ -141,6 +141,8 @@ def load_triangles(path: Path) -> trimesh.Trimesh:
         # trimesh passes on all exceptions of its parsers.
         raise CaptureError(f"{path} is not a complete mesh (such as .stl, .obj, .off or .ply): {error}") from error
     vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise CaptureError(f"{path} is not a complete mesh: expected vertices and triangles of three numbers each")
     if not len(faces) or not (np.abs(vertices) < _FARTHEST).all():
         raise CaptureError(f"{path} has no triangles, or vertices that are not finite or beyond {_FARTHEST:g}")
     if faces.min() < 0 or faces.max() >= len(vertices):
