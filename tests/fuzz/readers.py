@@ -1,6 +1,7 @@
 """All readers of external files, each with a small valid file made by the program itself."""
 
 import json
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,14 +12,23 @@ import cv2
 import laspy
 import numpy as np
 import trimesh
+from plyfile import PlyData, PlyElement
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.typesys import Stores, get_typestore
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from tests.uwlts.mount_views import sphere_campaign
 from tests.uwlts.storage.test_capture import a_header, interrupted, record, small_sensor
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
+from tests.uwlts.storage.test_ros_bags import messages, write_ros2
 from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
 from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, COLUMNS, INFO, POINTS, PROGRAMS, pcd
+from tests.uwlts.stripe.test_learned import centroid_model
+from twin.datasets.data_set import load_description as load_data_set
+from twin.datasets.loading import load_dataset
+from twin.datasets.shards import Sample, ShardReader, open_shard
 from twin.design.screening import encode_part, read_parts
 from twin.design.study import load_study
 from twin.scene.campaign import load_campaign
@@ -28,7 +38,10 @@ from twin.scene.objects import _surface_from_file
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.mount.calibrate import calibrate_mount
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.comparison.change_reference import read_datums, read_reference
+from uwlts.comparison.ideal_shapes import read_shape
 from uwlts.evaluation.evaluate import read_evaluation
+from uwlts.evaluation.gauge import gauge_study
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
 from uwlts.model.artefacts import read_artefact
@@ -42,12 +55,15 @@ from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, set_intrinsics
+from uwlts.storage.import_.centre_lines import read_profiles as read_centre_lines
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
+from uwlts.storage.mesh_file import read_mesh
 from uwlts.storage.mount_files import MountDescription, read_mount, read_profiles
 from uwlts.storage.pose_files import read_poses, read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
 from uwlts.storage.verification_file import describe_verification
+from uwlts.stripe.learned import read_model_of_lines
 from uwlts.thesis.published_tables import load_published
 from uwlts.thesis.results import CampaignResults, LineProfile, Measurement, SpacingInterval, WindowChoice, WindowProfile
 
@@ -221,6 +237,10 @@ def _shipped(name: str) -> Callable[[Path], object]:
     return lambda path: path.write_bytes((library_folder() / name).read_bytes())
 
 
+def _text(content: str) -> Callable[[Path], object]:
+    return lambda path: path.write_text(content)
+
+
 def _artefact(path: Path) -> None:
     path.write_text('kind = "pipe"\ndiameter_mm = 300.0\ndiameter_uncertainty_mm = 0.01\n')
 
@@ -254,6 +274,9 @@ distortion_coefficients:
   cols: 5
   data: [-0.1, 0.02, 0.001, -0.002, 0.0]
 """
+
+
+COLMAP = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 OPENCV 640 480 800 801 320.5 240.5 -0.1 0.02 0.001 -0.002\n"
 
 
 def _ros(path: Path) -> None:
@@ -314,6 +337,91 @@ def _results(path: Path) -> None:
 def _guided_plan(path: Path) -> None:
     text = 'title = "A calibration"\nsensor = "thesis"\nposes = "stage"\n[stage]\nfirst_mm = 1.0\nlast_mm = 90.0\n'
     path.write_text(text + 'count = 5\n[target]\nkind = "chessboard"\ncolumns = 9\nrows = 6\nsquare_mm = 15\n')
+
+
+def _surface(path: Path) -> None:
+    trimesh.creation.box((9.0, 9.0, 9.0)).export(path)
+
+
+def _read_surface(path: Path) -> None:
+    """Read a mesh as a result and as a reference of a comparison."""
+    read_mesh(path)
+    # Large discs have few samples, whose memory has its own limit.
+    read_reference(path, unit="mm", disc_mm=1e9)
+
+
+def _big_endian(path: Path) -> None:
+    vertices = np.zeros(9, [("x", ">f8"), ("y", ">f4"), ("z", ">i4")])
+    vertices["x"], vertices["z"] = np.arange(9), 7
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order=">").write(str(path))
+
+
+def _tum(path: Path) -> None:
+    path.write_text("# timestamp tx ty tz qx qy qz qw\n1.7e9 1 2 3 0 0 0 1\n1700000001.5 1 2 3 0.6 0 0 0.8\n")
+
+
+def _covariances(path: Path) -> None:
+    names = [f"cov_{i}{j}" for i in range(6) for j in range(i, 6)]
+    rows = [",".join([str(k), *(str(v) for v in np.eye(4)[:3].ravel()), *["0.25"] * 21]) for k in range(3)]
+    matrix = [f"m{i}{j}" for i in range(3) for j in range(4)]
+    path.write_text("\n".join([",".join(["time_s", *matrix, *names]), *rows]) + "\n")
+
+
+def _bag(path: Path) -> None:
+    """Write a recording of poses: of ROS 1, or of ROS 2 in the storage of the suffix."""
+    kind = "geometry_msgs/msg/PoseStamped"
+    if path.suffix == ".bag":
+        types = get_typestore(Stores.ROS1_NOETIC)
+        with BagWriter(path) as bag:
+            connection = bag.add_connection("/pose", kind, typestore=types)
+            for message in messages(types, kind):
+                bag.write(connection, 1, types.serialize_ros1(message, kind))
+        return
+    storage = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    with tempfile.TemporaryDirectory() as folder:
+        made = write_ros2(Path(folder) / "bag", {"/pose": kind}, storage)
+        shutil.copyfile(next(made.glob(f"*{path.suffix}")), path)
+
+
+def _shard(path: Path) -> None:
+    image, centre = np.zeros((4, 6), np.uint8), np.zeros(6, np.float32)
+    with open_shard(path, "hdf5" if path.suffix == ".h5" else "webdataset", frames=2) as shard:
+        for key in ("a", "b"):
+            shard.add(Sample(key, image, {"centre_px": centre}, {"frame": 1}))
+
+
+def _read_shard(path: Path) -> None:
+    reader = ShardReader(path, "hdf5" if path.suffix == ".h5" else "webdataset", frames=2)
+    for number in range(2):
+        reader.sample(number, None)
+
+
+def _card(path: Path) -> None:
+    shard = {"name": "train-0.h5", "split": "train", "frames": 2, "sha256": "a" * 64}
+    content = dict.fromkeys(("title", "notes", "licence"), "a") | {"seed": 1, "file_format": "hdf5", "redrawn": 0}
+    content |= {"versions": {"uwlts": "1"}, "image": {"width_px": 6}, "scenes": {"train": 1}, "frames": {"train": 2}}
+    content |= {"labels": {"centre_px": "a"}, "drawn": {"a": {"mean": 1.0}}, "status": {"ok": 3}, "description": {}}
+    path.write_text(json.dumps({"format": "uwlts-dataset", "version": 1} | content | {"shards": [shard]}))
+
+
+def _read_card(path: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "dataset.json").symlink_to(path.absolute())
+        load_dataset(folder)
+
+
+def _lines(path: Path) -> None:
+    """Write centre lines of two profiles as an array or a table."""
+    numbers = np.arange(12.0).reshape(2, 6)
+    if path.suffix == ".npy":
+        np.save(path, numbers)
+    else:
+        np.savetxt(path, numbers, delimiter=",")
+
+
+def _gauge(path: Path) -> None:
+    rows = [f"{part},{who},{part + 0.01 * k * part**k}" for part in range(1, 5) for who in "AB" for k in (1, 2)]
+    path.write_text("part,operator,value\n" + "".join(f"{row}\n" for row in rows))
 
 
 READERS = {
@@ -386,6 +494,34 @@ READERS = {
         Reader("mesh", ".obj", "lines", _mesh, _read_mesh),
         Reader("mesh-binary", ".glb", "bytes", _glb, _read_mesh),
         Reader("texture", ".png", "image", _picture, read_grey),
+        *(
+            Reader(f"surface-{kind}", f".{kind}", form, _surface, _read_surface)
+            for kind, form in (("ply", "bytes"), ("stl", "bytes"), ("obj", "lines"))
+        ),
+        Reader("cloud-big-endian", ".ply", "lines", _big_endian, read_cloud),
+        *(
+            Reader(f"bag-{kind}", f".{kind}", "bytes", _bag, lambda path: read_trajectory(path, pose_format="ros"))
+            for kind in ("bag", "mcap", "db3")
+        ),
+        Reader("tum", ".txt", "lines", _tum, lambda path: read_trajectory(path, pose_format="tum")),
+        Reader("covariances", ".csv", "lines", _covariances, read_trajectory),
+        Reader("learned", ".onnx", "bytes", centroid_model, read_model_of_lines),
+        Reader("shard-hdf5", ".h5", "bytes", _shard, _read_shard),
+        Reader("shard-tar", ".tar", "bytes", _shard, _read_shard),
+        Reader("card", ".json", "json", _card, _read_card),
+        Reader("data-set", ".toml", "toml", _shipped("datasets/stripe-turbid.toml"), load_data_set),
+        Reader("centre-lines-npy", ".npy", "bytes", _lines, lambda path: read_centre_lines(path, 6)),
+        Reader("centre-lines-csv", ".csv", "lines", _lines, lambda path: read_centre_lines(path, 6)),
+        Reader("gauge", ".csv", "lines", _gauge, gauge_study),
+        Reader(
+            "shape",
+            ".toml",
+            "toml",
+            _text('kind = "cylinder"\npoint_mm = [1, 2, 3]\naxis = [0, 0, 1]\ndiameter_mm = 5\n'),
+            read_shape,
+        ),
+        Reader("datums", ".toml", "toml", _text("[[datum]]\ncentre_mm = [1, 2, 3]\nradius_mm = 5\n"), read_datums),
+        Reader("colmap", ".txt", "lines", _text(COLMAP), _sensor_with),
         Reader("screened", ".parquet", "bytes", _part, _read_part),
         Reader("results", ".json", "json", _results, CampaignResults.read_file),
         Reader("guided-plan", ".toml", "toml", _guided_plan, load_guided_plan),

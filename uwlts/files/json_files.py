@@ -14,8 +14,8 @@ from typing import Any, ParamSpec, TypeVar
 
 from pydantic import BaseModel, JsonValue, ValidationError
 
-from uwlts.errors import CaptureError, Error, describe_problems
-from uwlts.files.reading import MOST_JSON_BYTES, add_article, log_warnings, parse_json, read_text
+from uwlts.errors import CaptureError, Error, OutputError, describe_problems
+from uwlts.files.reading import MOST_JSON_BYTES, add_article, find_not_finite, log_warnings, parse_json, read_text
 from uwlts.files.writing import require_ending, write_atomically
 
 _SHOWN = 3
@@ -62,7 +62,7 @@ def compute_seal(content: Mapping[str, Any]) -> str:
 
 def add_seal(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content as JSON, with its seal."""
-    plain = json.loads(json.dumps(content, allow_nan=False))
+    plain = json.loads(_dump(content))
     return plain | {SEAL: compute_seal(plain)}
 
 
@@ -231,10 +231,21 @@ def _brief(value: object) -> str:
 
 
 def json_text(content: object, *, indent: int | None = None, only_ascii: bool = True) -> str:
-    """Return JSON text, for a model of its set fields only; raises ValueError for numbers that are not finite.
+    """Return JSON text, for a model of its set fields only; raises OutputError for numbers that are not finite.
 
     Objects are sealed.
     """
     plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
     plain = add_seal(plain) if isinstance(plain, dict) else plain
-    return json.dumps(plain, indent=indent, ensure_ascii=only_ascii, allow_nan=False) + "\n"
+    return _dump(plain, indent=indent, ensure_ascii=only_ascii) + "\n"
+
+
+def _dump(content: object, **settings: Any) -> str:
+    """Return JSON text; raises OutputError for numbers that are not finite, with the first one's place."""
+    try:
+        return json.dumps(content, allow_nan=False, **settings)
+    except ValueError as error:
+        raise OutputError(
+            f"a result cannot be written: {find_not_finite(content) or error}; expected a finite number. Check the "
+            "input for values that are extreme or missing"
+        ) from error

@@ -209,23 +209,23 @@ def require_plain(content: Content, *, finite: bool = True) -> Content:
                 below.extend(each)
             elif kind is float:
                 if finite and not math.isfinite(each):
-                    raise ValueError(f"{_place_of(each, content)} is {each}; expected a finite number")
+                    raise ValueError(f"{find_not_finite(content)}; expected a finite number")
             elif kind is int and not -_LARGEST_INT <= each < _LARGEST_INT:
                 raise ValueError("it holds a whole number of more than 64 bits")
         level, depth = below, depth + 1
     return content
 
 
-def _place_of(wanted: object, content: object) -> str:
-    """Return the path of keys and indices to a value."""
+def find_not_finite(content: object) -> str:
+    """Return the path of keys and indices to a number that is not finite, with the number; empty without any."""
     waiting: list[tuple[object, str]] = [(content, "")]
     while waiting:
         each, place = waiting.pop()
-        if each is wanted:
-            return shorten(place.removeprefix(".")) or "it"
+        if isinstance(each, float) and not math.isfinite(each):
+            return f"{shorten(place.removeprefix('.')) or 'it'} is {each}"
         inside = each.items() if isinstance(each, dict) else enumerate(each) if isinstance(each, list | tuple) else ()
         waiting.extend((below, f"{place}.{key}") for key, below in inside)
-    return "it"
+    return ""
 
 
 def _unique(pairs: "list[tuple[str, JsonValue]]") -> "dict[str, JsonValue]":

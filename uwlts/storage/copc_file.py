@@ -29,6 +29,7 @@ from uwlts.storage.las_file import (
     START_BYTES,
     las_middle,
     load_library,
+    require_in_box,
     shorten_error,
     unwanted_points,
 )
@@ -206,6 +207,8 @@ def read_copc(
             total = int(reader.header.point_count)
             box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
             found = _query(reader, box, at_most)
+            points = 1e3 * np.column_stack([found.x, found.y, found.z])
+            require_in_box(points, reader.header)
     except BaseException as error:
         # The decompressor, in Rust, panics at damaged chunks: the exception is no Exception.
         if isinstance(error, Exception) or type(error).__name__ == "PanicException":
@@ -215,7 +218,6 @@ def read_copc(
     intensity = columns.pop("amplitude", found["intensity"])
     if np.isnan(columns.get("deviation_mm", np.nan)).all():
         columns.pop("deviation_mm", None)
-    points = 1e3 * np.column_stack([found.x, found.y, found.z])
     step, omitted = 1e3 * float(np.max(found.scales)), unwanted_points(found)
     return make_foreign_cloud(points, intensity=intensity, omitted=omitted, step_mm=step, **columns), total
 

@@ -23,6 +23,8 @@ _REACH_M = LAZ_STEP_M * (2**31 - 1)
 INTENSITY_LIMITS = 0, 2**16 - 1
 _NOISE_CLASSES = 7, 18
 """Low and high noise."""
+_BOX_MARGIN = 1e-3
+"""Distance of points outside the stated box that is allowed, in its longest edges."""
 START_BYTES = 104
 """Bytes of a LAS header up to its number of variable length records (LAS 1.4, 2.4)."""
 RECORD_BYTES = 54
@@ -108,6 +110,7 @@ def read_las(path: Path) -> PointCloud:
                 raise ValueError("its points are compressed, or fewer than its header declares")
             found = reader.read_points(header.point_count)
         points, step = 1e3 * np.column_stack([found.x, found.y, found.z]), 1e3 * float(np.max(header.scales))
+        require_in_box(points, header)
         names = set(found.point_format.dimension_names)
         column = {name: np.asarray(found[name]) for name in names & {"frame", "line", "deviation_mm", "gps_time"}}
         intensity = np.asarray(found["amplitude" if "amplitude" in names else "intensity"], np.float32)
@@ -132,6 +135,29 @@ def read_las(path: Path) -> PointCloud:
         step_mm=step,
         **column,
     )
+
+
+def require_in_box(points_mm: np.ndarray, header: Any) -> None:
+    """Raise ValueError if points (N, 3) are outside the box that a header states, which a wrong scale or offset causes.
+
+    Boxes that are empty state nothing.
+    """
+    low, high = 1e3 * np.asarray(header.mins), 1e3 * np.asarray(header.maxs)
+    if not len(points_mm) or not (np.isfinite([low, high]).all() and (high > low).any()):
+        return
+    # Programs round the box, some to the decimals of text.
+    margin = np.maximum(2e3 * np.asarray(header.scales), _BOX_MARGIN * (high - low).max())
+    found_low, found_high = points_mm.min(axis=0), points_mm.max(axis=0)
+    if (found_low < low - margin).any() or (found_high > high + margin).any():
+        raise ValueError(
+            f"its scale or offset is wrong: points are from {_numbers(found_low)} to {_numbers(found_high)} mm, the "
+            f"box of its header from {_numbers(low)} to {_numbers(high)} mm"
+        )
+
+
+def _numbers(values: np.ndarray) -> str:
+    """Return numbers in a few digits, in brackets."""
+    return f"({', '.join(f'{value:.5g}' for value in values.tolist())})"
 
 
 def unwanted_points(found: Any) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import open_regular, require_regular_file
@@ -27,6 +27,8 @@ MESH_FORMATS = (".stl", ".ply", ".glb")
 READ_FORMATS = (".ply", ".stl", ".obj")
 """Endings of the meshes that can be read."""
 
+_FARTHEST = 1e10
+"""Largest coordinate in the file's unit: in mm the circumference of the Earth is 4e10; larger ones are damage."""
 _FARTHEST_SINGLE_MM = 16_000.0
 """Beyond this distance 32-bit numbers are coarser than a micrometre."""
 
@@ -138,8 +140,16 @@ def load_triangles(path: Path) -> trimesh.Trimesh:
     except Exception as error:
         # trimesh passes on all exceptions of its parsers.
         raise CaptureError(f"{path} is not a complete mesh (such as .stl, .obj, .off or .ply): {error}") from error
-    if not len(loaded.faces) or not np.isfinite(loaded.vertices).all():
-        raise CaptureError(f"{path} has no triangles, or vertices that are not finite")
+    vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise CaptureError(f"{path} is not a complete mesh: expected vertices and triangles of three numbers each")
+    if not len(faces) or not (np.abs(vertices) < _FARTHEST).all():
+        raise CaptureError(f"{path} has no triangles, or vertices that are not finite or beyond {_FARTHEST:g}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise CaptureError(
+            f"{path} has {len(vertices)} vertices, and triangles of the vertices {faces.min()} to {faces.max()}: the "
+            "file is damaged or incomplete"
+        )
     return loaded
 
 
@@ -162,7 +172,10 @@ def read_mesh(path: str | Path, *, unit: Unit | None = None) -> SurfaceMesh:
     scale, faces = MM_PER_UNIT[check_unit(unit or "mm")], np.asarray(loaded.faces, np.int64)
     vertices = scale * np.asarray(loaded.vertices, float)
     is_ply = path.suffix.lower() == ".ply"
-    known = PlyData.read(open_ply(path, called="mesh"))["vertex"].data if is_ply else np.empty(len(vertices), [])
+    try:
+        known = PlyData.read(open_ply(path, called="mesh"))["vertex"].data if is_ply else np.empty(len(vertices), [])
+    except (PlyParseError, ValueError, KeyError, MemoryError) as error:
+        raise CaptureError(f"{path} is not a complete mesh: {error}") from error
     names = known.dtype.names or ()
     normals = np.asarray(loaded.vertex_normals, float)
     if {"nx", "ny", "nz"} <= set(names):

@@ -202,7 +202,8 @@ def trajectory_path(capture: str | Path) -> Path:
 
 def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray, covariance: np.ndarray | None) -> Trajectory:
     """Return a trajectory without the repetitions of a pose at the same time."""
-    same = np.append(False, (np.diff(times) == 0) & (poses[1:] == poses[:-1]).all(axis=(1, 2)))
+    same = np.zeros(len(times), bool)
+    same[1:] = (np.diff(times) == 0) & (poses[1:] == poses[:-1]).all(axis=(1, 2))
     warnings = []
     if count := int(np.count_nonzero(same)):
         warnings = [f"{count} of {len(times)} poses repeat the previous one at the same time and are omitted"]

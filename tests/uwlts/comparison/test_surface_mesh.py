@@ -7,8 +7,10 @@ from plyfile import PlyData
 
 import uwlts
 from uwlts.cli import app
-from uwlts.errors import EvaluationError, OutputError
+from uwlts.comparison.change_reference import read_reference
+from uwlts.errors import CaptureError, EvaluationError, OutputError
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.mesh_file import read_mesh
 
 NOISE_MM, IMAGES_MM, STRIPE_MM = 0.02, 0.5, 0.25
 
@@ -180,3 +182,27 @@ def test_wrong_requests_are_refused():
     few = PointCloud(cloud.points_mm[:9], cloud.intensity[:9], cloud.frame[:9], cloud.line[:9])
     with pytest.raises(EvaluationError, match="has 9 points"):
         uwlts.mesh(few)
+
+
+@pytest.mark.parametrize("ending", ["ply", "obj"])
+def test_triangles_of_absent_vertices_are_refused(tmp_path, ending):
+    path, corners = tmp_path / f"a.{ending}", ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
+    if ending == "obj":
+        path.write_text("".join(f"v {each}\n" for each in corners) + "f 1 2 3\nf 1 2 9\n")
+    else:
+        header = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        path.write_text(header + "".join(f"{each}\n" for each in corners) + "3 0 1 2\n3 0 1 8\n")
+    for read in (read_mesh, lambda path: read_reference(path, unit=None, disc_mm=1.0)):
+        with pytest.raises(CaptureError, match="damaged or incomplete|not a complete mesh"):
+            read(path)
+
+
+def test_damaged_headers_and_absurd_vertices_are_refused(tmp_path):
+    """trimesh reads a PLY whose format is misspelt; plyfile does not."""
+    content = trimesh.creation.box((9.0, 9.0, 9.0)).export(file_type="ply")
+    (tmp_path / "a.ply").write_bytes(content.replace(b"binary_little_endian", b"binary_littl?_endian"))
+    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1e30 0 0\nv 0 1 0\nf 1 2 3\n")
+    for name in ("a.ply", "b.obj"):
+        with pytest.raises(CaptureError, match="not a complete mesh|beyond 1e\\+10"):
+            read_mesh(tmp_path / name)

@@ -11,9 +11,9 @@ import pytest
 import uwlts
 from tests.fuzz.readers import READERS
 from uwlts.cli import app
-from uwlts.errors import CaptureError
+from uwlts.errors import CaptureError, OutputError
 from uwlts.evaluation.evaluate import FORMAT, VERSION, read_evaluation
-from uwlts.files.json_files import RecordFile, compute_seal, read_json, write_model
+from uwlts.files.json_files import RecordFile, compute_seal, read_json, write_model, write_record
 
 
 def _written(kind: str, folder: Path) -> Path:
@@ -103,3 +103,9 @@ def test_the_command_trusts_an_edited_calibration_only_when_told(tmp_path, caplo
         app(["info", str(path)], result_action="return_value")
     app(["info", str(path), "--trust-edited"], result_action="return_value")
     assert "edited" in caplog.text and "calibration of the sensor" in capsys.readouterr().out
+
+
+def test_numbers_that_are_not_finite_are_named(tmp_path):
+    with pytest.raises(OutputError, match=r"a result cannot be written: a\.b\.1 is nan; expected a finite"):
+        write_record(tmp_path / "a.json", {"a": {"b": [1.0, float("nan")]}}, overwrite=False)
+    assert not [*tmp_path.iterdir()]

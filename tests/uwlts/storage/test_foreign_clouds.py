@@ -1,5 +1,6 @@
 """Clouds of other programs: exported ones are read back, foreign ones are read, damaged ones are refused."""
 
+import struct
 from pathlib import Path
 
 import laspy
@@ -9,6 +10,7 @@ import pytest
 
 from tests.uwlts.storage.test_cloud import some_cloud
 from uwlts.errors import CaptureError
+from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_cloud, read_cloud, read_parts, read_thinned_cloud, write_cloud
 from uwlts.storage.mesh_file import read_mesh
 
@@ -195,4 +197,19 @@ def test_what_is_none_is_refused(tmp_path: Path, name: str, message: str):
         read_cloud(path)
     path.write_text("1 2\n3 4\n" if name == "a.xyz" else "")
     with pytest.raises(CaptureError, match=r"expected x, y and z in mm|is empty|not a complete"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.copc.laz"])
+def test_points_outside_the_stated_box_are_refused(tmp_path, name):
+    """The scale of x, at its place in the header (LAS 1.4, table 3), is changed to metres per millimetre."""
+    path = tmp_path / name
+    points = np.random.default_rng(1).uniform(-100, 100, (500, 3))
+    write_cloud(path, PointCloud(points, np.ones(500, np.float32), np.zeros(500, np.int32), np.zeros(500, np.int32)))
+    np.testing.assert_allclose(np.sort(read_cloud(path).points_mm, axis=0), np.sort(points, axis=0), atol=1e-4)
+    content = bytearray(path.read_bytes())
+    assert struct.unpack_from("<d", content, 131) == (1e-7,)
+    struct.pack_into("<d", content, 131, 1e-4)
+    path.write_bytes(content)
+    with pytest.raises(CaptureError, match="its scale or offset is wrong: points are from .* the box of its header"):
         read_cloud(path)

@@ -116,3 +116,10 @@ def test_without_the_library_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(SetupError, match=r"uwlts\[ros\]"):
         uwlts.read(path, pose_format="ros")
+
+
+def test_a_topic_without_messages_is_refused(tmp_path):
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        bag.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=get_typestore(Stores.ROS2_HUMBLE))
+    with pytest.raises(DescriptionError, match="bag"):
+        uwlts.read(tmp_path / "bag", pose_format="ros")

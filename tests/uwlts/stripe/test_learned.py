@@ -1,6 +1,7 @@
 """The method of a trained network, with a model of known results: the centroid of bright pixels."""
 
 import sys
+from itertools import pairwise
 
 import numpy as np
 import onnx
@@ -117,3 +118,59 @@ def test_without_onnx_runtime_the_extra_is_named(tmp_path, drawn, monkeypatch):
     path = centroid_model(tmp_path / "again.onnx")
     with pytest.raises(SetupError, match=r"uwlts\[learn\]"):
         extract_stripe(drawn[1], stripe_along="height", options=StripeOptions(method="learned", model=str(path)))
+
+
+def refused(path, drawn, words):
+    with pytest.raises(DescriptionError, match=words):
+        extract_stripe(drawn[1], stripe_along="height", options=StripeOptions(method="learned", model=str(path)))
+
+
+def test_loops_and_unknown_operators_are_refused(tmp_path, drawn):
+    """A loop of 2^62 passes would never end."""
+    held = onnx.load(centroid_model(tmp_path / "loop.onnx"))
+    flag = helper.make_tensor_value_info("go", TensorProto.BOOL, [])
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["go"], ["on"])],
+        "body",
+        [helper.make_tensor_value_info("pass", TensorProto.INT64, []), flag],
+        [helper.make_tensor_value_info("on", TensorProto.BOOL, [])],
+    )
+    held.graph.initializer.append(numpy_helper.from_array(np.int64(2**62), "passes"))
+    held.graph.node.append(helper.make_node("Loop", ["passes", ""], [], body=body))
+    onnx.save(held, tmp_path / "loop.onnx")
+    refused(tmp_path / "loop.onnx", drawn, "has the operators 'Loop', which this program does not run")
+    held.graph.node[-1].op_type, held.graph.node[-1].domain = "Relu", "com.example"
+    onnx.save(held, tmp_path / "other.onnx")
+    refused(tmp_path / "other.onnx", drawn, "has the operators 'Relu'")
+    held.graph.node[-1].domain = ""
+    onnx.save(held, tmp_path / "within.onnx")
+    refused(tmp_path / "within.onnx", drawn, "has functions or subgraphs")
+
+
+def test_data_in_other_files_are_refused(tmp_path, drawn):
+    held = onnx.load(centroid_model(tmp_path / "a.onnx"))
+    held.graph.initializer[3].data_location = TensorProto.EXTERNAL
+    held.graph.initializer[3].external_data.add(key="location", value="../secret")
+    held.graph.initializer[3].ClearField("raw_data")
+    (tmp_path / "b.onnx").write_bytes(held.SerializeToString())
+    refused(tmp_path / "b.onnx", drawn, "refers to data in other files")
+
+
+def test_models_that_take_too_much_memory_are_refused(tmp_path, drawn):
+    """Thirty doublings of the lines would take 2^30 times their memory."""
+    held = onnx.load(centroid_model(tmp_path / "a.onnx"))
+    names = ["light", *(f"twice{k}" for k in range(30))]
+    held.graph.node.extend(
+        helper.make_node("Concat", [before, before], [after], axis=0) for before, after in pairwise(names)
+    )
+    held.graph.node.append(helper.make_node("Identity", [names[-1]], ["large"]))
+    held.graph.output.append(helper.make_tensor_value_info("large", TensorProto.FLOAT, ["m", "p"]))
+    onnx.save(held, tmp_path / "b.onnx")
+    refused(tmp_path / "b.onnx", drawn, "cannot be run by ONNX Runtime on 256 lines of 176 pixels with 2 GiB")
+
+
+def test_garbage_is_refused(tmp_path, drawn):
+    content = centroid_model(tmp_path / "a.onnx").read_bytes()
+    for length in range(0, len(content), 97):
+        (tmp_path / "b.onnx").write_bytes(content[:length])
+        refused(tmp_path / "b.onnx", drawn, "b.onnx")

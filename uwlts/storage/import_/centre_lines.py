@@ -4,6 +4,7 @@ import csv
 import io
 from dataclasses import replace
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -31,7 +32,7 @@ def read_profiles(path: Path, lines: int) -> np.ndarray:
             content = read_bytes(path, most_bytes=_MOST_BYTES, error=ImageError, called="array")
             try:
                 numbers = np.load(io.BytesIO(content), allow_pickle=False)
-            except (ValueError, EOFError, OSError) as error:
+            except (ValueError, EOFError, OSError, SyntaxError, TokenError, MemoryError, OverflowError) as error:
                 raise ImageError(f"{path} is no NPY array, or is truncated: {error}") from error
             if not isinstance(numbers, np.ndarray) or numbers.dtype.kind not in "iuf":
                 raise ImageError(f"{path} holds no numbers: expected an array of centre lines")
