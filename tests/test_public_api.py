@@ -14,7 +14,8 @@ import twin
 import twin.cli
 import uwlts
 import uwlts.cli
-from uwlts.runtime.command_line import DerivedCommand, option_type
+from uwlts.files.inputs import OUTPUTS
+from uwlts.runtime.command_line import DerivedCommand, Job, option_type
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "optuna", "nicegui"}
@@ -150,3 +151,29 @@ def test_messages_name_options():
 def test_packages_run_as_programs(program: str):
     done = subprocess.run([sys.executable, "-m", program, "--version"], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == uwlts.__version__
+
+
+@pytest.mark.parametrize("program", APPS)
+def test_every_command_has_a_job(program: str):
+    jobs = {name: {group.name for group in APPS[program][name].group} for name in APPS[program]}
+    assert {name for name, groups in jobs.items() if name.startswith("-") != (groups == {"Program"})} == set()
+    assert all(len(groups) == 1 and groups <= {*get_args(Job), "Program"} for groups in jobs.values())
+
+
+@pytest.mark.parametrize(("program", "name"), COMMANDS)
+def test_common_options_are_those_of_the_examples(program: str, name: str):
+    command = APPS[program][name].default_command
+    examples = " ".join(line for line in command.__doc__.splitlines() if "Example:" in line).split()
+    for argument in APPS[program][name].assemble_argument_collection():
+        advanced = any(group.name == "Advanced" for group in argument.parameter.group)
+        if argument.required or argument.name in examples:
+            assert not advanced, argument.name
+        elif not argument.field_info.is_positional and argument.name not in ("--overwrite", "--out"):
+            assert advanced or argument.name.removeprefix("--").replace("-", "_") in OUTPUTS, argument.name
+
+
+@pytest.mark.parametrize(("program", "name"), COMMANDS)
+def test_help_names_no_file_of_the_repository(program: str, name: str):
+    command = APPS[program][name]
+    texts = [command.default_command.__doc__, *(each.parameter.help for each in command.assemble_argument_collection())]
+    assert not [text for text in texts if "docs/" in text]

@@ -5,29 +5,21 @@ Each command calls a function of `twin`; its options, defaults and help texts ar
 
 import sys
 
-from cyclopts import App
-
 import twin
-from uwlts._version import __version__
 from uwlts.errors import CommandFailed
-from uwlts.runtime.command_line import Call, command_from, say, show
+from uwlts.runtime.command_line import JOBS, Call, command_from, make_program, say, show
 from uwlts.runtime.console import run
 
-app = App(
-    name="twin",
-    help="Digital twin of an underwater laser triangulation sensor.",
-    version=__version__,
-    help_format="markdown",
-)
+app = make_program("twin", "Digital twin of an underwater laser triangulation sensor.")
 
 
-@command_from(app, twin, "simulate")
+@command_from(app, twin, "simulate", job="Simulate")
 def simulate(call: Call) -> None:
     """Example: twin simulate spheres --sensor thesis --placement far --out spheres-far.h5"""
     call()
 
 
-@command_from(app, twin, "serve")
+@command_from(app, twin, "serve", job="Simulate")
 def serve(call: Call) -> None:
     """Stop with Ctrl-C.
 
@@ -39,25 +31,25 @@ def serve(call: Call) -> None:
     say(f"ended after {served.rates()}")
 
 
-@command_from(app, twin, "record")
+@command_from(app, twin, "record", job="Simulate")
 def record(call: Call) -> None:
     """Example: twin record demo --out runs/campaign"""
     say(f"wrote {call()}")
 
 
-@command_from(app, twin, "dataset")
+@command_from(app, twin, "dataset", job="Simulate")
 def dataset(call: Call) -> None:
     """Example: twin dataset stripe-clean --scenes 20 --out runs/stripes"""
     say(f"wrote {call()}")
 
 
-@command_from(app, twin, "reproduce")
+@command_from(app, twin, "reproduce", job="Simulate")
 def reproduce(call: Call) -> None:
     """Example: twin reproduce --campaigns 1 --every 10 --out runs/quick"""
     _run_others(call)
 
 
-@command_from(app, twin, "demo")
+@command_from(app, twin, "demo", job="Simulate")
 def demo(call: Call) -> None:
     """Example: twin demo"""
     _run_others(call)
@@ -71,13 +63,13 @@ def _run_others(call: Call) -> None:
         sys.exit(error.returncode)
 
 
-@command_from(app, twin, "sweep")
+@command_from(app, twin, "sweep", job="Design")
 def sweep(call: Call) -> None:
     """Example: twin sweep baseline-angle --out runs/baseline-angle"""
     show(call().lines())
 
 
-@app.command
+@app.command(group=JOBS["Design"])
 def scenes() -> None:
     """List the scenes, sensors, campaigns, data sets, studies and waters that ship with the program.
 

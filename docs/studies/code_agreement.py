@@ -73,13 +73,13 @@ JOBS: dict[str, str] = {
         uwlts reconstruct inputs/scans/spheres.h5 --calibration polynomials/calibration.json \
             --out reconstruct/polynomials.ply""",
     "methods": "\n".join(
-        f"uwlts reconstruct inputs/scans/shapes.h5 {TAKEN} --no-with-uncertainty --method {method} "
+        f"uwlts reconstruct inputs/scans/shapes.h5 {TAKEN} --no-with-uncertainty --stripe-method {method} "
         f"{options} --out methods/{method}.ply"
         for method, options in (
             ("centre-of-mass", "--stripe half_window_px=24"),
-            ("profile-fit", "--peak direct"),
-            ("quadratic", "--peak strongest"),
-            ("zero-crossing", "--peak first"),
+            ("profile-fit", "--stripe-peak direct"),
+            ("quadratic", "--stripe-peak strongest"),
+            ("zero-crossing", "--stripe-peak first"),
             ("learned", "--stripe model=inputs/centroid.onnx"),
         )
     ),

@@ -19,7 +19,9 @@ import pye57
 import trimesh
 import yaml
 from mcap.reader import make_reader
-from plyfile import PlyData
+
+from uwlts.storage.mesh_file import has_faces, load_triangles
+from uwlts.storage.ply import read_ply
 
 RELATIVE = 1e-9
 FLOORS = {"mm": 1e-9, "px": 2e-9, "rad": 2e-12, "deg": 2e-10, "s": 1e-9, "um": 1e-6, "step": 1.0, "": 2e-12}
@@ -211,16 +213,14 @@ def _of_hdf5(path: Path) -> Iterator[tuple[str, np.ndarray | str]]:
 
 
 def _of_ply(path: Path) -> Iterator[tuple[str, np.ndarray | str]]:
-    file = PlyData.read(path)
-    for element in file.elements:
-        for column in element.data.dtype.names:
-            values = element.data[column]
-            values = np.vstack(values) if values.dtype == object else values
-            unit = "_mm" if column in ("x", "y", "z") else ""
-            yield f"{element.name}.{column}{unit}", values
-    metadata = [re.sub(r"^uwlts-metadata \d+/\d+ ", "", line) for line in file.comments if "-metadata " in line]
+    table, comments = read_ply(path, "vertex", called="cloud")
+    for column in table.dtype.names:
+        yield f"vertex.{column}{'_mm' if column in ('x', 'y', 'z') else ''}", table[column]
+    if has_faces(path):
+        yield "face.vertex_indices", np.asarray(load_triangles(path).faces)
+    metadata = [re.sub(r"^uwlts-metadata \d+/\d+ ", "", line) for line in comments if "-metadata " in line]
     yield from _of_json_text("".join(metadata), "metadata")
-    for n, line in enumerate(each for each in file.comments if "-metadata " not in each):
+    for n, line in enumerate(each for each in comments if "-metadata " not in each):
         yield f"comment[{n}]", line
 
 

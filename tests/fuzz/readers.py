@@ -12,7 +12,6 @@ import cv2
 import laspy
 import numpy as np
 import trimesh
-from plyfile import PlyData, PlyElement
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
@@ -353,7 +352,9 @@ def _read_surface(path: Path) -> None:
 def _big_endian(path: Path) -> None:
     vertices = np.zeros(9, [("x", ">f8"), ("y", ">f4"), ("z", ">i4")])
     vertices["x"], vertices["z"] = np.arange(9), 7
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order=">").write(str(path))
+    header = "ply\nformat binary_big_endian 1.0\nelement vertex 9\n"
+    header += "property double x\nproperty float y\nproperty int z\nend_header\n"
+    path.write_bytes(header.encode() + vertices.tobytes())
 
 
 def _tum(path: Path) -> None:

@@ -256,7 +256,7 @@ def hand_poses() -> Iterator[np.ndarray]:
 
 def _hold(tank: Tank, going: subprocess.Popen[str], said: list[str]) -> None:
     """Hold the target still until it was taken, then move it, until the guide has enough."""
-    poses, deadline, taken, asked = hand_poses(), time.monotonic() + 60, 0, False
+    poses, deadline, taken, asked = hand_poses(), time.monotonic() + 240, 0, False
     until = deadline
     while going.poll() is None:
         assert time.monotonic() < deadline, said

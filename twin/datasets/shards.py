@@ -25,6 +25,7 @@ import h5py
 import numpy as np
 
 from uwlts.errors import CaptureError
+from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import write_atomically
 
 Format = Literal["webdataset", "hdf5"]
@@ -139,6 +140,7 @@ class ShardReader:
 
     def sample(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
         """Read a sample: arrays by name, with "key", "image" and "info", its metadata; only ``names`` if given."""
+        require_regular_file(self.path, called="shard of a data set")
         try:
             match self.format:
                 case "webdataset":

@@ -85,9 +85,8 @@ def demo(out: str | Path = "runs/demo") -> Path:
             for line, ended in workers.map_unordered(_run, _announce([line for _, line in rows])):
                 if isinstance(ended, Lost):
                     raise SetupError(f"{line}: {ended.reason}")
-                code, output, complaints = ended
+                code, output = ended
                 print(output, end="", flush=True)
-                print(complaints, end="", file=sys.stderr, flush=True)
                 if code:
                     raise CommandFailed(line, code)
             seconds[stage] = round(time.perf_counter() - start, 2)
@@ -104,20 +103,30 @@ def _announce(lines: Iterable[str]) -> Iterator[str]:
         yield line
 
 
-def _run(line: str) -> tuple[int, str, str]:
-    """Run a command as ``python -m`` does, and return its exit code, output and error output.
+class _PlainErrors(io.TextIOBase):
+    """Standard error of a command that runs beside others: it is no terminal, so that it gets lines and no bars."""
+
+    def write(self, text: str, /) -> int:
+        assert sys.__stderr__ is not None
+        sys.__stderr__.write(text)
+        sys.__stderr__.flush()
+        return len(text)
+
+
+def _run(line: str) -> tuple[int, str]:
+    """Run a command as ``python -m`` does, and return its exit code and output; errors and progress appear at once.
 
     It runs in this process: importing the shared modules takes most commands longer than their work.
     """
     program, *arguments = shlex.split(line)
-    output, complaints = io.StringIO(), io.StringIO()
+    output = io.StringIO()
     sys.argv = [program, *arguments]
     code = 0
-    with redirect_stdout(output), redirect_stderr(complaints):
+    with redirect_stdout(output), redirect_stderr(_PlainErrors()):
         try:
             runpy.run_module(program, run_name="__main__", alter_sys=True)
         except SystemExit as end:
             code = int(end.code or 0)
     if code == INTERRUPTED:
         raise KeyboardInterrupt
-    return code, output.getvalue(), complaints.getvalue()
+    return code, output.getvalue()

@@ -15,7 +15,7 @@ from uwlts.runtime.command_line import Call, command_from, say, show, warn
 _EVIDENCE = ("air", "water", "step", "scan")
 
 
-@command_from(app, uwlts, "calibrate", also=[(uwlts, "record_guided")], shortcuts=STRIPE)
+@command_from(app, uwlts, "calibrate", job="Calibrate", also=[(uwlts, "record_guided")], shortcuts=STRIPE)
 def calibrate(
     call: Call,
     *,
@@ -23,7 +23,7 @@ def calibrate(
     live: Annotated[
         Path | None,
         Parameter(
-            help="Plan (TOML, docs/how-to/calibrate-live.md) of a guided calibration with camera and stage, instead "
+            help="Plan (TOML; docs: calibrate live) of a guided calibration with camera and stage, instead "
             "of captures: leads through the images, rejects bad ones with the reason, and records the good ones beside "
             "the calibration."
         ),
@@ -71,7 +71,7 @@ def calibrate(
     wrote([*calibration_lines(calibration), *advice], calibration.origin().warnings, out)
 
 
-@command_from(app, uwlts, "calibrate_camera")
+@command_from(app, uwlts, "calibrate_camera", job="Calibrate")
 def camera(
     call: Call,
     *,
@@ -94,7 +94,7 @@ def camera(
     wrote(camera_lines(found), found.warnings, out, page)
 
 
-@command_from(app, uwlts, "calibrate_mount")
+@command_from(app, uwlts, "calibrate_mount", job="Calibrate")
 def mount(
     call: Call,
     *,
@@ -109,7 +109,7 @@ def mount(
     wrote(mount_lines(found), found.weaknesses, out)
 
 
-@command_from(app, uwlts, "refresh", shortcuts=STRIPE)
+@command_from(app, uwlts, "refresh", job="Calibrate", shortcuts=STRIPE)
 def refresh(
     call: Call,
     *,
@@ -129,7 +129,7 @@ def refresh(
     wrote([*changes, *advice_lines(found.calibration)], found.warnings, path)
 
 
-@command_from(app, uwlts, "calibrate_polynomials", shortcuts=STRIPE)
+@command_from(app, uwlts, "calibrate_polynomials", job="Calibrate", shortcuts=STRIPE)
 def polynomials(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) -> None:
     """Example: uwlts polynomials --target target-water.h5 --out polynomials.json"""
     from uwlts.report.inventory import polynomial_lines
@@ -139,7 +139,7 @@ def polynomials(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False
     wrote(polynomial_lines(found.calibration), found.warnings, out)
 
 
-@command_from(app, uwlts, "compare_models", shortcuts=STRIPE)
+@command_from(app, uwlts, "compare_models", job="Calibrate", shortcuts=STRIPE)
 def models(
     call: Call,
     *,
@@ -157,7 +157,7 @@ def models(
         wrote_page(out)
 
 
-@command_from(app, uwlts.report, "write_certificate")
+@command_from(app, uwlts.report, "write_certificate", job="Calibrate")
 def certificate(
     call: Call,
     *,
@@ -189,7 +189,7 @@ def certificate(
     wrote_page(page)
 
 
-@command_from(app, uwlts, "verify")
+@command_from(app, uwlts, "verify", job="Calibrate")
 def verify(call: Call) -> None:
     """Answer pass or fail: exit code 0 or 1. The verdict is kept beside the calibration, for uwlts reconstruct.
 

@@ -7,7 +7,7 @@ from uwlts.cli.options import CalibrationOut, Overwrite, app, cloud_written, wro
 from uwlts.runtime.command_line import Call, command_from, say, show, warn
 
 
-@command_from(app, uwlts, "design")
+@command_from(app, uwlts, "design", job="Design")
 def design(call: Call) -> None:
     """Example: uwlts design thesis --medium water"""
     from uwlts.optics.design_table import format_table
@@ -15,20 +15,20 @@ def design(call: Call) -> None:
     show(format_table(call()))
 
 
-@command_from(app, uwlts, "nominal")
+@command_from(app, uwlts, "nominal", job="Design")
 def nominal(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) -> None:
     """Example: uwlts nominal thesis --medium water --out nominal.json"""
     call().save(out, overwrite=overwrite)
     wrote_files(out)
 
 
-@command_from(app, uwlts, "describe")
+@command_from(app, uwlts, "describe", job="Files")
 def info(call: Call) -> None:
     """Example: uwlts info capture.h5"""
     say(call())
 
 
-@command_from(app, uwlts, "import_images")
+@command_from(app, uwlts, "import_images", job="Files")
 def import_(call: Call) -> None:
     """Example: uwlts import photographs --out target.h5"""
     imported = call()
@@ -36,7 +36,7 @@ def import_(call: Call) -> None:
     say(f"wrote {call.given['out']} with {imported.laser} laser and {imported.lamp} lamp images")
 
 
-@command_from(app, uwlts, "export")
+@command_from(app, uwlts, "export", job="Files")
 def export(call: Call) -> None:
     """Example: uwlts export scan.ply --out scan.laz"""
     out, written = Path(call.given["out"]), call()

@@ -24,7 +24,7 @@ _INSPECTIONS = [(uwlts, f"inspect_{kind}") for kind in ("pipe", "weld", "flange"
 """Functions that provide the options of an inspection."""
 
 
-@command_from(app, uwlts, "evaluate")
+@command_from(app, uwlts, "evaluate", job="Inspect")
 def evaluate(
     call: Call,
     *,
@@ -43,7 +43,7 @@ def evaluate(
     wrote(evaluation_lines(evaluation.record()), [], out)
 
 
-@command_from(app, uwlts, "compare_clouds")
+@command_from(app, uwlts, "compare_clouds", job="Inspect")
 def compare(
     call: Call,
     *,
@@ -70,6 +70,7 @@ def compare(
     app,
     uwlts,
     "inspect_pipe",
+    job="Inspect",
     also=[*_INSPECTIONS, (uwlts, "export")],
     summary="Find the features of a pipe, weld, step, flange or gap in a cloud and measure them, with uncertainty.",
 )
@@ -108,7 +109,7 @@ def inspect(
         wrote_files(coloured, out)
 
 
-@command_from(app, uwlts, "gauge_study")
+@command_from(app, uwlts, "gauge_study", job="Inspect")
 def gauge(
     call: Call,
     *,
@@ -123,7 +124,7 @@ def gauge(
         wrote_files(out)
 
 
-@command_from(app, uwlts.report, "write_findings", also=_INSPECTIONS)
+@command_from(app, uwlts.report, "write_findings", job="Inspect", also=_INSPECTIONS)
 def findings_report(
     call: Call, *, section_mm=None, wall_mm=None, false_alarm=None, largest_ovality=None, datum=None
 ) -> None:
@@ -137,7 +138,7 @@ def findings_report(
     say(f"wrote {out}, {', '.join(each.name for each in beside)}")
 
 
-@command_from(app, uwlts.report, "write_campaign")
+@command_from(app, uwlts.report, "write_campaign", job="Inspect")
 def report(call: Call) -> None:
     """Print a table.
 
@@ -150,7 +151,7 @@ def report(call: Call) -> None:
     say(f"wrote {written.page} and {written.summary}")
 
 
-@command_from(app, uwlts, "evaluate_thesis")
+@command_from(app, uwlts, "evaluate_thesis", job="Inspect")
 def thesis(call: Call) -> None:
     """`twin reproduce` renders such a folder.
 

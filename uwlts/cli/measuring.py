@@ -10,7 +10,7 @@ from uwlts.cli.options import STRIPE, Overwrite, a_cloud, a_file, a_page, app, c
 from uwlts.runtime.command_line import Before, Call, command_from, say, show, warn
 
 
-@command_from(app, uwlts, "reconstruct", shortcuts=STRIPE)
+@command_from(app, uwlts, "reconstruct", job="Reconstruct", shortcuts=STRIPE)
 def reconstruct(
     call: Call,
     *,
@@ -46,7 +46,7 @@ def _counts(by_status: dict[str, int]) -> str:
     return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in by_status.items() if count)
 
 
-@command_from(app, uwlts, "register")
+@command_from(app, uwlts, "register", job="Reconstruct")
 def register(
     call: Call,
     *,
@@ -79,7 +79,7 @@ def register(
     wrote_files(out, poses_out, page)
 
 
-@command_from(app, uwlts, "align_trajectory")
+@command_from(app, uwlts, "align_trajectory", job="Reconstruct")
 def align(
     call: Call,
     *,
@@ -105,7 +105,7 @@ def align(
     say(f"wrote {out} and {out.with_suffix('.json').name}" + (f", {aligned}" if aligned else ""))
 
 
-@command_from(app, uwlts, "mesh")
+@command_from(app, uwlts, "mesh", job="Reconstruct")
 def mesh(
     call: Call,
     *,

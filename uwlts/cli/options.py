@@ -6,21 +6,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
-from uwlts._version import __version__
 from uwlts.files.writing import refuse_unsuitable
-from uwlts.runtime.command_line import Before, Shortcuts, say, show, warn
+from uwlts.runtime.command_line import Before, Shortcuts, make_program, say, show, warn
 
 if TYPE_CHECKING:
     from uwlts.storage.cloud import PointCloud
 
-app = App(
-    name="uwlts",
-    help="Software of an underwater laser triangulation sensor.",
-    version=__version__,
-    help_format="markdown",
-)
+app = make_program("uwlts", "Software of an underwater laser triangulation sensor.")
 
 if TYPE_CHECKING:
     MethodName = str

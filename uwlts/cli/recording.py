@@ -7,7 +7,7 @@ from uwlts.cli.options import app
 from uwlts.runtime.command_line import Call, command_from, say, warn
 
 
-@command_from(app, uwlts, "scan")
+@command_from(app, uwlts, "scan", job="Scan")
 def scan(call: Call) -> None:
     """Example: uwlts scan plan.toml --camera gige:192.168.1.10 --stage /dev/ttyACM0 --home --out scan.h5"""
     seen = call()
@@ -17,19 +17,19 @@ def scan(call: Call) -> None:
     say(f"wrote {call.given['out']}, {lines}; exposure {exposures or 'as before'}")
 
 
-@command_from(app, uwlts, "watch")
+@command_from(app, uwlts, "watch", job="Scan")
 def watch(call: Call) -> None:
     """Example: uwlts watch scan.h5 --calibration calibration.json"""
     call()
 
 
-@command_from(app, uwlts, "serve_desk")
+@command_from(app, uwlts, "serve_desk", job="Scan")
 def desk(call: Call) -> None:
     """Example: uwlts desk tank --plan plan.toml"""
     call()
 
 
-@command_from(app, uwlts, "examine")
+@command_from(app, uwlts, "examine", job="Scan")
 def doctor(call: Call) -> None:
     """End with exit code 1 if something required, or something named here, is missing or does not work.
 

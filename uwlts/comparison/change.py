@@ -221,7 +221,7 @@ def compare_clouds(
         Cloud of the surface, or its file (.ply, .h5, .copc.laz; from other programs .las, .e57, or text in mm).
     reference
         Earlier cloud; mesh file (.stl, .obj, .off, or .ply with faces); or ideal shape. "plane", "sphere" or "cylinder"
-        fits a shape. A TOML file states its kind and known sizes (docs/how-to/compare-scans.md).
+        fits a shape. A TOML file states its kind and known sizes (docs: compare scans).
     register
         Register the cloud to the reference first; by default both have the same frame. An ideal shape without a
         position is always fitted.

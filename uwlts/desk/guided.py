@@ -142,7 +142,7 @@ def record_guided(
     Parameters
     ----------
     plan : GuidedPlan or path of a TOML file
-        Description of the recording and its devices (docs/how-to/calibrate-live.md).
+        Description of the recording and its devices (docs: calibrate live).
     out : str or Path
         The calibration; the captures have its name with ``-target.h5`` and ``-step.h5``.
     camera : str, optional

@@ -70,7 +70,7 @@ def serve_desk(
     folder : str or Path
         Folder with plans, calibrations, captures and clouds, by default the current one. Results are written there.
     plan : str or Path, optional
-        Plan of a scan (docs/how-to/scan.md) to begin with; others can be chosen on the page.
+        Plan of a scan (docs: scan) to begin with; others can be chosen on the page.
     host : str
         Address of the page; the default can be reached from this machine only.
     port : int

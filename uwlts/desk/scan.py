@@ -57,7 +57,7 @@ def scan(
     Parameters
     ----------
     plan : ScanPlan or path of a TOML file
-        TOML file with sensor, medium, positions, lights and exposures (docs/how-to/scan.md).
+        TOML file with sensor, medium, positions, lights and exposures (docs: scan).
     out : str or Path
         Capture to write.
     camera : str, optional

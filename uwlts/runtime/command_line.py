@@ -17,10 +17,11 @@ from pathlib import Path
 from types import ModuleType, NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from cyclopts import App, Parameter
+from cyclopts import App, Group, Parameter
 
+from uwlts._version import __version__
 from uwlts.errors import make_printable
-from uwlts.runtime.console import progress_bar, replace_by_options
+from uwlts.runtime.console import SWITCHES, progress_bar, replace_by_options
 
 _LISTENERS = ("progress", "report", "warn")
 """Parameters through which functions report; a command prints the reports."""
@@ -33,6 +34,25 @@ class PathText(str):
 PathText.__name__ = "Path"
 _WORDS = (PathText, str, int, float, bool)
 
+Job = Literal["Design", "Simulate", "Calibrate", "Scan", "Reconstruct", "Inspect", "Files"]
+"""Groups of commands in the help, in its order."""
+JOBS = {job: Group(job, sort_key=place) for place, job in enumerate(get_args(Job))}
+_PROGRAM = Group("Program", sort_key=len(JOBS))
+_ADVANCED = Group("Advanced", sort_key=1)
+"""Options of a command that are neither required, nor outputs, nor part of its examples."""
+
+
+def make_program(name: str, title: str) -> App:
+    """Return a program without commands, with the options for its version, its messages and completion by the shell."""
+    app = App(name=name, help=title, version=__version__, help_format="markdown", group_commands=JOBS["Files"])
+    app.register_install_completion_command(group=_PROGRAM, help="Install completion of commands for your shell.")
+    for words, text in SWITCHES.values():
+        # `uwlts.runtime.console.run` takes them out of every command line; alone they do nothing.
+        app.command(lambda: None, name=words, group=_PROGRAM, help=text)
+    for flag in ("--help", "--version"):
+        app[flag].group = _PROGRAM
+    return app
+
 
 @dataclass(frozen=True)
 class Before:
@@ -44,11 +64,15 @@ class Before:
 
 @dataclass(frozen=True)
 class Shortcuts:
-    """Options that set entries of a function's settings, such as ``--method`` for an entry of ``stripe``."""
+    """Options that set entries of a function's settings, such as ``--stripe-method`` for an entry of ``stripe``."""
 
     setting: str
     options: Mapping[str, Any]
     """Annotations of the options by the names of the entries."""
+
+    def names(self) -> list[str]:
+        """Return the names of the parameters, in the order of the entries."""
+        return [f"{self.setting}_{entry}" for entry in self.options]
 
 
 def command_from(
@@ -56,6 +80,7 @@ def command_from(
     package: ModuleType,
     function: str,
     *,
+    job: Job,
     also: Sequence[tuple[ModuleType, str]] = (),
     shortcuts: Shortcuts | None = None,
     summary: str | None = None,
@@ -71,6 +96,8 @@ def command_from(
         Program that gets the command.
     package, function
         Package and name of the public function. It is imported when the command is run or its own help is shown.
+    job
+        Group of the command in the help.
     also
         Further functions (package, name) whose parameters the body may have.
     shortcuts
@@ -82,7 +109,7 @@ def command_from(
     def register(body: Callable[..., None]) -> DerivedCommand:
         made = DerivedCommand(package, function, body, tuple(also), shortcuts, summary)
         name = body.__name__.strip("_").replace("_", "-")
-        app.command(f"{body.__module__}:{body.__name__}", name=name, help=made.__doc__)
+        app.command(f"{body.__module__}:{body.__name__}", name=name, help=made.__doc__, group=JOBS[job])
         return made
 
     return register
@@ -167,13 +194,22 @@ class DerivedCommand:
     def _made(self) -> inspect.Signature:
         taken, options = self._taken, _options_of(self._package, self._function)
         if self._shortcuts is not None:
-            entries = self._shortcuts.options.items()
+            entries = zip(self._shortcuts.names(), self._shortcuts.options.values(), strict=True)
             options |= {
                 name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=hint)
                 for name, hint in entries
             }
         own = [one for name, one in self._own.items() if name not in taken]
-        return inspect.Signature(sorted([*options.values(), *own], key=_place), return_annotation=None)
+        made = [one if self._is_common(one) else _advanced(one) for one in [*options.values(), *own]]
+        return inspect.Signature(sorted(made, key=_place), return_annotation=None)
+
+    def _is_common(self, one: inspect.Parameter) -> bool:
+        """Return whether an option is required, an output or its replacement, or part of the command's examples."""
+        if one.default is one.empty or one.kind is not one.KEYWORD_ONLY or one.name == "overwrite":
+            return True
+        examples = " ".join(re.findall(r"Example: .*", self.__doc__ or ""))
+        is_output = any(isinstance(each, Before) for each in getattr(one.annotation, "__metadata__", ()))
+        return is_output or re.search(rf"--{one.name.replace('_', '-')}\b(?!-)", examples) is not None
 
     def __call__(self, *args: Any, **kwargs: Any) -> None:
         """Check the outputs, and run the body."""
@@ -189,7 +225,8 @@ class DerivedCommand:
         if any(one.kind is one.VAR_KEYWORD for one in self._taken.values()):
             given |= {name: value for name, value in explicit.items() if name in self._own}
         if self._shortcuts is not None:
-            entries = {name: explicit[name] for name in self._shortcuts.options if name in explicit}
+            names = zip(self._shortcuts.options, self._shortcuts.names(), strict=True)
+            entries = {entry: explicit[name] for entry, name in names if name in explicit}
             if settings := parse_settings(self._shortcuts.setting, explicit.get(self._shortcuts.setting, ())) | entries:
                 given[self._shortcuts.setting] = settings
         for name, one in self._taken.items():
@@ -225,6 +262,10 @@ def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Paramet
             parameter = Parameter(help=text, negative="", consume_multiple=together, show_default=shown)
         options[name] = one.replace(annotation=Annotated[kind, parameter], default=default)
     return options
+
+
+def _advanced(one: inspect.Parameter) -> inspect.Parameter:
+    return one.replace(annotation=Annotated[one.annotation, Parameter(group=_ADVANCED)])
 
 
 def _plain_text(value: Any) -> Any:

@@ -5,10 +5,12 @@ import os
 import re
 import signal
 import sys
+import time
+import traceback
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stdout
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, CycloptsPanel, MissingArgumentError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -18,19 +20,30 @@ from uwlts.runtime.interrupts import preserve_interrupts
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 
 USER_ERROR, INTERRUPTED = 2, 130
+SWITCHES = {
+    "verbose": (("--verbose", "-v"), "With any command: also print the traceback of an error."),
+    "quiet": (("--quiet", "-q"), "With any command: print only warnings and errors, without results and progress."),
+}
+"""Options of all commands, with their words and their help."""
+_LINE_EVERY_S = 10.0
+"""Interval between lines of progress without a terminal: a log of an hour stays readable."""
+_quiet = False
 
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[ProgressListener]:
     """Return a context with a progress bar on standard error, updated by ``progress(done, total)``.
 
-    Without a terminal it prints nothing. A full bar stops, so that other output can follow below it; the next stage
-    begins another bar.
+    A full bar stops, so that other output can follow below it; the next stage begins another bar. Without a terminal
+    it prints a line every ten seconds instead, and nothing for shorter work.
     """
     console = Console(stderr=True)
+    if _quiet:
+        yield ignore_progress
+        return
     if not console.is_terminal:
         # In rich before 14.3 a disabled bar prints an empty line.
-        yield ignore_progress
+        yield _progress_lines(title)
         return
     times = TimeElapsedColumn(), TimeRemainingColumn()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times
@@ -47,27 +60,52 @@ def progress_bar(title: str) -> Iterator[ProgressListener]:
         yield listen
 
 
+def _progress_lines(title: str) -> ProgressListener:
+    """Return a listener that prints the progress as lines."""
+    begun = said = time.monotonic()
+
+    def listen(done: int, total: int, stage: str = "") -> None:
+        nonlocal said
+        now = time.monotonic()
+        if now - said >= _LINE_EVERY_S:
+            said = now
+            what = make_printable(f"{title} {stage}".rstrip())
+            print(f"{what}: {done} of {total} after {now - begun:.0f} s", file=sys.stderr, flush=True)
+
+    return listen
+
+
 def run(app: App) -> int:
     """Run a command line and return its exit code: 2 with a message for the user's errors, 130 for Ctrl-C.
 
-    A wrong command line is explained by cyclopts, on standard error like all errors.
+    A wrong command line is explained on standard error like all errors.
     """
+    global _quiet
     # Matrices are small here: threads for their products gain nothing, and delay each other when other programs run.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Scripts start background commands with SIGINT ignored, so that it could not stop a laser.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    words = sys.argv[1:]
+    on = {name: not {*choices}.isdisjoint(words) for name, (choices, _) in SWITCHES.items()}
+    switches = {word for choices, _ in SWITCHES.values() for word in choices}
+    _quiet, words = on["quiet"], [word for word in words if word not in switches]
     command: object = None
     try:
-        with preserve_interrupts():
-            command, bound, _ = app.parse_args(sys.argv[1:], exit_on_error=False, print_error=True)
+        with preserve_interrupts(), ExitStack() as output:
+            command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+            if _quiet:
+                output.enter_context(redirect_stdout(output.enter_context(open(os.devnull, "w", encoding="utf-8"))))
             with protect_inputs():
                 refuse_named_inputs(bound.arguments)
                 command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
-    except CycloptsError:
+    except CycloptsError as error:
+        _explain(error, app.name[0])
         return USER_ERROR
     except Error as error:
+        if on["verbose"]:
+            traceback.print_exc()
         names = inspect.signature(command).parameters if callable(command) else ()
         print(f"error: {replace_by_options(str(error), names)}", file=sys.stderr)
         return USER_ERROR
@@ -81,6 +119,18 @@ def run(app: App) -> int:
         print(make_printable(f"error: {error.strerror or error}: {error.filename}"), file=sys.stderr)
         return USER_ERROR
     return 0
+
+
+def _explain(error: CycloptsError, program: str) -> None:
+    """Print what is wrong with a command line; an argument that was not given is called missing."""
+    message: object = error
+    if isinstance(error, MissingArgumentError) and error.argument is not None and error.keyword is None:
+        argument = error.argument
+        if not argument.tokens and not error.tokens_so_far:
+            chain = " ".join([program, *(error.command_chain or ())])
+            kind = "option" if argument.name.startswith("-") else "argument"
+            message = f"{chain}: the required {kind} {argument.name} is missing; {chain} --help explains it."
+    (error.console or Console(stderr=True)).print(CycloptsPanel(message))
 
 
 def replace_by_options(text: str, names: Collection[str]) -> str:

@@ -12,10 +12,9 @@ from typing import Any
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike
-from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import log_warnings, open_regular, parse_json, require_regular_file, shorten
+from uwlts.files.reading import log_warnings, open_regular, parse_json, require_regular_file
 from uwlts.files.writing import refuse_unsuitable, require_ending, write_atomically
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.cloud import (
@@ -43,6 +42,7 @@ from uwlts.storage.foreign_clouds import (
 )
 from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
+from uwlts.storage.ply import encode_ply, read_ply
 
 FORMAT = "uwlts-cloud"
 VERSION = 1
@@ -67,12 +67,6 @@ _COMMENT = "uwlts-metadata"
 # CloudCompare reads PLY with rply, which rejects a file with a comment of 1024 characters or more.
 _PIECE_LENGTH = 900
 _PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
-_LONGEST_PLY_HEADER = 2**24
-_MOST_PROPERTIES = 1000
-_TYPE_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
-_TYPE_BYTES |= {f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)}
-_IN_ASCII = bytes(range(128)) + b"?" * 128
-"""Comments may hold any bytes, such as names in UTF-8 or Latin-1."""
 _Rows = Callable[[int], slice]
 
 
@@ -141,9 +135,8 @@ def write_ply_points(
     vertices = np.empty(count, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
         vertices[name] = values
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=list(comments))
     with write_atomically(path, overwrite=overwrite) as aside:
-        ply.write(str(aside))
+        aside.write_bytes(encode_ply(vertices, comments=comments))
 
 
 def refuse_unsuitable_cloud(path: str | os.PathLike[str], *, overwrite: bool, coloured: bool = False) -> None:
@@ -399,14 +392,13 @@ def _metadata(comments: list[str]) -> Table:
 
 def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     try:
-        ply = PlyData.read(open_ply(path, called="cloud"))
+        whole, comments = read_ply(path, "vertex", called="cloud")
     except OSError as error:
         raise CaptureError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (PlyParseError, ValueError, MemoryError, ArithmeticError, LookupError) as error:
-        raise CaptureError(f"{path} is not a complete PLY file: {error}") from error
-    if "vertex" not in ply:
+    except MemoryError as error:
+        raise CaptureError(f"{path} does not fit into the memory") from error
+    if whole is None:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
-    whole = ply["vertex"].data
     vertices, names = whole[rows(len(whole))], whole.dtype.names or ()
     known = {name.lower().removeprefix("scalar_"): name for name in names} | {name: name for name in names}
     if missing := [axis for axis in "xyz" if axis not in known]:
@@ -441,7 +433,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
             poses = np.stack([column(name, np.nan) for name in _pose_names(parts)]).reshape(parts, 3, -1)
             uncertainty = replace(uncertainty, poses_mm=np.ascontiguousarray(np.moveaxis(poses, 1, 2)))
     deviation = column("deviation", np.nan)
-    metadata, uncertainty = _without_shared(_metadata(ply.comments), uncertainty)
+    metadata, uncertainty = _without_shared(_metadata(comments), uncertainty)
     cloud = PointCloud(
         points_mm=points,
         intensity=column("intensity", np.nan),
@@ -454,40 +446,6 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         warnings=warnings,
     )
     return cloud, len(whole)
-
-
-def open_ply(path: Path, *, called: str) -> str | BytesIO:
-    """Return the path of a PLY file or, if its comments are not in ASCII, its content with these bytes replaced.
-
-    Raises CaptureError if the file is shorter than its header declares; the reader finds other faults.
-    """
-    with open_regular(path, called=called) as file:
-        start, size = file.read(_LONGEST_PLY_HEADER), os.fstat(file.fileno()).st_size
-    header, end, _ = start.partition(b"end_header")
-    if not end:
-        raise CaptureError(f"{path} is not a complete PLY file: its header has no end in the first 16 MiB")
-    in_text, least, count, properties = b"format ascii" in header[:200], 0, 0, 0
-    for line in header.splitlines():
-        match line.decode("ascii", "replace").split():
-            case ["element", _, number] if number.isdecimal() and len(number) <= 18:
-                count = int(number)
-            case ["element", *_]:
-                raise CaptureError(f"{path} is not a complete PLY file: {shorten(repr(line))} is not an element")
-            case ["property", kind, *_]:
-                # In text a number takes at least a digit and a separator; a list takes at least its length.
-                least += count * (2 if in_text else _TYPE_BYTES.get(kind, 1))
-                properties += 1
-    if properties > _MOST_PROPERTIES:
-        raise CaptureError(f"{path} has {properties:,} properties; this program reads up to {_MOST_PROPERTIES:,}")
-    if least > size:
-        raise CaptureError(
-            f"{path} is not a complete PLY file: early end-of-file, its header declares at least {least:,} bytes of "
-            f"values, and the file has {size:,}"
-        )
-    if header.isascii():
-        return str(path)
-    content = path.read_bytes()
-    return BytesIO(content[: len(header)].translate(_IN_ASCII) + content[len(header) :])
 
 
 class _CloudHeader(Description):

@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import open_regular, require_regular_file
 from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
-from uwlts.storage.cloud_files import open_ply
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
+from uwlts.storage.ply import encode_ply, open_ply, read_ply
 
 if TYPE_CHECKING:
     import trimesh
@@ -104,11 +103,8 @@ class SurfaceMesh(Brief):
         """
         path = Path(path)
         match path.suffix.lower():
-            case ".ply":
-                with write_atomically(path, overwrite=overwrite) as aside:
-                    _ply(self).write(str(aside))
-            case ".stl" | ".glb":
-                content = _stl(self) if path.suffix.lower() == ".stl" else _glb(self)
+            case ".ply" | ".stl" | ".glb" as ending:
+                content = {".ply": _ply, ".stl": _stl, ".glb": _glb}[ending](self)
                 with write_atomically(path, overwrite=overwrite) as aside:
                     aside.write_bytes(content)
             case _:
@@ -171,11 +167,8 @@ def read_mesh(path: str | Path, *, unit: Unit | None = None) -> SurfaceMesh:
         loaded.merge_vertices()
     scale, faces = MM_PER_UNIT[check_unit(unit or "mm")], np.asarray(loaded.faces, np.int64)
     vertices = scale * np.asarray(loaded.vertices, float)
-    is_ply = path.suffix.lower() == ".ply"
-    try:
-        known = PlyData.read(open_ply(path, called="mesh"))["vertex"].data if is_ply else np.empty(len(vertices), [])
-    except (PlyParseError, ValueError, KeyError, MemoryError) as error:
-        raise CaptureError(f"{path} is not a complete mesh: {error}") from error
+    known = read_ply(path, "vertex", called="mesh")[0] if path.suffix.lower() == ".ply" else None
+    known = np.empty(len(vertices), []) if known is None else known
     names = known.dtype.names or ()
     normals = np.asarray(loaded.vertex_normals, float)
     if {"nx", "ny", "nz"} <= set(names):
@@ -187,7 +180,7 @@ def read_mesh(path: str | Path, *, unit: Unit | None = None) -> SurfaceMesh:
     return SurfaceMesh(vertices, normals, faces, noise, shared)
 
 
-def _ply(mesh: SurfaceMesh) -> PlyData:
+def _ply(mesh: SurfaceMesh) -> bytes:
     columns = dict(zip("xyz", mesh.vertices_mm.T, strict=True))
     columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.T.astype(np.float32), strict=True))
     parts = {"uncertainty": mesh.std_mm, "uncertainty_noise": mesh.noise_mm, "uncertainty_shared": mesh.shared_mm}
@@ -195,10 +188,7 @@ def _ply(mesh: SurfaceMesh) -> PlyData:
     vertices = np.empty(len(mesh.vertices_mm), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         vertices[name] = values
-    faces = np.empty(len(mesh.faces), [("vertex_indices", np.int32, (3,))])
-    faces["vertex_indices"] = mesh.faces
-    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-    return PlyData(elements, byte_order="<")
+    return encode_ply(vertices, faces=mesh.faces)
 
 
 def _stl(mesh: SurfaceMesh) -> bytes:

@@ -81,7 +81,7 @@ def centres(found: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def write_onnx(weights: Weights, path: Path) -> None:
-    """Write `centres` of `logits` as a model for ``--method learned``, with lines of any number and length."""
+    """Write `centres` of `logits` as a model for ``--stripe-method learned``, with lines of any number and length."""
     nodes, held = [], []
 
     def constant(name: str, value: np.ndarray) -> str:

@@ -7,7 +7,6 @@ import laspy
 import numpy as np
 import pytest
 import trimesh
-from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 import uwlts
@@ -16,6 +15,7 @@ from uwlts.comparison.options import ComparisonOptions
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
 from uwlts.registration.surface_registration import SampledSurface, register_to_surface
 from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty
+from uwlts.storage.ply import read_ply
 
 NOISE_MM, SHIFT_MM, TILT, STAGE_MM = 0.03, 0.04, 1e-3, 0.02
 SIDE_MM, STEP_MM = 60.0, 0.5
@@ -321,7 +321,7 @@ def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
     )
     record = json.loads((tmp_path / "change.json").read_text())
     assert record["largest_rise_mm"] == pytest.approx(0.3, abs=0.05) and record["registration"] is None
-    places = PlyData.read(tmp_path / "change.ply")["vertex"].data
+    places, _ = read_ply(tmp_path / "change.ply", "vertex", called="cloud")
     assert set(places.dtype.names) >= {"x", "y", "z", "distance", "level", "significant"}
     # Grey where nothing changed, else red below and blue above, as on the map.
     seen = np.asarray(trimesh.load(tmp_path / "change.ply").colors, int)[:, :3]

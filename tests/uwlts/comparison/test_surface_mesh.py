@@ -1,9 +1,10 @@
 """Meshes of exactly simulated scans: error against the true surface, stated uncertainty, holes and thin walls."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
-from plyfile import PlyData
 
 import uwlts
 from uwlts.cli import app
@@ -11,6 +12,7 @@ from uwlts.comparison.change_reference import read_reference
 from uwlts.errors import CaptureError, EvaluationError, OutputError
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 from uwlts.storage.mesh_file import read_mesh
+from uwlts.storage.ply import read_ply
 
 NOISE_MM, IMAGES_MM, STRIPE_MM = 0.02, 0.5, 0.25
 
@@ -153,10 +155,10 @@ def test_files_hold_the_mesh(tmp_path, monkeypatch):
     scan(rng, lambda x, y: 0.02 * x * y, half=6.0).save("scan.ply")
     for name in ("mesh.ply", "mesh.stl", "mesh.glb"):
         app(["mesh", "scan.ply", "--out", name, "--towards", "0", "0", "-1"], result_action="return_value")
-    table = PlyData.read("mesh.ply")
-    vertices = np.column_stack([table["vertex"][axis] for axis in "xyz"])
-    assert np.median(table["vertex"]["uncertainty"]) == pytest.approx(0.3 * NOISE_MM, rel=0.5)
-    assert len(table["face"]) == len(trimesh.load("mesh.stl").faces)
+    table, _ = read_ply(Path("mesh.ply"), "vertex", called="mesh")
+    vertices = np.column_stack([table[axis] for axis in "xyz"])
+    assert np.median(table["uncertainty"]) == pytest.approx(0.3 * NOISE_MM, rel=0.5)
+    assert len(trimesh.load("mesh.ply").faces) == len(trimesh.load("mesh.stl").faces)
     scene = trimesh.load("mesh.glb")
     (geometry,) = scene.geometry.values()
     placed = scene.to_geometry().vertices
@@ -199,7 +201,7 @@ def test_triangles_of_absent_vertices_are_refused(tmp_path, ending):
 
 
 def test_damaged_headers_and_absurd_vertices_are_refused(tmp_path):
-    """trimesh reads a PLY whose format is misspelt; plyfile does not."""
+    """trimesh alone reads a PLY whose format is misspelt."""
     content = trimesh.creation.box((9.0, 9.0, 9.0)).export(file_type="ply")
     (tmp_path / "a.ply").write_bytes(content.replace(b"binary_little_endian", b"binary_littl?_endian"))
     (tmp_path / "b.obj").write_text("v 0 0 0\nv 1e30 0 0\nv 0 1 0\nf 1 2 3\n")

@@ -1,9 +1,15 @@
-"""Entry of the commands: signals."""
+"""Entry of the commands: signals, progress without a terminal, and options of all commands."""
 
 import signal
 import subprocess
 import sys
 import time
+
+import pytest
+
+from uwlts.errors import Error
+from uwlts.runtime import console
+from uwlts.runtime.command_line import make_program
 
 _PROGRAM = """
 import sys, time
@@ -37,3 +43,47 @@ def test_a_command_that_was_started_with_interrupts_ignored_ends_by_one():
         _, said = process.communicate(timeout=30)
     assert (process.returncode, time.monotonic() - begun < 20) == (130, True)
     assert said.startswith("interrupted")
+
+
+def _said(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    app = make_program("x", "A program.")
+
+    @app.command
+    def count() -> None:
+        print("a result")
+        with console.progress_bar("counting") as progress:
+            for done in range(101):
+                clock[0] += 1.0
+                progress(done, 100, "images")
+
+    @app.command
+    def fail() -> None:
+        raise Error("something is wrong")
+
+    clock = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(sys, "argv", ["x", *words])
+    return console.run(app)
+
+
+def test_without_a_terminal_progress_is_a_line_every_ten_seconds(monkeypatch, capsys):
+    assert _said(monkeypatch, "count") == 0
+    lines = capsys.readouterr().err.splitlines()
+    # 101 calls, a second apart from 1 s on: at 10 s, 20 s, ..., 100 s.
+    assert lines == [f"counting images: {10 * k - 1} of 100 after {10 * k} s" for k in range(1, 11)]
+
+
+@pytest.mark.parametrize("words", [("count", "-q"), ("--quiet", "count")])
+def test_quiet_prints_neither_results_nor_progress(monkeypatch, capsys, words):
+    assert _said(monkeypatch, *words) == 0
+    assert capsys.readouterr() == ("", "")
+    assert _said(monkeypatch, "count") == 0
+    assert capsys.readouterr().out == "a result\n", "the next run is not quiet"
+    assert _said(monkeypatch, "fail", "-q") == 2
+    assert capsys.readouterr().err == "error: something is wrong\n"
+
+
+def test_verbose_prints_the_traceback_of_an_error(monkeypatch, capsys):
+    assert _said(monkeypatch, "fail", "-v") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("Traceback") and said.endswith("error: something is wrong\n")

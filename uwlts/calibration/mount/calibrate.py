@@ -71,7 +71,7 @@ def calibrate_mount(
     ----------
     profiles
         Folder with one CSV file (columns x and z) for each pose, or one CSV file with a column pose. A cloud whose
-        frames are the poses, or a description of everything (.toml; docs/reference/mount-files.md). With a
+        frames are the poses, or a description of everything (.toml; docs: mount files). With a
         calibration: a capture of the artefact, or of a target in images with the laser off. Or one array for each pose
         in the order along the profile, mm, NaN for missing points: (N, 2) with x along the profile and z, or (N, 3)
         with x, y, z in the sensor's frame.

@@ -1,0 +1,259 @@
+"""Files in PLY, text or binary: vertices with any numbers as properties, comments, and triangles."""
+
+import os
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.errors import CaptureError
+from uwlts.files.reading import open_regular, shorten
+
+_LONGEST_HEADER = 2**24
+_MOST_PROPERTIES = 1000
+_IN_ASCII = bytes(range(128)) + b"?" * 128
+"""Comments may hold any bytes, such as names in UTF-8 or Latin-1."""
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+_TYPES |= {"float": "f4", "double": "f8"}
+_NAMES = {code: name for name, code in _TYPES.items()}
+_TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+_TYPES |= {"float32": "f4", "float64": "f8"}
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class _Property:
+    """Property of an element: its name, type of numbers, and type of a list's length or None."""
+
+    name: str
+    kind: str
+    length: str | None
+
+
+@dataclass(frozen=True)
+class _Header:
+    text: bool
+    order: str
+    elements: dict[str, tuple[int, list[_Property]]]
+    comments: list[str]
+    size: int
+    is_ascii: bool
+
+
+def read_ply(path: Path, element: str, *, called: str) -> tuple[np.ndarray | None, list[str]]:
+    """Read an element's table (N,) with the properties as fields, None without the element, and the comments.
+
+    Lists are fields of objects, without values. Numbers in binary files without lists are read from the disk on use.
+    The whole file is examined, also after the element.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, damaged or truncated.
+    """
+    header = _read_header(path, called=called)
+    content = np.memmap(path, np.uint8, "r")[header.size :]
+    lines = bytes(content).translate(_IN_ASCII).splitlines() if header.text else []
+    found = None
+    for name, (count, properties) in header.elements.items():
+        if header.text:
+            table, lines = _parse_lines(lines[:count], properties, count, path), lines[count:]
+        else:
+            table, used = _parse_bytes(content, properties, count, header.order, path)
+            content = content[used:]
+        found = table if name == element else found
+    return found, header.comments
+
+
+def open_ply(path: Path, *, called: str) -> str | BytesIO:
+    """Return the path of a PLY file or, if its comments are not in ASCII, its content with these bytes replaced.
+
+    Raises CaptureError if the header is damaged, or the file is shorter than its header declares.
+    """
+    header = _read_header(path, called=called)
+    if header.is_ascii:
+        return str(path)
+    content = path.read_bytes()
+    return BytesIO(content[: header.size].translate(_IN_ASCII) + content[header.size :])
+
+
+def encode_ply(vertices: np.ndarray, *, faces: np.ndarray | None = None, comments: Sequence[str] = ()) -> bytes:
+    """Return a binary, little-endian file of a table of vertices (N,) and of triangles (F, 3)."""
+    kinds = {name: vertices.dtype[name].newbyteorder("<") for name in vertices.dtype.names or ()}
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {each}" for each in comments)]
+    header += [f"element vertex {len(vertices)}"]
+    header += [f"property {_NAMES[kind.str[1:]]} {name}" for name, kind in kinds.items()]
+    content = vertices.astype(list(kinds.items())).tobytes()
+    if faces is not None:
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        rows = np.empty(len(faces), [("count", "u1"), ("vertices", "<i4", (3,))])
+        rows["count"], rows["vertices"] = 3, faces
+        content += rows.tobytes()
+    return "\n".join([*header, "end_header", ""]).encode("ascii") + content
+
+
+def _fault(path: Path, what: str) -> CaptureError:
+    return CaptureError(f"{path} is not a complete PLY file: {what}")
+
+
+def _read_header(path: Path, *, called: str) -> _Header:
+    with open_regular(path, called=called) as file:
+        start, size = file.read(_LONGEST_HEADER), os.fstat(file.fileno()).st_size
+    text, end, rest = start.partition(b"end_header")
+    if not text.startswith((b"ply\n", b"ply\r")):
+        raise _fault(path, "it does not begin with the line 'ply'")
+    if not end:
+        raise _fault(path, "its header has no end in the first 16 MiB")
+    newline = b"\n" if text.startswith(b"ply\n") else b"\r\n" if text.startswith(b"ply\r\n") else b"\r"
+    if not rest.startswith(newline):
+        raise _fault(path, "early end-of-file, or other characters after end_header")
+    order, elements, comments = "", {}, []
+    count, properties = 0, []
+    for line in text.translate(_IN_ASCII).decode("ascii").splitlines()[1:]:
+        match line.split():
+            case ["comment", *_]:
+                comments.append(line.strip().removeprefix("comment").strip())
+            case ["obj_info", *_] | []:
+                pass
+            case ["format", name, "1.0"] if name in _ORDERS and not order:
+                order = name
+            case ["element", name, number] if number.isdecimal() and len(number) <= 18 and name not in elements:
+                count, properties = int(number), []
+                elements[name] = count, properties
+            case ["property", kind, name] if kind in _TYPES and elements:
+                properties.append(_Property(name, _TYPES[kind], None))
+            case ["property", "list", length, kind, name] if {length, kind} <= _TYPES.keys() and elements:
+                properties.append(_Property(name, _TYPES[kind], _TYPES[length]))
+            case _:
+                raise _fault(path, f"{shorten(repr(line))} is not an element, property, format or comment of PLY")
+    if not order:
+        raise _fault(path, "its header names no format")
+    total, least = 0, 0
+    for name, (number, columns) in elements.items():
+        names = [each.name for each in columns]
+        if len(set(names)) < len(names):
+            raise _fault(path, f"a property of the element {shorten(name)} is declared twice")
+        total += len(columns)
+        # In text a number takes at least a digit and a separator; a list takes at least its length.
+        least += number * sum(2 if order == "ascii" else np.dtype(c.length or c.kind).itemsize for c in columns)
+    if total > _MOST_PROPERTIES:
+        raise CaptureError(f"{path} has {total:,} properties; this program reads up to {_MOST_PROPERTIES:,}")
+    # The last line of a text may end without a separator.
+    if least > size:
+        raise _fault(
+            path,
+            f"early end-of-file, its header declares at least {least:,} bytes of values, and the file has {size:,}",
+        )
+    used = len(text) + len(end) + len(newline)
+    return _Header(order == "ascii", _ORDERS[order], elements, comments, used, text.isascii())
+
+
+def _table_type(properties: Sequence[_Property], order: str) -> np.dtype:
+    return np.dtype([(one.name, "O" if one.length else order + one.kind) for one in properties])
+
+
+def _parse_lines(lines: Sequence[bytes], properties: Sequence[_Property], count: int, path: Path) -> np.ndarray:
+    """Parse the lines of an element, one for each row."""
+    if len(lines) < count and properties:
+        raise _fault(path, f"early end-of-file, {len(lines):,} of {count:,} lines of an element are there")
+    table = np.empty(count if properties else 0, _table_type(properties, "="))
+    columns: list[list[bytes]] = [[] for _ in properties]
+    for number, line in enumerate(lines if properties else ()):
+        words, place = line.split(), 0
+        for one, column in zip(properties, columns, strict=True):
+            word = words[place] if place < len(words) else b""
+            if one.length is None:
+                column.append(word)
+                place += 1
+            else:
+                place += 1 + int(word) if word.isdigit() and len(word) < 10 else len(words) + 1
+        if place != len(words):
+            raise _fault(path, f"line {number + 1} of an element has {len(words)} values; its header declares others")
+    for one, column in zip(properties, columns, strict=True):
+        if one.length is not None:
+            continue
+        try:
+            values = np.array([float(word) for word in column])
+        except ValueError as error:
+            raise _fault(path, f"{one.name}: {error}") from error
+        if one.kind[0] in "iu":
+            limits = np.iinfo(one.kind)
+            if not ((values >= limits.min) & (values <= limits.max) & (values == np.round(values))).all():
+                raise _fault(path, f"{one.name} has values that are no numbers of its type")
+        with np.errstate(over="ignore"):
+            table[one.name] = values
+    return table
+
+
+def _parse_bytes(
+    content: np.ndarray, properties: Sequence[_Property], count: int, order: str, path: Path
+) -> tuple[np.ndarray, int]:
+    """Parse the bytes of an element; return its table and the number of bytes."""
+    kind = _table_type(properties, order)
+    if not kind.hasobject:
+        used = count * kind.itemsize
+        if used > len(content):
+            raise _fault(path, f"early end-of-file, an element has {used:,} bytes, and the file {len(content):,} more")
+        return (content[:used].view(kind) if used else np.empty(0, kind)), used
+    # Lists of one length, such as triangles, are rows of one type.
+    lengths = {one.name: _first_length(content, properties, one, order) for one in properties if one.length}
+    if None not in lengths.values() and count:
+        row = np.dtype(
+            [
+                (f"{place} {part}", form, shape)
+                for place, one in enumerate(properties)
+                for part, form, shape in (
+                    [("", order + one.kind, ())]
+                    if one.length is None
+                    else [("n", order + one.length, ()), ("", order + one.kind, (lengths[one.name],))]
+                )
+            ]
+        )
+        used = count * row.itemsize
+        if used <= len(content):
+            rows = content[:used].view(row)
+            listed = [(place, one) for place, one in enumerate(properties) if one.length]
+            if all((rows[f"{place} n"] == lengths[one.name]).all() for place, one in listed):
+                table = np.empty(count, kind)
+                for place, one in enumerate(properties):
+                    if one.length is None:
+                        table[one.name] = rows[f"{place} "]
+                return table, used
+    table, place, view = np.empty(count, kind), 0, content.data
+    sizes = {code: np.dtype(code).itemsize for code in _NAMES}
+    formats = {code: order + np.dtype(code).char for code in _NAMES}
+    try:
+        for number in range(count):
+            for one in properties:
+                code = one.length or one.kind
+                (value,) = struct.unpack_from(formats[code], view, place)
+                place += sizes[code]
+                if one.length is None:
+                    table[one.name][number] = value
+                elif not 0 <= value <= len(content):
+                    raise _fault(path, f"a list {one.name} has the length {value}")
+                else:
+                    place += int(value) * sizes[one.kind]
+    except struct.error as error:
+        raise _fault(path, "early end-of-file within an element with lists") from error
+    if place > len(content):
+        raise _fault(path, "early end-of-file within an element with lists")
+    return table, place
+
+
+def _first_length(content: np.ndarray, properties: Sequence[_Property], wanted: _Property, order: str) -> int | None:
+    """Return the length of a list in the first row, if it is the only list of the row."""
+    place = 0
+    for one in properties:
+        if one is wanted and one.length:
+            kind = np.dtype(order + one.length)
+            first = content[place : place + kind.itemsize]
+            value = float(first.view(kind)[0]) if len(first) == kind.itemsize else -1.0
+            return int(value) if 0 <= value <= len(content) and value == int(value) else None
+        if one.length:
+            return None
+        place += np.dtype(one.kind).itemsize
+    return None
