@@ -1,7 +1,9 @@
 """The method of a trained network, with a model of known results: the centroid of bright pixels."""
 
+import re
 import sys
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -9,7 +11,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from uwlts.errors import CaptureError, DescriptionError, RangeError, SetupError
-from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
+from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe, learned
 
 LINES, LENGTH = 300, 170
 DARK, DOUBTFUL = slice(0, 20), slice(20, 40)
@@ -174,3 +176,10 @@ def test_garbage_is_refused(tmp_path, drawn):
     for length in range(0, len(content), 97):
         (tmp_path / "b.onnx").write_bytes(content[:length])
         refused(tmp_path / "b.onnx", drawn, "b.onnx")
+
+
+def test_the_documented_network_has_listed_operators():
+    """The example is trained with a library that tests do not need; its source names each operator."""
+    source = (Path(__file__).parents[3] / "docs/examples/learned_stripe/network.py").read_text(encoding="utf-8")
+    used = set(re.findall(r'node\("([A-Z]\w+)"', source))
+    assert {"Conv", "Softmax", "Range"} <= used <= set(learned._OPERATORS.split())
