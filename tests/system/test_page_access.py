@@ -419,7 +419,7 @@ def test_the_desk_shows_bystanders_no_control_and_gives_out_nothing_but_its_fold
     folder.mkdir()
     (folder / "wall.html").write_text("<p>report</p>", encoding="utf-8")
     (folder / "secret.txt").write_text("secret", encoding="utf-8")
-    (tmp_path / "outside.html").write_text("outside", encoding="utf-8")
+    (tmp_path / "outside.html").write_text("beyond the folder", encoding="utf-8")
     (folder / "link.html").symlink_to(tmp_path)
     (folder / "leak.html").symlink_to(tmp_path / "outside.html")
     desk = subprocess.Popen(
@@ -445,7 +445,7 @@ def test_the_desk_shows_bystanders_no_control_and_gives_out_nothing_but_its_fold
         links, outside = ("link.html", "leak.html"), ("../outside.html", "..%2foutside.html")
         for name, own in product(("secret.txt", *outside, *links, "none.html", "%00.html"), ("", kept)):
             answer = asked(served, f"/files/{name}", **({"Cookie": own} if own else {}))
-            assert b"outside" not in answer.body and b"secret\n" not in answer.body
+            assert b"beyond the folder" not in answer.body and b"secret\n" not in answer.body
             assert answer.status == 404 or b"<title>desk: tank" in answer.body, name
         # A browser that is still there is no reason to complain.
         with Browser(served, Cookie=kept):

@@ -26,6 +26,11 @@ ROOT = Path(__file__).resolve().parents[3]
 NOBODY = 65534
 
 
+def other_than_progress(stderr: str) -> list[str]:
+    """Return the lines that are not progress, of which a slow machine prints one every ten seconds."""
+    return [line for line in stderr.splitlines() if not re.fullmatch(r"examine.*: \d+ of \d+ after \d+ s", line)]
+
+
 def doctor(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "uwlts", "doctor", *arguments]
     return subprocess.run(command, cwd=folder, env=os.environ | environment, capture_output=True, text=True, timeout=60)
@@ -57,7 +62,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProce
 
 def test_a_machine_on_which_the_tests_run_lacks_nothing_required(whole):
     assert whole.returncode == 0, whole.stdout + whole.stderr
-    assert whole.stderr == ""
+    assert not other_than_progress(whole.stderr)
     assert "nothing that is required is missing" in whole.stdout
     devices_of_all = ("Aravis", "camera", "GenTL producer", "serial port")
     for subject in (
@@ -88,7 +93,7 @@ def test_a_broken_library_ends_in_exit_code_1_without_a_traceback(tmp_path):
 
 def test_devices_that_are_named_and_missing_end_in_exit_code_1(tmp_path):
     ended = doctor("--camera", "replay:nothing", "--stage", str(tmp_path / "tty"), folder=tmp_path)
-    assert ended.returncode == 1 and ended.stderr == ""
+    assert ended.returncode == 1 and not other_than_progress(ended.stderr)
     assert "missing: camera, stage; " in ended.stdout
     assert "there is no such port" in re.sub(r"\s+", " ", ended.stdout)
 
