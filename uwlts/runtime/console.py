@@ -124,9 +124,10 @@ def run(app: App) -> int:
 def _explain(error: CycloptsError, program: str) -> None:
     """Print what is wrong with a command line; an argument that was not given is called missing."""
     message: object = error
-    if isinstance(error, MissingArgumentError) and error.argument is not None and error.keyword is None:
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
         argument = error.argument
-        if not argument.tokens and not error.tokens_so_far:
+        part = getattr(error, "keyword", None)  # a part of an argument, in newer versions of cyclopts
+        if part is None and not argument.tokens and not error.tokens_so_far:
             chain = " ".join([program, *(error.command_chain or ())])
             kind = "option" if argument.name.startswith("-") else "argument"
             message = f"{chain}: the required {kind} {argument.name} is missing; {chain} --help explains it."
