@@ -27,7 +27,7 @@ NOBODY = 65534
 
 
 def other_than_progress(stderr: str) -> list[str]:
-    """Return the lines that are not progress, of which a slow machine prints one every ten seconds."""
+    """Return the lines that are not progress. A slow machine prints one of progress every ten seconds."""
     return [line for line in stderr.splitlines() if not re.fullmatch(r"examine.*: \d+ of \d+ after \d+ s", line)]
 
 
