@@ -22,7 +22,7 @@ READ = {
 
 
 def stated(library: metadata.Distribution) -> str:
-    """What metadata say on the licence; a whole text counts by its first line."""
+    """Return the licence that metadata state; a whole text counts by its first line."""
     about = library.metadata
     classifiers = [line for line in about.get_all("Classifier") or [] if line.startswith("License ::")]
     text = (about["License"] or "").strip().splitlines()
@@ -30,7 +30,7 @@ def stated(library: metadata.Distribution) -> str:
 
 
 def obliges(licence: str) -> bool:
-    """Whether every alternative of a licence is a GPL or AGPL; the Lesser GPL and exceptions for linking are not."""
+    """Return whether all alternatives of a licence are GPL or AGPL; Lesser GPL and exceptions for linking are not."""
     words = re.split(r"\bOR\b|; ", licence)
     strict = [
         re.search(r"\bA?GPL|(Affero|GNU) General Public", word) is not None

@@ -464,8 +464,8 @@ class _Field:
     def find_hollows(self, depths: np.ndarray, edge: float, *, std: float) -> list[int]:
         """Return the deepest cells of neighbours in the blemish, the deepest first; none for a single hollow.
 
-        Cells are joined from the deepest on. A hollow is one of its own if its depth exceeds that of the saddle to a
-        deeper one by a fraction, and by some standard deviations ``std`` of such a difference.
+        Cells are joined from the deepest on. A hollow is separate if it is clearly deeper than the saddle to a deeper
+        one: by a fraction, and by some standard deviations ``std`` of such a difference.
         """
         inside = self.region & (depths > edge)
         top, saddles, kept = np.full(len(depths), -1), dict[int, float](), list[int]()

@@ -20,7 +20,7 @@ MISSED = {
     ("bell", 23): "the pit in the dent is part of the dent",
     ("bell", 24): "the total depth of the pit is 0.10 mm too small, five standard uncertainties",
 }
-"""What the search misses, by profile and seed of the pipe."""
+"""Misses of the search, by profile and seed of the pipe."""
 CASES = [
     pytest.param(
         profile,
