@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any, Literal, Protocol, assert_never
 
 import cv2
@@ -25,18 +24,15 @@ import h5py
 import numpy as np
 
 from uwlts.errors import CaptureError
-from uwlts.files.reading import require_regular_file
+from uwlts.files.reading import NPY_DAMAGE, require_regular_file
 from uwlts.files.writing import write_atomically
+from uwlts.storage.hdf5_file import DAMAGE
 
 Format = Literal["webdataset", "hdf5"]
 SUFFIXES: dict[Format, str] = {"webdataset": ".tar", "hdf5": ".h5"}
 _PICTURES = ("mask", "object_map")
 _PNG_EFFORT = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 """Level of compression. Noise is incompressible: higher levels save a few percent and take several times longer."""
-
-
-_DAMAGE = OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, SyntaxError, MemoryError, OverflowError
-"""Errors of NumPy and h5py for damaged content."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +145,7 @@ class ShardReader:
                     return self._from_hdf5(number, names)
                 case _:
                     assert_never(self.format)
-        except (*_DAMAGE, tarfile.TarError, cv2.error, TokenError) as error:
+        except (*DAMAGE, *NPY_DAMAGE, AttributeError, tarfile.TarError, cv2.error) as error:
             raise CaptureError(f"{self.path} is not a shard of this data set, or is damaged: {error}") from error
 
     def _from_tar(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:

@@ -373,8 +373,9 @@ class Instrument:
             # A fault, or Laser off, has locked the stage.
             light = self.light = None
         if connected is None or light is None or connected.stage.faulty:
-            # No live image until the stage is homed or unlocked; then the rig is set up again.
-            self._rig = None if connected is None or connected.stage.faulty else self._rig
+            if connected is not None and connected.stage.faulty:
+                # No live image until the stage is homed or unlocked; then the rig is set up again.
+                self._rig = None
             self._end_live()
             return
         try:

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
+from tokenize import TokenError
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from uwlts.errors import CaptureError, Error, make_printable
@@ -109,6 +110,10 @@ def log_warnings(path: str | os.PathLike[str], warnings: Iterable[str]) -> None:
     """Log warnings about the content of a file; without further settings, Python prints them on standard error."""
     for warning in warnings:
         _LOG.warning("%s", make_printable(f"warning: {path}: {warning}"))
+
+
+NPY_DAMAGE = (ValueError, EOFError, OSError, SyntaxError, TokenError, MemoryError, OverflowError)
+"""Exceptions of NumPy for a damaged NPY file, depending on the kind of damage."""
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, error: type[Error] = CaptureError, called: str = "file") -> bytes:

@@ -131,12 +131,8 @@ def write_ply_points(
     path: Path, columns: Mapping[str, np.ndarray], *, comments: Sequence[str] = (), overwrite: bool
 ) -> None:
     """Write columns (N,) as properties of vertices, binary and little-endian, completely or not at all."""
-    count = len(next(iter(columns.values())))
-    vertices = np.empty(count, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
-    for name, values in columns.items():
-        vertices[name] = values
     with write_atomically(path, overwrite=overwrite) as aside:
-        aside.write_bytes(encode_ply(vertices, comments=comments))
+        aside.write_bytes(encode_ply(columns, comments=comments))
 
 
 def refuse_unsuitable_cloud(path: str | os.PathLike[str], *, overwrite: bool, coloured: bool = False) -> None:

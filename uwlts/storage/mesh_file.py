@@ -185,10 +185,7 @@ def _ply(mesh: SurfaceMesh) -> bytes:
     columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.T.astype(np.float32), strict=True))
     parts = {"uncertainty": mesh.std_mm, "uncertainty_noise": mesh.noise_mm, "uncertainty_shared": mesh.shared_mm}
     columns |= {name: values.astype(np.float32) for name, values in parts.items()}
-    vertices = np.empty(len(mesh.vertices_mm), [(name, values.dtype) for name, values in columns.items()])
-    for name, values in columns.items():
-        vertices[name] = values
-    return encode_ply(vertices, faces=mesh.faces)
+    return encode_ply(columns, faces=mesh.faces)
 
 
 def _stl(mesh: SurfaceMesh) -> bytes:

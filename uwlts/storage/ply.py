@@ -2,10 +2,11 @@
 
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -80,19 +81,26 @@ def open_ply(path: Path, *, called: str) -> str | BytesIO:
     return BytesIO(content[: header.size].translate(_IN_ASCII) + content[header.size :])
 
 
-def encode_ply(vertices: np.ndarray, *, faces: np.ndarray | None = None, comments: Sequence[str] = ()) -> bytes:
-    """Return a binary, little-endian file of a table of vertices (N,) and of triangles (F, 3)."""
-    kinds = {name: vertices.dtype[name].newbyteorder("<") for name in vertices.dtype.names or ()}
+def encode_ply(
+    columns: Mapping[str, np.ndarray], *, faces: np.ndarray | None = None, comments: Sequence[str] = ()
+) -> bytes:
+    """Return a binary, little-endian file of vertices with columns (N,) as properties, and of triangles (F, 3)."""
+    kinds = {name: values.dtype.newbyteorder("<") for name, values in columns.items()}
+    vertices = np.empty(len(next(iter(columns.values()))), list(kinds.items()))
+    for name, values in columns.items():
+        vertices[name] = values
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {each}" for each in comments)]
     header += [f"element vertex {len(vertices)}"]
     header += [f"property {_NAMES[kind.str[1:]]} {name}" for name, kind in kinds.items()]
-    content = vertices.astype(list(kinds.items())).tobytes()
+    tables = [vertices]
     if faces is not None:
         header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
         rows = np.empty(len(faces), [("count", "u1"), ("vertices", "<i4", (3,))])
         rows["count"], rows["vertices"] = 3, faces
-        content += rows.tobytes()
-    return "\n".join([*header, "end_header", ""]).encode("ascii") + content
+        tables.append(rows)
+    return b"".join(
+        ["\n".join([*header, "end_header", ""]).encode("ascii"), *(each.view("u1").data for each in tables)]
+    )
 
 
 def _fault(path: Path, what: str) -> CaptureError:
@@ -198,30 +206,16 @@ def _parse_bytes(
         if used > len(content):
             raise _fault(path, f"early end-of-file, an element has {used:,} bytes, and the file {len(content):,} more")
         return (content[:used].view(kind) if used else np.empty(0, kind)), used
-    # Lists of one length, such as triangles, are rows of one type.
-    lengths = {one.name: _first_length(content, properties, one, order) for one in properties if one.length}
-    if None not in lengths.values() and count:
-        row = np.dtype(
-            [
-                (f"{place} {part}", form, shape)
-                for place, one in enumerate(properties)
-                for part, form, shape in (
-                    [("", order + one.kind, ())]
-                    if one.length is None
-                    else [("n", order + one.length, ()), ("", order + one.kind, (lengths[one.name],))]
-                )
-            ]
-        )
-        used = count * row.itemsize
-        if used <= len(content):
-            rows = content[:used].view(row)
-            listed = [(place, one) for place, one in enumerate(properties) if one.length]
-            if all((rows[f"{place} n"] == lengths[one.name]).all() for place, one in listed):
-                table = np.empty(count, kind)
-                for place, one in enumerate(properties):
-                    if one.length is None:
-                        table[one.name] = rows[f"{place} "]
-                return table, used
+    row = _row_type(content, properties, order)
+    if row is not None and 0 < (used := count * row.itemsize) <= len(content):
+        rows = content[:used].view(row)
+        (listed,) = (one for one in properties if one.length)
+        if (rows[f"{listed.name} length"] == row[listed.name].shape[0]).all():
+            table = np.empty(count, kind)
+            for one in properties:
+                if one is not listed:
+                    table[one.name] = rows[one.name]
+            return table, used
     table, place, view = np.empty(count, kind), 0, content.data
     sizes = {code: np.dtype(code).itemsize for code in _NAMES}
     formats = {code: order + np.dtype(code).char for code in _NAMES}
@@ -244,16 +238,23 @@ def _parse_bytes(
     return table, place
 
 
-def _first_length(content: np.ndarray, properties: Sequence[_Property], wanted: _Property, order: str) -> int | None:
-    """Return the length of a list in the first row, if it is the only list of the row."""
-    place = 0
+def _row_type(content: np.ndarray, properties: Sequence[_Property], order: str) -> np.dtype | None:
+    """Return the type of rows whose only list has the length of that in the first row, such as triangles.
+
+    None for rows of other kinds. The length is the field ``NAME length``; names of properties have no spaces.
+    """
+    if sum(one.length is not None for one in properties) != 1:
+        return None
+    fields: list[tuple[Any, ...]] = []
     for one in properties:
-        if one is wanted and one.length:
+        if one.length is not None:
+            place = np.dtype(fields).itemsize
             kind = np.dtype(order + one.length)
             first = content[place : place + kind.itemsize]
-            value = float(first.view(kind)[0]) if len(first) == kind.itemsize else -1.0
-            return int(value) if 0 <= value <= len(content) and value == int(value) else None
-        if one.length:
-            return None
-        place += np.dtype(one.kind).itemsize
-    return None
+            length = float(first.view(kind)[0]) if len(first) == kind.itemsize else -1.0
+            if not (0 <= length <= len(content) and length == int(length)):
+                return None
+            fields += [(f"{one.name} length", kind), (one.name, order + one.kind, (int(length),))]
+        else:
+            fields.append((one.name, order + one.kind))
+    return np.dtype(fields)

@@ -4,12 +4,11 @@ import csv
 import io
 from dataclasses import replace
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.reading import read_bytes, read_text
+from uwlts.files.reading import NPY_DAMAGE, read_bytes, read_text
 from uwlts.model.sensor import Camera
 from uwlts.model.stripe import ROWS, Coordinates
 from uwlts.storage.encoder_counts import unwrap_counts
@@ -32,7 +31,7 @@ def read_profiles(path: Path, lines: int) -> np.ndarray:
             content = read_bytes(path, most_bytes=_MOST_BYTES, error=ImageError, called="array")
             try:
                 numbers = np.load(io.BytesIO(content), allow_pickle=False)
-            except (ValueError, EOFError, OSError, SyntaxError, TokenError, MemoryError, OverflowError) as error:
+            except NPY_DAMAGE as error:
                 raise ImageError(f"{path} is no NPY array, or is truncated: {error}") from error
             if not isinstance(numbers, np.ndarray) or numbers.dtype.kind not in "iuf":
                 raise ImageError(f"{path} holds no numbers: expected an array of centre lines")
