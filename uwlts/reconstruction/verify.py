@@ -19,6 +19,14 @@ from uwlts.storage.capture import Capture, open_capture
 from uwlts.storage.verification_file import VerificationRecord, write_verification
 
 
+def normalise_error(error: float, measured: float | None, calibrated: float | None) -> float | None:
+    """Return E_n of ISO/IEC 17043 from the expanded uncertainties of both values; None if the measured one is unknown.
+
+    An unknown uncertainty of the calibrated value counts as zero.
+    """
+    return None if measured is None else abs(error) / float(np.hypot(measured, calibrated or 0.0))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
     """Result for one calibrated quantity, mm.
@@ -42,12 +50,12 @@ class Verdict:
     @property
     def expanded_mm(self) -> float:
         """Expanded uncertainty of the error; unknown contributions count as zero."""
-        return float(np.hypot(self.calibrated_expanded_mm or 0.0, self.measured_expanded_mm or 0.0))
+        return float(np.hypot(self.measured_expanded_mm or 0.0, self.calibrated_expanded_mm or 0.0))
 
     @property
     def normalised_error(self) -> float | None:
         """E_n of ISO/IEC 17043, error divided by expanded uncertainty; None if that of the measurement is unknown."""
-        return None if self.measured_expanded_mm is None else abs(self.error_mm) / self.expanded_mm
+        return normalise_error(self.error_mm, self.measured_expanded_mm, self.calibrated_expanded_mm)
 
     @property
     def passed(self) -> bool:

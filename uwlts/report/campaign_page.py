@@ -28,6 +28,7 @@ from uwlts.pages.toolkit import (
     render_page,
     write_page,
 )
+from uwlts.reconstruction.verify import normalise_error
 from uwlts.report import plot
 from uwlts.report.campaign_tables import Row, parameter_table, residual_table, summary_table
 from uwlts.report.gather import (
@@ -376,19 +377,20 @@ def headline_tiles(campaign: GatheredCampaign, reference: Reference | None) -> l
 
 
 def conclude(rows: Sequence[Row]) -> str:
-    """Return the date, and whether errors agree with their stated expanded uncertainties (|E| / U at most 1)."""
-    ratios = {
-        f"{row.quantity} of {row.measurement}": abs(row.error) / row.stated
+    """Return the date, and whether errors agree with the expanded uncertainties of both values (E_n at most 1)."""
+    known = {
+        f"{row.quantity} of {row.measurement}": normalise_error(row.error, row.stated, row.uncertainty)
         for row in rows
         if row.error is not None and row.stated
     }
+    ratios = {name: value for name, value in known.items() if value is not None}
     today = datetime.now(UTC).date().isoformat()
     if not ratios:
         return f"{today}: no error has a stated uncertainty, so that none can be judged."
     worst, within = max(ratios, key=ratios.__getitem__), sum(each <= 1 for each in ratios.values())
     return (
-        f"{today}: {within} of {len(ratios)} errors are within their expanded uncertainty (|E| / U at most 1); the "
-        f"largest |E| / U is {ratios[worst]:.2f} ({worst})."
+        f"{today}: {within} of {len(ratios)} errors are within the expanded uncertainties of measured and true value; "
+        f"the largest |E| / U (E_n of ISO/IEC 17043) is {ratios[worst]:.2f} ({worst})."
     )
 
 

@@ -377,6 +377,8 @@ def test_the_conclusion_counts_errors_within_their_uncertainty():
     said = conclude(rows)
     assert "1 of 2 errors" in said and "1.50 (step height of b)" in said
     assert "none can be judged" in conclude(rows[2:])
+    certified = [Row("b", "step height", error=0.03, stated=0.03, uncertainty=0.04)]
+    assert "1 of 1 errors" in conclude(certified) and "0.60 (step height of b)" in conclude(certified)
 
 
 def test_published_values_are_found_by_the_captures_name(campaign):
