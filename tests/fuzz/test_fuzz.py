@@ -15,7 +15,7 @@ from uwlts.files.writing import write_atomically
 from uwlts.storage.calibration_file import load_calibration
 
 CORPUS = Path(__file__).with_name("corpus")
-CASES = 2000
+CASES = 500
 
 
 def test_past_failures_are_refused(tmp_path: Path):

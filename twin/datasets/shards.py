@@ -5,7 +5,7 @@ In a tar archive, the files of a sample are consecutive and share the name up to
 contains the metadata. Each further array is a ``.npy`` file with its name.
 
 In an HDF5 file, each array is a dataset with the frames along its first axis; further datasets are ``image``, ``json``
-and ``key``.
+and ``key``. Texts have a fixed length: in those of variable length, HDF5 may search a damaged file forever.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 from uwlts.errors import CaptureError
 from uwlts.files.reading import NPY_DAMAGE, require_regular_file
 from uwlts.files.writing import write_atomically
-from uwlts.storage.hdf5_file import DAMAGE
+from uwlts.storage.hdf5_file import DAMAGE, find_dataset, require_small_chunks
 
 Format = Literal["webdataset", "hdf5"]
 SUFFIXES: dict[Format, str] = {"webdataset": ".tar", "hdf5": ".h5"}
@@ -63,7 +63,9 @@ def open_shard(path: Path, file_format: Format, *, frames: int) -> Iterator[Shar
                     yield _TarWriter(archive)
             case "hdf5":
                 with h5py.File(aside, "w", libver="latest") as file:
-                    yield _Hdf5Writer(file, frames)
+                    writer = _Hdf5Writer(file, frames)
+                    yield writer
+                    writer.write_texts()
             case _:
                 assert_never(file_format)
 
@@ -91,7 +93,8 @@ class _TarWriter:
 
 class _Hdf5Writer:
     def __init__(self, file: h5py.File, frames: int):
-        self._file, self._frames, self._done = file, frames, 0
+        self._file, self._frames = file, frames
+        self._texts: dict[str, list[bytes]] = {"key": [], "json": []}
 
     def add(self, sample: Sample) -> None:
         """Write a sample."""
@@ -100,17 +103,16 @@ class _Hdf5Writer:
                 chunk = (1, *values.shape)
                 packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
                 self._file.create_dataset(name, (self._frames, *values.shape), values.dtype, chunks=chunk, **packed)
-            self._array(name)[self._done] = values
-        for name, text in (("key", sample.key), ("json", json.dumps(sample.info, allow_nan=False))):
-            if name not in self._file:
-                self._file.create_dataset(name, (self._frames,), h5py.string_dtype())
-            self._array(name)[self._done] = text
-        self._done += 1
+            dataset = self._file[name]
+            assert isinstance(dataset, h5py.Dataset)
+            dataset[len(self._texts["key"])] = values
+        self._texts["key"].append(sample.key.encode())
+        self._texts["json"].append(json.dumps(sample.info, allow_nan=False).encode())
 
-    def _array(self, name: str) -> h5py.Dataset:
-        found = self._file[name]
-        assert isinstance(found, h5py.Dataset)
-        return found
+    def write_texts(self) -> None:
+        """Write the keys and the metadata of all samples, whose longest text is known now."""
+        for name, texts in self._texts.items():
+            self._file.create_dataset(name, data=np.array(texts, dtype=np.bytes_), chunks=(1,), compression="gzip")
 
 
 def _png(values: np.ndarray) -> bytes:
@@ -174,15 +176,28 @@ class ShardReader:
 
     def _from_hdf5(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
         with h5py.File(self.path, "r") as file:
-            datasets: dict[str, Any] = {str(name): each for name, each in file.items()}
-            if len(datasets["key"]) != self.frames:
-                raise ValueError(f"it contains {len(datasets['key'])} frames, expected {self.frames}")
-            sample: dict[str, Any] = {"key": datasets.pop("key")[number].decode()}
-            text = datasets.pop("json")
-            sample |= {name: each[number] for name, each in datasets.items() if names is None or name in names}
+            keys, infos = (_texts(file, name) for name in ("key", "json"))
+            if len(keys) != self.frames:
+                raise ValueError(f"it contains {len(keys)} frames, expected {self.frames}")
+            sample: dict[str, Any] = {"key": keys[number].decode()}
+            for name in sorted(set(file) - {"key", "json"}):
+                if names is None or name in names:
+                    dataset = find_dataset(file, name, path=self.path)
+                    if dataset is None:
+                        raise ValueError(f"'{name}' is not an array")
+                    require_small_chunks(dataset, name, path=self.path)
+                    sample[name] = dataset[number]
             if names is None or "info" in names:
-                sample["info"] = json.loads(text[number])
+                sample["info"] = json.loads(infos[number])
             return sample
+
+
+def _texts(file: h5py.File, name: str) -> h5py.Dataset:
+    texts = file[name]
+    if not isinstance(texts, h5py.Dataset) or texts.dtype.kind != "S":
+        raise ValueError(f"'{name}' is not text of a fixed length; uwlts 0.2 and older wrote others: make it again")
+    require_small_chunks(texts, name, path=file.filename)
+    return texts
 
 
 def _decode(ending: str, content: bytes) -> Any:

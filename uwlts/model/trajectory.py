@@ -156,9 +156,12 @@ def _check_covariances(values: np.ndarray, count: int) -> np.ndarray:
             f"the covariances of {count} poses must be finite numbers ({count}, 6, 6); found {covariances.shape}"
         )
     sizes = np.sqrt(np.maximum(np.einsum("nii->ni", covariances), 1e-30))
-    scaled = covariances / (sizes[:, :, None] * sizes[:, None])
-    lopsided = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2)) > _ROUNDED
-    wrong = lopsided | (np.linalg.eigvalsh(scaled)[:, 0] < -_ROUNDED)
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = covariances / (sizes[:, :, None] * sizes[:, None])
+        lopsided = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2)) > _ROUNDED
+    wrong = lopsided | (np.abs(scaled).max(axis=(1, 2)) > 1 + _ROUNDED)
+    # Eigenvalues of other matrices may overflow.
+    wrong[~wrong] = np.linalg.eigvalsh(scaled[~wrong])[:, 0] < -_ROUNDED
     if wrong.any():
         raise DescriptionError(
             f"the covariance of pose {int(np.argmax(wrong)) + 1} must be symmetric and without negative variances"

@@ -308,7 +308,7 @@ def poses_from_rows(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarra
     turns = rows[:, 3:]
     if pose_format.startswith("quaternion"):
         lengths = np.linalg.norm(turns, axis=1)
-        wrong = np.flatnonzero(np.abs(lengths - 1) > _ROUNDED)
+        wrong = np.flatnonzero(~(np.abs(lengths - 1) <= _ROUNDED))  # not a number, too
         if len(wrong):
             raise DescriptionError(
                 f"{path}: the quaternion of pose {wrong[0] + 1} has the length {lengths[wrong[0]]:.4g}; expected 1. "
