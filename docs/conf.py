@@ -5,10 +5,17 @@ import shutil
 from importlib.metadata import version as version_of
 from pathlib import Path
 
+import twin
+import uwlts
 from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
 
 ROOT = Path(__file__).resolve().parents[1]
+
+# autodoc changes the annotations of pydantic's classes; models that are imported afterwards cannot be built.
+for package in (uwlts, twin):
+    for name in package.__all__:
+        getattr(package, name)
 
 project = "uwlts"
 project_copyright = "the uwlts authors"
@@ -16,7 +23,7 @@ release = version = version_of("uwlts")
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
 source_suffix = {".md": "myst-nb"}
-exclude_patterns = ["_build", "studies", "examples", "pictures"]
+exclude_patterns = ["_build", "studies", "examples", "pictures", "static"]
 html_theme = "pydata_sphinx_theme"
 html_title = "uwlts"
 html_theme_options = {
@@ -33,6 +40,8 @@ html_show_sourcelink = False
 # Options keep both of their dashes.
 smartquotes = False
 html_copy_source = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4

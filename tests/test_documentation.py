@@ -5,11 +5,14 @@ import os
 import re
 import subprocess
 import tomllib
+import types
 from pathlib import Path
 
 import cyclopts
 import pytest
 
+import twin
+import uwlts
 from tests.documented import APPS, PAGES, README, ROOT, blocks, mentioned_commands, name_of, words_of
 from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
@@ -79,6 +82,19 @@ def test_every_page_is_in_a_table_of_contents():
             listed |= {path for entry in entries for path in page.parent.glob(f"{entry}.md")}
     pages = {path for path in PAGES if path.is_relative_to(ROOT / "docs")} - {ROOT / "docs" / "index.md"}
     assert pages == listed
+
+
+@pytest.mark.parametrize("package", [uwlts, twin])
+def test_every_public_name_is_on_one_page_of_the_api(package):
+    pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "reference" / "api").glob("*.md"))
+    names = [name for name in package.__all__ if not isinstance(getattr(package, name), types.ModuleType)]
+    if f".. automodule:: {package.__name__}\n   :members:\n" in pages:
+        hidden = re.search(rf"automodule:: {package.__name__}\n.*\n   :exclude-members: (.*)", pages)
+        names = hidden[1].split(", ") if hidden else []
+    counts = {name: len(re.findall(rf"auto(?:function|class):: {name}$", pages, re.MULTILINE)) for name in names}
+    assert {
+        name: count for name, count in counts.items() if count != 1 and name not in ("Error", "StripeOptions")
+    } == {}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)

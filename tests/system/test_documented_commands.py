@@ -45,6 +45,7 @@ uwlts mesh pipe.ply --out pipe.stl
 """
 
 MAKE = {"make ": "`make test-full` runs this test, and demo, bench, docs and check take minutes each"}
+INSTALL = {"pip install": "make does it", "twin demo": "takes a minute; tests/system/test_campaign.py runs it"}
 HARDWARE = "needs hardware: docs/how-to/scan.md and desk.md run it with the twin"
 ALIGNED_ELSEWHERE = "a pass that can be aligned takes minutes to render: tests/uwlts/alignment/test_align.py runs it"
 NEEDS_LEARN = "needs the extra learn, with some 1 GB of libraries, and minutes of training"
@@ -168,12 +169,8 @@ PAGES_RUN = {
     ),
     "CONTRIBUTING.md": Page(not_run=MAKE),
     "docs/install.md": Page(not_run=MAKE | {"python3 -m venv": "make does it", ".venv/bin/": "make does it"}),
-    "docs/getting-started.md": Page(
-        not_run=MAKE
-        | {"pip install": "make does it", "twin demo": "takes a minute; tests/system/test_campaign.py runs it"},
-        small_python=True,
-        again=("twin simulate spheres",),
-    ),
+    "docs/index.md": Page(not_run=INSTALL),
+    "docs/getting-started.md": Page(not_run=MAKE | INSTALL, small_python=True, again=("twin simulate spheres",)),
     "docs/explanation/design-studies.md": Page(),
     "docs/explanation/joint-calibration.md": Page(
         given={name: name for name in ("target-air.h5", "target-water.h5", "step-near.h5", "step-far.h5", "spheres.h5")}
