@@ -23,7 +23,7 @@ release = version = version_of("uwlts")
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
 source_suffix = {".md": "myst-nb"}
-exclude_patterns = ["_build", "studies", "examples", "pictures", "static"]
+exclude_patterns = ["_build", "studies", "examples", "paper", "pictures", "static"]
 html_theme = "pydata_sphinx_theme"
 html_title = "uwlts"
 html_theme_options = {

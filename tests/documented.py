@@ -13,7 +13,9 @@ README = ROOT / "README.md"
 PAGES = (
     README,
     ROOT / "CONTRIBUTING.md",
-    *sorted(path for path in (ROOT / "docs").rglob("*.md") if "_build" not in path.relative_to(ROOT).parts),
+    *sorted(
+        path for path in (ROOT / "docs").rglob("*.md") if not {"_build", "paper"} & set(path.relative_to(ROOT).parts)
+    ),
 )
 APPS = ("twin", "uwlts")
 PROGRAMS = (*APPS, "cd", "make", "pip", ".venv/bin/pip", "pytest", "python", "python3", ".venv/bin/python")

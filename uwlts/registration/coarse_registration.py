@@ -133,7 +133,7 @@ def _import_kiss_matcher() -> Any:
         import kiss_matcher
     except ImportError as error:
         raise SetupError(
-            "the search for initial poses needs the library kiss-matcher, which is not installed: pip install "
-            "'uwlts[registration]', or give initial poses"
+            "the search for initial poses needs the library kiss-matcher, which is not installed (its wheels are for "
+            "Python 3.12 and older): pip install 'uwlts[registration]', or give initial poses"
         ) from error
     return kiss_matcher
