@@ -12,7 +12,7 @@ _MOST = 8
 
 
 class Brief:
-    """Base of results with a `repr` that fits on a screen and a table for notebooks; names contain the units."""
+    """Base of results with a `repr` and `str` that fit on a screen and a table for notebooks; names contain the units."""
 
     def summarise_fields(self) -> dict[str, str]:
         """Return short texts of the fields' values by name."""
@@ -25,6 +25,10 @@ class Brief:
         return "\n".join(
             [f"{type(self).__name__}:", *(f"  {name}: {text}" for name, text in self.summarise_fields().items())]
         )
+
+    def __str__(self) -> str:
+        """Return the same: pydantic's models would print all their contents."""
+        return repr(self)
 
     def _repr_html_(self) -> str:
         """Return the fields as an HTML table."""

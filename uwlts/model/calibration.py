@@ -18,6 +18,7 @@ from uwlts.errors import describe_problems
 from uwlts.files.json_files import write_model
 from uwlts.model.brief import Brief
 from uwlts.model.joint_estimate import JointEstimate, Origin
+from uwlts.model.parameter_keys import SheetParameter
 from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Table, UnitVector, Vector, Window
 
 FORMAT, VERSION = "uwlts-calibration", 1
@@ -268,10 +269,19 @@ class Calibration(Brief, Description):
         known |= {f"{name}_px": camera.pop(name, None) for name in ("cx", "cy")}
         others = {
             "distortion": camera,
-            "sheet_normal_deg": _select_numbers(self.figures("sheet")).get("normal_std_deg"),
+            "sheet_normal_deg": self._sheet_normal_std_deg(),
             "window_distance_mm": _select_numbers(self.figures("window")).get("std_mm"),
         }
         return CalibrationStd.model_validate(known | others)
+
+    def _sheet_normal_std_deg(self) -> float | None:
+        """Return the largest standard uncertainty of the direction of the sheet's normal, deg."""
+        turns = SheetParameter.TURN_FAN, SheetParameter.TURN_AXIS  # about two orthogonal axes in the sheet
+        if self.joint is None or not set(turns) <= set(self.joint.parameters):
+            return _select_numbers(self.figures("sheet")).get("normal_std_deg")
+        places = [self.joint.parameters.index(turn) for turn in turns]
+        covariance = self.joint.covariance_matrix()[np.ix_(places, places)]
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[-1])))
 
     def origin(self) -> Origin:
         """Return the evidence of the calibration, from its provenance."""

@@ -113,7 +113,7 @@ def test_results_are_short_texts():
     """Sizes in place of arrays: a screen has some 40 lines of 100 characters."""
     for result in (cloud_of(100_000), uwlts.nominal("thesis", medium="water")):
         lines = repr(result).splitlines()
-        assert len(lines) < 40 and max(map(len, lines)) <= 100
+        assert len(lines) < 40 and max(map(len, lines)) <= 100 and str(result) == repr(result)
     assert "points_mm: 100000 x 3 float64" in repr(cloud_of(100_000))
     assert "<td>100000 x 3 float64</td>" in cloud_of(100_000)._repr_html_()
 

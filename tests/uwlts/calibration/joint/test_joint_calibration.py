@@ -209,6 +209,9 @@ def test_target_images_in_water_alone_give_everything(in_water, thesis):
     calibration = result.calibration
     assert calibration.media[0].index == pytest.approx(WATER, abs=5e-4)
     assert calibration.medium_index(calibration.media[0].medium) == calibration.media[0].index
+    turns = np.degrees([std["sheet_turn_fan"], std["sheet_turn_axis"]])
+    normal = calibration.std().sheet_normal_deg
+    assert normal is not None and max(turns) <= normal <= np.hypot(*turns)
 
 
 def test_air_and_water_together_are_better_than_either(in_air, in_water, thesis):
