@@ -153,6 +153,11 @@ def photographs_of_the_page(runner: Runner) -> None:
     shutil.copytree(runner.names["folder"], runner.folder / "photographs")
 
 
+def both_folders_of_the_page(runner: Runner) -> None:
+    for name in ("target", "scan"):
+        shutil.copytree(runner.names["folder"] / name, runner.folder / name)
+
+
 def photographs_with_description(runner: Runner) -> None:
     shutil.copytree(ROOT / "tests" / "data" / "etna", runner.folder / "photographs")
     shutil.copy(runner.names["folder"] / "board.toml", runner.folder)
@@ -246,6 +251,7 @@ PAGES_RUN = {
     "docs/tutorials/learn-from-a-data-set.md": Page(
         instead={"scenes=50": "scenes=6"}, not_run={"example = next(": NEEDS_LEARN, "methods = {": NEEDS_LEARN}
     ),
+    "docs/tutorials/photographs-to-cloud.md": Page(prepare={"uwlts import target": both_folders_of_the_page}),
     "docs/tutorials/photographs-to-sensor.md": Page(
         prepare={"uwlts camera photographs": photographs_with_description},
         instead={"Path.cwd().parents": "Path(uwlts.__file__).parents"},
