@@ -1,4 +1,4 @@
-"""Files of other makers: PCD clouds, CSV of Gocator sensors, and poses in robot programs."""
+"""Files of other makers: PCD clouds, CSV of Gocator and scanCONTROL sensors, and poses in robot programs."""
 
 import struct
 from pathlib import Path
@@ -127,6 +127,58 @@ def test_a_surface_of_a_gocator_is_read(tmp_path: Path):
         (tmp_path / "b.csv").write_text(text)
         with pytest.raises(uwlts.Error, match=message):
             read_cloud(tmp_path / "b.csv")
+
+
+def test_a_point_cloud_of_a_gocator_is_read(tmp_path: Path):
+    attributes = "Frame,Source,Time,Encoder,Z Encoder,Inputs,Row Count,Column Count,X Offset,Y Offset,Z Offset"
+    part = f"SurfacePointCloud\n{attributes}\n0,0,1,2,0,0,2,2,0,0,0\nx,y,z,x,y,z\n0,5,1,0.1,5.1,2\n0,6,4,,,\nEnd\n"
+    (tmp_path / "a.csv").write_text(INFO + part)
+    cloud = read_cloud(tmp_path / "a.csv")
+    assert cloud.points_mm.tolist() == [[0, 5, 1], [0.1, 5.1, 2], [0, 6, 4]]
+    (tmp_path / "a.csv").write_text(INFO + part.replace("0,5,1,0.1", "0,5,0.1"))
+    with pytest.raises(uwlts.Error, match="a row has 5 cells"):
+        read_cloud(tmp_path / "a.csv")
+
+
+BLOCK = "scanCONTROL 2950-100\nSerial number{0}218020023\nMeasuring range{0}100{0}mm\n\nDate{0}12.03.2024 10:11\n"
+ROWS = [[0.5 * i, 0.25 * p, 90 + 0.125 * i, 300 + i] for p in range(3) for i in range(20)]
+
+
+@pytest.mark.parametrize("mark", ";,\t")
+@pytest.mark.parametrize("decimal", ".,")
+@pytest.mark.parametrize(
+    ("names", "scale"),
+    [
+        ("Profile X-Value[mm] Y-Value[mm] Z-Value[mm] Intensity", 1.0),
+        ("Profile X/um Y/um Z/um Intensity", 1e-3),
+        ("Profile X Y Z Intensity", 1.0),
+    ],
+)
+def test_lines_before_the_names_of_columns_are_said_and_omitted(
+    tmp_path: Path, mark: str, decimal: str, names: str, scale: float
+):
+    if mark == decimal:
+        return
+    rows = ["0 " + " ".join(map(str, row)) for row in ROWS]
+    text = "\n".join([names, *rows]).replace(".", decimal).replace(" ", mark)
+    for encoding in ("utf-8", "utf-16"):
+        (tmp_path / "a.csv").write_text(BLOCK.format(mark) + text, encoding=encoding)
+        cloud = read_cloud(tmp_path / "a.csv")
+        assert np.allclose(cloud.points_mm, scale * np.array(ROWS)[:, :3], rtol=1e-15)
+        assert cloud.intensity.tolist() == [row[3] for row in ROWS]
+        assert "4 lines before the names of columns are omitted: scanCONTROL 2950-100" in cloud.warnings[0]
+
+
+def test_a_block_of_lines_may_state_a_unit_or_profiles_without_positions(tmp_path: Path):
+    rows = "\n".join(";".join(map(str, row[:3])) for row in ROWS)
+    (tmp_path / "a.csv").write_text(f"scanCONTROL\nUnit;m\nX;Y;Z\n{rows}\n")
+    assert "may state another unit" in " ".join(read_cloud(tmp_path / "a.csv").warnings)
+    (tmp_path / "a.csv").write_text(f"scanCONTROL\nProfile;X;Z\n{rows}\n")
+    with pytest.raises(uwlts.Error, match="expected x, y and z"):
+        read_cloud(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text(f"scanCONTROL\nX;Y;Z\n{rows}\nX;Y;Z\n{rows}\n")
+    with pytest.raises(uwlts.Error, match="no table of numbers"):
+        read_cloud(tmp_path / "a.csv")
 
 
 PROGRAMS = {
