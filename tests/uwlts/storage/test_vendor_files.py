@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.number_tables import read_number_table
-from uwlts.storage.pose_files import read_poses
+from uwlts.storage.pose_files import read_poses, read_trajectory
 
 # Equal values follow each other, so that the compressed file has references of all kinds.
 POINTS = np.repeat(np.random.default_rng(8).uniform(-80, 80, (60, 3)).astype(np.float32), 7, axis=0)
@@ -217,3 +217,40 @@ def test_poses_of_robot_programs_are_read(tmp_path: Path, robot: str):
     (tmp_path / "b.mod").write_text("no pose")
     with pytest.raises(uwlts.Error, match=f"no pose in the form of {robot}"):
         read_poses(tmp_path / "b.mod", pose_format=robot)
+
+
+def test_poses_of_colmap_are_inverted_and_sorted_by_name(tmp_path: Path):
+    """The transform from the world to the camera is drawn with SciPy; the pose is its inverse."""
+    rng = np.random.default_rng(4)
+    names = ["img 10.png", "img 9.png", "img 1.png"]
+    turns, shifts = Rotation.random(3, rng=rng), rng.uniform(-2, 2, (3, 3))
+    points = ["100.5 20.5 -1 3.5 4.5 12", "", ""]
+    rows = []
+    for number, (name, turn, shift, seen) in enumerate(zip(names, turns, shifts, points, strict=True), start=1):
+        quaternion = turn.as_quat(scalar_first=True)
+        rows += [f"{number} {' '.join(map(repr, map(float, [*quaternion, *shift])))} 1 {name}", seen]
+    header = (
+        "# Image list with two lines of data per image:\n#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+    )
+    text = header + "\n".join(rows)
+    (tmp_path / "images.txt").write_text(text + "\n")
+    for unit, scale in (("mm", 1.0), ("m", 1000.0)):
+        poses, times = read_poses(tmp_path / "images.txt", pose_format="colmap", unit=unit)
+        assert times is None
+        for pose, number in zip(poses, (2, 1, 0), strict=True):
+            from_world = np.vstack([np.column_stack([turns[number].as_matrix(), scale * shifts[number]]), [0, 0, 0, 1]])
+            assert np.allclose(pose @ from_world, np.eye(4), atol=1e-10)
+    with pytest.raises(uwlts.Error, match="lengths of COLMAP have no unit"):
+        read_poses(tmp_path / "images.txt", pose_format="colmap")
+    with pytest.raises(uwlts.Error, match="colmap have no times"):
+        read_trajectory(tmp_path / "images.txt", pose_format="colmap", unit="m")
+    without_points = header + "\n".join(rows[::2]) + "\n"
+    for wrong in (
+        without_points,
+        header,
+        text.replace(" 1 img 9.png", ""),
+        text.replace("img 10.png", "").replace("1 ", "nan "),
+    ):
+        (tmp_path / "images.txt").write_text(wrong)
+        with pytest.raises(uwlts.Error, match=r"images\.txt"):
+            read_poses(tmp_path / "images.txt", pose_format="colmap", unit="m")
