@@ -395,6 +395,8 @@ def describe_source(capture: Capture) -> CaptureSource:
     header, laser = capture.header, int(np.count_nonzero(capture.laser_on))
     medium = header.medium
     known: Table = {"medium": header.medium_name, "window": header.sensor.camera.window.mounted}
+    if (offset := header.sensor.camera.offset_px) is not None:
+        known |= {"offset_px": list(offset)}
     if medium.kind in ("fresh", "sea"):
         known |= {"temperature_c": medium.temperature_c, "salinity_g_kg": medium.salinity_g_kg}
     known |= {key: thing for key in ("target", "artefact") if (thing := getattr(header, key)) is not None}
