@@ -23,7 +23,7 @@ from tests.uwlts.storage.test_capture import a_header, interrupted, record, smal
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_ros_bags import messages, write_ros2
 from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
-from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, COLUMNS, INFO, POINTS, PROGRAMS, pcd
+from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, BLOCK, COLUMNS, INFO, POINTS, PROGRAMS, pcd
 from tests.uwlts.stripe.test_learned import centroid_model
 from twin.datasets.data_set import load_description as load_data_set
 from twin.datasets.loading import load_dataset
@@ -275,6 +275,9 @@ distortion_coefficients:
 """
 
 
+COLMAP_IMAGES = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n" + "".join(
+    f"{number} 0.5 -0.5 0.5 0.5 {number} 2 3 1 image{number}.png\n1.5 2.5 -1 3 4 7\n" for number in range(1, 4)
+)
 COLMAP = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 OPENCV 640 480 800 801 320.5 240.5 -0.1 0.02 0.001 -0.002\n"
 
 
@@ -462,6 +465,14 @@ READERS = {
             )
             for robot in PROGRAMS
         ),
+        Reader(
+            "poses-colmap",
+            ".txt",
+            "lines",
+            _text(COLMAP_IMAGES),
+            lambda path: read_poses(path, pose_format="colmap", unit="m"),
+        ),
+        Reader("cloud-block", ".csv", "lines", _text(BLOCK.format(";") + "X;Y;Z\n" + 12 * "1,5;2;3\n"), read_cloud),
         Reader("verification", ".verification.json", "json", _verification, _verified),
         Reader(
             "mount-description",

@@ -106,6 +106,11 @@ def shorten(text: str, most: int = 300) -> str:
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
 
 
+def natural_key(name: str) -> list[str | int]:
+    """Return a sort key that orders image9 before image10."""
+    return [int(part) if part.isascii() and part.isdigit() else part.casefold() for part in re.split(r"([0-9]+)", name)]
+
+
 def log_warnings(path: str | os.PathLike[str], warnings: Iterable[str]) -> None:
     """Log warnings about the content of a file; without further settings, Python prints them on standard error."""
     for warning in warnings:

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import HardwareError, ImageError
-from uwlts.files.reading import is_regular_file
+from uwlts.files.reading import is_regular_file, natural_key
 from uwlts.hardware.camera_interface import BUFFERS, CameraDevice, CameraInfo, CameraSettings, Delivered
 from uwlts.model.stripe import Coordinates, Stripe
 from uwlts.storage.capture import Capture
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
-from uwlts.storage.import_.matching import natural_key
 
 
 class ReplayCamera(CameraDevice):

@@ -125,6 +125,7 @@ class CaptureSource(_Stored):
     laser_images: _Count | None = None
     medium: str | None = None
     window: bool | None = None
+    offset_px: tuple[int, int] | None = None
     temperature_c: float | None = None
     salinity_g_kg: float | None = None
     target: Table | None = None

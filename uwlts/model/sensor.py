@@ -148,12 +148,15 @@ class Camera(Description):
     of the laser stripe in the image: "width" (one peak per column, 1280 in the thesis's camera) or "height" (one peak
     per row, 1024). It also defines the side of the laser: above the camera (-y) for "width", to the right (+x) for
     "height". ``pixel_size_um`` is the width of a pixel, and ``pixel_aspect`` its width divided by its height.
+    ``offset_px`` is the column and row of the images' first pixel on the image sensor, if known: images of the same
+    size from another part of it have another principal point.
     """
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
     height_px: Annotated[int, Field(ge=16, le=20000)]
     pixel_size_um: Annotated[float, Field(ge=0.1, le=1000)]
     pixel_aspect: Annotated[float, Field(ge=0.9, le=1.1)] = 1.0
+    offset_px: tuple[Annotated[int, Field(ge=0, le=20000)], Annotated[int, Field(ge=0, le=20000)]] | None = None
     focal_length_mm: _Length
     principal_point_px: tuple[_Coordinate, _Coordinate] | None = None
     distortion: Distortion = Distortion()

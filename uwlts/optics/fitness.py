@@ -1,4 +1,4 @@
-"""Check of a calibration against a recording: image size, stripe, wavelength, lens, medium and window."""
+"""Check of a calibration against a recording: image size and place, stripe, wavelength, lens, medium and window."""
 
 from uwlts.errors import CalibrationError
 from uwlts.model.any_calibration import AnyCalibration
@@ -30,9 +30,9 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
     Raises
     ------
     CalibrationError
-        Image size, stripe orientation, wavelength or focal length differ; the recording was made in water and the
-        calibration has no window; or a polynomial calibration was made in another medium, or with the window mounted
-        and the recording without, or the reverse.
+        Image size, a stated offset of the images on the image sensor, stripe orientation, wavelength or focal length
+        differ; the recording was made in water and the calibration has no window; or a polynomial calibration was made
+        in another medium, or with the window mounted and the recording without, or the reverse.
     """
     camera = header.sensor.camera
     model = calibration if isinstance(calibration, PolynomialCalibration) else calibration.camera
@@ -44,6 +44,12 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
         raise CalibrationError(
             f"{source} has images of {size[0]} x {size[1]} pixels, the calibration is for {wanted[0]} x {wanted[1]}: "
             f"{advice}"
+        )
+    offsets = _offsets(calibration)
+    if camera.offset_px is not None and offsets - {camera.offset_px}:
+        raise CalibrationError(
+            f"{source} has images from {camera.offset_px} px of the image sensor, the calibration is for images from "
+            f"{', '.join(map(str, sorted(offsets)))} px: calibrate with images of this region (`offset_px`)"
         )
     if camera.stripe_along != calibration.stripe_along:
         raise CalibrationError(
@@ -77,7 +83,22 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
             f"{source} was made in air, but the calibration has a single viewpoint in water "
             f"({calibration.medium_kind}), which includes the refraction: calibrate in air"
         )
-    return [f"{named}: check that it is the right one"] if other else []
+    warnings = [f"{named}: check that it is the right one"] if other else []
+    if (camera.offset_px is None) == bool(offsets):
+        warnings.append(
+            f"only one of {source} and the calibration states the images' offset on the image sensor "
+            "(offset_px): check that it is the same"
+        )
+    return warnings
+
+
+def _offsets(calibration: AnyCalibration) -> set[tuple[int, int]]:
+    """Return the stated offsets of a calibration's images on the image sensor, px."""
+    if isinstance(calibration, PolynomialCalibration):
+        stated = calibration.provenance.get("offset_px")
+        x, y = stated if isinstance(stated, list) and len(stated) == 2 else (None, None)
+        return {(x, y)} if isinstance(x, int) and isinstance(y, int) else set()
+    return {source.offset_px for source in calibration.origin().captures() if source.offset_px is not None}
 
 
 def _check_same_refraction(header: CaptureHeader, calibration: PolynomialCalibration, *, source: str) -> None:

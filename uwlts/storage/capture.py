@@ -34,7 +34,7 @@ from uwlts.model.calibration import is_rigid
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import Camera, CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, StripeStatus
-from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_label, read_plan, require_small_chunks
+from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_label, read_plan, read_values, require_small_chunks
 from uwlts.storage.unfinished_hdf5 import UnfinishedFile, has_writer
 
 FORMAT = "uwlts-capture"
@@ -230,7 +230,7 @@ class Capture(AbstractContextManager["Capture"]):
         }
         for name, dataset in columns.items():
             require_small_chunks(dataset, name, path=self.path)
-        self._images, self.dtype = images, images.dtype
+        self._images, self.dtype = images, images.dtype.newbyteorder("=")
         self.holds_lines = "centre_lines" in self.file
         self.moving = "stage_reports" in self.file
         more = {
@@ -247,7 +247,7 @@ class Capture(AbstractContextManager["Capture"]):
         self._count = min(map(len, counted))
         for dataset, name in zip(more.values(), more, strict=True):
             require_small_chunks(dataset, name, path=self.path)
-        known = {name: dataset[: self._count] for name, dataset in more.items()}
+        known = {name: read_values(dataset, slice(self._count)) for name, dataset in more.items()}
         self.has_image = known.get("has_image", np.ones(self._count, bool))
         self.encoder = known.get("encoder", np.full(self._count, np.nan))
         self.speed_mm_per_s = known.get("speed_mm_per_s", np.zeros(self._count))
@@ -255,20 +255,20 @@ class Capture(AbstractContextManager["Capture"]):
         if self.moving:
             reports = self._dataset("stage_reports", (2,), "f")
             require_small_chunks(reports, "stage_reports", path=self.path)
-            self.stage_reports = reports[:]
+            self.stage_reports = read_values(reports)
         if not (np.isfinite(self.speed_mm_per_s).all() and np.isfinite(self.stage_reports).all()):
             raise CaptureError(f"{self.path} holds speeds or reports of the stage that are not finite")
         if self.holds_lines:
             self._require_stored(self._lines, int(np.count_nonzero(~self.has_image)), "centre lines")
         self._require_stored(images, int(np.count_nonzero(self.has_image)), "images")
         self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
-            dataset[: self._count] for dataset in columns.values()
+            read_values(dataset, slice(self._count)) for dataset in columns.values()
         )
         if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
             raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
         self.pose_covariance: np.ndarray | None = None
         if COVARIANCE in self.file:
-            covariances: np.ndarray = self._dataset(COVARIANCE, (6, 6), "f")[: self._count]
+            covariances = read_values(self._dataset(COVARIANCE, (6, 6), "f"), slice(self._count))
             known = np.isfinite(covariances).all(axis=(1, 2))
             if known.any():
                 require_covariances(covariances[known], self.path)
@@ -325,8 +325,8 @@ class Capture(AbstractContextManager["Capture"]):
             raise IndexError(f"frame {index} of {self._count}")
         try:
             if self.has_image[index]:
-                return self._images[index]
-            rows = self._lines[index]
+                return read_values(self._images, index)
+            rows = read_values(self._lines, index)
         except DAMAGE as error:
             raise CaptureError(f"frame {index} of {self.path} cannot be read: the file is damaged ({error})") from error
         return self._stripe(rows, index)
@@ -395,6 +395,8 @@ def describe_source(capture: Capture) -> CaptureSource:
     header, laser = capture.header, int(np.count_nonzero(capture.laser_on))
     medium = header.medium
     known: Table = {"medium": header.medium_name, "window": header.sensor.camera.window.mounted}
+    if (offset := header.sensor.camera.offset_px) is not None:
+        known |= {"offset_px": list(offset)}
     if medium.kind in ("fresh", "sea"):
         known |= {"temperature_c": medium.temperature_c, "salinity_g_kg": medium.salinity_g_kg}
     known |= {key: thing for key in ("target", "artefact") if (thing := getattr(header, key)) is not None}

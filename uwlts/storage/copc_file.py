@@ -208,7 +208,7 @@ def read_copc(
             box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
             found = _query(reader, box, at_most)
             points = 1e3 * np.column_stack([found.x, found.y, found.z])
-            require_in_box(points, reader.header)
+            require_in_box(points, reader.header, whole=len(points) == total)
     except BaseException as error:
         # The decompressor, in Rust, panics at damaged chunks: the exception is no Exception.
         if isinstance(error, Exception) or type(error).__name__ == "PanicException":

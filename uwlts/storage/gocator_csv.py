@@ -1,6 +1,7 @@
 """CSV files of LMI Gocator sensors: sections with a name, rows of names and values, and a line End.
 
-The sections are described in the Gocator user manual ("CSV converter tool"). Lengths are in mm.
+The sections are described in the Gocator user manual ("CSV converter tool") and that of GoPxL ("CSV File Format").
+Lengths are in mm.
 """
 
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 
 from uwlts.errors import DescriptionError
 
-_PROFILES, _SURFACES = ("Profile", "RawProfile"), ("Part", "Surface")
+_SECTIONS = ("Profile", "RawProfile", "Part", "Surface", "SurfacePointCloud")
 _FRAME, _AXIS, _Y = "Frame", "Axis", "Y"
 
 
@@ -25,20 +26,25 @@ def read_gocator_csv(content: bytes, path: Path) -> tuple[dict[str, np.ndarray],
     DescriptionError if there is no such section, or it is damaged.
     """
     sections = _sections(content.decode("latin-1").splitlines())
-    for name in (*_PROFILES, *_SURFACES):
+    for name in _SECTIONS:
         if (rows := sections.get(name)) is None:
             continue
         try:
-            columns = (_read_profiles if name in _PROFILES else _read_surface)(rows[2:])
+            match name:
+                case "Profile" | "RawProfile":
+                    columns = _read_profiles(rows[2:])
+                case "SurfacePointCloud":
+                    columns = _read_points(rows[3:])
+                case _:
+                    columns = _read_surface(rows[2:])
             offsets = {n: float(v) for n, v in zip(rows[0], rows[1], strict=False) if n.endswith("Offset") and float(v)}
         except (ValueError, IndexError, KeyError, StopIteration) as error:
             raise DescriptionError(f"{path}: the section {name} is damaged or incomplete: {error}") from error
         notes = [f"read the section {name} of a Gocator's CSV file"]
         notes += [f"offsets are not added: {', '.join(f'{n} {v:g} mm' for n, v in offsets.items())}"] if offsets else []
         return columns, notes
-    known = ", ".join((*_PROFILES, *_SURFACES))
     raise DescriptionError(
-        f"{path} is a Gocator's CSV file with the sections {', '.join(sections)}; this reads {known}"
+        f"{path} is a Gocator's CSV file with the sections {', '.join(sections)}; this reads {', '.join(_SECTIONS)}"
     )
 
 
@@ -84,6 +90,14 @@ def _read_surface(rows: list[list[str]]) -> dict[str, np.ndarray]:
         raise ValueError(f"expected rows of a Y value and {len(x)} ranges")
     numbers = np.array(table)
     return {"x": np.tile(x, len(table)), "y": np.repeat(numbers[:, 0], len(x)), "z": numbers[:, 1:].ravel()}
+
+
+def _read_points(rows: list[list[str]]) -> dict[str, np.ndarray]:
+    """Read rows of x, y and z of one point after the other; a comma may end a row."""
+    parts = [_numbers(row[:-1] if len(row) % 3 == 1 and not row[-1] else row) for row in rows]
+    if wrong := next((len(part) for part in parts if len(part) % 3), 0):
+        raise ValueError(f"a row has {wrong} cells; expected x, y and z of each point")
+    return dict(zip("xyz", np.concatenate(parts).reshape(-1, 3).T, strict=True))
 
 
 def _numbers(cells: list[str]) -> np.ndarray:

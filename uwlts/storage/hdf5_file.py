@@ -179,7 +179,13 @@ def read_array(
             f"{path} is damaged: '{name}' has the shape {dataset.shape}, but only {stored:,} bytes are stored"
         )
     require_small_chunks(dataset, name, path=path)
-    return dataset[selection]
+    return read_values(dataset, selection)
+
+
+def read_values(dataset: h5py.Dataset, selection: object = ...) -> np.ndarray:
+    """Read values in the byte order of this machine, which compiled functions need."""
+    values = dataset[selection]
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
 def require_small_chunks(dataset: h5py.Dataset, name: str, *, path: str | Path) -> None:

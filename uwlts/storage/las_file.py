@@ -110,7 +110,7 @@ def read_las(path: Path) -> PointCloud:
                 raise ValueError("its points are compressed, or fewer than its header declares")
             found = reader.read_points(header.point_count)
         points, step = 1e3 * np.column_stack([found.x, found.y, found.z]), 1e3 * float(np.max(header.scales))
-        require_in_box(points, header)
+        require_in_box(points, header, whole=True)
         names = set(found.point_format.dimension_names)
         column = {name: np.asarray(found[name]) for name in names & {"frame", "line", "deviation_mm", "gps_time"}}
         intensity = np.asarray(found["amplitude" if "amplitude" in names else "intensity"], np.float32)
@@ -137,10 +137,12 @@ def read_las(path: Path) -> PointCloud:
     )
 
 
-def require_in_box(points_mm: np.ndarray, header: Any) -> None:
-    """Raise ValueError if points (N, 3) are outside the box that a header states, which a wrong scale or offset causes.
+def require_in_box(points_mm: np.ndarray, header: Any, *, whole: bool) -> None:
+    """Raise ValueError if points (N, 3) contradict the box that a header states, which a wrong scale or offset causes.
 
-    Boxes that are empty state nothing.
+    Points are outside the box; or its corners are beyond the largest integers; or the points' own box is that of the
+    header scaled about the origin of the integers, if the points are those of the ``whole`` file. Boxes that are empty
+    state nothing.
     """
     low, high = 1e3 * np.asarray(header.mins), 1e3 * np.asarray(header.maxs)
     if not len(points_mm) or not (np.isfinite([low, high]).all() and (high > low).any()):
@@ -148,11 +150,26 @@ def require_in_box(points_mm: np.ndarray, header: Any) -> None:
     # Programs round the box, some to the decimals of text.
     margin = np.maximum(2e3 * np.asarray(header.scales), _BOX_MARGIN * (high - low).max())
     found_low, found_high = points_mm.min(axis=0), points_mm.max(axis=0)
-    if (found_low < low - margin).any() or (found_high > high + margin).any():
+    step, origin = 1e3 * np.asarray(header.scales), 1e3 * np.asarray(header.offsets)
+    stated, found = np.stack([low, high]) - origin, np.stack([found_low, found_high]) - origin
+    beyond = (found_low < low - margin).any() or (found_high > high + margin).any()
+    unreachable = (np.abs(stated) > 2**31 * step + margin).any()
+    if beyond or unreachable or (whole and _is_scaled(stated, found, margin, step)):
         raise ValueError(
             f"its scale or offset is wrong: points are from {_numbers(found_low)} to {_numbers(found_high)} mm, the "
             f"box of its header from {_numbers(low)} to {_numbers(high)} mm"
         )
+
+
+def _is_scaled(stated: np.ndarray, found: np.ndarray, margin: np.ndarray, step: np.ndarray) -> bool:
+    """Return whether corners (2, 3) are others times a factor, on one axis or all, that exceeds the ``margin`` (3,)."""
+    for axes in ([0], [1], [2], [0, 1, 2]):
+        one, other = stated[:, axes], found[:, axes]
+        if np.count_nonzero(np.abs(one) > margin[axes]) > 1 and (np.abs(one - other) > margin[axes]).any():
+            rest = other - np.sum(one * other) / np.sum(one**2) * one
+            if (np.abs(rest) <= 2 * step[axes] + _BOX_MARGIN * np.abs(other).max()).all():
+                return True
+    return False
 
 
 def _numbers(values: np.ndarray) -> str:

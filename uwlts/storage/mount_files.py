@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
 from uwlts.files.json_files import read_model
+from uwlts.files.reading import natural_key
 from uwlts.files.writing import hash_file
 from uwlts.model.library import read_table, validate_description
 from uwlts.model.mount import FORMAT, VERSION, Mount
 from uwlts.model.sensor import Description, Positive
 from uwlts.storage.cloud_files import is_cloud, read_cloud
-from uwlts.storage.import_.matching import natural_key
 from uwlts.storage.number_tables import NumberTable, Unit, read_number_table
 from uwlts.storage.pose_files import FARTHEST_MM, check_matrices, read_poses
 

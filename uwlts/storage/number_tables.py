@@ -45,7 +45,7 @@ _IN_BRACKETS = re.compile(r"(.*?)[\s_]*[\[(<](.*)[\])>]")
 _AT_END = re.compile(r"(.+?)[\s_/.\-]+([^\s_/.\-]+)|([xyz])(mm|cm|um|m)")
 _POSITION = re.compile(
     r"(?:(?:p|t|(?:.*[._ /])?(?:pos|position|trans|translation|coord|coordinate|point))(?:[._ ](?:.*[._ ])?)?)?([xyz])"
-    r"(?:[._ ]?(?:pos|position|coord|coordinate))?"
+    r"(?:[._ -]?(?:pos|position|coord|coordinate|value|axis))?"
 )
 _QUATERNION = re.compile(
     r"(?:.*[._ /])?(?:(?:q|quat|quaternion|orientation)(?:[._ ](?:.*[._ ])?)?([wxyz])|(?:rot|rotation)[._ ]?(w))"
@@ -53,12 +53,14 @@ _QUATERNION = re.compile(
 _ROTATION = re.compile(r"(?:.*[._ /])?(?:r|rot|rotation|rotvec)[._ ]?([xyz])")
 _DECIMAL_COMMA = re.compile(rb"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?")
 _UNIT_IN_COMMENT = re.compile(
-    r"\b(?:in|units?)\b[\s:=]*(?:the |are |is )?[\[(]?(m|cm|um|µm|in|inch(?:es)?|ft|feet|(?:centi)?met(?:re|er)s?)\b"
+    r"\b(?:in|units?)\b[\s:=;,]*(?:the |are |is )?[\[(]?(m|cm|um|µm|in|inch(?:es)?|ft|feet|(?:centi)?met(?:re|er)s?)\b"
 )
 _NUMBER = re.compile(rb"[+-]?\d*(?:[.,](\d*))?")
 _FIRST, _FEWEST = 200, 10
 """Number of rows whose decimals are counted, and fewest rows that show them."""
 _COMMENTS = (b"#", b"//", b"%", b"!")
+_LONGEST_BLOCK = 200
+"""Number of lines before the names of columns, with a sensor's type, number and settings; those seen have 5 to 30."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +106,8 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
 
     With separators other than commas, numbers may have decimal commas. Lines that begin with #, //, % or ! are
     comments; the last comment before the numbers names the columns if it contains x and z, or an angle. A first line
-    with the number of rows is recognised, as are a row of units below the names, UTF-8, UTF-16 and Latin-1. Names are
-    in lower case and without unit.
+    with the number of rows is recognised, as are other lines before such names, a row of units below them, UTF-8,
+    UTF-16 and Latin-1. Names are in lower case and without unit.
     Usual names for times, positions, quaternions and Euler angles become ``time_s``, ``x``, ``qw``, ``roll`` and so
     on. Without names, two columns are x and z, and others are numbered. ``digests`` takes the file's SHA-256 by name.
 
@@ -125,6 +127,7 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     if not lines:
         raise DescriptionError(f"{path} is empty: expected a table of numbers")
     lines, counted = _without_count(lines)
+    lines, block = _without_block(lines)
     header = None
     if not _is_row(lines[0]):
         header, *lines = lines
@@ -165,7 +168,9 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     notes: list[str] = []
     if comma and delimiter == b" ":
         notes.append("commas between digits were read as decimal commas, blanks as separators")
-    said = [text for text in map(_text, comments[:1000]) if _UNIT_IN_COMMENT.search(text.lower())]
+    if block:
+        notes.append(f"{len(block)} lines before the names of columns are omitted: {shorten(_text(block[0]), 60)} ...")
+    said = [text for text in map(_text, [*block, *comments[:1000]]) if _UNIT_IN_COMMENT.search(text.lower())]
     if said and not units.keys() & set("xyz"):
         notes.append(f"a comment may state another unit than that of the coordinates: {shorten(said[0], 100)}")
     decimals = [_decimals(row) for row in zip(*(_cells(line, delimiter) for line in lines[:_FIRST]), strict=False)]
@@ -252,6 +257,21 @@ def _without_count(lines: list[bytes]) -> tuple[list[bytes], int | None]:
         further = len(_cells(lines[1], _separators(lines[1])[0]))
         return (lines[1:], int(lines[0])) if further > 1 else (lines, None)
     return lines, None
+
+
+def _without_block(lines: list[bytes]) -> tuple[list[bytes], list[bytes]]:
+    """Remove lines that sensors write before the names of columns, and return them, too.
+
+    The names contain x and z, or an angle, and a row of as many numbers follows, perhaps after a row of units.
+    """
+    for number, line in enumerate(lines[:_LONGEST_BLOCK]):
+        further = lines[number + 1 : number + 3]
+        if row := next((each for each in further if not _is_unit_row(each)), None):
+            delimiter = _separators(row)[0]
+            count = len(cells := _cells(row, delimiter))
+            if all(not cell.strip() or _is_number(cell) for cell in cells) and _names_columns(line, delimiter, count):
+                return lines[number:], lines[:number]
+    return lines, []
 
 
 def _separators(line: bytes) -> tuple[bytes, bool]:

@@ -22,7 +22,7 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.reconstruction.reconstruct import reconstruct, reconstruct_stripes
 from uwlts.storage.calibration_file import read_calibration
-from uwlts.storage.capture import NO_STAGE, Capture, CaptureHeader, Frame, FrameTable
+from uwlts.storage.capture import NO_STAGE, Capture, CaptureHeader, Frame, FrameTable, describe_source
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import StripeOptions, find_stripes
 from uwlts.targets import ChessboardTarget
@@ -224,6 +224,32 @@ def test_another_camera_is_refused(path, camera, message):
     other = other if camera else other.model_copy(update={"stripe_along": "height"})
     with Capture(path) as capture, pytest.raises(CalibrationError, match=message):
         check_fits(capture.header, other, source=path.name)
+
+
+def test_images_from_another_place_of_the_image_sensor_are_refused(path, tmp_path):
+    """Cropped images of the same size have another principal point."""
+    cropped = small_sensor()
+    cropped = cropped.model_copy(update={"camera": cropped.camera.model_copy(update={"offset_px": (64, 8)})})
+    with Capture(write(tmp_path / "a.h5", sensor=cropped)) as capture:
+        assert describe_source(capture).in_file()["offset_px"] == [64, 8]
+
+    def fits(offset, *stated):
+        camera = small_sensor().camera.model_copy(update={"offset_px": offset})
+        with Capture(path) as capture:
+            sensor = capture.header.sensor.model_copy(update={"camera": camera})
+            header = capture.header.model_copy(update={"sensor": sensor})
+        sources = [{"file": "a.h5", "sha256": "0"} | ({"offset_px": each} if each else {}) for each in stated]
+        known = CALIBRATION.model_copy(update={"provenance": {"air_captures": sources}})
+        return check_fits(header, known, source="scan")
+
+    assert fits(None, None) == fits((64, 8), [64, 8], None) == fits((0, 0), [0, 0]) == []
+    with pytest.raises(
+        CalibrationError, match=r"from \(64, 8\) px of the image sensor, .* for images from \(0, 8\) px"
+    ):
+        fits((64, 8), [0, 8])
+    with pytest.raises(CalibrationError, match=r"from \(0, 0\) px"):
+        fits((0, 0), [0, 0], [0, 8])
+    assert ["only one of scan" in each for each in fits((0, 0), None) + fits(None, [4, 4])] == [True, True]
 
 
 def test_another_sensor_s_calibration_is_noticed(path):

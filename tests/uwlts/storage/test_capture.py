@@ -113,6 +113,24 @@ def test_everything_comes_back(tmp_path: Path, dtype: type, with_pose: bool):
         assert capture.laser_on.dtype == bool
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_big_endian_numbers_become_those_of_the_machine(tmp_path: Path, dtype: type):
+    """Compiled functions refuse arrays in another byte order."""
+    record(tmp_path / "a.h5", 3, dtype)
+    with h5py.File(tmp_path / "a.h5") as source, h5py.File(tmp_path / "b.h5", "w", libver="latest") as copy:
+        for name in source.attrs:
+            copy.attrs.create(name, source.attrs[name], dtype=source.attrs.get_id(name).dtype)
+        for name, each in source.items():
+            kind = each.dtype.newbyteorder(">")
+            copy.create_dataset(name, data=each[...].astype(kind), chunks=each.chunks, maxshape=each.maxshape)
+            assert copy[name].dtype.byteorder == ">" or kind.itemsize == 1
+    with Capture(tmp_path / "a.h5") as expected, Capture(tmp_path / "b.h5") as found:
+        assert found.dtype == dtype and found.pose.dtype.isnative and found.stage_mm.dtype.isnative
+        assert np.array_equal(found.pose, expected.pose, equal_nan=True)
+        for one, other in zip(found, expected, strict=True):
+            assert one.seen.dtype.isnative and np.array_equal(one.seen, other.seen) and one.time_s == other.time_s
+
+
 def test_a_process_that_writes_no_capture_reads_one(tmp_path: Path):
     """A uniform image, which is stored compressed; noise is not."""
     path = tmp_path / "a.h5"

@@ -42,14 +42,14 @@ def described(folder: Path, laser: str, **more) -> Path:
 def write(path: Path, places: np.ndarray) -> None:
     match path.suffix:
         case ".npy":
-            np.save(path, raw(places))
+            np.save(path, raw(places).astype(">f8") if "big-endian" in path.name else raw(places))
         case ".csv":
             path.write_text("\n".join(";".join(map(str, row)) for row in raw(places).tolist()))
         case _:
             assert cv2.imwrite(str(path), raw(places))
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".csv", ".png", ".tif"])
+@pytest.mark.parametrize("suffix", [".npy", "-big-endian.npy", ".csv", ".png", ".tif"])
 def test_profiles_come_in_from_every_format(tmp_path: Path, suffix: str):
     places = profiles()
     folder = described(tmp_path / "f", f"map{suffix}")

@@ -201,15 +201,55 @@ def test_what_is_none_is_refused(tmp_path: Path, name: str, message: str):
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.copc.laz"])
-def test_points_outside_the_stated_box_are_refused(tmp_path, name):
-    """The scale of x, at its place in the header (LAS 1.4, table 3), is changed to metres per millimetre."""
+@pytest.mark.parametrize("axes", [[0], [2], [0, 1, 2]])
+@pytest.mark.parametrize("scale", [1e-4, 1e-8, 1e-11, 0.98e-7])
+def test_points_that_contradict_the_stated_box_are_refused(tmp_path, name, axes, scale):
+    """Scales, at their place in the header (LAS 1.4, table 3), are changed: larger ones, and smaller ones."""
     path = tmp_path / name
     points = np.random.default_rng(1).uniform(-100, 100, (500, 3))
     write_cloud(path, PointCloud(points, np.ones(500, np.float32), np.zeros(500, np.int32), np.zeros(500, np.int32)))
     np.testing.assert_allclose(np.sort(read_cloud(path).points_mm, axis=0), np.sort(points, axis=0), atol=1e-4)
     content = bytearray(path.read_bytes())
-    assert struct.unpack_from("<d", content, 131) == (1e-7,)
-    struct.pack_into("<d", content, 131, 1e-4)
+    for axis in axes:
+        assert struct.unpack_from("<d", content, 131 + 8 * axis) == (1e-7,)
+        struct.pack_into("<d", content, 131 + 8 * axis, scale)
     path.write_bytes(content)
     with pytest.raises(CaptureError, match="its scale or offset is wrong: points are from .* the box of its header"):
         read_cloud(path)
+
+
+def las(path: Path, points_m: np.ndarray, box_m: np.ndarray, offset_m, scale: float = 1e-5) -> Path:
+    """Write a LAS file, with a box (2, 3) of its own in the header."""
+    header = laspy.LasHeader(version="1.2", point_format=0)
+    header.offsets, header.scales = np.broadcast_to(np.asarray(offset_m, float), 3), np.full(3, scale)
+    table = laspy.LasData(header)
+    table.x, table.y, table.z = points_m.T
+    table.write(path)
+    content = bytearray(path.read_bytes())
+    for axis in range(3):
+        struct.pack_into("<2d", content, 179 + 16 * axis, box_m[1, axis], box_m[0, axis])
+    path.write_bytes(content)
+    return path
+
+
+def test_boxes_of_the_header_that_scales_do_not_explain_are_accepted(tmp_path: Path):
+    """Programs round boxes, leave them empty, or keep those of the cloud that they cropped."""
+    points = np.random.default_rng(6).uniform([10, 20, 5], [11, 22, 5.3], (400, 3))
+    box = np.stack([points.min(axis=0), points.max(axis=0)])
+    boxes = {
+        "rounded": np.stack([np.floor(1e3 * box[0]), np.ceil(1e3 * box[1])]) / 1e3,
+        "empty": np.zeros((2, 3)),
+        "of a larger cloud": np.array([[0, 0, 0], [40, 40, 10.0]]),
+        "of a cloud around": np.stack([2 * box[0] - box[1] - 0.1, box[1] + 0.3]),
+        "cropped along one axis": box + [[0, 0, 0], [3, 0, 0]],
+    }
+    for name, stated in boxes.items():
+        for offset in (0.0, box[0], [10, 20, 5], box.mean(axis=0)):
+            found = read_cloud(las(tmp_path / "a.las", points, stated, offset))
+            assert len(found) == 400, name
+    for offset in (0.0, box[0], box.mean(axis=0)):
+        origin = np.broadcast_to(offset, 3)
+        with pytest.raises(CaptureError, match="its scale or offset is wrong"):
+            read_cloud(las(tmp_path / "a.las", points, origin + (box - origin) * 1.2, offset))
+    with pytest.raises(CaptureError, match="its scale or offset is wrong"):
+        read_cloud(las(tmp_path / "a.las", points, box * [[1, 1, 1], [1, 1, 1e6]], 0.0))

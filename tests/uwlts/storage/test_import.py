@@ -11,6 +11,7 @@ import tomli_w
 
 from uwlts import cli
 from uwlts.errors import DescriptionError, ImageError, OutputError
+from uwlts.files.reading import natural_key
 from uwlts.runtime.console import run
 from uwlts.storage.capture import NO_STAGE, Capture, part_path
 from uwlts.storage.export_ import export
@@ -18,7 +19,7 @@ from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_ import import_images
 from uwlts.storage.import_.grey_values import extract_channel, grey_values
-from uwlts.storage.import_.matching import natural_key, read_rows
+from uwlts.storage.import_.matching import read_rows
 from uwlts.stripe import extract_stripe
 
 WIDTH, HEIGHT = 96, 64

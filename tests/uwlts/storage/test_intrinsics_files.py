@@ -254,6 +254,35 @@ def test_names_that_state_no_foreign_model(tmp_path: Path, more: str):
     assert read_intrinsics(tmp_path / "camera.yaml") == KNOWN
 
 
+def test_the_region_of_a_camera_info_moves_the_principal_point(tmp_path: Path):
+    """K is that of the whole image sensor (sensor_msgs/CameraInfo); images of a region begin at its corner."""
+
+    def with_region(text: str) -> Path:
+        path = tmp_path / "camera.yaml"
+        path.write_text(MESSAGE.replace("  do_rectify: False\n", text))
+        return path
+
+    whole = read_intrinsics(with_region("  x_offset: 0\n  y_offset: 0\n  height: 0\n  width: 0\nbinning_x: 1\n"))
+    region = "  x_offset: 256\n  y_offset: 128\n  height: 600\n  width: 800\n"
+    found = read_intrinsics(with_region(region))
+    assert found == replace(
+        whole, cx_px=whole.cx_px - 256, cy_px=whole.cy_px - 128, size_px=(800, 600), offset_px=(256, 128)
+    )
+    sensor = load_sensor("thesis")
+    cropped = sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"width_px": 800, "height_px": 600})})
+    assert set_intrinsics(cropped, found, source="a").camera.offset_px == (256, 128)
+    elsewhere = cropped.model_copy(update={"camera": cropped.camera.model_copy(update={"offset_px": (0, 0)})})
+    with pytest.raises(DescriptionError, match=r"from \(256, 128\) px of the image sensor"):
+        set_intrinsics(elsewhere, found, source="a")
+    for text, words in (
+        ("  x_offset: 0\nbinning_x: 2\n", "binned pixels"),
+        (region.replace("800", "0"), "expected its offsets and its size"),
+        (region.replace("256", "left"), "expected whole numbers"),
+    ):
+        with pytest.raises(DescriptionError, match=words):
+            read_intrinsics(with_region(text))
+
+
 def test_a_missing_or_binary_file(tmp_path: Path):
     with pytest.raises(DescriptionError, match="no intrinsics at"):
         read_intrinsics(tmp_path / "camera.yaml")

@@ -1,4 +1,4 @@
-"""Files of other makers: PCD clouds, CSV of Gocator sensors, and poses in robot programs."""
+"""Files of other makers: PCD clouds, CSV of Gocator and scanCONTROL sensors, and poses in robot programs."""
 
 import struct
 from pathlib import Path
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.number_tables import read_number_table
-from uwlts.storage.pose_files import read_poses
+from uwlts.storage.pose_files import read_poses, read_trajectory
 
 # Equal values follow each other, so that the compressed file has references of all kinds.
 POINTS = np.repeat(np.random.default_rng(8).uniform(-80, 80, (60, 3)).astype(np.float32), 7, axis=0)
@@ -129,6 +129,58 @@ def test_a_surface_of_a_gocator_is_read(tmp_path: Path):
             read_cloud(tmp_path / "b.csv")
 
 
+def test_a_point_cloud_of_a_gocator_is_read(tmp_path: Path):
+    attributes = "Frame,Source,Time,Encoder,Z Encoder,Inputs,Row Count,Column Count,X Offset,Y Offset,Z Offset"
+    part = f"SurfacePointCloud\n{attributes}\n0,0,1,2,0,0,2,2,0,0,0\nx,y,z,x,y,z\n0,5,1,0.1,5.1,2\n0,6,4,,,\nEnd\n"
+    (tmp_path / "a.csv").write_text(INFO + part)
+    cloud = read_cloud(tmp_path / "a.csv")
+    assert cloud.points_mm.tolist() == [[0, 5, 1], [0.1, 5.1, 2], [0, 6, 4]]
+    (tmp_path / "a.csv").write_text(INFO + part.replace("0,5,1,0.1", "0,5,0.1"))
+    with pytest.raises(uwlts.Error, match="a row has 5 cells"):
+        read_cloud(tmp_path / "a.csv")
+
+
+BLOCK = "scanCONTROL 2950-100\nSerial number{0}218020023\nMeasuring range{0}100{0}mm\n\nDate{0}12.03.2024 10:11\n"
+ROWS = [[0.5 * i, 0.25 * p, 90 + 0.125 * i, 300 + i] for p in range(3) for i in range(20)]
+
+
+@pytest.mark.parametrize("mark", ";,\t")
+@pytest.mark.parametrize("decimal", ".,")
+@pytest.mark.parametrize(
+    ("names", "scale"),
+    [
+        ("Profile X-Value[mm] Y-Value[mm] Z-Value[mm] Intensity", 1.0),
+        ("Profile X/um Y/um Z/um Intensity", 1e-3),
+        ("Profile X Y Z Intensity", 1.0),
+    ],
+)
+def test_lines_before_the_names_of_columns_are_said_and_omitted(
+    tmp_path: Path, mark: str, decimal: str, names: str, scale: float
+):
+    if mark == decimal:
+        return
+    rows = ["0 " + " ".join(map(str, row)) for row in ROWS]
+    text = "\n".join([names, *rows]).replace(".", decimal).replace(" ", mark)
+    for encoding in ("utf-8", "utf-16"):
+        (tmp_path / "a.csv").write_text(BLOCK.format(mark) + text, encoding=encoding)
+        cloud = read_cloud(tmp_path / "a.csv")
+        assert np.allclose(cloud.points_mm, scale * np.array(ROWS)[:, :3], rtol=1e-15)
+        assert cloud.intensity.tolist() == [row[3] for row in ROWS]
+        assert "4 lines before the names of columns are omitted: scanCONTROL 2950-100" in cloud.warnings[0]
+
+
+def test_a_block_of_lines_may_state_a_unit_or_profiles_without_positions(tmp_path: Path):
+    rows = "\n".join(";".join(map(str, row[:3])) for row in ROWS)
+    (tmp_path / "a.csv").write_text(f"scanCONTROL\nUnit;m\nX;Y;Z\n{rows}\n")
+    assert "may state another unit" in " ".join(read_cloud(tmp_path / "a.csv").warnings)
+    (tmp_path / "a.csv").write_text(f"scanCONTROL\nProfile;X;Z\n{rows}\n")
+    with pytest.raises(uwlts.Error, match="expected x, y and z"):
+        read_cloud(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text(f"scanCONTROL\nX;Y;Z\n{rows}\nX;Y;Z\n{rows}\n")
+    with pytest.raises(uwlts.Error, match="no table of numbers"):
+        read_cloud(tmp_path / "a.csv")
+
+
 PROGRAMS = {
     "abb": (
         "MODULE a\n! CONST robtarget p0:=[[9,9,9],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];\n"
@@ -165,3 +217,40 @@ def test_poses_of_robot_programs_are_read(tmp_path: Path, robot: str):
     (tmp_path / "b.mod").write_text("no pose")
     with pytest.raises(uwlts.Error, match=f"no pose in the form of {robot}"):
         read_poses(tmp_path / "b.mod", pose_format=robot)
+
+
+def test_poses_of_colmap_are_inverted_and_sorted_by_name(tmp_path: Path):
+    """The transform from the world to the camera is drawn with SciPy; the pose is its inverse."""
+    rng = np.random.default_rng(4)
+    names = ["img 10.png", "img 9.png", "img 1.png"]
+    turns, shifts = Rotation.random(3, rng=rng), rng.uniform(-2, 2, (3, 3))
+    points = ["100.5 20.5 -1 3.5 4.5 12", "", ""]
+    rows = []
+    for number, (name, turn, shift, seen) in enumerate(zip(names, turns, shifts, points, strict=True), start=1):
+        quaternion = turn.as_quat(scalar_first=True)
+        rows += [f"{number} {' '.join(map(repr, map(float, [*quaternion, *shift])))} 1 {name}", seen]
+    header = (
+        "# Image list with two lines of data per image:\n#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+    )
+    text = header + "\n".join(rows)
+    (tmp_path / "images.txt").write_text(text + "\n")
+    for unit, scale in (("mm", 1.0), ("m", 1000.0)):
+        poses, times = read_poses(tmp_path / "images.txt", pose_format="colmap", unit=unit)
+        assert times is None
+        for pose, number in zip(poses, (2, 1, 0), strict=True):
+            from_world = np.vstack([np.column_stack([turns[number].as_matrix(), scale * shifts[number]]), [0, 0, 0, 1]])
+            assert np.allclose(pose @ from_world, np.eye(4), atol=1e-10)
+    with pytest.raises(uwlts.Error, match="lengths of COLMAP have no unit"):
+        read_poses(tmp_path / "images.txt", pose_format="colmap")
+    with pytest.raises(uwlts.Error, match="colmap have no times"):
+        read_trajectory(tmp_path / "images.txt", pose_format="colmap", unit="m")
+    without_points = header + "\n".join(rows[::2]) + "\n"
+    for wrong in (
+        without_points,
+        header,
+        text.replace(" 1 img 9.png", ""),
+        text.replace("img 10.png", "").replace("1 ", "nan "),
+    ):
+        (tmp_path / "images.txt").write_text(wrong)
+        with pytest.raises(uwlts.Error, match=r"images\.txt"):
+            read_poses(tmp_path / "images.txt", pose_format="colmap", unit="m")

@@ -262,6 +262,7 @@ def fit_polynomials(
             "shape that is too fine for polynomials smooth over the lines"
         )
     provenance = {"source": "polynomials from captures", "captures": list(sources), "warnings": warnings}
+    provenance |= {} if camera.offset_px is None else {"offset_px": list(camera.offset_px)}
     calibration = calibration.model_copy(update={"residuals": figures, "provenance": provenance})
     return PolynomialResult(calibration, stripes, depth, along, warnings)
 

@@ -158,6 +158,7 @@ def common_header(captures: Sequence[Capture]) -> CaptureHeader:
         header, camera = capture.header, capture.header.sensor.camera
         return {
             "image size": (camera.width_px, camera.height_px),
+            "offset_px": camera.offset_px,
             "stripe_along": camera.stripe_along,
             "wavelength": header.sensor.laser.wavelength_nm,
             "medium": header.medium,

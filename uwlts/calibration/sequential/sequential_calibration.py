@@ -362,6 +362,7 @@ def common_sensor(captures: Sequence[Capture]) -> Sensor:
         camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
         return {
             "image size": f"{camera.width_px} x {camera.height_px} px",
+            "image offset": camera.offset_px,
             "stripe_along": camera.stripe_along,
             "wavelength": f"{laser.wavelength_nm:g} nm",
         }
@@ -369,7 +370,9 @@ def common_sensor(captures: Sequence[Capture]) -> Sensor:
     for capture in captures[1:]:
         own, other = optics(capture), optics(captures[0])
         differ = ", ".join(
-            f"its {name} is {own[name]} instead of {other[name]}" for name in own if own[name] != other[name]
+            f"its {name} is {own[name]} instead of {other[name]}"
+            for name in own
+            if own[name] != other[name] and None not in (own[name], other[name])
         )
         if differ:
             camera = capture.header.sensor.camera

@@ -71,7 +71,7 @@ _Loader.add_multi_constructor(
 
 @dataclass(frozen=True)
 class KnownCamera:
-    """Focal lengths and principal point in px, distortion, and the image size (width, height) if given."""
+    """Focal lengths and principal point in px, distortion, and image size and offset on the image sensor if given."""
 
     fx_px: float
     fy_px: float
@@ -79,6 +79,7 @@ class KnownCamera:
     cy_px: float
     distortion: Distortion
     size_px: tuple[int, int] | None
+    offset_px: tuple[int, int] | None = None
 
 
 def read_intrinsics(path: Path) -> KnownCamera:
@@ -86,6 +87,9 @@ def read_intrinsics(path: Path) -> KnownCamera:
 
     A text file of one COLMAP camera (``cameras.txt``) is read as well; its pixel coordinates begin at the corner of the
     first pixel, half a pixel before those of this program.
+
+    The camera matrix of a CameraInfo is that of the whole image sensor: for images of a region (``roi``), the principal
+    point is moved by its offset.
 
     An equidistant lens becomes the rational one that it equals in the image. Raises DescriptionError if the file is
     missing or damaged, lacks camera matrix or distortion, or the camera has neither Brown-Conrady, rational nor
@@ -109,16 +113,19 @@ def read_intrinsics(path: Path) -> KnownCamera:
         raise DescriptionError(
             f"{path}: the camera matrix is {matrix.tolist()}; expected fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy"
         )
-    size = _size(known, path)
+    size, offset = _size(known, path), None
+    if region := _region(known, path):
+        *offset, width, height = region
+        cx, cy, size, offset = cx - offset[0], cy - offset[1], (width, height), (offset[0], offset[1])
     if not equidistant:
-        return KnownCamera(fx, fy, cx, cy, _distortion(coefficients, path), size)
+        return KnownCamera(fx, fy, cx, cy, _distortion(coefficients, path), size, offset)
     if len(coefficients) != 4:
         raise DescriptionError(f"{path}: an equidistant lens has 4 coefficients, k1 to k4; found {len(coefficients)}")
     # Without a size, the principal point is taken as the image's centre.
     width, height = size or (2.0 * cx + 1.0, 2.0 * cy + 1.0)
     corner = float(np.hypot(max(cx, width - 1.0 - cx) / fx, max(cy, height - 1.0 - cy) / fy))
     converted = convert_equidistant(coefficients, corner=corner, focal_px=max(fx, fy), source=str(path))
-    return KnownCamera(fx, fy, cx, cy, converted, size)
+    return KnownCamera(fx, fy, cx, cy, converted, size, offset)
 
 
 def set_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor:
@@ -132,10 +139,16 @@ def set_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor
             f"{source} is for images of {' x '.join(map(str, known.size_px))} pixels, the sensor's are "
             f"{camera.width_px} x {camera.height_px}: give the intrinsics of this camera at this size"
         )
+    offset = known.offset_px or camera.offset_px
+    if camera.offset_px not in (None, offset):
+        raise DescriptionError(
+            f"{source} is for images from {offset} px of the image sensor, the sensor's are from {camera.offset_px} px"
+        )
     fx, fy = known.fx_px, known.fy_px
     if abs(fy / fx - 1) < _SQUARE:
         fx = fy = (fx + fy) / 2
     changes = {
+        "offset_px": offset,
         "focal_length_mm": 1e-3 * fx * camera.pixel_size_um,
         "pixel_aspect": fy / fx,
         "principal_point_px": [known.cx_px, known.cy_px],
@@ -345,3 +358,22 @@ def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
         found = shorten(" x ".join(map(repr, size)))
         raise DescriptionError(f"{path}: the image size is {found}; expected whole numbers") from error
     return width_px, height_px
+
+
+def _region(known: dict[str, object], path: Path) -> list[int]:
+    """Return column, row, width and height of a CameraInfo's region; empty for the whole image sensor.
+
+    Raises DescriptionError if pixels are binned.
+    """
+    if any(str(known.get(f"binning{axis}", 0)) not in ("0", "1") for axis in "xy"):
+        raise DescriptionError(f"{path} is for binned pixels: give the intrinsics of the images that are used")
+    roi = known.get("roi")
+    names = ("xoffset", "yoffset", "width", "height")
+    stated = {_plain_name(key): value for key, value in roi.items()} if isinstance(roi, dict) else {}
+    try:
+        region = [int(str(stated.get(name) or 0)) for name in names]
+    except ValueError as error:
+        raise DescriptionError(f"{path}: the region (roi) is {shorten(str(roi))}; expected whole numbers") from error
+    if any(region) and not (min(region[:2]) >= 0 and min(region[2:]) > 0):
+        raise DescriptionError(f"{path}: the region (roi) is {shorten(str(roi))}; expected its offsets and its size")
+    return region if any(region) else []

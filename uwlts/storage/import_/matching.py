@@ -2,7 +2,6 @@
 
 import csv
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ import numpy as np
 
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.files.inputs import record_input
-from uwlts.files.reading import is_regular_file, read_text
+from uwlts.files.reading import is_regular_file, natural_key, read_text
 from uwlts.model.calibration import is_rigid
 from uwlts.storage.capture import NO_STAGE, POSE_ROUNDED
 from uwlts.storage.image_header import SUFFIXES
@@ -54,11 +53,6 @@ class Matched:
     laser: list[ImageRow]
     lamp: list[ImageRow]
     unmatched: list[str]
-
-
-def natural_key(name: str) -> list[str | int]:
-    """Return a sort key that orders image9 before image10."""
-    return [int(part) if part.isascii() and part.isdigit() else part.casefold() for part in re.split(r"([0-9]+)", name)]
 
 
 def read_rows(path: Path) -> list[ImageRow]:
