@@ -1,18 +1,15 @@
 """View of the cloud in the page, a NiceGUI element drawn by three.js."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
-import nicegui
 import numpy as np
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-_THREE = Path(nicegui.__file__).parent / "elements" / "scene" / "dist"
-"""NiceGUI's copy of three.js, so that the page works without internet."""
+from uwlts.pages.cloud_figure import THREE, VIEW
 
 
-class CloudView(Element, component="cloud_view.js", esm={"nicegui-scene": str(_THREE)}, default_classes="w-full"):
+class CloudView(Element, component=VIEW, esm={"nicegui-scene": str(THREE.parent)}, default_classes="w-full"):
     """View of the board's cloud; ``picked`` is called with the position (3,) in mm of a clicked point."""
 
     def __init__(self, picked: Callable[[np.ndarray], None] | None = None):

@@ -32,6 +32,7 @@ from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
 from uwlts.files.writing import refuse_unsuitable, write_atomically
+from uwlts.pages.cloud_figure import CloudPoints, view_scripts
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -80,7 +81,7 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     template
         File name of the template, which extends ``base.html.j2``.
     interactive
-        The page's interactive figures; scripts are allowed and embedded only if there are any.
+        The page's interactive figures and clouds; scripts are allowed and embedded only if there are any.
     **values
         Variables of the template.
     """
@@ -89,7 +90,8 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     loader = FileSystemLoader([own, own / "templates", templates])
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["minus"] = typeset_number
-    scripts, plotly = [] if interactive is None else interactive.scripts, ""
+    collected = FigureCollector() if interactive is None else interactive
+    scripts, clouds, plotly = collected.scripts, collected.clouds, ""
     if scripts:
         from plotly.offline import get_plotlyjs
 
@@ -99,6 +101,8 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
         page_style=Markup((templates / "style.css").read_text(encoding="utf-8")),
         page_figures=scripts,
         page_plotly=plotly,
+        page_clouds=clouds,
+        page_cloud_scripts=view_scripts() if clouds else {},
         **values,
     )
 
@@ -155,29 +159,43 @@ def refuse_unsuitable_page(page: Path, *, kind: str = "", overwrite: bool) -> No
 
 @dataclass(frozen=True)
 class InteractiveFigure:
-    """Position of an interactive figure in a page; ``still`` is the address of a picture that replaces it in print."""
+    """Position of an interactive figure in a page."""
 
     number: int
     caption: str
     height: int
-    webgl: bool = False
-    still: str | None = None
+
+
+@dataclass(frozen=True)
+class InteractiveCloud:
+    """Position of an interactive cloud in a page; ``still`` is the address of a picture that replaces it in print."""
+
+    number: int
+    caption: str
+    still: str
 
 
 class FigureCollector:
-    """Interactive figures of a page, numbered, with their JSON for the end of the page."""
+    """Interactive figures and clouds of a page, each numbered, with their JSON for the end of the page."""
 
     def __init__(self) -> None:
         self.scripts: list[Markup] = []
+        self.clouds: list[Markup] = []
 
-    def add(
-        self, figure: go.Figure, caption: str = "", *, webgl: bool = False, still: str | None = None
-    ) -> InteractiveFigure:
-        """Add a plotly figure with a height; browsers allow few ``webgl`` figures, which are drawn near the screen."""
-        # There is no escaping in a script element, so the text must not contain its end tag.
-        text = figure.to_json(validate=False) or ""
-        self.scripts.append(Markup(text.replace("<", "\\u003c")))
-        return InteractiveFigure(len(self.scripts) - 1, caption, int(figure.layout.height), webgl, still)
+    def add(self, figure: go.Figure, caption: str = "") -> InteractiveFigure:
+        """Add a plotly figure with a height."""
+        self.scripts.append(_script_json(figure.to_json(validate=False) or ""))
+        return InteractiveFigure(len(self.scripts) - 1, caption, int(figure.layout.height))
+
+    def add_cloud(self, points: CloudPoints, caption: str, *, still: str) -> InteractiveCloud:
+        """Add a cloud and the address of its picture."""
+        self.clouds.append(_script_json(points.to_json()))
+        return InteractiveCloud(len(self.clouds) - 1, caption, still)
+
+
+def _script_json(text: str) -> Markup:
+    """Return JSON for a script element, where there is no escaping: the text must not contain its end tag."""
+    return Markup(text.replace("<", "\\u003c"))
 
 
 @dataclass(frozen=True)
@@ -250,6 +268,8 @@ def legend_below(figure: Figure, *, columns: int = 4) -> None:
 def figure_svg(drawn: Drawn) -> Markup:
     """Return a matplotlib figure, or the figure of axes, as an SVG element for a page."""
     text = _save_figure(drawn, format="svg", metadata={"Date": None}).decode("utf-8")
+    # Paths are accurate to 0.01 pt.
+    text = re.sub(r'(?<= d=")[^"]*', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text)
     # Ids of groups would be repeated in every figure and are not referenced; SVG in HTML needs no namespaces.
     text = re.sub(r'(?<=<g) id="[^"]*"|<metadata>.*?</metadata>| xmlns(:\w+)?="[^"]*"', "", text, flags=re.S)
     return Markup(text[text.index("<svg") :].replace("xlink:href", "href"))
@@ -288,6 +308,18 @@ def _save_figure(drawn: Drawn, **options: Any) -> bytes:
 def plain_text(text: str) -> str:
     """Escape a text so that matplotlib finds no formulas in it."""
     return text.replace("$", r"\$")
+
+
+def webp_data_uri(picture: bytes) -> str:
+    """Return the bytes of a PNG as the address of a WebP, the smaller one of lossless and of quality 80."""
+    from PIL import Image
+
+    image, found = Image.open(io.BytesIO(picture)).convert("RGB"), []
+    for options in ({"lossless": True}, {"quality": 80}):
+        content = io.BytesIO()
+        image.save(content, "webp", method=6, **options)
+        found.append(content.getvalue())
+    return "data:image/webp;base64," + base64.b64encode(min(found, key=len)).decode("ascii")
 
 
 def png_data_uri(picture: Drawn | bytes, *, dpi: int = 100) -> str:

@@ -24,8 +24,8 @@ from uwlts.pages.toolkit import (
     FigureCollector,
     Tile,
     figure_svg,
-    png_data_uri,
     render_page,
+    webp_data_uri,
     write_page,
 )
 from uwlts.reconstruction.verify import normalise_error
@@ -39,10 +39,10 @@ from uwlts.report.gather import (
     gather_campaign,
     load_reference,
 )
-from uwlts.report.pictures import MeasurementPictures, draw_pictures, svg_if_any, write_pictures
+from uwlts.report.pictures import MeasurementPictures, cloud_points, draw_pictures, svg_if_any, write_pictures
 from uwlts.report.summary_file import KEY_FIGURES, summary, write_summary
 
-_LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "matplotlib", "plotly")
+_LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "matplotlib", "nicegui")
 _CAPTIONS = {
     "camera image_rms_px": "Root mean square distance between found and calculated target points of each image.",
     "window heights_mm": "Height of the step in each image, with the estimated window distance.",
@@ -142,8 +142,11 @@ def report_page(
     pictures: Sequence[MeasurementPictures] | None = None,
 ) -> str:
     """Return the page as text; ``pictures`` are those of `draw_pictures` (default: drawn here)."""
-    collected, rows = FigureCollector(), summary_table(campaign, reference)
-    drawn = zip(campaign.measurements, pictures or draw_pictures(campaign), strict=True)
+    collected, rows, main = FigureCollector(), summary_table(campaign, reference), campaign.main_measurements
+    drawn = [*zip(campaign.measurements, pictures or draw_pictures(campaign), strict=True)]
+    # Measurements with other calibrations come last.
+    drawn.sort(key=lambda each: each[0] not in main)
+    stripes: dict[bytes, str] = {}
     return render_page(
         "uwlts.report",
         "campaign.html.j2",
@@ -155,7 +158,7 @@ def report_page(
         groups=_group_rows(rows),
         published=None if reference is None else reference.title,
         explanations=explanations(rows, reference),
-        measurements=[_measurement(measurement, each, collected) for measurement, each in drawn],
+        measurements=[_measurement(measurement, each, collected, stripes) for measurement, each in drawn],
         calibration=_calibrations(campaign) if campaign.calibrations else None,
         true_window=campaign.true_window_mm is not None,
         seconds=figure_svg(plot.seconds(campaign.seconds)) if campaign.seconds else None,
@@ -165,15 +168,20 @@ def report_page(
 
 
 def _measurement(
-    measurement: GatheredMeasurement, pictures: MeasurementPictures, collected: FigureCollector
+    measurement: GatheredMeasurement,
+    pictures: MeasurementPictures,
+    collected: FigureCollector,
+    stripes: dict[bytes, str],
 ) -> dict[str, Any]:
-    """Return the parts of a measurement's section; missing ones are None."""
+    """Return the parts of a measurement's section; missing ones are None.
+
+    ``stripes`` are the pictures of stripes on the page so far, by measurement: one of the same images is not repeated.
+    """
     cloud, judged = measurement.cloud, measurement.judged
     evaluation, truth = (None, None) if judged is None else (judged.evaluation, judged.truth)
     shown = figures = None
     if cloud is not None and pictures.cloud is not None:
-        figure, caption = plot.interactive_cloud(cloud)
-        shown = collected.add(figure, caption, webgl=True, still=png_data_uri(pictures.cloud))
+        shown = collected.add_cloud(*cloud_points(cloud), still=webp_data_uri(pictures.cloud))
     if judged is not None and evaluation is not None:
         rows = []
         for name, value in evaluation.figures_mm.items():
@@ -181,12 +189,15 @@ def _measurement(
             values = format_length(value, signed="error" in name or "SSE" in name), format_length(stated)
             rows.append((name, "", values if judged.uncertainty else values[:1]))
         figures = ComparisonTable(("value", "U (k = 2)") if judged.uncertainty else ("value",), tuple(rows))
+    stripe = pictures.stripe
+    first = None if stripe is None else stripes.setdefault(stripe, measurement.name)
     recorded = measurement.capture is not None
     no_stripe = "no image of its capture shows a stripe" if recorded else "its capture is not in the folder"
     return {
         "name": measurement.name,
         "facts": _facts(measurement),
-        "stripe": None if pictures.stripe is None else png_data_uri(pictures.stripe),
+        "stripe": None if stripe is None or first != measurement.name else webp_data_uri(stripe),
+        "same_stripe": first,
         "no_stripe": no_stripe,
         "cloud": shown,
         "histogram": pictures.histogram,
@@ -262,12 +273,14 @@ def _calibrations(campaign: GatheredCampaign) -> dict[str, Any]:
             caption = _CAPTIONS.get(f"{each.group} {each.name}", caption)
             plots.append((figure_svg(plot.residuals(calibration, which=each)), caption))
         groups.append({"name": name, "plots": plots})
+    curve = svg_if_any(plot.window_curves, by_name, true_mm=campaign.true_window_mm)
     return {
         "parameters": parameter_table(campaign),
         "residuals": residual_table(campaign.calibrations),
         "warnings": warnings,
-        "curve": svg_if_any(plot.window_curves, by_name, true_mm=campaign.true_window_mm),
+        "curve": curve,
         "groups": groups,
+        "drawn": curve is not None or any(group["plots"] for group in groups),
     }
 
 

@@ -12,11 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from uwlts.files.writing import write_atomically
+from uwlts.pages.cloud_figure import CloudPoints
+from uwlts.pages.numbers import unit_for
 from uwlts.pages.toolkit import figure_png, figure_svg, new_figure
 from uwlts.report import plot
 from uwlts.report.gather import GatheredCampaign, GatheredMeasurement
 from uwlts.runtime.workers import Send, run_jobs
 from uwlts.storage.capture import Capture, drawable_image
+from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe, find_stripe
 
 # Width of a picture, inches.
@@ -25,6 +28,8 @@ _WIDTH_IN = 11.2
 _TALLEST_IN = 4.4
 # An image with fewer stripe centres than this is regarded as having no stripe.
 _LEAST_LINES = 8
+MOST_POINTS = 12_000
+"""Largest number of points in an interactive cloud, which take about 60 kB of a page."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +109,29 @@ def _draw_measurement(measurement: GatheredMeasurement, send: Send) -> Measureme
         None if cloud is None else svg_if_any(plot.deviation_histogram, cloud),
         None if cloud is None else svg_if_any(plot.along_stripe, cloud),
     )
+
+
+def cloud_points(cloud: PointCloud) -> tuple[CloudPoints, str]:
+    """Return points for an interactive view, seen from the sensor, and its caption."""
+    chosen = np.arange(len(cloud))
+    shown = f"All {len(cloud):,} points."
+    if len(cloud) > MOST_POINTS:
+        chosen = np.sort(np.random.default_rng(0).choice(len(cloud), MOST_POINTS, replace=False))
+        shown = f"{MOST_POINTS:,} of {len(cloud):,} points, drawn at random."
+    values, limit, unit = None, 1.0, "mm"
+    if cloud.deviation_mm is None:
+        shown += " The file holds no deviations; let the evaluation write a coloured cloud to see them here."
+    else:
+        limit = plot.colour_limit_mm(cloud.deviation_mm)
+        unit, factor = unit_for(limit)
+        limit *= factor
+        values = factor * cloud.deviation_mm[chosen].astype(np.float64)
+        shown += f" The colours end at {plot.LIMIT_STD:g} standard deviations, ±{limit:.3g} {unit}."
+        if np.isnan(values).any():
+            shown += " Dark points were not evaluated: outliers, near an edge, or beside the artefact."
+    x, y, z = (-plot.view_direction()).tolist()
+    points = CloudPoints(cloud.points_mm[chosen], values, limit, unit, plot.STOPS, (x, y, z))
+    return points, f"{shown} X: direction of the scan; Y: along the stripe; Z: away from the sensor."
 
 
 def svg_if_any(draw: Callable[..., Axes], shown: object, **options: Any) -> Markup | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle, product
-from typing import TYPE_CHECKING, Any, Literal, assert_never
+from typing import Any, Literal, assert_never
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,13 +19,10 @@ from mpl_toolkits.mplot3d import Axes3D, proj3d
 
 from uwlts.model.calibration import Calibration
 from uwlts.pages.numbers import entries_of, format_to_scale, number_list, split_name, unit_for, unit_of
-from uwlts.pages.toolkit import BLUE, COLOURS, FAINT, INK, RED, make_figure, new_figure, plain_text, typeset_number
+from uwlts.pages.toolkit import BLUE, COLOURS, INK, RED, make_figure, new_figure, plain_text, typeset_number
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
-
-if TYPE_CHECKING:
-    import plotly.graph_objects as go
 
 Colour = Literal["deviation", "depth", "intensity", "uncertainty"]
 
@@ -59,9 +56,6 @@ AZIMUTH_DEG = 28.0
 """Viewing direction of clouds: angle from +X towards +Y, deg."""
 ELEVATION_DEG = 38.0
 """Viewing direction of clouds: angle downwards (towards +Z), deg."""
-
-MOST_POINTS = 15_000
-"""Largest number of points in an interactive cloud that still rotates smoothly."""
 
 SHORT_LIST = 3
 """Lists of residuals up to this length are written into tables; longer ones are drawn."""
@@ -207,75 +201,6 @@ def surface_limit_mm(distance_mm: np.ndarray) -> float:
     return (float(np.quantile(np.abs(known), _SHOWN_SHARE)) if len(known) else 0.0) or 1e-3
 
 
-def interactive_cloud(cloud: PointCloud) -> tuple[go.Figure, str]:
-    """Return an interactive plot of points in the OCS with equal scales, seen from the sensor, and its caption."""
-    import plotly.graph_objects as go
-
-    chosen = np.arange(len(cloud))
-    shown = f"All {len(cloud):,} points."
-    if len(cloud) > MOST_POINTS:
-        chosen = np.sort(np.random.default_rng(0).choice(len(cloud), MOST_POINTS, replace=False))
-        shown = f"{MOST_POINTS:,} of {len(cloud):,} points, drawn at random."
-    points = cloud.points_mm[chosen].astype(np.float32)
-    place = "X %{x:.3f}, Y %{y:.3f}, Z %{z:.3f} mm"
-    figure, unknown = go.Figure(), np.ones(len(chosen), bool)
-    if cloud.deviation_mm is not None:
-        limit = colour_limit_mm(cloud.deviation_mm)
-        unit, factor = unit_for(limit)
-        deviation = cloud.deviation_mm[chosen] * np.float32(factor)
-        unknown = np.isnan(deviation)
-        figure.add_scatter3d(
-            **_xyz(points[~unknown]),
-            mode="markers",
-            name="evaluated",
-            marker_size=2,
-            marker_color=deviation[~unknown],
-            marker_colorscale=[[at, "rgb({}, {}, {})".format(*rgb)] for at, rgb in STOPS],
-            marker_cmin=-factor * limit,
-            marker_cmax=factor * limit,
-            marker_colorbar={"title": {"text": f"deviation<br>/ {unit}"}, "thickness": 16, "len": 0.8},
-            hovertemplate=f"{place}<br>deviation %{{marker.color:.4g}} {unit}<extra></extra>",
-        )
-        shown += f" The colours end at {LIMIT_STD:g} standard deviations, ±{factor * limit:.3g} {unit}."
-    if unknown.any():
-        coloured = cloud.deviation_mm is not None
-        figure.add_scatter3d(
-            **_xyz(points[unknown]),
-            mode="markers",
-            name="not evaluated",
-            marker={"size": 1.5, "color": UNKNOWN if coloured else PLAIN},
-            hovertemplate=f"{place}<extra>not evaluated</extra>",
-        )
-        shown += (
-            " Dark points were not evaluated: outliers, near an edge, or beside the artefact."
-            if coloured
-            else " The file holds no deviations; let the evaluation write a coloured cloud to see them here."
-        )
-    low, high = cloud_limits(cloud.points_mm)
-    for name, start, end in zip("xyz", low, high, strict=True):
-        axis = {"title": {"text": f"{name.upper()} / mm"}, "gridcolor": FAINT, "color": INK, "range": [start, end]}
-        figure.update_layout({f"scene_{name}axis": axis | {"nticks": 8 if name == "y" else 5}})
-    figure.update_layout(
-        template="none",
-        height=520,
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        showlegend=False,
-        font={"size": 12, "color": INK},
-        scene_aspectmode="manual",
-        scene_aspectratio=_xyz(2.7 * (high - low) / (high - low).max()),
-        scene_dragmode="orbit",
-        scene_camera_eye=_xyz(-1.6 * view_direction()),
-        scene_camera_up={"x": 0, "y": 0, "z": -1},
-        scene_camera_projection_type="orthographic",
-    )
-    return figure, f"{shown} X: direction of the scan; Y: along the stripe; Z: away from the sensor."
-
-
-def _xyz(points: np.ndarray) -> dict[str, Any]:
-    """Return columns of points (N, 3), or components of a vector (3,), by axis."""
-    return dict(zip("xyz", points.T if points.ndim == 2 else points.tolist(), strict=True))
-
-
 def stripe(
     image: np.ndarray | Frame, stripe: Stripe | None = None, ax: Axes | None = None, *, enlarged: bool = False
 ) -> Axes:
@@ -371,7 +296,7 @@ def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     middles, width = (edges[1:] + edges[:-1]) / 2, 2 * reach / _BINS
     beyond = len(finite) - int(counts.sum())
     label = f"points; {beyond:,} of {len(finite):,} outside" if beyond else "points"
-    ax.bar(factor * middles, counts, width=factor * width, color=PALE, label=label)
+    ax.stairs(counts, factor * edges, fill=True, color=PALE, label=label)
     if std > 0:
         normal = len(finite) * width / (std * np.sqrt(2 * np.pi)) * np.exp(-0.5 * ((middles - mean) / std) ** 2)
         ax.plot(factor * middles, normal, color=INK, linewidth=1.2, label="normal distribution")

@@ -1,6 +1,7 @@
 // A point cloud of bounded size: fitted to the view, rotated with the mouse or by touch, coloured by a field, with a
-// scale bar, axes and a legend. A click on a point emits its position. Points come from /cloud as float32 (see `pack`
-// in thinned_cloud.py); for larger clouds the points in view are fetched from /cloud/detail when the view is at rest.
+// scale bar, axes and a legend. A click on a point emits its position. Shared by the desk and by pages. On the desk,
+// points come from /cloud as float32 (see `pack` in thinned_cloud.py); for larger clouds the points in view are fetched
+// from /cloud/detail when the view is at rest. A page gives its own points (`source`), in the same form.
 import { OrbitControls, THREE } from "nicegui-scene";
 
 const COLUMNS = 6;
@@ -14,8 +15,13 @@ const TURBO = [
 const turbo = (x) =>
   TURBO.map((p) => Math.min(1, Math.max(0, p.reduceRight((sum, factor) => sum * x + factor, 0))));
 
-// Without its darkest end, which is invisible on a dark background.
-const shade = (share) => turbo(0.05 + 0.95 * Math.min(1, Math.max(0, share)));
+const limited = (share) => Math.min(1, Math.max(0, share));
+// Between stops: places from 0 to 1, each with red, green, blue.
+const between = (stops, x) => {
+  const next = Math.max(1, stops.findIndex(([place]) => x <= place));
+  const [[low, from], [high, to]] = [stops[next - 1], stops[next]];
+  return from.map((c, k) => c + ((x - low) / (high - low)) * (to[k] - c));
+};
 
 export default {
   template: `
@@ -27,7 +33,12 @@ export default {
         <b>{{ legend }}</b></div>
       <div class="empty" v-show="!count">{{ problem }}</div>
     </div>`,
-  props: { field: String, version: Number, marks: Array, fit: Number, closer: Boolean },
+  // Of a page: `source` of the points, `stops` of the colours, `limits` and `unit` of the field, direction of the `eye`.
+  props: {
+    field: String, version: Number, marks: Array, fit: Number, closer: Boolean, stops: Array, limits: Array,
+    source: { type: Function, default: () => fetch("cloud") }, unit: { type: String, default: "mm" },
+    eye: { type: Array, default: () => [-0.5, 0.35, -1] }, up: { type: Array, default: () => [1, 0, 0] },
+  },
   data: () => ({ legend: "", low: "", high: "", count: 0, problem: "no points yet" }),
   mounted() {
     try {
@@ -38,7 +49,7 @@ export default {
     }
     // Colours are shown without conversion.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
-    const steps = Array.from({ length: 11 }, (_, k) => `rgb(${shade(k / 10).map((c) => 255 * c)})`);
+    const steps = Array.from({ length: 11 }, (_, k) => `rgb(${this.shade(k / 10).map((c) => 255 * c)})`);
     this.$el.querySelector(".ramp").style.background = `linear-gradient(to top, ${steps})`;
     this.renderer.setClearColor(new THREE.Color().setRGB(0.06, 0.08, 0.11));
     this.scene = new THREE.Scene();
@@ -80,6 +91,7 @@ export default {
     this.resized?.disconnect();
     this.controls?.dispose();
     this.renderer?.dispose();
+    this.renderer?.forceContextLoss();
   },
   watch: {
     version() { this.load(); },
@@ -95,7 +107,7 @@ export default {
       if (this.loading) { this.again = true; return; }
       this.loading = true;
       try {
-        await this.take(this.whole, await fetch("cloud"));
+        await this.take(this.whole, await this.source());
         this.count = this.whole.count;
         this.clearNear();
         this.colour();
@@ -167,6 +179,8 @@ export default {
       return [...box.min.toArray(), ...box.max.toArray()];
     },
     column() { return { depth: 2, intensity: 3, deviation: 4, uncertainty: 5 }[this.field] ?? 2; },
+    // Turbo without its darkest end, which is invisible on a dark background.
+    shade(share) { return this.stops ? between(this.stops, limited(share)) : turbo(0.05 + 0.95 * limited(share)); },
     colour() {
       if (!this.renderer) return;
       const column = this.column();
@@ -179,17 +193,18 @@ export default {
       let high = values[Math.ceil(0.99 * (values.length - 1))] ?? 1;
       // The scale of deviations is symmetric about zero.
       if (this.field === "deviation") { high = Math.max(Math.abs(low), Math.abs(high)); low = -high; }
+      if (this.limits) [low, high] = this.limits;
       const span = high - low || 1;
       for (const layer of [this.whole, this.near]) {
         const colours = new Float32Array(3 * layer.count).fill(0.4);
         const moved = column < 3 ? layer.origin[column] - offset : 0;
         for (let k = 0; k < layer.count; k++) {
           const value = layer.table[COLUMNS * k + column] + moved;
-          if (!Number.isNaN(value)) colours.set(shade((value - low) / span), 3 * k);
+          if (!Number.isNaN(value)) colours.set(this.shade((value - low) / span), 3 * k);
         }
         layer.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
       }
-      const unit = this.field === "intensity" ? "grey values" : "mm";
+      const unit = this.field === "intensity" ? "grey values" : this.unit;
       const digits = Math.max(0, 2 - Math.floor(Math.log10(span)));
       const text = (value) => (value + offset).toFixed(Math.min(digits, 6));
       this.legend = values.length ? `${this.field}, ${unit}` : `${this.field}: not known`;
@@ -224,18 +239,25 @@ export default {
       const box = this.whole.geometry.boundingBox;
       const middle = box.getCenter(new THREE.Vector3());
       const radius = Math.max(box.getSize(new THREE.Vector3()).length() / 2, 1);
-      // Slightly from the side of the sensor's view: X up, Z away.
-      this.camera.up.set(1, 0, 0);
-      this.camera.position.copy(middle).add(new THREE.Vector3(-0.5, 0.35, -1).multiplyScalar(radius));
+      // By default slightly from the side of the sensor's view: X up, Z away.
+      this.camera.up.set(...this.up);
+      this.camera.position.copy(middle).add(new THREE.Vector3(...this.eye).multiplyScalar(radius));
       this.controls.target.copy(middle);
       this.camera.zoom = 1;
-      const wide = Math.min(1, this.$el.clientWidth / Math.max(this.$el.clientHeight, 1));
-      this.camera.top = (1.05 * radius) / wide;
+      this.controls.update();
+      this.camera.updateMatrixWorld();
+      const wide = this.$el.clientWidth / Math.max(this.$el.clientHeight, 1);
+      const corner = new THREE.Vector3();
+      this.camera.top = 1e-3;
+      for (let k = 0; k < 8; k++) {
+        corner.set(...[0, 1, 2].map((c) => (((k >> c) & 1) ? box.max : box.min).getComponent(c)));
+        corner.applyMatrix4(this.camera.matrixWorldInverse);
+        this.camera.top = Math.max(this.camera.top, 1.1 * Math.abs(corner.y), (1.1 * Math.abs(corner.x)) / wide);
+      }
       this.camera.bottom = -this.camera.top;
       this.camera.near = -10 * radius;
       this.camera.far = 10 * radius;
       this.aspect();
-      this.controls.update();
       this.draw();
     },
     draw() {
@@ -287,7 +309,7 @@ export default {
       if (best === null) return;
       const [layer, number] = best;
       const at = [0, 1, 2].map((c) => layer.table[COLUMNS * number + c] + layer.origin[c]);
-      this.$emit("pick", { at });
+      this.$emit("pick", { at, value: layer.table[COLUMNS * number + this.column()] });
     },
     key(event) {
       const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
