@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from pathlib import Path
 
 import numpy as np
 from nicegui import ui
@@ -20,38 +21,7 @@ _LASER: dict[LaserState, tuple[str, str]] = {
     "on": ("laser ON", "bg-red-600"),
     "unknown": ("laser may be ON: switch its power off", "bg-red-600"),
 }
-_STYLE = """
-.desk { display: grid; gap: 10px; grid-template-columns: minmax(300px, 1fr) minmax(340px, 1.5fr) minmax(370px, 1fr);
-  grid-template-rows: minmax(0, 1fr) 170px; grid-template-areas: "image cloud tools" "log log tools";
-  height: calc(100vh - 84px); width: 100%; }
-.desk.looking { grid-template-columns: 1fr 1.6fr; grid-template-areas: "image cloud" "log log"; }
-.desk > * { min-width: 0; min-height: 0; border: 1px solid #d5dae1; border-radius: 6px; background: white; }
-.desk.guided { grid-template-columns: 1fr 1fr; grid-template-areas: "image cloud" "log log"; }
-@media (max-width: 1000px) {
-  .desk, .desk.looking, .desk.guided { display: flex; flex-direction: column; height: auto; }
-  .cloud-view { min-height: 50vh; }
-  .image img { max-height: 45vh; }
-  .desk .log { height: 200px; }
-}
-.image { grid-area: image; overflow: hidden; padding: 8px; display: flex; flex-direction: column; }
-.image img { width: 100%; min-height: 0; object-fit: contain; object-position: top; }
-.tools .q-tab { padding: 0 6px; min-height: 40px; }
-.cloud { grid-area: cloud; display: flex; flex-direction: column; }
-.tools { grid-area: tools; overflow: auto; }
-.log { grid-area: log; overflow: auto; padding: 6px 10px; font-family: monospace; font-size: 13px; }
-.log .warning { color: #9a5b00; } .log .error { color: #b00020; font-weight: bold; }
-.cloud-view { position: relative; flex: 1; min-height: 200px; outline-offset: -2px; overflow: hidden; }
-.cloud-view > canvas:first-child { position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none; }
-.cloud-view .axes { position: absolute; left: 4px; bottom: 4px; pointer-events: none; }
-.cloud-view .scale { position: absolute; right: 12px; bottom: 10px; color: white; text-align: right; font-size: 13px;
-  pointer-events: none; }
-.cloud-view .bar { border: 2px solid white; border-top: none; height: 6px; margin-left: auto; }
-.cloud-view .legend { position: absolute; right: 12px; top: 10px; color: white; font-size: 12px; display: flex;
-  flex-direction: column; align-items: flex-end; pointer-events: none; }
-.cloud-view .ramp { width: 14px; height: 110px; margin: 3px 0; }
-.cloud-view .empty { position: absolute; inset: 0; display: flex; align-items: center; justify-content: center;
-  color: #8a94a3; pointer-events: none; }
-"""
+_STYLE = Path(__file__).with_name("desk.css")
 
 
 class BoardView:
@@ -83,7 +53,7 @@ class BoardView:
             self._image = ui.element("img").props('alt="latest image"')
             self._image.set_visibility(False)
             self._caption = ui.label("no image yet").classes("text-sm")
-            self._histogram = ui.html("", sanitize=False)
+            self._histogram = ui.html("", sanitize=False).classes("histogram")
 
     def coverage(self) -> None:
         """Build the map of the image area covered in a guided calibration."""
@@ -96,7 +66,7 @@ class BoardView:
         """Build the cloud, with a choice of colours."""
         with ui.element("section").classes("cloud").props('aria-label="cloud"'):
             shown = self._cloud = CloudView(self._picked)
-            with ui.row().classes("items-center px-2 py-1 gap-3"):
+            with ui.row().classes("items-center px-2 py-1 gap-x-3 gap-y-0"):
                 colours = ui.select(["depth", *FIELDS], value="depth", label="colour").props("dense")
                 colours.classes("w-32").on_value_change(lambda event: shown.colour_by(event.value))
                 ui.button("fit", on_click=shown.fit).props("flat dense")

@@ -289,14 +289,14 @@ class _OperatorPage:
             self._button("disconnect", self._instrument.disconnect, _FREE).props("outline")
         ui.separator()
         ui.label("live image").classes("text-sm")
-        with ui.row().classes("items-center"):
-            self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
-            self._light.on_value_change(lambda event: self._look(event.value))
-            self._only.append((self._light, _FREE))
-            self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
+        self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
+        self._light.on_value_change(lambda event: self._look(event.value))
+        self._only.append((self._light, _FREE))
         self._exposed = self._exposure_now()
-        self._exposure = _Number("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
-        self._exposure.on("change", self._expose)
+        with ui.element("div").classes("fields"):
+            self._exposure = _Number("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
+            self._exposure.on("change", self._expose)
+            self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
         ui.label("The laser is on only while an image is exposed.").classes("text-xs")
 
     def _choose(self) -> None:
@@ -358,8 +358,9 @@ class _OperatorPage:
         self._guided_plan = ui.select(self._desk.plans(load_guided_plan), label="plan of the calibration").classes(
             "w-full"
         )
-        self._calibration_name = ui.input("name of the calibration", value="calibration").classes("w-full")
-        self._replace = ui.checkbox("replace an existing one")
+        with ui.element("div").classes("fields"):
+            self._calibration_name = ui.input("name of the calibration", value="calibration")
+            self._replace = ui.checkbox("replace existing")
         with ui.row():
             self._button("begin", lambda: self._calibrate(resume=False), (InstrumentState.DISCONNECTED, *_FREE))
             self._button(
@@ -383,7 +384,7 @@ class _OperatorPage:
         plan = self._desk.plan
         stage = None if plan is None else plan.stage
         start, step, count = (None, None, None) if stage is None else (stage.start_mm, stage.step_mm, stage.count)
-        with ui.row():
+        with ui.element("div").classes("fields"):
             self._start = _Number("first position, mm", value=start, format="%.3f")
             self._step = _Number("step, mm", value=step, format="%.4f")
             self._number = _Number("positions", value=count, min=1, precision=0)
@@ -392,8 +393,9 @@ class _OperatorPage:
         for each in (self._start, self._step, self._number):
             each.on_value_change(self._show_extent)
         self._calibration = ui.select([], label="calibration for the cloud", clearable=True).classes("w-full")
-        self._out = ui.input("name of the capture", value="scan").classes("w-full")
-        self._overwrite = ui.checkbox("replace an existing capture")
+        with ui.element("div").classes("fields"):
+            self._out = ui.input("name of the capture", value="scan")
+            self._overwrite = ui.checkbox("replace existing")
         with ui.row():
             self._button("start", lambda: self._record(resume=False), (InstrumentState.READY,))
             self._button("continue interrupted", lambda: self._record(resume=True), (InstrumentState.READY,)).props(

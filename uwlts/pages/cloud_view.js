@@ -28,9 +28,10 @@ export default {
     <div class="cloud-view" tabindex="0" aria-label="point cloud; arrow keys turn it, plus and minus zoom, F fits it">
       <canvas></canvas>
       <canvas class="axes" width="90" height="90"></canvas>
-      <div class="scale" v-show="count"><div class="bar"></div><span></span></div>
-      <div class="legend" v-show="count"><span>{{ high }}</span><div class="ramp"></div><span>{{ low }}</span>
-        <b>{{ legend }}</b></div>
+      <div class="keys" v-show="count">
+        <div class="legend"><span>{{ high }}</span><div class="ramp"></div><span>{{ low }}</span><b>{{ legend }}</b></div>
+        <div class="scale"><div class="bar"></div><span></span></div>
+      </div>
       <div class="empty" v-show="!count">{{ problem }}</div>
     </div>`,
   // Of a page: `source` of the points, `stops` of the colours, `limits` and `unit` of the field, direction of the `eye`.
@@ -268,7 +269,8 @@ export default {
     },
     showScale() {
       const perPixel = (2 * this.camera.top) / this.camera.zoom / Math.max(this.$el.clientHeight, 1);
-      const wanted = 120 * perPixel;
+      // Beside the axes also on a phone.
+      const wanted = Math.min(120, Math.max(30, this.$el.clientWidth - 115)) * perPixel;
       const ten = 10 ** Math.floor(Math.log10(wanted));
       const length = [5, 2, 1].map((n) => n * ten).find((n) => n <= wanted);
       const scale = this.$el.querySelector(".scale");
