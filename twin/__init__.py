@@ -7,6 +7,6 @@ evaluation of the thesis. The stub file lists all names. Each name is imported a
 selected before Mitsuba is imported.
 """
 
-import lazy_loader
+from uwlts.argument_types import attach_public
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_public(__name__, __file__)

@@ -41,6 +41,10 @@ class Error(Exception):
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1000]} ... {text[-1000:]}"
 
 
+class ArgumentError(Error, TypeError):
+    """An argument of a public function has a wrong type."""
+
+
 class DescriptionError(Error):
     """A description of a sensor, scene or target cannot be read: unknown key, wrong type, unknown name."""
 

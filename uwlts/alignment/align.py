@@ -21,6 +21,7 @@ from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.path_solution import initial_estimate, settle
 from uwlts.alignment.pieces import Survey
+from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError
 from uwlts.files.json_files import write_record
 from uwlts.fitting.least_squares import noise_factor
@@ -99,6 +100,7 @@ class AlignedTrajectory(Brief):
             "doubtful_s": [list(each) for each in self.doubtful_s],
         }
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the corrected trajectory as CSV with covariances, and the crossings as JSON beside it."""
         self.trajectory.save(path, overwrite=overwrite)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
+from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError, describe_problems
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
@@ -204,6 +205,7 @@ class Evaluation(Brief):
                 f"the metadata of the cloud {self.source} is not valid: {describe_problems(error)}"
             ) from error
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the evaluation as indented JSON, atomically; OutputError if writing fails."""
         write_model(path, self.record(), file_format=FORMAT, version=VERSION, overwrite=overwrite)

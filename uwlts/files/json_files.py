@@ -14,6 +14,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from pydantic import BaseModel, JsonValue, ValidationError
 
+from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError, Error, OutputError, describe_problems
 from uwlts.files.reading import MOST_JSON_BYTES, add_article, find_not_finite, log_warnings, parse_json, read_text
 from uwlts.files.writing import require_ending, write_atomically
@@ -192,6 +193,7 @@ class RecordFile(ABC):
     def record(self) -> object:
         """Return the result as JSON."""
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the record as indented JSON, completely or not at all; raises OutputError if that fails."""
         write_record(path, self.record(), overwrite=overwrite)

@@ -14,6 +14,7 @@ from pydantic import (
     model_validator,
 )
 
+from uwlts.argument_types import check_arguments
 from uwlts.errors import describe_problems
 from uwlts.files.json_files import write_model
 from uwlts.model.brief import Brief
@@ -253,6 +254,7 @@ class Calibration(Brief, Description):
         place = 1 + next((number for number, (key, _) in enumerate(figures) if key == "camera"), -1)
         return dict([*figures[:place], ("joint", self.joint.in_file()), *figures[place:]])
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the calibration as JSON, completely or not at all; OutputError if that fails."""
         write_model(path, self, file_format=FORMAT, version=VERSION, overwrite=overwrite)

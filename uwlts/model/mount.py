@@ -6,6 +6,7 @@ from typing import Annotated, Literal, assert_never
 import numpy as np
 from pydantic import Field, model_validator
 
+from uwlts.argument_types import check_arguments
 from uwlts.files.json_files import write_model
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
@@ -150,6 +151,7 @@ class Mount(Brief, Description):
             raise ValueError("covariance must have positive variances")
         return self
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the mount as JSON, completely or not at all; OutputError if that fails."""
         write_model(path, self, file_format=FORMAT, version=VERSION, overwrite=overwrite)

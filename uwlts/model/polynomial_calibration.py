@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from uwlts.argument_types import check_arguments
 from uwlts.files.json_files import add_seal
 from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.brief import Brief
@@ -70,6 +71,7 @@ class PolynomialCalibration(Brief, Description):
             raise ValueError("domains_px must have increasing ranges within position_range_px")
         return self
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the calibration as JSON, completely or not at all; OutputError if that fails."""
         # One line for each key; with indentation, each of thousands of coefficients would take a line.

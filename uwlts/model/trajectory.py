@@ -9,6 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from uwlts.argument_types import check_arguments
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.brief import Brief
@@ -73,6 +74,7 @@ class Trajectory(Brief):
             values.flags.writeable = False
             object.__setattr__(self, name, values)
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the trajectory as CSV, format quaternion-xyzw, mm, with covariances; OutputError if that fails."""
         require_ending(Path(path), (".csv",))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError, RangeError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties
@@ -98,6 +99,7 @@ class Verification:
         """One line of text for each quantity."""
         return "\n".join(verdict.text for verdict in self.verdicts)
 
+    @check_arguments
     def save(self, calibration: str | Path) -> Path:
         """Write verdict and date beside the calibration's file, where `reconstruct` finds them; OutputError if not."""
         record = VerificationRecord(

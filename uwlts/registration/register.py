@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import surface_patches
 from uwlts.model.brief import Brief
@@ -184,6 +185,7 @@ class RegisteredScans(Brief):
             "points": len(self.cloud),
         }
 
+    @check_arguments
     def save_poses(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the poses of the scans as CSV in the format "matrix", mm; OutputError if writing fails."""
         write_poses(path, self.poses, overwrite=overwrite)

@@ -3,6 +3,6 @@
 The stub beside this file lists the pages that can be written. Each is imported when it is first used.
 """
 
-import lazy_loader
+from uwlts.argument_types import attach_public
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_public(__name__, __file__)

@@ -17,6 +17,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D, proj3d
 
+from uwlts.argument_types import check_arguments
+from uwlts.errors import ImageError
 from uwlts.model.calibration import Calibration
 from uwlts.pages.numbers import entries_of, format_to_scale, number_list, split_name, unit_for, unit_of
 from uwlts.pages.toolkit import BLUE, COLOURS, INK, RED, make_figure, new_figure, plain_text, typeset_number
@@ -84,6 +86,7 @@ class NothingToDrawError(ValueError):
     """A cloud or calibration does not contain the data of a plot."""
 
 
+@check_arguments
 def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviation") -> Axes3D:
     """Draw all points of a cloud, seen obliquely from the sensor's side, with equal scales and without perspective.
 
@@ -201,6 +204,7 @@ def surface_limit_mm(distance_mm: np.ndarray) -> float:
     return (float(np.quantile(np.abs(known), _SHOWN_SHARE)) if len(known) else 0.0) or 1e-3
 
 
+@check_arguments
 def stripe(
     image: np.ndarray | Frame, stripe: Stripe | None = None, ax: Axes | None = None, *, enlarged: bool = False
 ) -> Axes:
@@ -222,6 +226,8 @@ def stripe(
         Show the brightest part of the stripe, with linear grey values and connected centres.
     """
     grey = image.image if isinstance(image, Frame) else image
+    if grey.ndim != 2:
+        raise ImageError(f"`image` has the shape {grey.shape}; expected rows and columns of grey values")
     ax = _axes(ax, 11.2, 4.0)
     names = ("column u / px", "row v / px")
     if stripe is not None and stripe.stripe_along == "height":
@@ -277,6 +283,7 @@ def _shown_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
     return stripe.lines[(stripe.lines >= first) & (stripe.lines < first + count)]
 
 
+@check_arguments
 def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     """Draw the distribution of a cloud's deviations, and the normal distribution with its mean and deviation.
 
@@ -309,6 +316,7 @@ def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     return ax
 
 
+@check_arguments
 def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     """Draw mean and scatter of a cloud's deviations over all images, in short intervals of Y.
 
@@ -372,6 +380,7 @@ def residual_lists(calibration: Calibration) -> list[ResidualList]:
     return found
 
 
+@check_arguments
 def residuals(calibration: Calibration, ax: Axes | None = None, *, which: ResidualList | None = None) -> Axes:
     """Draw one list of a calibration's residuals by image: ``which``, or the first one of `residual_lists`.
 
@@ -402,6 +411,7 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: Residu
     return ax
 
 
+@check_arguments
 def window_curves(
     calibrations: Mapping[str, Calibration], ax: Axes | None = None, *, true_mm: float | None = None
 ) -> Axes:

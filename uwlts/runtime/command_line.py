@@ -8,18 +8,19 @@ import ast
 import inspect
 import re
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache, cached_property, reduce
 from operator import or_
 from pathlib import Path
-from types import ModuleType, NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from types import ModuleType, NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from cyclopts import App, Group, Parameter
 
 from uwlts._version import __version__
+from uwlts.argument_types import union_members
 from uwlts.errors import make_printable
 from uwlts.runtime.console import SWITCHES, progress_bar, replace_by_options
 
@@ -239,7 +240,7 @@ class DerivedCommand:
 
     def _plain(self, name: str, value: Any) -> Any:
         """Return a value as the function takes it: a single literal word is not a tuple."""
-        kinds = _members(self._taken[name].annotation)
+        kinds = union_members(self._taken[name].annotation)
         alone = [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
         return value[0] if isinstance(value, tuple) and len(value) == 1 and value[0] in alone else value
 
@@ -280,20 +281,9 @@ def _place(one: inspect.Parameter) -> tuple[int, bool]:
     return one.kind, one.default is not one.empty
 
 
-def _members(hint: Any) -> Iterator[Any]:
-    """Iterate over the types of a union, or the type itself, without annotations."""
-    if get_origin(hint) is Annotated:
-        yield from _members(get_args(hint)[0])
-    elif get_origin(hint) in (Union, UnionType):
-        for each in get_args(hint):
-            yield from _members(each)
-    else:
-        yield hint
-
-
 def option_type(hint: Any) -> Any:
     """Return the type of an option for a parameter of some type, or None if it cannot be given as text."""
-    kinds = list(_members(hint))
+    kinds = list(union_members(hint))
     if Path in kinds:
         kinds = [PathText if kind is str else kind for kind in kinds]
     words = [kind for kind in _WORDS if kind in kinds] or [kind for kind in kinds if kind is Path]

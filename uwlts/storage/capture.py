@@ -27,6 +27,7 @@ import h5py
 import hdf5plugin  # noqa: F401, gives HDF5 the filter by which frames are read
 import numpy as np
 
+from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError, ImageError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import hash_file
@@ -202,6 +203,7 @@ class Capture(AbstractContextManager["Capture"]):
         The file is missing, foreign, truncated, of a newer version, or contradicts itself.
     """
 
+    @check_arguments
     def __init__(self, path: str | Path):
         self.path = Path(path)
         require_regular_file(self.path, called="capture")

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_plain
 from uwlts.model.brief import Brief
@@ -186,7 +187,10 @@ class PointCloud(Brief):
     def __post_init__(self) -> None:
         for name, kind in KINDS.items():
             if (values := getattr(self, name)) is not None:
-                column = np.asarray(values, dtype=kind).view()
+                try:
+                    column = np.asarray(values, dtype=kind).view()
+                except (TypeError, ValueError) as error:
+                    raise CaptureError(f"`{name}` of a cloud needs an array of numbers: {error}") from error
                 column.flags.writeable = False
                 object.__setattr__(self, name, column)
         points = self.points_mm
@@ -211,6 +215,7 @@ class PointCloud(Brief):
     def __len__(self) -> int:
         return len(self.points_mm)
 
+    @check_arguments
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the cloud in the format of the ending; raises the errors of `uwlts.storage.cloud_files.write_cloud`.
 

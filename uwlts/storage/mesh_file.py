@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import open_regular, require_regular_file
 from uwlts.files.writing import write_atomically
@@ -86,6 +87,7 @@ class SurfaceMesh(Brief):
             lines.append(f"points without a surface  {100 * self.left_out:.2f} %")
         return lines
 
+    @check_arguments
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the mesh in the format of the path's ending, completely or not at all.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from uwlts.argument_types import check_arguments
 from uwlts.calibration.camera.lens import (
     WIDE_DEG,
     Distortion,
@@ -68,6 +69,7 @@ class CameraCalibration(Brief):
     photographs: list[Photograph]
     warnings: list[str]
 
+    @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the camera as YAML in the form of ROS CameraInfo, which `uwlts import` reads as ``intrinsics``.
 

@@ -1,0 +1,227 @@
+"""Check of the arguments of public functions against their annotations, in one place for all of them.
+
+`attach_public` makes the names of a package's stub available when they are first used; functions among them check their
+arguments. Modules inside the packages import the functions themselves, which do not.
+"""
+
+import inspect
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import cache, wraps
+from itertools import repeat
+from numbers import Integral, Real
+from pathlib import Path
+from reprlib import Repr
+from types import NoneType, SimpleNamespace, UnionType
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import lazy_loader
+
+from uwlts.errors import ArgumentError
+
+P, R = ParamSpec("P"), TypeVar("R")
+
+_SHORT = Repr()
+"""Short texts of values, for messages."""
+_SHORT.maxstring = _SHORT.maxother = 60
+
+
+class _MisfitError(Exception):
+    """A value does not have a type."""
+
+
+def attach_public(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package with a stub file beside ``file``."""
+    find, list_names, names = lazy_loader.attach_stub(package, file)
+
+    def find_checked(name: str) -> Any:
+        found = find(name)
+        if inspect.isfunction(found):
+            found = check_arguments(found)
+            # Pickled by its public name, under which it is found again.
+            found.__module__, found.__qualname__ = package, name
+            # The loader keeps what it has found, without the check.
+            setattr(sys.modules[package], name, found)
+        return found
+
+    return find_checked, list_names, names
+
+
+def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
+    """Make a function raise ArgumentError for arguments that do not have the types of its parameters.
+
+    Lists of numbers become arrays where the function takes an array.
+    """
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        signature = inspect.signature(function)
+        try:
+            bound = signature.bind(*args, **kwargs)
+        except TypeError:
+            return function(*args, **kwargs)  # Python's message has the function's name
+        hints = _hints(function)
+        for name, value in bound.arguments.items():
+            kind = signature.parameters[name].kind
+            if name not in hints or kind is inspect.Parameter.VAR_KEYWORD:
+                continue
+            several = kind is inspect.Parameter.VAR_POSITIONAL
+            values = [_checked(name, each, hints[name]) for each in (value if several else (value,))]
+            bound.arguments[name] = tuple(values) if several else values[0]
+        return function(*bound.args, **bound.kwargs)
+
+    return checked
+
+
+@cache
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the types of a function's parameters; that of its result may be unknown when it runs."""
+    annotations = {name: hint for name, hint in inspect.get_annotations(function).items() if name != "return"}
+    return get_type_hints(
+        SimpleNamespace(__annotations__=annotations),
+        globalns=inspect.unwrap(function).__globals__,
+        include_extras=False,
+    )
+
+
+def _checked(name: str, value: Any, hint: Any) -> Any:
+    with suppress(_MisfitError):
+        return _convert(value, hint)
+    shown = _SHORT.repr(value)
+    single = any(_is_list(kind) and _fits([value], kind) for kind in union_members(hint))
+    advice = f"; give a single one as [{shown}]" if single else ""
+    raise ArgumentError(f"`{name}` is {shown} ({type(value).__name__}), expected {_describe(hint)}{advice}")
+
+
+def union_members(hint: Any) -> Iterator[Any]:
+    """Iterate over the types of a union, or the type itself, without annotations."""
+    if get_origin(hint) is Annotated:
+        yield from union_members(get_args(hint)[0])
+    elif get_origin(hint) in (Union, UnionType):
+        for each in get_args(hint):
+            yield from union_members(each)
+    else:
+        yield hint
+
+
+def _is_array(kind: Any) -> bool:
+    origin = get_origin(kind) or kind
+    return (origin.__module__, origin.__name__) == ("numpy", "ndarray")
+
+
+def _is_list(kind: Any) -> bool:
+    return get_origin(kind) in (Sequence, list) or (get_origin(kind) is tuple and get_args(kind)[-1] is ...)
+
+
+def _is_path(kind: Any) -> bool:
+    origin = get_origin(kind) or kind
+    return isinstance(origin, type) and issubclass(origin, os.PathLike)
+
+
+def _convert(value: Any, hint: Any) -> Any:
+    """Return a value in one of the types of a union; raises _MisfitError if it has none of them."""
+    for kind in union_members(hint):
+        with suppress(_MisfitError):
+            return _convert_to_one(value, kind)
+    raise _MisfitError
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    try:
+        _convert(value, hint)
+    except _MisfitError:
+        return False
+    return True
+
+
+def _convert_to_one(value: Any, kind: Any) -> Any:
+    origin, parts = get_origin(kind) or kind, get_args(kind)
+    if origin in (Any, object):
+        return value
+    if origin is Literal:
+        fits = any(value == word for word in parts if _is_instance(value, type(word)))
+    elif origin in (Sequence, list, tuple):
+        return _convert_entries(value, origin, parts)
+    elif _is_array(kind):
+        return _convert_to_array(value)
+    elif origin in (Mapping, dict):
+        fits = isinstance(value, Mapping) and all(map(_fits, value.values(), repeat(parts[1])))
+    else:
+        fits = _is_instance(value, origin)
+    if not fits:
+        raise _MisfitError
+    return value
+
+
+def _is_instance(value: Any, kind: Any) -> bool:
+    """Return whether a value is of a type; a bool is not a number here, and NumPy's scalars are Python's."""
+    is_bool = type(value).__name__ in ("bool", "bool_")
+    if kind is bool:
+        return is_bool
+    if kind in (int, float):
+        return isinstance(value, Integral if kind is int else Real) and not is_bool
+    if kind is Callable or getattr(kind, "_is_protocol", False):
+        return callable(value)
+    return isinstance(value, os.PathLike if kind is Path else kind)
+
+
+def _convert_entries(value: Any, origin: Any, parts: tuple[Any, ...]) -> Any:
+    if isinstance(value, str | bytes) or not (isinstance(value, Sequence) or _is_array(type(value))):
+        raise _MisfitError
+    if origin is tuple and parts[-1] is not ...:
+        if len(value) != len(parts):
+            raise _MisfitError
+    else:
+        parts = parts[:1] * len(value)
+    entries = list(value)
+    converted = list(map(_convert, entries, parts))
+    if origin is tuple:
+        return tuple(converted)
+    return value if all(one is other for one, other in zip(entries, converted, strict=True)) else converted
+
+
+def _convert_to_array(value: Any) -> Any:
+    """Return an array, or numbers in lists or tables as an array."""
+    import numpy as np
+
+    if isinstance(value, str | bytes | os.PathLike | Mapping | NoneType):
+        raise _MisfitError
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):
+        raise _MisfitError from None
+    if not array.ndim or array.dtype.kind not in "biuf":
+        raise _MisfitError
+    return array
+
+
+def _describe(hint: Any) -> str:
+    """Return the expected types in words; None, which the signature shows as default, is left out."""
+    kinds = [kind for kind in union_members(hint) if kind is not NoneType]
+    named = any(map(_is_path, kinds))
+    words = list(dict.fromkeys(word for kind in kinds for word in _words(kind, beside_path=named)))
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+
+
+def _words(kind: Any, *, beside_path: bool) -> list[str]:
+    origin, parts = get_origin(kind) or kind, get_args(kind)
+    plain = {str: "text", int: "a whole number", float: "a number", bool: "True or False"}
+    if _is_path(kind) or (kind is str and beside_path):
+        return ["a path"]
+    if origin is Literal:
+        return [repr(word) for word in parts]
+    if origin in plain:
+        return [plain[origin]]
+    if _is_array(kind):
+        return ["an array of numbers"]
+    if _is_list(kind):
+        return [f"a list (entries: {_describe(parts[0])})"]
+    if origin is tuple:
+        return [f"{len(parts)} values ({', '.join(dict.fromkeys(map(_describe, parts)))})"]
+    if origin in (Mapping, dict):
+        return ["a dictionary" if parts[1] is Any else f"a dictionary (values: {_describe(parts[1])})"]
+    if origin is Callable or getattr(origin, "_is_protocol", False):
+        return ["a function"]
+    return [f"{'an' if origin.__name__[0] in 'AEIOU' else 'a'} {origin.__name__}"]
