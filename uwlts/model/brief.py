@@ -12,7 +12,7 @@ _MOST = 8
 
 
 class Brief:
-    """Base of results with a `repr` and `str` that fit on a screen and a table for notebooks; names contain the units."""
+    """Base of results with texts that fit on a screen, and a table for notebooks; names contain the units."""
 
     def summarise_fields(self) -> dict[str, str]:
         """Return short texts of the fields' values by name."""
