@@ -16,8 +16,8 @@ RUN python3 -m venv /opt/venv \
     && pip install --no-cache-dir '/opt/uwlts[clouds,registration]' jupyterlab jupytext
 COPY docs/tutorials /opt/uwlts/tutorials
 
-RUN useradd --create-home operator && mkdir /work && chown operator /work
-USER operator
+RUN useradd --create-home diver && mkdir /work && chown diver /work
+USER diver
 WORKDIR /work
 VOLUME /work
 
