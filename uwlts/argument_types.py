@@ -198,7 +198,7 @@ def _convert_to_array(value: Any) -> Any:
 
 
 def _describe(hint: Any) -> str:
-    """Return the expected types in words; None, which the signature shows as default, is left out."""
+    """Return the expected types as text; None, which the signature shows as default, is left out."""
     kinds = [kind for kind in union_members(hint) if kind is not NoneType]
     named = any(map(_is_path, kinds))
     words = list(dict.fromkeys(word for kind in kinds for word in _words(kind, beside_path=named)))
