@@ -47,6 +47,8 @@ _MIXED = np.sqrt([2.0, 3.0, 5.0])
 """Weights whose sum of coordinates differs between places."""
 _FARTHEST_MM = 1e12
 """Coordinates of maps in mm reach 1e10; squares and products of larger ones would overflow."""
+_LARGEST_ERROR_MM = 1e6
+"""A kilometre: no scan is so uncertain, and squares of larger numbers would lose the noise of others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +168,8 @@ class PointCloud(Brief):
     Raises
     ------
     CaptureError
-        The shapes of the arrays do not match, points are not finite, or the metadata is not JSON.
+        The shapes of the arrays do not match, points or uncertainties are not finite, variances are negative, or the
+        metadata is not JSON.
     """
 
     points_mm: np.ndarray
@@ -206,6 +209,7 @@ class PointCloud(Brief):
             by_pose = None if known.poses_mm is None else known.poses_mm.shape[1:]
             if shapes != ((len(points), 6), points.shape, points.shape) or by_pose not in (None, points.shape):
                 raise CaptureError(f"the uncertainty of {len(points)} points has the shapes {shapes}")
+            _require_sound(known)
         metadata_json(self.metadata)
 
     def __len__(self) -> int:
@@ -234,6 +238,25 @@ class PointCloud(Brief):
     def covariance_mm2(self) -> np.ndarray | None:
         """Total covariance (N, 3, 3) of each point's coordinates, mm2; None if unknown."""
         return None if self.uncertainty is None else self.uncertainty.covariance_mm2()
+
+
+def _require_sound(known: PointUncertainty) -> None:
+    """Raise CaptureError if numbers of an uncertainty are not finite or too large, or variances are negative."""
+    variances = [known.random_mm2[:, PAIRS.index((axis, axis))] for axis in range(3)]
+    parts = {
+        "random_mm2": (known.random_mm2, _LARGEST_ERROR_MM**2),
+        "position_mm": (known.position_mm, _LARGEST_ERROR_MM),
+        "patterns_mm": (known.patterns_mm, _LARGEST_ERROR_MM),
+        "poses_mm": (known.poses_mm, _LARGEST_ERROR_MM),
+    } | {f"shared_errors of {name}": (each, _LARGEST_ERROR_MM) for name, each in known.shared.items()}
+    for name, (values, most) in parts.items():
+        # Comparisons with NaN are false.
+        if values is not None and values.size and not (values.max() <= most and values.min() >= -most):
+            raise CaptureError(f"{name} of the cloud's uncertainty has numbers that are not finite, or above {most:g}")
+    if any((variance < 0).any() for variance in variances):
+        raise CaptureError("the cloud's uncertainty has negative variances (random_mm2)")
+    if any(each.ndim != 2 or len(each) != len(known.patterns_mm) for each in known.shared.values()):
+        raise CaptureError(f"the shared_errors of the cloud do not belong to its {len(known.patterns_mm)} patterns")
 
 
 def make_foreign_cloud(
