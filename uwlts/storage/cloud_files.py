@@ -353,12 +353,6 @@ def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Ta
         shared = {name: np.array(each, dtype=np.float64) for name, each in stated.items()}
     except (TypeError, ValueError) as error:
         raise CaptureError(f"its metadata is damaged: {_SHARED} holds no numbers") from error
-    if any(
-        each.ndim != 2 or len(each) != len(known.patterns_mm) or not np.isfinite(each).all() for each in shared.values()
-    ):
-        raise CaptureError(
-            f"its metadata is damaged: {_SHARED} does not belong to its {len(known.patterns_mm)} patterns"
-        )
     return rest, replace(known, shared=shared)
 
 
