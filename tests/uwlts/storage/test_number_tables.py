@@ -126,8 +126,8 @@ def test_names_decide_the_axes_of_euler_angles(tmp_path: Path, header: str, angl
 @pytest.mark.parametrize(
     ("header", "pose_format", "unit", "message"),
     [
-        ("x_m,y_m,z_m,roll,pitch,yaw", "euler-zyx-deg", "mm", "names columns in m"),
-        ("x_mm,y_mm,z_mm,roll,pitch,yaw", "euler-zyx-deg", "m", "names columns in mm"),
+        ("x_m,y_m,z_m,roll,pitch,yaw", "euler-zyx-deg", "mm", "states m, but the unit mm"),
+        ("x_mm,y_mm,z_mm,roll,pitch,yaw", "euler-zyx-deg", "m", "states mm, but the unit m"),
         ("x,y,z,roll_rad,pitch_rad,yaw_rad", "euler-zyx-deg", None, "roll|yaw in rad"),
         ("x,y,z,roll [deg],pitch [deg],yaw [deg]", "euler-zyx-rad", None, "in deg, but"),
         ("x,y,z,roll [turn],pitch [turn],yaw [turn]", "euler-zyx-rad", None, "unknown unit"),
