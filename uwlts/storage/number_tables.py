@@ -40,6 +40,7 @@ _UNITS = _LENGTHS | _ANGLES | _TIMES
 _UNITS_OF = {"time_s": _TIMES} | dict.fromkeys("xyz", _LENGTHS) | dict.fromkeys(ROTATION_NAMES[4:], _ANGLES)
 """Units of the columns whose units are converted or checked."""
 _SAME_NAMES = {name: name for name in ROTATION_NAMES} | {"heading": "yaw"}
+_OF_NUMBERS = {"q0": "qw", "q1": "qx", "q2": "qy", "q3": "qz"}
 _TIME_NAMES = ("time", "t", "timestamp", "stamp", "time_s")
 _IN_BRACKETS = re.compile(r"(.*?)[\s_]*[\[(<](.*)[\])>]")
 _AT_END = re.compile(r"(.+?)[\s_/.\-]+([^\s_/.\-]+)|([xyz])(mm|cm|um|m)")
@@ -216,6 +217,8 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
             )
         names.append(name or f"column {number}")
         units |= {names[-1]: unit} if unit else {}
+    if {"q0", "q1", "q2", "q3"} <= set(names):  # the scalar is q0
+        names = [_OF_NUMBERS.get(name, name) for name in names]
     if "qw" in names:
         names = [f"q{name[1]}" if name in ("rx", "ry", "rz") else name for name in names]
     return names, units
