@@ -493,7 +493,7 @@ class _OperatorPage:
             raise DescriptionError("choose the calibration first, under Scan")
         folder, board = self._desk.folder, self._board
         capture, calibration = find_file(folder, name), find_file(folder, known)
-        out = new_path(folder, Path(name).stem, suffix=".ply")
+        out = new_path(folder, Path(name).stem, suffix=".cloud.h5")
         refuse_unsuitable(out, overwrite=False)
         board.say(f"reconstructing {name} with {known}")
         cloud = await asyncio.to_thread(reconstruct, capture, calibration)
