@@ -334,8 +334,9 @@ def concatenate_clouds(parts: Sequence[PointCloud]) -> PointCloud:
     known = [part.uncertainty for part in parts if part.uncertainty is not None]
     poses = [each.poses_mm for each in known if each.poses_mm is not None]
     kept = [name for name in KINDS if all(getattr(part, name) is not None for part in parts)]
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in kept}
     return PointCloud(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in kept},
+        **columns,
         uncertainty=PointUncertainty(
             np.concatenate([each.random_mm2 for each in known]),
             np.concatenate([each.position_mm for each in known]),
