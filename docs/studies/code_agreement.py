@@ -64,18 +64,19 @@ JOBS: dict[str, str] = {
         uwlts certificate joint/calibration.json --out certificate/certificate.html
         uwlts certificate joint/calibration.json --check certificate/certificate.json""",
     "reconstruct": f"""
-        uwlts reconstruct inputs/scans/spheres.h5 {TAKEN} --out reconstruct/spheres.ply
+        uwlts reconstruct inputs/scans/spheres.h5 {TAKEN} --out reconstruct/spheres.full.ply
         uwlts reconstruct inputs/scans/spheres.h5 {TAKEN} --out reconstruct/spheres.h5
-        uwlts reconstruct inputs/scans/step-scan.h5 {TAKEN} --out reconstruct/step.ply
-        uwlts reconstruct inputs/scans/plane.h5 {TAKEN} --no-with-uncertainty --out reconstruct/plane.ply
-        uwlts reconstruct inputs/scans/spheres.h5 --calibration sequential/two.json --out reconstruct/sequential.ply
+        uwlts reconstruct inputs/scans/step-scan.h5 {TAKEN} --out reconstruct/step.full.ply
+        uwlts reconstruct inputs/scans/plane.h5 {TAKEN} --no-with-uncertainty --out reconstruct/plane.full.ply
+        uwlts reconstruct inputs/scans/spheres.h5 --calibration sequential/two.json \
+            --out reconstruct/sequential.full.ply
         uwlts reconstruct inputs/scans/spheres.h5 --calibration sequential/one.json --index 1.33 \
-            --out reconstruct/one-refraction.ply
+            --out reconstruct/one-refraction.full.ply
         uwlts reconstruct inputs/scans/spheres.h5 --calibration polynomials/calibration.json \
-            --out reconstruct/polynomials.ply""",
+            --out reconstruct/polynomials.full.ply""",
     "methods": "\n".join(
         f"uwlts reconstruct inputs/scans/shapes.h5 {TAKEN} --no-with-uncertainty --stripe-method {method} "
-        f"{options} --out methods/{method}.ply"
+        f"{options} --out methods/{method}.full.ply"
         for method, options in (
             ("centre-of-mass", "--stripe half_window_px=24"),
             ("profile-fit", "--stripe-peak direct"),
@@ -85,11 +86,11 @@ JOBS: dict[str, str] = {
         )
     ),
     "moving": f"""
-        uwlts reconstruct inputs/scans/robot-sphere.h5 {TAKEN} --out moving/robot.ply
+        uwlts reconstruct inputs/scans/robot-sphere.h5 {TAKEN} --out moving/robot.full.ply
         uwlts mount inputs/scans/robot-sphere.h5 {TAKEN} --radius-mm 19.05 --out moving/mount.json
-        uwlts reconstruct inputs/scans/robot-sphere.h5 {TAKEN} --mount moving/mount.json --out moving/mounted.ply
+        uwlts reconstruct inputs/scans/robot-sphere.h5 {TAKEN} --mount moving/mount.json --out moving/mounted.full.ply
         uwlts reconstruct inputs/scans/vehicle.h5 {TAKEN} --mount moving/mount.json --clock-offset-s 0.012 \
-            --trajectory inputs/scans/vehicle.trajectory.csv {PROFILED} --out moving/vehicle.ply
+            --trajectory inputs/scans/vehicle.trajectory.csv {PROFILED} --out moving/vehicle.full.ply
         uwlts mount inputs/scans/robot-target.h5 {TAKEN} --out moving/board.json
         uwlts mount inputs/scans/rotary-sphere.h5 {TAKEN} --axis=-y --radius-mm 19.05 --out moving/table.json""",
     "mount": "\n".join(
@@ -102,58 +103,60 @@ JOBS: dict[str, str] = {
         )
     ),
     "evaluate": """
-        uwlts evaluate reconstruct/spheres.ply --truth inputs/scans/spheres.truth.h5 --out evaluate/spheres.json \
-            --coloured evaluate/spheres.ply
-        uwlts evaluate reconstruct/step.ply --truth inputs/scans/step-scan.truth.h5 --out evaluate/step.json
-        uwlts evaluate reconstruct/plane.ply --out evaluate/plane.json
-        uwlts evaluate reconstruct/sequential.ply --truth inputs/scans/spheres.truth.h5 --out evaluate/sequential.json
-        uwlts evaluate reconstruct/polynomials.ply --out evaluate/polynomials.json""",
+        uwlts evaluate reconstruct/spheres.full.ply --truth inputs/scans/spheres.truth.h5 --out evaluate/spheres.json \
+            --coloured evaluate/spheres.full.ply
+        uwlts evaluate reconstruct/step.full.ply --truth inputs/scans/step-scan.truth.h5 --out evaluate/step.json
+        uwlts evaluate reconstruct/plane.full.ply --out evaluate/plane.json
+        uwlts evaluate reconstruct/sequential.full.ply --truth inputs/scans/spheres.truth.h5 \
+            --out evaluate/sequential.json
+        uwlts evaluate reconstruct/polynomials.full.ply --out evaluate/polynomials.json""",
     "verify": f"""
         uwlts verify inputs/scans/spheres.h5 {TAKEN} --limit 0.5
         uwlts verify inputs/scans/step-scan.h5 {TAKEN}""",
     "clouds": "\n".join(
-        f"uwlts reconstruct inputs/scans/{name}.h5 {TAKEN} --out clouds/{name}.ply"
+        f"uwlts reconstruct inputs/scans/{name}.h5 {TAKEN} --out clouds/{name}.full.ply"
         for name in ("pipe", "pipe-later", "weld", "flange", "shapes", "shapes-again")
     ),
     "inspect": """
-        uwlts inspect clouds/pipe.ply --wall-mm 9.5 --out inspect/pipe.json --coloured inspect/pipe.ply
-        uwlts inspect clouds/weld.ply weld --out inspect/weld.json
-        uwlts inspect clouds/flange.ply flange --out inspect/flange.json
-        uwlts inspect reconstruct/step.ply step --out inspect/step.json
-        uwlts findings-report clouds/pipe.ply --captures inputs/scans/pipe.h5 --calibration joint/calibration.json \
-            --certificate certificate/certificate.json --verification evaluate/spheres.json \
-            --out inspect/report.html""",
+        uwlts inspect clouds/pipe.full.ply --wall-mm 9.5 --out inspect/pipe.json --coloured inspect/pipe.full.ply
+        uwlts inspect clouds/weld.full.ply weld --out inspect/weld.json
+        uwlts inspect clouds/flange.full.ply flange --out inspect/flange.json
+        uwlts inspect reconstruct/step.full.ply step --out inspect/step.json
+        uwlts findings-report clouds/pipe.full.ply --captures inputs/scans/pipe.h5 \
+            --calibration joint/calibration.json --certificate certificate/certificate.json \
+            --verification evaluate/spheres.json --out inspect/report.html""",
     "compare": """
-        uwlts compare clouds/pipe-later.ply clouds/pipe.ply --same-water --out compare/change.html \
-            --coloured compare/change.ply
-        uwlts compare clouds/pipe-later.ply clouds/pipe.ply --register --out compare/registered.html
-        uwlts compare clouds/pipe.ply cylinder --out compare/cylinder.html
-        uwlts compare reconstruct/plane.ply plane --out compare/plane.html""",
+        uwlts compare clouds/pipe-later.full.ply clouds/pipe.full.ply --same-water --out compare/change.html \
+            --coloured compare/change.full.ply
+        uwlts compare clouds/pipe-later.full.ply clouds/pipe.full.ply --register --out compare/registered.html
+        uwlts compare clouds/pipe.full.ply cylinder --out compare/cylinder.html
+        uwlts compare reconstruct/plane.full.ply plane --out compare/plane.html""",
     "register": """
-        uwlts register clouds/shapes.ply clouds/shapes-again.ply --out register/shapes.ply \
+        uwlts register clouds/shapes.full.ply clouds/shapes-again.full.ply --out register/shapes.full.ply \
             --page register/shapes.html --poses-out register/poses.csv
-        uwlts register clouds/shapes.ply clouds/shapes-again.ply --start-std-mm 0.05 --start-std-deg 0.02 \
-            --out register/known.ply --page register/known.html""",
+        uwlts register clouds/shapes.full.ply clouds/shapes-again.full.ply --start-std-mm 0.05 --start-std-deg 0.02 \
+            --out register/known.full.ply --page register/known.html""",
     "mesh": """
-        uwlts mesh clouds/shapes.ply --out mesh/shapes.ply
-        uwlts mesh clouds/shapes.ply clouds/shapes-again.ply --cube-mm 1.5 --patch-radius-mm 3 --out mesh/both.glb""",
+        uwlts mesh clouds/shapes.full.ply --out mesh/shapes.ply
+        uwlts mesh clouds/shapes.full.ply clouds/shapes-again.full.ply --cube-mm 1.5 --patch-radius-mm 3 \
+            --out mesh/both.glb""",
     "align": f"""
-        uwlts align inputs/crossing.ply --trajectory inputs/crossing.csv {PROFILED} --drift-mm 60 --drift-deg 0.3 \
-            --out align/corrected.csv --aligned align/aligned.ply""",
+        uwlts align inputs/crossing.full.ply --trajectory inputs/crossing.csv {PROFILED} --drift-mm 60 --drift-deg 0.3 \
+            --out align/corrected.csv --aligned align/aligned.full.ply""",
     "formats": "\n".join(
-        f"uwlts export moving/vehicle.ply --out formats/vehicle{ending}"
+        f"uwlts export moving/vehicle.full.ply --out formats/vehicle{ending}"
         for ending in (".h5", ".xyz", ".laz", ".copc.laz", ".e57", ".mcap", ".foxglove.mcap")
     ),
     "report": """
         copy inputs/scans/spheres.h5 report/spheres.h5
         copy joint/calibration.json report/calibration.json
         copy evaluate/spheres.json report/spheres.evaluation.json
-        copy evaluate/spheres.ply report/spheres.ply
+        copy evaluate/spheres.full.ply report/spheres.full.ply
         uwlts report report --published thesis""",
     "gauge": "uwlts gauge inputs/diameters.csv --tolerance 0.5 --out gauge/study.json",
     "info": """
         uwlts info joint/calibration.json
-        uwlts info reconstruct/spheres.ply
+        uwlts info reconstruct/spheres.full.ply
         uwlts info inputs/scans/spheres.h5
         uwlts info evaluate/spheres.json""",
 }

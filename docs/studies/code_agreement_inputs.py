@@ -175,7 +175,10 @@ def write_crossing(folder: Path) -> None:
     rng = np.random.default_rng(SEED)
     cloud, reported, _ = ride(rng, LOOP_MM, drift_mm=DRIFT_MM, drift_deg=DRIFT_DEG)
     # Checkouts of version 0.1 have functions in place of methods.
-    for name, thing, write in (("crossing.ply", cloud, "write_cloud"), ("crossing.csv", reported, "write_trajectory")):
+    for name, thing, write in (
+        ("crossing.full.ply", cloud, "write_cloud"),
+        ("crossing.csv", reported, "write_trajectory"),
+    ):
         if hasattr(thing, "save"):
             thing.save(folder / name, overwrite=True)
         else:

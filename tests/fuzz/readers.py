@@ -442,7 +442,7 @@ READERS = {
         Reader("unfinished", ".h5.part", "hdf5", _unfinished, _all_of_capture),
         Reader("cloud-hdf5", ".h5", "hdf5", _cloud, read_cloud),
         Reader("truth", ".truth.h5", "hdf5", lambda path: write_truth(path, truth_header(), a_truth()), read_truth),
-        Reader("cloud-ply", ".ply", "lines", _cloud, read_cloud),
+        Reader("cloud-ply", ".full.ply", "lines", _cloud, read_cloud),
         Reader("cloud-text", ".ply", "lines", _text_cloud, read_cloud),
         Reader("export", ".ply", "lines", _plain_cloud, _exported),
         *(

@@ -36,12 +36,12 @@ twin simulate flange --as-built thesis-as-built --out flange.h5
 twin simulate step-scan --as-built thesis-as-built --out step-scan.h5
 uwlts calibrate --air target-air.h5 --water target-water.h5 --step step-near.h5 step-far.h5 --out calibration.json
 uwlts certificate calibration.json --out certificate.html
-uwlts reconstruct spheres.h5 --calibration calibration.json --out spheres.ply
-uwlts reconstruct pipe.h5 --calibration calibration.json --out pipe.ply
-uwlts reconstruct weld.h5 --calibration calibration.json --out weld.ply
-uwlts reconstruct flange.h5 --calibration calibration.json --out flange.ply
-uwlts reconstruct step-scan.h5 --calibration calibration.json --out step-scan.ply
-uwlts mesh pipe.ply --out pipe.stl
+uwlts reconstruct spheres.h5 --calibration calibration.json --out spheres.cloud.h5
+uwlts reconstruct pipe.h5 --calibration calibration.json --out pipe.cloud.h5
+uwlts reconstruct weld.h5 --calibration calibration.json --out weld.cloud.h5
+uwlts reconstruct flange.h5 --calibration calibration.json --out flange.cloud.h5
+uwlts reconstruct step-scan.h5 --calibration calibration.json --out step-scan.cloud.h5
+uwlts mesh pipe.cloud.h5 --out pipe.stl
 """
 
 MAKE = {"make ": "`make test-full` runs this test, and demo, bench, docs and check take minutes each"}
@@ -49,7 +49,7 @@ INSTALL = {"pip install": "make does it", "twin demo": "takes a minute; tests/sy
 HARDWARE = "needs hardware: docs/how-to/scan.md and desk.md run it with the twin"
 ALIGNED_ELSEWHERE = "a pass that can be aligned takes minutes to render: tests/uwlts/alignment/test_align.py runs it"
 NEEDS_LEARN = "needs the extra learn, with some 1 GB of libraries, and minutes of training"
-THREE_VIEWS = {"top.ply": "pipe.ply", "left.ply": "pipe.ply", "right.ply": "pipe.ply"}
+THREE_VIEWS = {"top.cloud.h5": "pipe.cloud.h5", "left.cloud.h5": "pipe.cloud.h5", "right.cloud.h5": "pipe.cloud.h5"}
 NO_MOVEMENT = "1,0,0,0,0,1,0,0,0,0,1,0\n" * 3
 GAUGE = "part,operator,value\n" + "".join(
     f"pipe {part},{operator},{299.8 + 0.05 * part + 0.01 * (7 * part * turn % 5):.2f}\n"
@@ -166,7 +166,7 @@ def photographs_with_description(runner: Runner) -> None:
 
 PAGES_RUN = {
     "README.md": Page(
-        given=THREE_VIEWS | {"after.ply": "pipe.ply", "before.ply": "pipe.ply"},
+        given=THREE_VIEWS | {"after.cloud.h5": "pipe.cloud.h5", "before.cloud.h5": "pipe.cloud.h5"},
         small_python=True,
         instead={"--scenes 200": "--scenes 1"},
         again=("twin simulate spheres",),
@@ -210,35 +210,36 @@ PAGES_RUN = {
         + ("uwlts reconstruct scan.h5 --calibration calibration.json --mount mount.json --traj",),
     ),
     "docs/how-to/compare-scans.md": Page(
-        given=dict.fromkeys(("after.ply", "before.ply", "scan.ply", "pipe.ply"), "pipe.ply") | {"part.stl": "pipe.stl"},
-        again=("uwlts compare scan.ply", "uwlts compare pipe.ply"),
+        given=dict.fromkeys(("after.cloud.h5", "before.cloud.h5", "scan.cloud.h5", "pipe.cloud.h5"), "pipe.cloud.h5")
+        | {"part.stl": "pipe.stl"},
+        again=("uwlts compare scan.cloud.h5", "uwlts compare pipe.cloud.h5"),
     ),
     "docs/how-to/gauge-study.md": Page(
         texts={"diameters.csv": GAUGE, "runs/gauge/heights.csv": GAUGE},
         not_run={"python docs/studies/gauge_twin.py": "renders 18 scans"},
     ),
     "docs/how-to/inspect-a-pipe.md": Page(
-        given={name: name for name in ("pipe.ply", "pipe.h5", "weld.ply", "flange.ply")}
-        | {"other-flange.ply": "flange.ply", "plate.ply": "step-scan.ply"}
+        given={name: name for name in ("pipe.cloud.h5", "pipe.h5", "weld.cloud.h5", "flange.cloud.h5")}
+        | {"other-flange.cloud.h5": "flange.cloud.h5", "plate.cloud.h5": "step-scan.cloud.h5"}
         | {"water.json": "calibration.json", "water.certificate.json": "certificate.json"},
         texts={"gap.toml": PLATES},
         before="""
             twin simulate gap.toml --out plates.h5
             uwlts nominal thesis --medium water --out nominal.json
-            uwlts reconstruct plates.h5 --calibration nominal.json --out plates.ply
+            uwlts reconstruct plates.h5 --calibration nominal.json --out plates.cloud.h5
         """,
     ),
     "docs/how-to/large-clouds.md": Page(
-        given={"scan.ply": "pipe.ply"}, instead={"1000 -50 300 1100 50 600": "-10 -50 0 10 50 30"}
+        given={"scan.cloud.h5": "pipe.cloud.h5"}, instead={"1000 -50 300 1100 50 600": "-10 -50 0 10 50 30"}
     ),
     "docs/how-to/make-a-data-set.md": Page(
         tables={"mine.toml": 0}, instead={"--scenes 200": "--scenes 1", "scenes = 40": "scenes = 2"}
     ),
-    "docs/how-to/make-a-mesh.md": Page(given=THREE_VIEWS | {"merged.ply": "pipe.ply"}),
+    "docs/how-to/make-a-mesh.md": Page(given=THREE_VIEWS | {"merged.cloud.h5": "pipe.cloud.h5"}),
     "docs/how-to/register-scans.md": Page(given=THREE_VIEWS, texts={"start.csv": NO_MOVEMENT}),
     "docs/how-to/scan-from-a-vehicle.md": Page(
         prepare={"uwlts reconstruct pass.h5 --calibration calibration.json --mount mount.json --traj": correct_nothing},
-        not_run={"uwlts align pass.ply": ALIGNED_ELSEWHERE},
+        not_run={"uwlts align pass.cloud.h5": ALIGNED_ELSEWHERE},
     ),
     "docs/reference/api.md": Page(given={name: name for name in ("target-air.h5", "target-water.h5", "spheres.h5")}),
     "docs/tutorials/calibrate-a-sensor.md": Page(small_python=True),

@@ -72,9 +72,16 @@ def test_lens_and_window_are_found_from_a_target_in_water(folder: Path, thesis_a
 def test_spheres_in_water_have_their_distance_and_size(folder: Path):
     """Spacing and diameters to 0.02 mm by three sigma of what speckle and this calibration leave."""
     run(
-        "uwlts", "reconstruct", "spheres.h5", "--calibration", "calibration.json", "--out", "spheres.ply", folder=folder
+        "uwlts",
+        "reconstruct",
+        "spheres.h5",
+        "--calibration",
+        "calibration.json",
+        "--out",
+        "spheres.cloud.h5",
+        folder=folder,
     )
-    run("uwlts", "evaluate", "spheres.ply", "--out", "spheres.json", folder=folder)
+    run("uwlts", "evaluate", "spheres.cloud.h5", "--out", "spheres.json", folder=folder)
     figures = json.loads((folder / "spheres.json").read_text(encoding="utf-8"))["evaluation"]["figures_mm"]
     assert abs(figures["SSE"]) < 0.02
     assert abs(figures["diameter error sphere 1"]) < 0.03

@@ -91,8 +91,8 @@ def test_a_scan_of_the_served_twin_is_the_simulated_one(served, folder, board, s
     for name in ("scan", "simulated"):
         for line in (
             f"nominal {folder / 'sensor.toml'} --medium air --out {tmp_path / name}.json",
-            f"reconstruct {tmp_path / name}.h5 --calibration {tmp_path / name}.json --out {tmp_path / name}.ply",
-            f"evaluate {tmp_path / name}.ply --out {tmp_path / name}.evaluation.json",
+            f"reconstruct {tmp_path / name}.h5 --calibration {tmp_path / name}.json --out {tmp_path / name}.cloud.h5",
+            f"evaluate {tmp_path / name}.cloud.h5 --out {tmp_path / name}.evaluation.json",
         ):
             judged = subprocess.run([sys.executable, "-m", "uwlts", *line.split()], capture_output=True, text=True)
             assert judged.returncode == 0, judged.stderr

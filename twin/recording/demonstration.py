@@ -39,10 +39,10 @@ def commands(out: Path) -> list[tuple[str, str]]:
         rows.append(("calibrate", f"uwlts calibrate {evidence} --out {calibration} --overwrite"))
         for scan in scans:
             capture, cloud = f"{folder}/{scan}", f"{folder}/{scan}{suffix}"
-            made = f"{capture}.h5 --calibration {calibration} --out {cloud}.ply --overwrite"
+            made = f"{capture}.h5 --calibration {calibration} --out {cloud}.cloud.h5 --overwrite"
             rows.append(("reconstruct", f"uwlts reconstruct {made}"))
             judged = f"--out {cloud}.evaluation.json --coloured {cloud}-coloured.ply --overwrite"
-            rows.append(("evaluate", f"uwlts evaluate {cloud}.ply --truth {capture}.truth.h5 {judged}"))
+            rows.append(("evaluate", f"uwlts evaluate {cloud}.cloud.h5 --truth {capture}.truth.h5 {judged}"))
     rows.append(("report", f"uwlts report {folder} --published thesis --workers {AT_ONCE} --overwrite"))
     return rows
 

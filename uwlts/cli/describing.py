@@ -38,6 +38,6 @@ def import_(call: Call) -> None:
 
 @command_from(app, uwlts, "export", job="Files")
 def export(call: Call) -> None:
-    """Example: uwlts export scan.ply --out scan.laz"""
+    """Example: uwlts export scan.cloud.h5 --out scan.laz"""
     out, written = Path(call.given["out"]), call()
     say(f"wrote {written} images and import.toml to {out}" if out.is_dir() else cloud_written(out, written))

@@ -32,7 +32,7 @@ def evaluate(
     coloured: ColouredOut = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Example: uwlts evaluate spheres.ply --truth spheres.truth.h5 --out spheres.evaluation.json"""
+    """Example: uwlts evaluate spheres.cloud.h5 --truth spheres.truth.h5 --out spheres.evaluation.json"""
     from uwlts.report.inventory import evaluation_lines
     from uwlts.report.plot import colour_limit_mm
 
@@ -58,7 +58,7 @@ def compare(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Example: uwlts compare after.ply before.ply --out change.html"""
+    """Example: uwlts compare after.cloud.h5 before.cloud.h5 --out change.html"""
     change = call()
     title = f"{Path(call.given['cloud']).name} against {Path(call.given['reference']).name}"
     uwlts.report.write_change(out, change, title=title, coloured=coloured, overwrite=overwrite)
@@ -90,7 +90,7 @@ def inspect(
     unit=None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Example: uwlts inspect pipe.ply --wall-mm 9.5 --out pipe.json"""
+    """Example: uwlts inspect pipe.cloud.h5 --wall-mm 9.5 --out pipe.json"""
     from uwlts.inspection.inspect import inspect_cloud
     from uwlts.report.plot import surface_limit_mm
     from uwlts.storage.cloud_files import read_cloud
@@ -128,7 +128,7 @@ def gauge(
 def findings_report(
     call: Call, *, section_mm=None, wall_mm=None, false_alarm=None, largest_ovality=None, datum=None
 ) -> None:
-    """Example: uwlts findings-report pipe.ply --wall-mm 9.5 --calibration water.json --out pipe.html --pdf"""
+    """Example: uwlts findings-report pipe.cloud.h5 --wall-mm 9.5 --calibration water.json --out pipe.html --pdf"""
     from uwlts.pages.toolkit import json_beside
 
     found = call()

@@ -6,7 +6,18 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import STRIPE, Overwrite, a_cloud, a_file, a_page, app, cloud_written, wrote, wrote_files
+from uwlts.cli.options import (
+    STRIPE,
+    Overwrite,
+    a_cloud,
+    a_file,
+    a_page,
+    app,
+    cloud_written,
+    note_lean,
+    wrote,
+    wrote_files,
+)
 from uwlts.runtime.command_line import Before, Call, command_from, say, show, warn
 
 
@@ -18,13 +29,13 @@ def reconstruct(
         Path,
         Before(a_cloud),
         Parameter(
-            help="Cloud to write: PLY, HDF5 (.h5) or another format of uwlts export, by its ending; with intensity, "
-            "frame and line of every point, and its uncertainty if the calibration is a joint one."
+            help="Cloud to write: HDF5 (.h5), with the whole uncertainty if the calibration is a joint one; PLY for "
+            "other programs, with the standard deviation along the normal; or another format of uwlts export."
         ),
     ],
     overwrite: Overwrite = False,
 ) -> None:
-    """Example: uwlts reconstruct scan.h5 --calibration calibration.json --out scan.ply"""
+    """Example: uwlts reconstruct scan.h5 --calibration calibration.json --out scan.cloud.h5"""
     from uwlts.storage.capture import Capture
     from uwlts.storage.cloud import VERIFIED
 
@@ -40,6 +51,7 @@ def reconstruct(
     if lost := _counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):
         say(f"stripe centres without a point: {lost}")
     say(cloud_written(out, len(cloud)))
+    note_lean(out, cloud)
 
 
 def _counts(by_status: dict[str, int]) -> str:
@@ -68,7 +80,7 @@ def register(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Example: uwlts register top.ply left.ply right.ply --out pipe.ply --page pipe.html"""
+    """Example: uwlts register top.cloud.h5 left.cloud.h5 right.cloud.h5 --out pipe.cloud.h5 --page pipe.html"""
     found = call()
     show(found.lines())
     found.cloud.save(out, overwrite=overwrite)
@@ -77,6 +89,7 @@ def register(
     if page:
         uwlts.report.write_registration(page, found, overwrite=overwrite)
     wrote_files(out, poses_out, page)
+    note_lean(out, found.cloud)
 
 
 @command_from(app, uwlts, "align_trajectory", job="Reconstruct")
@@ -96,13 +109,15 @@ def align(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Example: uwlts align pass.ply --trajectory pass.trajectory.csv --drift-mm 300 --drift-deg 1 --out path.csv"""
+    """Example: uwlts align pass.cloud.h5 --trajectory pass.csv --drift-mm 300 --drift-deg 1 --out path.csv"""
     found = call()
     show(found.lines())
     found.save(out, overwrite=overwrite)
     if aligned:
         found.cloud.save(aligned, overwrite=overwrite)
     say(f"wrote {out} and {out.with_suffix('.json').name}" + (f", {aligned}" if aligned else ""))
+    if aligned:
+        note_lean(aligned, found.cloud)
 
 
 @command_from(app, uwlts, "mesh", job="Reconstruct")
@@ -116,7 +131,7 @@ def mesh(
     ],
     overwrite: Overwrite = False,
 ) -> None:
-    """Example: uwlts mesh left.ply right.ply --out pipe.glb"""
+    """Example: uwlts mesh left.cloud.h5 right.cloud.h5 --out pipe.glb"""
     surface = call()
     surface.save(out, overwrite=overwrite)
     wrote(surface.lines(), [], out)

@@ -116,6 +116,17 @@ def cloud_written(path: Path, points: int) -> str:
     return f"wrote {path} with {points} points in {unit_of(path)}"
 
 
+def note_lean(path: Path, cloud: "PointCloud") -> None:
+    """Say so if the file holds less of the uncertainty than the cloud."""
+    from uwlts.storage.cloud_files import FULL, is_lean
+
+    if cloud.uncertainty is not None and is_lean(path):
+        say(
+            f"{path.name} has the standard deviation along the normal, for other programs; NAME.h5 or NAME{FULL} have "
+            "the whole uncertainty, which measuring needs"
+        )
+
+
 def wrote_page(page: Path) -> None:
     """Print the page written for a result, and the JSON beside it."""
     say(f"wrote {page} and {page.with_suffix('.json').name}")

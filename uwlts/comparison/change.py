@@ -256,9 +256,9 @@ def compare_clouds(
 
     Examples
     --------
-    >>> change = uwlts.compare_clouds("after.ply", "before.ply")
+    >>> change = uwlts.compare_clouds("after.cloud.h5", "before.cloud.h5")
     >>> change.significant.mean(), change.distance_mm[change.significant].min()
-    >>> uwlts.compare_clouds("pipe.ply", "cylinder").regions()
+    >>> uwlts.compare_clouds("pipe.cloud.h5", "cylinder").regions()
     """
     new = load_cloud(cloud, unit=cloud_unit)
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):

@@ -18,7 +18,7 @@ from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
 from uwlts.fitting.point_spacing import POINTS_PER_DISC
 from uwlts.model.sensor import Description, Positive, Vector
 from uwlts.storage.cloud import PointCloud, PointUncertainty, rounding_std_mm
-from uwlts.storage.cloud_files import is_readable_cloud, read_cloud
+from uwlts.storage.cloud_files import is_readable_cloud, load_cloud
 from uwlts.storage.mesh_file import has_faces, load_triangles
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
 
@@ -99,7 +99,7 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
         if path.suffix.lower() == ".toml":
             reference = read_shape(path)
         elif path.suffix.lower() == ".h5" or (is_readable_cloud(path) and not has_faces(path)):
-            cloud = read_cloud(path, unit=unit)
+            cloud = load_cloud(path, unit=unit)
             return ReferencePoints(cloud.points_mm, None, cloud.uncertainty, cloud.frame, rounding_std_mm(cloud))
         else:
             if path.suffix.lower() in _IN_METRES:

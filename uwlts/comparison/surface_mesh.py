@@ -87,7 +87,7 @@ def mesh(
 
     Examples
     --------
-    >>> surface = uwlts.mesh("left.ply", "right.ply")
+    >>> surface = uwlts.mesh("left.cloud.h5", "right.cloud.h5")
     >>> surface.save("pipe.glb")
     """
     for name, length in (("cube_mm", cube_mm), ("patch_radius_mm", patch_radius_mm)):

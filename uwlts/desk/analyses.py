@@ -173,7 +173,7 @@ def _compare(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
 
 def _register(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
     found = uwlts.register(**job.values, progress=progress)
-    found.cloud.save(job.path("-merged.ply"))
+    found.cloud.save(job.path("-merged.cloud.h5"))
     uwlts.report.write_registration(job.path(".html"), found)
     return AnalysisOutcome(tuple(found.lines()))
 
@@ -189,7 +189,7 @@ def _export(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
 
 def _reconstruct(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
     cloud = uwlts.reconstruct(**job.values, progress=progress)
-    write_cloud(job.path(".ply"), cloud)
+    write_cloud(job.path(".cloud.h5"), cloud)
     return AnalysisOutcome((f"{len(cloud):,} points",), warnings=tuple(cloud.warnings))
 
 
@@ -198,7 +198,7 @@ _INSPECTED = (".html", ".findings.json", "-coloured.ply")
 _OPTIONS = {"pipe": ("wall_mm",), "weld": ("section_mm",), "flange": ("datum",)}
 ANALYSES: Mapping[str, Analysis] = MappingProxyType(
     {
-        "reconstruct": Analysis(_reconstruct, ((uwlts, "reconstruct", ("capture", "calibration")),), "", (".ply",)),
+        "reconstruct": Analysis(_reconstruct, ((uwlts, "reconstruct", ("capture", "calibration")),), "", (".cloud.h5",)),
         **{
             f"inspect {kind}": Analysis(
                 _inspect,
@@ -218,7 +218,7 @@ ANALYSES: Mapping[str, Analysis] = MappingProxyType(
             _register,
             ((uwlts, "register", ("clouds", "reach_mm", "sphere_mm")),),
             "-registered",
-            (".html", ".registration.json", "-merged.ply"),
+            (".html", ".registration.json", "-merged.cloud.h5"),
         ),
         "export": Analysis(_export, ((uwlts, "export", ("file", "at_most")),), "-export"),
     }
@@ -256,7 +256,12 @@ def name_results(kind: str, values: Mapping[str, Any]) -> str:
     first = next((values[each.name] for each in list_fields(kind) if each.file_kind), None)
     if isinstance(first, list):
         first = next(iter(first), None)
-    return f"{Path(first).stem.removesuffix('.copc')}{ANALYSES[kind].suffix}" if first else ""
+    if not first:
+        return ""
+    stem = Path(first).stem
+    for ending in (".copc", ".cloud", ".full"):
+        stem = stem.removesuffix(ending)
+    return f"{stem}{ANALYSES[kind].suffix}"
 
 
 class _Cancelled(Exception):
@@ -371,7 +376,7 @@ class Analyses:
             self.state = replace(self.state, running=False, outcome=outcome, files=names)
             board.say(f"wrote {', '.join(names)}")
             for each in targets:
-                if each.suffix == ".ply":
+                if each.name.endswith((".ply", ".cloud.h5")):
                     self._show(each)
 
     def _analyse(

@@ -19,7 +19,7 @@ from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.truth import Truth, TruthHeader, read_truth, scene_digest, truth_path
 
@@ -299,7 +299,7 @@ def evaluate(
     """
     if not isinstance(cloud, PointCloud):
         source = source or Path(cloud).name
-        cloud = read_cloud(cloud, unit=unit)
+    cloud = load_cloud(cloud, unit=unit)
     if artefact is None and (named := cloud.metadata.get("artefact")) is not None:
         artefact = parse_artefact(named)
     if isinstance(artefact, str | Path):

@@ -83,7 +83,7 @@ def inspect_pipe(
 
     Examples
     --------
-    >>> found = uwlts.inspect_pipe("pipe.ply", wall_mm=9.5)
+    >>> found = uwlts.inspect_pipe("pipe.cloud.h5", wall_mm=9.5)
     >>> print("\\n".join(found.lines()))
     """
     cloud = load_cloud(cloud)

@@ -277,8 +277,8 @@ def register(
 
     Examples
     --------
-    >>> found = uwlts.register(["top.ply", "left.ply", "right.ply"])
-    >>> found.cloud.save("pipe.ply")
+    >>> found = uwlts.register(["top.cloud.h5", "left.cloud.h5", "right.cloud.h5"])
+    >>> found.cloud.save("pipe.cloud.h5")
     """
     names = tuple(_scan_name(each, number) for number, each in enumerate(clouds))
     scans = [load_cloud(each, unit=unit) for each in clouds]

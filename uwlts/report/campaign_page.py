@@ -146,7 +146,8 @@ def report_page(
     drawn = [*zip(campaign.measurements, pictures or draw_pictures(campaign), strict=True)]
     # Measurements with other calibrations come last.
     drawn.sort(key=lambda each: each[0] not in main)
-    stripes: dict[bytes, str] = {}
+    names, stripes = [measurement.name for measurement, _ in drawn], {}
+    groups = sorted(_group_rows(rows), key=lambda group: names.index(group[0]) if group[0] in names else len(names))
     return render_page(
         "uwlts.report",
         "campaign.html.j2",
@@ -155,7 +156,7 @@ def report_page(
         introduction=introduction(campaign),
         conclusion=conclude(rows),
         key_figures=headline_tiles(campaign, reference),
-        groups=_group_rows(rows),
+        groups=groups,
         published=None if reference is None else reference.title,
         explanations=explanations(rows, reference),
         measurements=[_measurement(measurement, each, collected, stripes) for measurement, each in drawn],

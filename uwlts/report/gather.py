@@ -125,10 +125,10 @@ class GatheredCampaign:
 def gather_campaign(folder: str | Path) -> GatheredCampaign:
     """Read a campaign's folder.
 
-    It contains captures ``NAME.h5``, their truth ``NAME.truth.h5``, clouds ``NAME.ply`` or ``.h5``, evaluations
-    ``NAME.evaluation.json``, calibrations ``calibration*.json``, and times ``seconds.json``. The metadata of a cloud
-    name its capture; otherwise the capture of the same name is used. CaptureError if the folder is missing or contains
-    nothing to report, or a file (named in the message) is damaged.
+    It contains captures ``NAME.h5``, their truth ``NAME.truth.h5``, clouds ``NAME.cloud.h5``, ``NAME.h5`` or
+    ``NAME.ply``, evaluations ``NAME.evaluation.json``, calibrations ``calibration*.json``, and times ``seconds.json``.
+    The metadata of a cloud name its capture; otherwise the capture of the same name is used. CaptureError if the folder
+    is missing or contains nothing to report, or a file (named in the message) is damaged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -138,7 +138,8 @@ def gather_campaign(folder: str | Path) -> GatheredCampaign:
     read = {path.stem: read_calibration(path) for path in _files(folder, "calibration*.json", but=_NOT_CALIBRATIONS)}
     by_length = sorted(read, key=lambda name: (len(name), name))
     calibrations = [GatheredCalibration(name, read[name], calibration_digest(read[name])) for name in by_length]
-    clouds = {path.stem: read_cloud(path) for path in [*filter(is_cloud, in_hdf5), *_files(folder, "*.ply")]}
+    # Of a cloud in both formats, HDF5 is used.
+    clouds = {_name(path): read_cloud(path) for path in [*_files(folder, "*.ply"), *filter(is_cloud, in_hdf5)]}
     judged = {path.name.removesuffix(_EVALUATION): read_evaluation(path) for path in _files(folder, f"*{_EVALUATION}")}
     if not (clouds or judged or calibrations):
         raise CaptureError(
@@ -169,6 +170,10 @@ def _files(folder: Path, pattern: str, *, but: str | tuple[str, ...] | None = No
             yield path
 
 
+def _name(cloud: Path) -> str:
+    return cloud.stem.removesuffix(".cloud").removesuffix(".full")
+
+
 def _capture(path: Path) -> GatheredCapture:
     with Capture(path) as capture:
         laser = tuple(np.flatnonzero(capture.laser_on).tolist())
@@ -184,7 +189,7 @@ def _pair_clouds(clouds: dict[str, PointCloud], judged: dict[str, EvaluationReco
     pairs: dict[str, PointCloud | None] = {}
     taken = set()
     for name, found in judged.items():
-        source = name if name in clouds else Path(found.cloud).stem
+        source = name if name in clouds else _name(Path(found.cloud))
         pairs[name] = plain = clouds.get(source)
         taken.add(source)
         if plain is not None and plain.deviation_mm is None:

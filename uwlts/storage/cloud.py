@@ -36,8 +36,10 @@ NO_INDEX = -1
 PER_POINT = ("points_mm", "intensity", "frame", "line")
 """Columns of every cloud."""
 KINDS = dict(zip(PER_POINT, (np.float64, np.float32, np.int32, np.int32), strict=True)) | {"deviation_mm": np.float32}
-KINDS |= {"time_s": np.float64}
+KINDS |= {"time_s": np.float64, "normal_std_mm": np.float32}
 """Types of all columns."""
+OPTIONAL = tuple(KINDS)[len(PER_POINT) :]
+"""Columns that clouds may lack."""
 WATER = "water"
 """Prefix of error names for a medium's index, which may drift between scans."""
 _BLOCK = 8192
@@ -167,6 +169,8 @@ class PointCloud(Brief):
         The same for stripe centres by the name of their `RayStatus`.
     warnings : list of str
         Evidence that the calibration is not that of the sensor; and omissions and doubts of the reader of a file.
+    normal_std_mm : (N,) float32 or None
+        Standard deviation along the surface normal, of clouds whose file holds no more of the uncertainty.
 
     Raises
     ------
@@ -186,6 +190,7 @@ class PointCloud(Brief):
     lines_by_status: dict[str, int] = field(default_factory=dict)
     rays_by_status: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    normal_std_mm: np.ndarray | None = None
     writer: ClassVar[Callable[..., None]]
     """Function that writes clouds; `uwlts.storage.cloud_files`, which knows the formats, sets it."""
 
@@ -205,7 +210,7 @@ class PointCloud(Brief):
             raise CaptureError(f"{unusable} of {len(points)} points of the cloud are not finite; leave them out")
         if len(points) and (farthest := np.abs(points).max()) > _FARTHEST_MM:
             raise CaptureError(f"a point is {farthest:g} mm from the origin; expected at most {_FARTHEST_MM:g} mm")
-        for name in (*PER_POINT[1:], "deviation_mm", "time_s"):
+        for name in (*PER_POINT[1:], *OPTIONAL):
             column = getattr(self, name)
             if column is not None and column.shape != (len(points),):
                 raise CaptureError(f"{name} has the shape {column.shape}; the cloud has {len(points)} points")
@@ -231,12 +236,10 @@ class PointCloud(Brief):
 
     def select(self, selection: slice | np.ndarray) -> "PointCloud":
         """Return the cloud of selected points, by a slice, indices or a mask."""
-        known, deviation = self.uncertainty, self.deviation_mm
+        known, kept = self.uncertainty, [name for name in KINDS if getattr(self, name) is not None]
         return PointCloud(
-            *(getattr(self, name)[selection] for name in PER_POINT),
-            deviation_mm=None if deviation is None else deviation[selection],
+            **{name: getattr(self, name)[selection] for name in kept},
             uncertainty=None if known is None else known[selection],
-            time_s=None if self.time_s is None else self.time_s[selection],
             metadata=self.metadata,
             warnings=self.warnings,
         )
@@ -371,11 +374,10 @@ def concatenate_clouds(parts: Sequence[PointCloud]) -> PointCloud:
     """Concatenate the parts of one cloud."""
     known = [part.uncertainty for part in parts if part.uncertainty is not None]
     poses = [each.poses_mm for each in known if each.poses_mm is not None]
-    deviations = [part.deviation_mm for part in parts if part.deviation_mm is not None]
-    times = [part.time_s for part in parts if part.time_s is not None]
+    kept = [name for name in KINDS if all(getattr(part, name) is not None for part in parts)]
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in kept}
     return PointCloud(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in PER_POINT),
-        deviation_mm=np.concatenate(deviations) if len(deviations) == len(parts) else None,
+        **columns,
         uncertainty=PointUncertainty(
             np.concatenate([each.random_mm2 for each in known]),
             np.concatenate([each.position_mm for each in known]),
@@ -385,7 +387,6 @@ def concatenate_clouds(parts: Sequence[PointCloud]) -> PointCloud:
         )
         if len(known) == len(parts)
         else None,
-        time_s=np.concatenate(times) if len(times) == len(parts) else None,
         metadata=parts[0].metadata,
         warnings=list(dict.fromkeys(warning for part in parts for warning in part.warnings)),
     )

@@ -20,6 +20,7 @@ from uwlts.model.sensor import Description, Table
 from uwlts.storage.cloud import (
     KINDS,
     NO_INDEX,
+    OPTIONAL,
     PAIRS,
     PER_POINT,
     STEP,
@@ -41,6 +42,7 @@ from uwlts.storage.foreign_clouds import (
     write_foreign,
 )
 from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
+from uwlts.storage.normal_std import compute_normal_std
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
 from uwlts.storage.ply import encode_ply, read_ply
 
@@ -57,9 +59,15 @@ CLOUD_FORMATS = (".ply", ".h5", *WRITTEN_FORMATS)
 COLOURED_FORMATS = (".ply", ".h5", ".laz", ".las", ".e57")
 """Endings of the clouds that can be written with a colour of each point."""
 PLY_COLOURS = ("red", "green", "blue")
+FULL = ".full.ply"
+"""Ending of PLY files with the whole uncertainty."""
 _IN_METRES = (".laz", ".las", ".e57", ".mcap")
 _CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57", ".pcd")
 """Endings that only clouds have."""
+_LEAN = (
+    "it holds the standard deviation of each point along the surface normal, and no errors that points share: results "
+    f"have no uncertainty. Use the cloud in HDF5 (NAME.h5) or in PLY with the whole uncertainty (NAME{FULL})"
+)
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _SHARED = "shared_errors"
@@ -75,12 +83,15 @@ def write_cloud(
 ) -> None:
     """Write a cloud in the format of the path's ending, completely or not at all.
 
-    - ``.ply``, ``.h5``: mm, with all attributes. In HDF5 the datasets have the names in `PointCloud` and
-      `PointUncertainty`, plus systematic_mm2 (N, 6). In PLY, binary and little-endian, the vertex properties are x, y,
-      z (double), intensity, deviation (float), frame, line (int), and optionally time (double, s). If the uncertainty
-      is known (`PointUncertainty`), there are the covariances random_xx to random_zz and systematic_xx to systematic_zz
-      in mm2. Shared errors in mm are position_x to position_z, pattern0_x, pattern0_y and so on, and optionally pose0_x
-      to pose5_z. The metadata is JSON in numbered comments that every reader accepts.
+    - ``.h5``: mm, with all attributes. The datasets have the names in `PointCloud` and `PointUncertainty`, plus
+      systematic_mm2 (N, 6).
+    - ``.ply``: mm, for other programs, binary and little-endian. The vertex properties are x, y, z (double) and
+      intensity (float). If known, there are deviation, normal_std (float), time (double, s), frame and line (int).
+      normal_std is the standard deviation along the surface normal. The metadata is JSON in numbered comments that
+      every reader accepts.
+    - ``.full.ply``: the same with the whole uncertainty in place of normal_std (`PointUncertainty`). The covariances
+      are random_xx to random_zz and systematic_xx to systematic_zz in mm2. Shared errors in mm are position_x to
+      position_z, pattern0_x, pattern0_y and so on, and optionally pose0_x to pose5_z.
     - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan if unknown) of every point, with all
       digits.
     - ``.laz``, ``.las``: LAS 1.4, point format 6, or 7 with colours, metres in steps of 1e-7 m. The standard intensity
@@ -113,14 +124,19 @@ def write_cloud(
     if _in_hdf5(path):
         _write_hdf5(path, cloud, overwrite=overwrite)
         return
-    deviation = np.full(len(cloud), np.nan, np.float32) if cloud.deviation_mm is None else cloud.deviation_mm
     columns = dict(zip("xyz", cloud.points_mm.T, strict=True))
     if colours is not None:
         columns |= dict(zip(PLY_COLOURS, colours.T, strict=True))
-    columns |= {"intensity": cloud.intensity, "deviation": deviation}
-    if cloud.time_s is not None:
-        columns["time"] = cloud.time_s
-    columns |= {"frame": cloud.frame, "line": cloud.line} | _uncertainty_columns(cloud.uncertainty)
+    full = not is_lean(path)
+    std = None if full else compute_normal_std(cloud)
+    columns |= {"intensity": cloud.intensity, "deviation": cloud.deviation_mm, "time": cloud.time_s}
+    columns |= {"normal_std": cloud.normal_std_mm if std is None else std}
+    for name, indices in (("frame", cloud.frame), ("line", cloud.line)):
+        columns[name] = None if (indices == NO_INDEX).all() else indices
+    columns = {name: values for name, values in columns.items() if values is not None}
+    if full:
+        columns |= _uncertainty_columns(cloud.uncertainty)
+    cloud = cloud if full else replace(cloud, uncertainty=None)
     write_ply_points(path, columns, comments=_comments(_with_shared(cloud)), overwrite=overwrite)
 
 
@@ -168,8 +184,14 @@ def read_cloud(path: str | os.PathLike[str], *, unit: Unit | None = None) -> Poi
 
 
 def load_cloud(cloud: PointCloud | str | os.PathLike[str], *, unit: Unit | None = None) -> PointCloud:
-    """Return a cloud unchanged, or read it from a file; raises the errors of `read_cloud`."""
-    return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud, unit=unit)
+    """Return a cloud to measure, unchanged or read from a file; raises the errors of `read_cloud`.
+
+    Logs a warning if its file held no more of the uncertainty than the standard deviation along the normal.
+    """
+    found = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud, unit=unit)
+    if found.normal_std_mm is not None and found.uncertainty is None:
+        log_warnings("cloud" if isinstance(cloud, PointCloud) else cloud, [_LEAN])
+    return found
 
 
 def read_thinned_cloud(
@@ -290,6 +312,12 @@ def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
 def _every(count: int, at_most: int | None) -> slice:
     """Return a slice with an even sample of at most ``at_most`` of ``count`` points."""
     return slice(None, None, 1 if at_most is None else max(1, -(-count // at_most)))
+
+
+def is_lean(path: str | os.PathLike[str]) -> bool:
+    """Return whether `write_cloud` writes no more of the uncertainty than the standard deviation along the normal."""
+    name = str(path).lower()
+    return name.endswith(".ply") and not name.endswith(FULL)
 
 
 def is_cloud(path: str | os.PathLike[str]) -> bool:
@@ -432,6 +460,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         deviation_mm=None if np.isnan(deviation).all() else deviation,
         uncertainty=uncertainty,
         time_s=column("time", np.nan, np.float64) if "time" in known else None,
+        normal_std_mm=column("normal_std", np.nan) if "normal_std" in known and uncertainty is None else None,
         metadata=metadata,
         warnings=warnings,
     )
@@ -446,7 +475,7 @@ class _CloudHeader(Description):
 
 def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool) -> None:
     arrays = {name: getattr(cloud, name) for name in PER_POINT}
-    arrays |= {name: each for name in ("deviation_mm", "time_s") if (each := getattr(cloud, name)) is not None}
+    arrays |= {name: each for name in OPTIONAL if (each := getattr(cloud, name)) is not None}
     if cloud.uncertainty is not None:
         arrays |= {name: each for name in _UNCERTAINTY if (each := getattr(cloud.uncertainty, name)) is not None}
         arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()

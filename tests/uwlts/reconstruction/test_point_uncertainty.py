@@ -203,8 +203,8 @@ def test_a_cloud_keeps_it_in_its_file(calibration, stripes, thesis, tmp_path):
     with capture_of(tmp_path, thesis, MEDIUM) as capture:
         known = point_uncertainty(capture, calibration, frame, line, centre)
     cloud = PointCloud(np.ones((len(line), 3)), np.ones(len(line)), frame, line, uncertainty=known)
-    write_cloud(tmp_path / "a.ply", cloud)
-    again = read_cloud(tmp_path / "a.ply").uncertainty
+    write_cloud(tmp_path / "a.full.ply", cloud)
+    again = read_cloud(tmp_path / "a.full.ply").uncertainty
     np.testing.assert_array_equal(again.random_mm2, known.random_mm2)
     np.testing.assert_array_equal(again.position_mm, known.position_mm)
     np.testing.assert_array_equal(again.patterns_mm, known.patterns_mm)

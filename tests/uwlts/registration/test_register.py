@@ -258,13 +258,13 @@ def test_the_command_writes_cloud_poses_and_page(tmp_path, monkeypatch):
     scans, _, wrong = views(np.random.default_rng(SEED), count=5, radius=oval)
     monkeypatch.chdir(tmp_path)
     for number in range(2):
-        scans[number].save(f"view-{number}.ply")
+        scans[number].save(f"view-{number}.cloud.h5")
     write_poses("start.csv", wrong[:2])
-    words = ["register", "view-0.ply", "view-1.ply", "--poses", "start.csv", "--out", "pipe.h5"]
+    words = ["register", "view-0.cloud.h5", "view-1.cloud.h5", "--poses", "start.csv", "--out", "pipe.h5"]
     app([*words, "--page", "pipe.html", "--poses-out", "found.csv"], result_action="return_value")
     merged, record = uwlts.read("pipe.h5"), json.loads((tmp_path / "pipe.registration.json").read_text())
     assert len(merged) == len(scans[0]) + len(scans[1]) and merged.uncertainty is not None
-    assert [each["name"] for each in merged.metadata["scans"]] == ["view-0", "view-1"]
+    assert [each["name"] for each in merged.metadata["scans"]] == ["view-0.cloud", "view-1.cloud"]
     poses, _ = read_poses("found.csv")
     np.testing.assert_allclose(poses, [each["transform"] for each in record["scans"]], atol=1e-11)
     page = (tmp_path / "pipe.html").read_text()

@@ -530,6 +530,7 @@ def test_the_conclusion_comes_first_and_repeated_units_last(page):
     # Measurements with the calibration of the campaign come before others.
     names = re.findall(r'<h2 id="measurement-\d">([^<]*)', body)
     assert names == ["spheres-far", "spheres-near", "step", "spheres-one"]
+    assert re.findall(r'scope="rowgroup"[^>]*>([^<]*)', body)[:4] == names
 
 
 def test_the_interactive_clouds_work_offline(page, campaign, tmp_path, chromium):

@@ -22,7 +22,7 @@ from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 from uwlts.storage.cloud_files import is_cloud, read_cloud, read_thinned_cloud, write_cloud
 
-KINDS = pytest.mark.parametrize("name", ["a.ply", "a.h5"])
+KINDS = pytest.mark.parametrize("name", ["a.full.ply", "a.h5"])
 
 
 def some_cloud(count: int = 40, **changes) -> PointCloud:
@@ -151,9 +151,9 @@ def test_a_cloud_without_points_deviation_or_uncertainty_comes_back(tmp_path, na
 
 def test_both_files_hold_the_systematic_covariance_for_other_programs(tmp_path):
     cloud = some_cloud(uncertainty=some_uncertainty())
-    for name in ("a.ply", "a.h5"):
+    for name in ("a.full.ply", "a.h5"):
         write_cloud(tmp_path / name, cloud)
-    vertices = read_by_trimesh(tmp_path / "a.ply")
+    vertices = read_by_trimesh(tmp_path / "a.full.ply")
     pairs = [f"systematic_{pair}" for pair in ("xx", "xy", "xz", "yy", "yz", "zz")]
     with h5py.File(tmp_path / "a.h5") as file:
         assert dict(file.attrs)["format"] == b"uwlts-cloud"
@@ -173,8 +173,8 @@ def test_captures_and_clouds_in_hdf5_are_distinguished(tmp_path):
 def test_a_cloud_in_hdf5_goes_through_the_commands(tmp_path):
     write_cloud(tmp_path / "a.h5", some_cloud(uncertainty=some_uncertainty()))
     assert "cloud of 40 points from 6 frames" in uwlts("info", tmp_path / "a.h5").stdout
-    assert uwlts("export", tmp_path / "a.h5", "--out", tmp_path / "b.ply").returncode == 0
-    assert uwlts("export", tmp_path / "b.ply", "--out", tmp_path / "c.h5").returncode == 0
+    assert uwlts("export", tmp_path / "a.h5", "--out", tmp_path / "b.full.ply").returncode == 0
+    assert uwlts("export", tmp_path / "b.full.ply", "--out", tmp_path / "c.h5").returncode == 0
     back = read_cloud(tmp_path / "c.h5")
     np.testing.assert_array_equal(back.points_mm, some_cloud().points_mm)
     np.testing.assert_array_equal(back.uncertainty.patterns_mm, some_uncertainty().patterns_mm)
