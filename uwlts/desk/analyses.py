@@ -198,7 +198,9 @@ _INSPECTED = (".html", ".findings.json", "-coloured.ply")
 _OPTIONS = {"pipe": ("wall_mm",), "weld": ("section_mm",), "flange": ("datum",)}
 ANALYSES: Mapping[str, Analysis] = MappingProxyType(
     {
-        "reconstruct": Analysis(_reconstruct, ((uwlts, "reconstruct", ("capture", "calibration")),), "", (".cloud.h5",)),
+        "reconstruct": Analysis(
+            _reconstruct, ((uwlts, "reconstruct", ("capture", "calibration")),), "", (".cloud.h5",)
+        ),
         **{
             f"inspect {kind}": Analysis(
                 _inspect,
