@@ -98,10 +98,13 @@ def test_distortion_is_auto_or_each_coefficient_once(command, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     named = {"x.h5": {"camera": "x.yaml", "calibrate": "x.json"}[command]}
     required = [named.get(word, word) for word in _required(uwlts_app, command, "--distortion")]
-    for wrong in ("auto k1", "k1 k1"):
+    for wrong, words in (
+        ("auto k1", " is ('auto', 'k1') (tuple), expected 'auto' or a list"),
+        ("k1 k1", " k1 k1: expected only auto"),
+    ):
         ended = uwlts(command, *required, "--distortion", *wrong.split())
         assert ended.returncode == 2
-        assert f"--distortion {wrong}: expected only auto" in ended.stderr
+        assert f"--distortion{words}" in ended.stderr
     assert _parsed(uwlts_app, command, "--distortion", ["--distortion", "auto"]) == ("auto",)
     # The coefficients are accepted: something else is missing next.
     ended = uwlts(command, *required, "--distortion", "k1", "k2")

@@ -32,14 +32,15 @@ _JOIN_GROUP = "sudo usermod -aG {} $USER\nthen log out and in again"
 def examine_cameras() -> list[Finding]:
     """Examine the library Aravis, and search for cameras for 2.5 s."""
     from uwlts.hardware.aravis import list_aravis_cameras
-    from uwlts.runtime.shared_library import load_aravis
+    from uwlts.runtime.shared_library import ARAVIS_VARIABLE, load_aravis
 
     try:
         library = load_aravis()
     except SetupError as error:
         fault, _, advice = str(error).partition("\nInstall it:")
         advice = "\n".join(line.strip() for line in advice.strip().splitlines())
-        return [Finding("Aravis", "warning", fault, f"only for GigE Vision and USB3 Vision cameras:\n{advice}")]
+        status = "warning" if os.environ.get(ARAVIS_VARIABLE) else "optional"
+        return [Finding("Aravis", status, fault, f"only for GigE Vision and USB3 Vision cameras:\n{advice}")]
     findings = [Finding("Aravis", "ok", f"{library._name}, for GigE Vision and USB3 Vision cameras")]
     answers: list[Sequence[object]] = []
     # A daemon, so that a search that hangs in the library does not keep the program from ending.
@@ -63,7 +64,7 @@ def examine_producers(folders: str | None = None) -> list[Finding]:
             "only for cameras with a GenTL producer: install the camera maker's software, which sets it, "
             "or name the producer in the camera's address"
         )
-        return [Finding("GenTL producers", "warning", f"{PRODUCERS} is not set", advice)]
+        return [Finding("GenTL producers", "optional", f"{PRODUCERS} is not set", advice)]
     findings = []
     for folder in map(Path, filter(None, named.split(":"))):
         producers = sorted(folder.glob("*.cti"))

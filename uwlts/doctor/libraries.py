@@ -1,32 +1,18 @@
 """Findings about Python, the required libraries, and the optional ones."""
 
 import platform
-import shlex
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
-from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
-from packaging.utils import canonicalize_name
 
 from uwlts.doctor.machine import Finding
+from uwlts.runtime.optional_library import EXTRAS, pip_install, read_requirements
 
-PROJECT = "uwlts"
-OPTIONAL = {
-    "harvesters": "cameras with a GenTL producer, XIMEA's among them",
-    "genicam": "cameras with a GenTL producer, XIMEA's among them",
-    "laspy": "clouds as LAZ",
-    "lazrs": "clouds as LAZ",
-    "pye57": "clouds as E57",
-    "dask": "sweeps on several machines",
-    "distributed": "sweeps on several machines",
-}
-"""Optional libraries, with the features that need them."""
-
+_ABSENT = "not installed"
 _LOAD_S = 120
 # The last printed name is that of the module that did not load, by an error or by ending the process.
 _LOAD = "import importlib, sys\nfor name in sys.argv[1:]: print(name, flush=True); importlib.import_module(name)"
@@ -34,25 +20,8 @@ _LOAD = "import importlib, sys\nfor name in sys.argv[1:]: print(name, flush=True
 
 def examine() -> list[Finding]:
     """Python and all libraries."""
-    python, required, extras = project_requirements()
-    return [examine_python(python), *examine_required(required), *examine_optional(OPTIONAL, requirements=extras)]
-
-
-def project_requirements() -> tuple[str, list[str], list[str]]:
-    """Versions of Python, required libraries and those of all extras, as this project's description lists them.
-
-    In a checkout its pyproject.toml counts: the description that an editable installation keeps grows old.
-    """
-    file = Path(__file__).parents[2] / "pyproject.toml"
-    if file.is_file():
-        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
-        extras = [line for lines in project.get("optional-dependencies", {}).values() for line in lines]
-        return project["requires-python"], project["dependencies"], extras
-    installed = metadata.distribution(PROJECT)
-    lines = [Requirement(line) for line in installed.requires or ()]
-    applying = [line for line in lines if line.marker is None or line.marker.evaluate({"extra": ""})]
-    others = [str(line).partition(";")[0] for line in lines if line not in applying]
-    return installed.metadata["Requires-Python"], [str(line) for line in applying], others
+    python, required, extras = read_requirements()
+    return [examine_python(python), *examine_required(required), *examine_optional(extras)]
 
 
 def examine_python(wanted: str) -> Finding:
@@ -74,23 +43,22 @@ def examine_required(requirements: Sequence[str]) -> list[Finding]:
     findings = [Finding("required libraries", "ok", good)] if good else []
     for requirement, _, fault in examined:
         if fault:
-            force = "--force-reinstall --no-deps " if "does not load" in fault else ""
-            advice = _pip(f"{force}{shlex.quote(str(requirement))}")
+            force = ["--force-reinstall", "--no-deps"] if "does not load" in fault else []
+            advice = pip_install([*force, str(requirement)])
             findings.append(Finding(requirement.name, "missing", fault, advice))
     return findings
 
 
-def examine_optional(purposes: Mapping[str, str], *, requirements: Sequence[str] = ()) -> list[Finding]:
-    """Check optional libraries; ``purposes`` maps each library to the feature that needs it.
-
-    A version is checked if one of the ``requirements`` specifies it.
-    """
-    asked = {canonicalize_name(each.name): each for each in map(Requirement, requirements)}
-    examined = _examine_requirements(asked.get(canonicalize_name(name), Requirement(name)) for name in purposes)
+def examine_optional(extras: Mapping[str, Sequence[str]], purposes: Mapping[str, str] = EXTRAS) -> list[Finding]:
+    """Examine the libraries of each extra with a purpose; absent ones are optional, and others that fail a warning."""
     findings = []
-    for (name, purpose), (requirement, version, fault) in zip(purposes.items(), examined, strict=True):
-        advice = f"only for {purpose}:\n{_pip(shlex.quote(str(requirement)))}" if fault else ""
-        findings.append(Finding.from_advice(name, fault or f"{version}, for {purpose}", advice))
+    for extra, purpose in purposes.items():
+        examined = _examine_requirements(map(Requirement, extras[extra]))
+        texts = [f"{requirement.name} {fault or version}" for requirement, version, fault in examined]
+        faults = {fault for _, _, fault in examined if fault}
+        status = "ok" if not faults else "optional" if faults == {_ABSENT} else "warning"
+        advice = f"only for {purpose}:\n{pip_install(extras[extra])}" if faults else ""
+        findings.append(Finding(extra, status, f"{', '.join(texts)}; for {purpose}", advice))
     return findings
 
 
@@ -104,7 +72,7 @@ def _examine_requirements(requirements: Iterable[Requirement]) -> list[tuple[Req
             if not requirement.specifier.contains(version, prereleases=True):
                 fault = f"{version} is installed, {requirement.specifier} is needed"
         except metadata.PackageNotFoundError:
-            fault = "not installed"
+            fault = _ABSENT
         states.append((requirement, version, fault))
     broken = _load_faults([requirement.name for requirement, _, fault in states if not fault])
     for k, (requirement, version, _) in enumerate(states):
@@ -142,7 +110,3 @@ def _modules(name: str) -> list[str]:
     if usual in packages or not packages:
         return [usual]
     return sorted(package for package in packages if not package.startswith("_"))
-
-
-def _pip(what: str) -> str:
-    return f"{shlex.quote(sys.executable)} -m pip install {what}"

@@ -19,9 +19,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-Status = Literal["ok", "warning", "missing"]
+Status = Literal["ok", "optional", "warning", "missing"]
 
-_STYLES = {"ok": "green", "warning": "yellow", "missing": "bold red"}
+_STYLES = {"ok": "green", "optional": "dim", "warning": "yellow", "missing": "bold red"}
 _WIDTH = 110
 
 
@@ -30,7 +30,8 @@ class Finding:
     """Result of one examination.
 
     ``status`` is "missing" if something required, or named by the user, is absent or does not work, and "warning" if
-    some features are limited. Both come with ``advice``, one action per line.
+    some features are limited. "optional" is absent, and only some features need it. All three come with ``advice``, one
+    action per line.
     """
 
     subject: str

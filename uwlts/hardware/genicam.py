@@ -28,6 +28,7 @@ from uwlts.hardware.camera_interface import (
     Delivered,
     Region,
 )
+from uwlts.runtime.optional_library import pip_install, read_requirements
 
 # GenApi's access modes in order: not implemented, not available, write only, read only, read and write.
 _WRITE_ONLY = 2
@@ -55,7 +56,8 @@ class GenicamCamera(CameraDevice):
             from harvesters import core
         except ImportError as error:
             raise SetupError(
-                f"the libraries harvesters and genicam are not installed: pip install harvesters genicam ({error})"
+                "a camera with a GenTL producer needs the libraries harvesters and genicam, which are not installed "
+                f"({error}): {pip_install(read_requirements()[2]['genicam'])}"
             ) from error
         self._faults = (genapi.GenericException, gentl.GenericException)
         self._timeout = gentl.TimeoutException

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
-from uwlts.errors import EvaluationError, SetupError
+from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import Patches
 from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair
 from uwlts.registration.marker_spheres import MarkerSphere, match_markers
+from uwlts.runtime.optional_library import optional_library
 
 _TRIES = ((0.55, 2.0, 6.0), (0.55, 3.0, 5.0), (0.8, 2.0, 6.0), (0.8, 3.0, 5.0), (1.6, 3.0, 5.0))
 """Voxel size (unit: patch radius), normal radius and feature radius (unit: voxel) of each attempt."""
@@ -104,7 +104,12 @@ def _match_features(
 
     ``voxel`` is the voxel size in mm. The gains are the radii for normals and features, in voxels.
     """
-    kiss = _import_kiss_matcher()
+    kiss = optional_library(
+        "kiss_matcher",
+        needed_by="the search for initial poses",
+        extra="registration",
+        instead=", or give initial poses",
+    )
     # KISS-Matcher prints warnings for bounds above one unit, so coordinates are scaled.
     gains = {"normal_r_gain": normal_gain, "fpfh_r_gain": feature_gain}
     matcher = kiss.KISSMatcher(kiss.KISSMatcherConfig(voxel_size=_VOXEL_UNITS, **gains))
@@ -126,14 +131,3 @@ def _refine_transform(a: Patches, b: Patches, movement: np.ndarray) -> tuple[np.
     found = fitted[1]
     fits = np.abs(found.distance_mm) < _CLOSE * found.std_mm
     return fitted[0], float(np.count_nonzero(fits)) if len(fits) and np.mean(fits) > _LEAST_SHARE else 0.0
-
-
-def _import_kiss_matcher() -> Any:
-    try:
-        import kiss_matcher
-    except ImportError as error:
-        raise SetupError(
-            "the search for initial poses needs the library kiss-matcher, which is not installed (its wheels are for "
-            "Python 3.12 and older): pip install 'uwlts[registration]', or give initial poses"
-        ) from error
-    return kiss_matcher

@@ -1,9 +1,28 @@
-"""Libraries that only some features need; the message for a missing one states the extra that installs it."""
+"""Libraries that only some features need, by extras; the message for a missing one is a command that installs it.
 
-from importlib import import_module
+The project is not published: advice names the libraries themselves, which works in a checkout and with a wheel.
+"""
+
+import shlex
+import sys
+import tomllib
+from collections.abc import Iterable
+from importlib import import_module, metadata
+from pathlib import Path
 from types import ModuleType
 
 from uwlts.errors import SetupError
+
+PROJECT = "uwlts"
+EXTRAS = {
+    "clouds": "clouds as LAZ, LAS, E57 and COPC",
+    "cluster": "sweeps on several machines",
+    "genicam": "cameras with a GenTL producer, XIMEA's among them",
+    "learn": "learned stripes",
+    "registration": "the search for initial poses by shape",
+    "ros": "ROS bags, and clouds as MCAP",
+}
+"""Features that need optional libraries, by the extra of this project that lists them."""
 
 
 def optional_library(module: str, *, needed_by: str, extra: str, instead: str = "") -> ModuleType:
@@ -14,5 +33,34 @@ def optional_library(module: str, *, needed_by: str, extra: str, instead: str = 
         return import_module(module)
     except ImportError as error:
         raise SetupError(
-            f"{needed_by} needs the library {library}, which is not installed: pip install 'uwlts[{extra}]'{instead}"
+            f"{needed_by} needs the library {library.replace('_', '-')}, which is not installed: "
+            f"{pip_install(read_requirements()[2][extra])}{instead}"
         ) from error
+
+
+def pip_install(requirements: Iterable[str]) -> str:
+    """Return the command that installs libraries into the environment of this Python."""
+    return f"{shlex.quote(sys.executable)} -m pip install {' '.join(map(shlex.quote, requirements))}"
+
+
+def read_requirements() -> tuple[str, list[str], dict[str, list[str]]]:
+    """Return versions of Python, required libraries, and those of each extra, as this project's description lists them.
+
+    In a checkout its pyproject.toml counts: the description that an editable installation keeps grows old.
+    """
+    file = Path(__file__).parents[2] / "pyproject.toml"
+    if file.is_file():
+        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        return project["requires-python"], project["dependencies"], project["optional-dependencies"]
+    from packaging.requirements import Requirement
+
+    installed = metadata.distribution(PROJECT)
+    required, extras = [], {name: [] for name in EXTRAS}
+    for line in installed.requires or ():
+        marker = Requirement(line).marker
+        if marker is None or marker.evaluate({"extra": ""}):
+            required.append(line)
+        for name in EXTRAS:
+            if marker is not None and "extra" in str(marker) and marker.evaluate({"extra": name}):
+                extras[name].append(line.partition(";")[0].strip())
+    return installed.metadata["Requires-Python"], required, extras

@@ -29,6 +29,7 @@ from typing import Any, Literal, TypeVar, assert_never
 from uwlts.errors import Error, SetupError
 from uwlts.files.writing import remove_unfinished
 from uwlts.runtime.interrupts import preserve_interrupts
+from uwlts.runtime.optional_library import pip_install, read_requirements
 
 Item = TypeVar("Item")
 Job = TypeVar("Job")
@@ -422,7 +423,8 @@ def _cluster(address: str, patience_s: float) -> Iterator[_Cluster]:
         from distributed import Client
         from distributed.scheduler import KilledWorker
     except ImportError as error:
-        raise SetupError("a scheduler needs Dask: pip install 'dask[distributed]'") from error
+        needed = pip_install(read_requirements()[2]["cluster"])
+        raise SetupError(f"a scheduler needs the library distributed, which is not installed: {needed}") from error
     try:
         client: Any = Client(address, timeout=patience_s, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -19,7 +19,7 @@ import twin
 from tests.virtual_sensors import altered
 from twin.datasets.data_set import SPLITS, DataSetDescription
 from twin.datasets.draws import draw_scene
-from uwlts.errors import CaptureError, DescriptionError, DesignError, OutputError
+from uwlts.errors import ArgumentError, CaptureError, DescriptionError, DesignError, OutputError
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import hash_file
 from uwlts.model.library import load_sensor
@@ -163,7 +163,7 @@ def test_samples_are_read_in_any_way(folder):
     assert shapes["light_e"] == (5, 128, 160)
     few = twin.load_dataset(folder, names=["image", "centre_px"])[0]
     assert set(few) == {"key", "image", "centre_px"}
-    with pytest.raises(DescriptionError, match="unknown split 'dev'"):
+    with pytest.raises(ArgumentError, match="`split` is 'dev' .*, expected 'train', 'validation' or 'test'"):
         twin.load_dataset(folder, split="dev")
     with pytest.raises(DescriptionError, match="unknown centres; the data set contains bound_px"):
         twin.load_dataset(folder, names=["centres"])

@@ -3,10 +3,12 @@
 import os
 import re
 import resource
+import shlex
 import subprocess
 import sys
 import textwrap
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -21,6 +23,9 @@ from packaging.requirements import Requirement
 from twin.devices.grbl_controller import BENCH_SETTINGS, GrblController
 from uwlts.doctor import devices, libraries, machine
 from uwlts.doctor.machine import Finding, examine_renderer
+from uwlts.errors import SetupError
+from uwlts.runtime import optional_library
+from uwlts.runtime.optional_library import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[3]
 NOBODY = 65534
@@ -75,7 +80,7 @@ def test_a_machine_on_which_the_tests_run_lacks_nothing_required(whole):
         "clock",
         *devices_of_all,
     ):
-        assert re.search(rf"^ ?(ok|warning) +{subject}", whole.stdout, re.MULTILINE), subject
+        assert re.search(rf"^ ?(ok|optional|warning) +{subject}", whole.stdout, re.MULTILINE), subject
 
 
 def test_a_broken_library_ends_in_exit_code_1_without_a_traceback(tmp_path):
@@ -108,15 +113,18 @@ def test_python_is_compared_with_what_is_required():
 
 
 def test_the_requirements_are_the_projects_own():
-    python, required, extras = libraries.project_requirements()
+    python, required, extras = libraries.read_requirements()
     assert python == ">=3.11"
     assert {"numpy", "rich", "optuna"} <= {Requirement(line).name for line in required}
-    assert "dask" in {Requirement(line).name for line in extras}
+    assert "dask" in {Requirement(line).name for lines in extras.values() for line in lines}
 
 
 def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path):
-    face = [ROOT / "uwlts" / name for name in ("__init__.py", "__init__.pyi", "_version.py", "errors.py")]
-    progress = [ROOT / "uwlts" / "runtime" / name for name in ("__init__.py", "progress.py")]
+    face = [
+        ROOT / "uwlts" / name
+        for name in ("__init__.py", "__init__.pyi", "_version.py", "argument_types.py", "errors.py")
+    ]
+    progress = [ROOT / "uwlts" / "runtime" / name for name in ("__init__.py", "optional_library.py", "progress.py")]
     for source in [*face, *progress, *(ROOT / "uwlts" / "doctor").glob("*.py")]:
         copy = tmp_path / source.relative_to(ROOT)
         copy.parent.mkdir(parents=True, exist_ok=True)
@@ -124,11 +132,14 @@ def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path
     (tmp_path / "uwlts-9.dist-info").mkdir()
     (tmp_path / "uwlts-9.dist-info" / "METADATA").write_text(
         "Metadata-Version: 2.4\nName: uwlts\nVersion: 9\nRequires-Python: >=3.11\nRequires-Dist: numpy>=2\n"
-        "Requires-Dist: winonly; sys_platform == 'win32'\nRequires-Dist: laspy>=2; extra == 'cloud'\n"
+        "Requires-Dist: winonly; sys_platform == 'win32'\nRequires-Dist: laspy>=2; extra == 'clouds'\n"
+        "Requires-Dist: anything; extra == 'test'\n"
     )
-    program = "from uwlts.doctor import libraries; print(libraries.project_requirements())"
+    program = "from uwlts.doctor import libraries; print(libraries.read_requirements())"
     ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert ended.stdout.strip() == "('>=3.11', ['numpy>=2'], ['winonly', 'laspy>=2'])"
+    assert ended.stdout.strip() == str(
+        (">=3.11", ["numpy>=2"], {extra: [] for extra in EXTRAS} | {"clouds": ["laspy>=2"]})
+    )
 
 
 def test_every_kind_of_missing_library_is_named():
@@ -151,14 +162,33 @@ def test_a_library_that_ends_the_process_is_named_and_the_others_are_still_tried
     assert re.fullmatch(r"jinja2 \S+, tomli-w \S+", found["required libraries"].found)
 
 
-def test_a_missing_optional_library_is_a_warning_that_names_its_purpose():
-    purposes = {"no-such-library-of-ours": "clouds as XYZ", "Pytest": "tests"}
-    missing, there = libraries.examine_optional(purposes, requirements=["no-such-library-of-ours>=2", "pytest>=8"])
-    assert missing.status == "warning" and missing.found == "not installed"
-    assert "only for clouds as XYZ" in missing.advice and "'no-such-library-of-ours>=2'" in missing.advice
-    assert there == Finding("Pytest", "ok", f"{metadata.version('pytest')}, for tests")
-    old = libraries.examine_optional({"pytest": "tests"}, requirements=["pytest>=999"])[0]
+def test_absent_optional_libraries_are_optional_and_old_ones_a_warning():
+    extras = {"xyz": ["no-such-library-of-ours>=2", "pytest>=8"], "there": ["pytest"], "old": ["pytest>=999"]}
+    purposes = {"xyz": "clouds as XYZ", "there": "tests", "old": "tests"}
+    absent, there, old = libraries.examine_optional(extras, purposes)
+    version = metadata.version("pytest")
+    assert absent.status == "optional"
+    assert absent.found == f"no-such-library-of-ours not installed, pytest {version}; for clouds as XYZ"
+    assert "only for clouds as XYZ" in absent.advice
+    assert absent.advice.endswith("-m pip install 'no-such-library-of-ours>=2' 'pytest>=8'")
+    assert there == Finding("there", "ok", f"pytest {version}; for tests")
     assert old.status == "warning" and ">=999 is needed" in old.found
+
+
+def test_every_extra_for_users_is_examined():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    assert extras.keys() - EXTRAS.keys() == {"docs", "test", "mutants"}
+    assert EXTRAS.keys() <= extras.keys()
+
+
+def test_a_missing_library_is_named_with_a_command_that_works_without_an_index_of_this_project():
+    with pytest.raises(SetupError) as caught:
+        optional_library.optional_library("no_such_library", needed_by="LAZ", extra="clouds", instead=", or write PLY")
+    pattern = r"LAZ needs the library no-such-library, .*: \S+ -m pip install (.*), or write PLY$"
+    found = re.search(pattern, str(caught.value))
+    assert found is not None
+    assert shlex.split(found[1]) == optional_library.read_requirements()[2]["clouds"]
+    assert "uwlts[" not in str(caught.value)
 
 
 def test_an_invalid_libllvm_gives_a_warning_with_the_install_command(tmp_path, monkeypatch):

@@ -273,7 +273,7 @@ def test_a_producer_lists_its_cameras():
 
 def test_missing_libraries_are_said_with_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "harvesters", None)
-    with pytest.raises(SetupError, match="pip install harvesters genicam"):
+    with pytest.raises(SetupError, match="pip install 'harvesters>=1.4.3'"):
         open_camera(f"genicam:{PRODUCER}")
     shared_library.load_aravis.cache_clear()
     monkeypatch.setenv(shared_library.ARAVIS_VARIABLE, str(tmp_path / "libaravis.so"))
