@@ -2,10 +2,13 @@
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
+# A demo needs the project's own libraries only, everything else those of the tests as well.
 INSTALLED := $(VENV)/.installed
+FOR_TESTS := $(VENV)/.installed-for-tests
 OLDEST := .venv-oldest
 # A recipe with the word MAKE would run even by make -n.
 BY_ITSELF = $(MAKE) --no-print-directory
+WITH_LLVM = $(call with_packages,$(PYTHON) -m twin.backend.llvm,libatomic1$(if $(filter x86_64,$(shell uname -m)),, libllvm19))
 WITH_ARAVIS = $(call with_packages,$(PYTHON) -m uwlts.runtime.shared_library,libaravis-0.8-0)
 WITH_BROWSER = $(call with_packages,$(PYTHON) -m tests.browser,chromium-headless-shell fonts-dejavu-core)
 
@@ -31,7 +34,8 @@ help:
 	@echo "make setup   only prepare .venv and libLLVM (the targets above do it too)"
 	@echo "make clean   remove .venv, $(OLDEST), caches and build results"
 
-demo: setup
+demo: $(INSTALLED)
+	@$(WITH_LLVM)
 	@$(PYTHON) -m twin demo
 
 test: PYTEST_OPTIONS := -m "not slow"
@@ -89,15 +93,15 @@ docs: setup
 	@$(PYTHON) -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "documentation: docs/_build/html/index.html"
 
-setup: $(INSTALLED)
-	@$(call with_packages,$(PYTHON) -m twin.backend.llvm,libatomic1$(if $(filter x86_64,$(shell uname -m)),, libllvm19))
+setup: $(FOR_TESTS)
+	@$(WITH_LLVM)
 
-$(INSTALLED): pyproject.toml
+$(INSTALLED) $(FOR_TESTS): pyproject.toml
 	@$(PYTHON) -m pip --version >/dev/null 2>&1 || { \
 		rm -rf $(VENV) && $(call create_venv,$(VENV),python3.13 python3.12 python3.11 python3); }
 	@echo "setup: installing the project and its libraries into $(VENV) (about a minute)"
-	@$(PYTHON) -m pip install --quiet --editable '.[test]'
-	@touch $@
+	@$(PYTHON) -m pip install --quiet --editable '.$(if $(filter $@,$(FOR_TESTS)),[test])'
+	@touch $(INSTALLED) $@
 
 # Their wheels are for Python 3.11 and 3.12.
 $(OLDEST)/.installed: pyproject.toml tests/oldest.py | $(INSTALLED)

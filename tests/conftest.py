@@ -71,6 +71,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # them: only one of these tests can run at a time.
 SERVING = {
     "test_desk.py",
+    "test_desk_analyses.py",
     "test_desk_calibration.py",
     "test_serve.py",
     "test_gige_camera.py",

@@ -14,7 +14,7 @@ import uwlts
 from uwlts.argument_types import check_arguments
 from uwlts.errors import ArgumentError
 
-PLOTS = ["cloud", "stripe", "deviation_histogram", "along_stripe", "residuals", "window_curves", "interactive_cloud"]
+PLOTS = ["cloud", "stripe", "deviation_histogram", "along_stripe", "residuals", "window_curves"]
 SERVERS = {"uwlts.serve_desk", "uwlts.watch", "uwlts.examine", "twin.demo", "twin.reproduce", "twin.serve"}
 """Functions that work without any file: for minutes, or until they are ended. No fitting argument is given to them."""
 WRONG = [None, 3, -2.5, True, "no such thing", Path("nothing"), np.zeros((2, 3, 3)), [1, 2], ["a"], {"a": 1}, object()]
@@ -46,7 +46,7 @@ def call_with(function: Callable[..., Any], parameter: str, value: object) -> No
         function(**named | {parameter: value})
 
 
-@pytest.mark.parametrize(("package", "least"), [("uwlts", 28), ("uwlts.report", 8), ("uwlts.plot", 7), ("twin", 9)])
+@pytest.mark.parametrize(("package", "least"), [("uwlts", 28), ("uwlts.report", 8), ("uwlts.plot", 6), ("twin", 9)])
 def test_wrong_types_raise_errors_that_name_the_argument(
     package: str, least: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

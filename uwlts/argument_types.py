@@ -21,7 +21,8 @@ import lazy_loader
 
 from uwlts.errors import ArgumentError
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _SHORT = Repr()
 """Short texts of values, for messages."""
@@ -117,7 +118,7 @@ def _is_list(kind: Any) -> bool:
 
 def _is_path(kind: Any) -> bool:
     origin = get_origin(kind) or kind
-    return isinstance(origin, type) and issubclass(origin, os.PathLike)
+    return origin is os.PathLike or (isinstance(origin, type) and issubclass(origin, Path))
 
 
 def _convert(value: Any, hint: Any) -> Any:
@@ -198,7 +199,7 @@ def _convert_to_array(value: Any) -> Any:
 
 
 def _describe(hint: Any) -> str:
-    """Return the expected types in words; None, which the signature shows as default, is left out."""
+    """Return the expected types as text; None, which the signature shows as default, is left out."""
     kinds = [kind for kind in union_members(hint) if kind is not NoneType]
     named = any(map(_is_path, kinds))
     words = list(dict.fromkeys(word for kind in kinds for word in _words(kind, beside_path=named)))

@@ -46,16 +46,17 @@ JOBS: dict[str, str] = {
     "joint": f"uwlts calibrate {AIR} {WATER} {STEPS} --scan inputs/scans/plane.h5 --out joint/calibration.json",
     "sequential": f"""
         uwlts calibrate --air inputs/scans/target-bare.h5 {STEPS} --out sequential/two.json
-        uwlts calibrate --air inputs/scans/target-air.h5 {STEPS} --refractions 1 --poses free --out sequential/one.json
-        uwlts calibrate --air inputs/scans/target-bare.h5 --poses stage --out sequential/air.json""",
-    "polynomials": "uwlts polynomials --target inputs/scans/target-water.h5 --out polynomials/calibration.json",
+        uwlts calibrate --air inputs/scans/target-air.h5 {STEPS} --refractions 1 --target-poses free \
+            --out sequential/one.json
+        uwlts calibrate --air inputs/scans/target-bare.h5 --target-poses stage --out sequential/air.json""",
+    "polynomials": "uwlts polynomials --captures inputs/scans/target-water.h5 --out polynomials/calibration.json",
     "refresh": "uwlts refresh joint/calibration.json --step inputs/scans/step-today.h5 --out refresh/calibration.json",
     "models": "uwlts models --air inputs/scans/target-bare.h5 --water inputs/scans/target-water.h5 \
         --step inputs/scans/step-near.h5 --workers 1 --out models/models.html",
     "camera": "uwlts camera inputs/photographs --out camera/camera.yaml",
     "import": """
         uwlts import inputs/photographs --out import/photographs.h5
-        uwlts calibrate --air import/photographs.h5 --poses free --out import/calibration.json""",
+        uwlts calibrate --air import/photographs.h5 --target-poses free --out import/calibration.json""",
     "export": """
         uwlts export inputs/scans/step-near.h5 --out export/step
         uwlts import export/step --out export/step.h5""",
@@ -96,9 +97,9 @@ JOBS: dict[str, str] = {
         f"uwlts mount inputs/{name}-profiles.csv inputs/{name}-poses.csv {PROFILED} {options} --out mount/{name}.json"
         for name, options in (
             ("sphere", "--radius-mm 20"),
-            ("plane", "--artefact plane"),
-            ("step", "--artefact step"),
-            ("ring", "--artefact ring --radius-mm 25"),
+            ("plane", "--artefact-kind plane"),
+            ("step", "--artefact-kind step"),
+            ("ring", "--artefact-kind ring --radius-mm 25"),
         )
     ),
     "evaluate": """
@@ -137,7 +138,7 @@ JOBS: dict[str, str] = {
             --out register/known.full.ply --page register/known.html""",
     "mesh": """
         uwlts mesh clouds/shapes.full.ply --out mesh/shapes.ply
-        uwlts mesh clouds/shapes.full.ply clouds/shapes-again.full.ply --cube-mm 1.5 --radius-mm 3 \
+        uwlts mesh clouds/shapes.full.ply clouds/shapes-again.full.ply --cube-mm 1.5 --patch-radius-mm 3 \
             --out mesh/both.glb""",
     "align": f"""
         uwlts align inputs/crossing.full.ply --trajectory inputs/crossing.csv {PROFILED} --drift-mm 60 --drift-deg 0.3 \
@@ -151,7 +152,7 @@ JOBS: dict[str, str] = {
         copy joint/calibration.json report/calibration.json
         copy evaluate/spheres.json report/spheres.evaluation.json
         copy evaluate/spheres.full.ply report/spheres.full.ply
-        uwlts report report --reference thesis""",
+        uwlts report report --published thesis""",
     "gauge": "uwlts gauge inputs/diameters.csv --tolerance 0.5 --out gauge/study.json",
     "info": """
         uwlts info joint/calibration.json

@@ -87,7 +87,7 @@ def by_faces(campaigns: int, artefact: Literal["step", "ring"], *, write: bool) 
             rng = np.random.default_rng([seed, 24])
             campaign = ring_campaign(rng, robot_mm=robot) if artefact == "ring" else step_campaign(rng, height_mm=12.0)
             radius = RING_MM["inner"] if artefact == "ring" else None
-            mount = calibrate_mount(*_of(campaign), artefact=artefact, radius_mm=radius)
+            mount = calibrate_mount(*_of(campaign), artefact_kind=artefact, radius_mm=radius)
             shift, turn = errors_of(mount.transform())
             within = np.mean(np.abs([*shift, *turn]) < mount.coverage_factor * mount.std())
             rows.append((np.linalg.norm(shift), np.degrees(np.linalg.norm(turn)), within))

@@ -232,12 +232,12 @@ def test_version(command, program: str):
         ("uwlts reconstruct scan.h5 --calibration calibration.json --out x.ply --stripe-peak second", "second"),
         ("uwlts calibrate --out x.json", "--air"),
         ("uwlts calibrate --air air.h5 --out x.json --refractions 3", "3"),
-        ("uwlts calibrate --air air.h5 --out x.json --poses wild", "wild"),
+        ("uwlts calibrate --air air.h5 --out x.json --target-poses wild", "wild"),
         ("uwlts calibrate --air air.h5 --out x.json --distortion k9", "k9"),
         ("uwlts calibrate --water scan.h5 --out x.json --new-water", "--scan"),
-        ("uwlts polynomials --out x.json", "--target"),
-        ("uwlts polynomials --target air.h5", "--out"),
-        ("uwlts polynomials --target air.h5 --out x.json --degree six", "six"),
+        ("uwlts polynomials --out x.json", "--captures"),
+        ("uwlts polynomials --captures air.h5", "--out"),
+        ("uwlts polynomials --captures air.h5 --out x.json --degree six", "six"),
         ("uwlts design thesis", "--medium"),
         ("uwlts design --medium water", "SENSOR"),
         ("uwlts nominal thesis --out x.json", "--medium"),
@@ -293,13 +293,13 @@ PLACES = {
     "reconstruct, calibration": ("uwlts reconstruct scan.h5 --calibration {} --out x.ply", {"calibration.json"}),
     "calibrate, air": ("uwlts calibrate --air {} --out x.json", set()),
     "calibrate, step": ("uwlts calibrate --air air.h5 --step {} --out x.json", set()),
-    "polynomials, target": ("uwlts polynomials --target {} --out x.json", set()),
+    "polynomials, captures": ("uwlts polynomials --captures {} --out x.json", set()),
     "design, sensor": ("uwlts design {} --medium water", {"sensor.toml"}),
     "nominal, sensor": ("uwlts nominal {} --medium water --out x.json", {"sensor.toml"}),
     "evaluate, cloud": ("uwlts evaluate {} --out x.json", {"scan.ply"}),
     "evaluate, artefact": ("uwlts evaluate scan.ply --artefact {} --out x.json", {"artefact.toml"}),
     "evaluate, truth": ("uwlts evaluate scan.ply --truth {} --out x.json", set()),
-    "report, reference": ("uwlts report campaign --reference {}", set()),
+    "report, published": ("uwlts report campaign --published {}", set()),
     "thesis, folder": ("uwlts thesis {}", set()),
     "thesis, published": ("uwlts thesis campaigns --published {}", set()),
     "reproduce, campaign": ("twin reproduce {} --campaigns 1 --out x", set()),
@@ -495,12 +495,12 @@ def test_targets_that_were_not_all_seen_in_one_medium(fails, folder: Path, tmp_p
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ("--target air.h5", "target"),
-        ("--target black.h5", "target"),
-        ("--target no-frames.h5", "error: "),
-        ("--target air.h5 scan.h5", "error: "),
-        ("--target air.h5 --degree 0", "degree"),
-        ("--target air.h5 --degree -2", "degree"),
+        ("--captures air.h5", "target"),
+        ("--captures black.h5", "target"),
+        ("--captures no-frames.h5", "error: "),
+        ("--captures air.h5 scan.h5", "error: "),
+        ("--captures air.h5 --degree 0", "degree"),
+        ("--captures air.h5 --degree -2", "degree"),
     ],
 )
 def test_polynomials_without_target(fails, folder: Path, tmp_path: Path, monkeypatch, options: str, says: str):
@@ -583,7 +583,7 @@ def test_reports_that_cannot_be(fails, folder: Path, tmp_path: Path):
     (tmp_path / "empty").mkdir()
     fails("uwlts", "report", tmp_path / "empty", says="empty")
     assert list((tmp_path / "empty").iterdir()) == []
-    fails("uwlts", "report", folder / "campaign", "--reference", "no-reference", says="no-reference")
+    fails("uwlts", "report", folder / "campaign", "--published", "no-reference", says="no-reference")
     out = tmp_path / "missing" / "x.html"
     fails("uwlts", "report", folder / "campaign", "--out", out, says="missing does not exist")
 
@@ -652,7 +652,7 @@ BEGINNINGS = {
 
 OUTPUTS = {
     "calibrate": "uwlts calibrate --air air.h5 --out {}.json",
-    "polynomials": "uwlts polynomials --target air.h5 --out {}.json",
+    "polynomials": "uwlts polynomials --captures air.h5 --out {}.json",
     "reconstruct": "uwlts reconstruct scan.h5 --calibration calibration.json --out {}.ply",
     "nominal": "uwlts nominal sensor.toml --medium water --out {}.json",
     "evaluate": "uwlts evaluate scan.ply --out {}.json",

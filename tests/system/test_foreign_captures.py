@@ -257,7 +257,7 @@ def test_the_target_as_it_should_be_calibrates(target_frames, tmp_path: Path, mo
 
 
 @pytest.mark.parametrize("name", ["black", "switched", "laser off", "stripe across"])
-@pytest.mark.parametrize("line", ["polynomials --degree 3 --target", "calibrate --joint --air"])
+@pytest.mark.parametrize("line", ["polynomials --degree 3 --captures", "calibrate --joint --air"])
 def test_other_calibrations_say_the_same(says, target_frames, tmp_path: Path, name: str, line: str):
     damage, words = TARGETS[name]
     path = captured(tmp_path / "x.h5", damage(target_frames), target=PLATE)
@@ -266,7 +266,7 @@ def test_other_calibrations_say_the_same(says, target_frames, tmp_path: Path, na
 
 def test_polynomials_of_images_upside_down(says, target_frames, tmp_path: Path):
     path = captured(tmp_path / "x.h5", images(upside_down)(target_frames), target=PLATE)
-    says(f"polynomials --degree 3 --target {path} --out {tmp_path / 'x.json'}", "not rotated by 180 deg or mirrored")
+    says(f"polynomials --degree 3 --captures {path} --out {tmp_path / 'x.json'}", "not rotated by 180 deg or mirrored")
 
 
 # --- Captures of steps and scans

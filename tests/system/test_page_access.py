@@ -387,6 +387,24 @@ def test_a_port_in_use_is_passed_over_and_a_foreign_address_refused():
             DeskServer(Board("nowhere"), host=host)
 
 
+def test_a_server_that_cannot_start_says_why():
+    """Here semaphores are forbidden, as in a container whose /dev/shm belongs to somebody else."""
+    code = """
+import multiprocessing.synchronize as m
+from uwlts.desk.board import Board
+from uwlts.desk.server import DeskServer
+
+def refuse(*_, **__):
+    raise PermissionError(13, "Permission denied")
+
+m.SemLock.__init__ = refuse
+DeskServer(Board("page"), port=0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "the page's server did not start: PermissionError: [Errno 13] Permission denied" in done.stderr
+
+
 def test_one_page_is_served_at_a_time_and_the_next_is_no_continuation(page):
     with pytest.raises(SetupError, match="serves a page already"):
         DeskServer(Board("second"), port=0)

@@ -251,7 +251,9 @@ def _mount_agrees_with_the_board(capture: Capture, calibration: Calibration, air
     cloud = reconstruct_stripes(capture, find_stripes(capture), calibration)
     # Without a stage its positions count the poses.
     seen = cloud.points_mm - np.outer(capture.stage_mm[cloud.frame], capture.header.stage_direction)
-    mount = uwlts.calibrate_mount([seen[cloud.frame == n] for n in np.unique(cloud.frame)], poses, artefact="plane")
+    mount = uwlts.calibrate_mount(
+        [seen[cloud.frame == n] for n in np.unique(cloud.frame)], poses, artefact_kind="plane"
+    )
     assert all(pose.reason is None for pose in mount.poses)
     # The plate is bent by some tenths of a millimetre and stands on a level table.
     assert mount.rms_mm < 0.5 and mount.held_out_rms_mm < 0.8

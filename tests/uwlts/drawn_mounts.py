@@ -26,7 +26,7 @@ def mount_of(given: ProfilerSet, *, size_known: bool = True) -> Mount:
     radius_mm = given.size_mm if size_known and given.kind in ("sphere", "ring") else None
     height_mm = given.size_mm if size_known and given.kind == "step" else None
     return uwlts.calibrate_mount(
-        given.profiles, given.poses, artefact=given.kind, radius_mm=radius_mm, height_mm=height_mm
+        given.profiles, given.poses, artefact_kind=given.kind, radius_mm=radius_mm, height_mm=height_mm
     )
 
 

@@ -34,7 +34,8 @@ _NAME = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.so(\..+)?")
 _SYSTEM_FOLDERS = ("local/lib", "local/lib64", "lib", "lib64", "lib/*-linux-gnu", "lib/llvm*/lib", "lib64/llvm*/lib")
 _HOW_TO_INSTALL = """\
 Install what is missing:
-  x86-64 Linux:    pip install 'karellen-llvm-core>=19.1.7,<20'   (libatomic comes from the system)
+  x86-64 Linux:    pip install 'karellen-llvm-core>=19.1.7,<20'   (libatomic comes from the system). Whoever installed
+                   it starts this Python once, which completes the installation.
   Debian, Ubuntu:  apt-get install libllvm19 libatomic1   (as root; any of libllvm17 and newer)
   Fedora:          dnf install llvm-libs libatomic   (as root)
   Arch:            pacman -S llvm-libs gcc-libs   (as root)"""

@@ -43,7 +43,7 @@ def commands(out: Path) -> list[tuple[str, str]]:
             rows.append(("reconstruct", f"uwlts reconstruct {made}"))
             judged = f"--out {cloud}.evaluation.json --coloured {cloud}-coloured.ply --overwrite"
             rows.append(("evaluate", f"uwlts evaluate {cloud}.cloud.h5 --truth {capture}.truth.h5 {judged}"))
-    rows.append(("report", f"uwlts report {folder} --reference thesis --workers {AT_ONCE} --overwrite"))
+    rows.append(("report", f"uwlts report {folder} --published thesis --workers {AT_ONCE} --overwrite"))
     return rows
 
 

@@ -30,7 +30,7 @@ def calibrate(
     unknown_sizes: bool = False,
     strict: bool = False,
     refractions: Literal[1, 2] = 2,
-    poses: Poses = "stage-normal",
+    target_poses: Poses = "stage-normal",
     distortion: Distortion = "auto",
     pixels: Pixels = "auto",
     index: float | None = None,
@@ -68,7 +68,7 @@ def calibrate(
     refractions : {1, 2}
         2: window of known thickness, air images taken without it. 1: one interface, air images taken through the
         window, with its effect included in the distortion. The joint calibration reads this from the captures.
-    poses : {"stage-normal", "stage", "free"}
+    target_poses : {"stage-normal", "stage", "free"}
         stage-normal: one target pose, moved by the stage along the target's normal (the thesis). stage: the same with a
         free direction, as always in the joint calibration. free: every image has its own pose.
     distortion : "auto" or tuple of str
@@ -110,7 +110,7 @@ def calibrate(
         raise DescriptionError("`new_water` and `unknown_sizes` apply to scans: give `scan`, too")
     options = CalibrationOptions(
         refractions=refractions,
-        poses=poses,
+        poses=target_poses,
         camera=CameraOptions(
             ("k1", "k2") if distortion == "auto" else distortion, pixel_aspect=None if pixels == "free" else 1.0
         ),

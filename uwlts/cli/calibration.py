@@ -64,7 +64,8 @@ def calibrate(
             report=say,
         )
         warn(*(f"still missing: {line}; --resume takes more images" for line in recording.missing))
-        recorded = {name: getattr(recording, name) for name in ("air", "water", "step", "poses")}
+        recorded = {name: getattr(recording, name) for name in ("air", "water", "step")}
+        recorded["target_poses"] = recording.poses
     calibration = call(**recorded)
     advice = [] if calibration.joint is None else advice_lines(calibration)
     calibration.save(out, overwrite=overwrite)
@@ -131,7 +132,7 @@ def refresh(
 
 @command_from(app, uwlts, "calibrate_polynomials", job="Calibrate", shortcuts=STRIPE)
 def polynomials(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) -> None:
-    """Example: uwlts polynomials --target target-water.h5 --out polynomials.json"""
+    """Example: uwlts polynomials --captures target-water.h5 --out polynomials.json"""
     from uwlts.report.inventory import polynomial_lines
 
     found = call()

@@ -142,7 +142,7 @@ def findings_report(
 def report(call: Call) -> None:
     """Print a table.
 
-    Example: uwlts report runs/demo --reference thesis
+    Example: uwlts report runs/demo --published thesis
     """
     from uwlts.report.campaign_tables import print_table
 

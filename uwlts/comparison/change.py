@@ -200,7 +200,7 @@ def compare_clouds(
     disc_mm: float | None = None,
     deep_mm: float | None = None,
     same_water: bool = False,
-    unit: Unit | None = None,
+    reference_unit: Unit | None = None,
     cloud_unit: Unit | None = None,
 ) -> SurfaceChange:
     """Find where a surface differs from an earlier cloud, a mesh or an ideal shape by more than the uncertainty.
@@ -235,7 +235,7 @@ def compare_clouds(
     same_water
         Both clouds were scanned in water of the same temperature and salinity. The error of its refractive index then
         cancels for clouds of one calibration.
-    unit
+    reference_unit
         Unit of the reference, mm or m, if its file does not state it; by default mm.
     cloud_unit
         The same of the cloud.
@@ -265,7 +265,7 @@ def compare_clouds(
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
     disc = disc_mm or choose_disc_diameter(require_enough(new.points_mm, "cloud"), new.frame)
-    surface = read_reference(reference, unit=unit, disc_mm=disc)
+    surface = read_reference(reference, unit=reference_unit, disc_mm=disc)
     fixed = None if datums is None else read_datums(datums)
     if isinstance(surface, ReferencePoints):
         require_same_unit(new.points_mm, require_enough(surface.points_mm, "reference"))

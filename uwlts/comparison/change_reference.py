@@ -148,7 +148,7 @@ def require_same_unit(cloud: np.ndarray, reference: np.ndarray) -> None:
     if sizes[0] > OPTIONS.other_unit_ratio * sizes[1]:
         raise EvaluationError(
             f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g} mm. If the reference is in "
-            "metres, give `unit` m"
+            "metres, give `reference_unit` m"
         )
     if sizes[1] > 1000 * OPTIONS.other_unit_ratio * sizes[0]:
         raise EvaluationError(

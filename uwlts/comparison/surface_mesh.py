@@ -48,7 +48,7 @@ _FEWEST_OF_PIECE = 20
 def mesh(
     *clouds: PointCloud | str | os.PathLike[str],
     cube_mm: float | None = None,
-    radius_mm: float | None = None,
+    patch_radius_mm: float | None = None,
     towards: Sequence[tuple[float, float, float]] | None = None,
     unit: Unit | None = None,
     progress: ProgressListener = ignore_progress,
@@ -62,7 +62,7 @@ def mesh(
     cube_mm
         Edge of the cubes, smaller than the walls; by default the smaller of a third of the patch radius and two thirds
         of the thinnest wall.
-    radius_mm
+    patch_radius_mm
         Radius of the averaging patches; much smaller holes are closed. By default a patch holds about thirty points of
         three images.
     towards
@@ -90,9 +90,9 @@ def mesh(
     >>> surface = uwlts.mesh("left.cloud.h5", "right.cloud.h5")
     >>> surface.save("pipe.glb")
     """
-    for name, length in (("cube_mm", cube_mm), ("radius_mm", radius_mm)):
+    for name, length in (("cube_mm", cube_mm), ("patch_radius_mm", patch_radius_mm)):
         if length is not None and not 0 < length < np.inf:
-            raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
+            raise EvaluationError(f"`{name}` is {length:g}; expected a positive length in mm")
     if not clouds:
         raise EvaluationError("no cloud was given; a mesh needs at least one")
     read = [load_cloud(each, unit=unit) for each in clouds]
@@ -107,7 +107,7 @@ def mesh(
     ]
     if small := [len(cloud) for cloud, _ in scans if len(cloud) < _FEWEST]:
         raise EvaluationError(f"a cloud or scan has {small[0]} points; at least {_FEWEST} are needed")
-    radius = radius_mm or max(0.65 * choose_disc_diameter(cloud.points_mm, cloud.frame) for cloud, _ in scans)
+    radius = patch_radius_mm or max(0.65 * choose_disc_diameter(cloud.points_mm, cloud.frame) for cloud, _ in scans)
     if cube_mm is not None and cube_mm > radius:
         raise EvaluationError(f"cube_mm is {cube_mm:g}; expected at most the patches' radius, {radius:g} mm")
     points = _collect_points(scans, radius)
@@ -126,7 +126,7 @@ def mesh(
     if not len(faces):
         raise EvaluationError(
             f"no surface was found with patches of {radius:g} mm radius: the points may be too sparse. Give a larger "
-            "radius_mm"
+            "`patch_radius_mm`"
         )
     every = points.points_mm[:: max(1, len(points.points_mm) // _WALLS_ASKED)]
     away = np.asarray(KDTree(places[used]).query(every, distance_upper_bound=radius)[0])

@@ -63,8 +63,14 @@ def guess_kind(name: str) -> str:
             return "cloud"
         case [_, *_, "h5"]:
             return "capture"
+        case [_, *_, "laz" | "las" | "xyz" | "e57" | "mcap"]:
+            return "exported cloud"
+        case [_, *_, "findings" | "registration", "json"]:
+            return "figures"
         case [_, *_, "json"]:
             return "calibration"
+        case [_, *_, "pdf"]:
+            return "printed report"
         case [_, *_, "toml"]:
             return "description"
         case [_, *_, "html"]:

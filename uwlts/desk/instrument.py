@@ -468,7 +468,7 @@ class Instrument:
             board.say(f"still missing: {line}; continue it for more images", "warning")
         board.phase("calibrating")
         found = calibrate(
-            air=recording.air, water=recording.water, step=recording.step, poses=recording.poses, refractions=2
+            air=recording.air, water=recording.water, step=recording.step, target_poses=recording.poses, refractions=2
         )
         found.save(out, overwrite=overwrite)
         for line in calibration_lines(found):

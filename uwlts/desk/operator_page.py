@@ -16,6 +16,8 @@ from nicegui.elements.mixins.disableable_element import DisableableElement
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
+from uwlts.desk.analyses import Analyses
+from uwlts.desk.analysis_panel import AnalysisPanel
 from uwlts.desk.board import Board
 from uwlts.desk.board_page import BoardView, build_board, update_regularly
 from uwlts.desk.desk_files import find_file, guess_kind, is_interrupted, list_files, new_path
@@ -24,15 +26,13 @@ from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.server import DeskServer
 from uwlts.desk.thinned_cloud import point_table
 from uwlts.errors import DescriptionError, Error
-from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
 from uwlts.inspection.picking import Shape, find_nearest_point, fit_shape_near, measure_length
 from uwlts.model.library import validate_description
-from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.report.inventory import describe
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_region, read_thinned_cloud, write_cloud
+from uwlts.storage.cloud_files import read_region, read_thinned_cloud
 from uwlts.storage.copc_file import is_copc
 
 _LIST_S = 2.0
@@ -92,7 +92,10 @@ def serve_desk(
     board = Board(f"desk: {place.resolve().name}")
     with closing(Instrument(board)) as instrument:
         work = _Desk(place, board, instrument, None if plan is None else Path(plan), begun)
-        with DeskServer(board, build=work.build, host=host, port=port, switch=instrument.switch) as server:
+        with (
+            closing(work.analyses),
+            DeskServer(board, build=work.build, host=host, port=port, switch=instrument.switch) as server,
+        ):
             try:
                 work.serve_files(server)
                 report(f"open {server.operator_address} to work, {server.address} to look; Ctrl-C ends it")
@@ -114,6 +117,7 @@ class _Desk:
         self.folder, self.board, self.instrument = folder, board, instrument
         self.plan_path, self.plan = plan_path, plan
         self.opened = _Opened()
+        self.analyses = Analyses(folder, board, self._show_result)
 
     def serve_files(self, server: DeskServer) -> None:
         """Add a route for the files of the folder; viewers may fetch reports only."""
@@ -174,6 +178,23 @@ class _Desk:
         self.board.cloud.add(shown.points_mm, total, **_fields(shown))
         self.board.detail = closer if total > len(shown) else None
 
+    def open_cloud(self, name: str) -> None:
+        """Read a cloud of the folder, a sample of a very large one, and show it."""
+        path = find_file(self.folder, name)
+        cloud, total = read_thinned_cloud(path, _MOST_OPENED)
+        if total > len(cloud):
+            self.board.say(f"{name} has {total:,} points: an even sample of {len(cloud):,} is measured", "warning")
+        self.show_cloud(name, cloud, of=total, path=path if is_copc(path) else None)
+
+    def _show_result(self, path: Path) -> None:
+        """Show the cloud of an analysis, unless a scan is shown."""
+        if self.instrument.state in _RUNNING:
+            return
+        try:
+            self.open_cloud(path.name)
+        except Error as error:
+            self.board.say(str(error), "error")
+
     def cloud_to_measure(self) -> PointCloud:
         """Return the opened cloud, or else the cloud of the running scan."""
         if self.opened.cloud is not None:
@@ -208,6 +229,7 @@ class _OperatorPage:
         self._desk, self._instrument, self._board = desk, desk.instrument, desk.board
         self._view = BoardView(desk.board, picked=self._show_picked)
         self._only: list[tuple[DisableableElement, tuple[InstrumentState, ...]]] = []
+        self._analyses = AnalysisPanel(desk.folder, desk.analyses, button=self._button, mark=self._view.mark)
         self._refreshed = 0
         self._files: tuple[object, ...] = ()
 
@@ -219,10 +241,14 @@ class _OperatorPage:
             view.image()
             view.cloud()
             with ui.element("section").classes("tools").props('aria-label="controls"'):
-                with ui.tabs().props("dense no-caps align=left") as tabs:
-                    names = ["Connect", "Stage", "Calibrate", "Scan", "Files", "Measure"]
+                with ui.tabs().props("dense no-caps align=left") as self._tabs:
+                    names = ["Connect", "Stage", "Calibrate", "Scan", "Files", "Inspect", "Measure"]
                     shown = {name: ui.tab(name) for name in names}
-                with ui.tab_panels(tabs, value=shown["Connect"], animated=False).classes("w-full").props("keep-alive"):
+                with (
+                    ui.tab_panels(self._tabs, value=shown["Connect"], animated=False)
+                    .classes("w-full")
+                    .props("keep-alive")
+                ):
                     for name, part in zip(names, self._parts(), strict=True):
                         with ui.tab_panel(shown[name]).classes("gap-2"):
                             part()
@@ -237,6 +263,7 @@ class _OperatorPage:
             self._calibrate_part,
             self._scan_part,
             self._files_part,
+            self._analyses.build,
             self._measure_part,
         )
 
@@ -262,6 +289,7 @@ class _OperatorPage:
     def _refresh(self) -> None:
         self._view.refresh()
         self._show_request()
+        self._analyses.refresh()
         self._light.value = self._instrument.light or "none"
         if (shown := self._exposure_now()) != self._exposed:
             # Not while the operator types in it.
@@ -455,15 +483,17 @@ class _OperatorPage:
         self._calibration.set_options(self._desk.calibrations(), value=self._calibration.value)
         for choice, load in ((self._plan, load_plan), (self._guided_plan, load_guided_plan)):
             choice.set_options(self._desk.plans(load), value=choice.value)
+        self._analyses.set_files()
         self._rows.clear()
         with self._rows:
             for file in files:
                 with ui.row().classes("w-full items-center no-wrap gap-2 text-sm"):
-                    ui.label(file.name).classes("grow break-all font-mono")
+                    address = f"files/{quote(file.name)}"
+                    ui.link(file.name, address).props("download").classes("grow break-all font-mono download")
                     ui.label(f"{file.kind}, {_size_text(file.size)}").classes("text-xs text-slate-500")
                     name = file.name
                     if file.kind == "report":
-                        ui.link("open", f"files/{quote(name)}", new_tab=True)
+                        ui.link("open", address, new_tab=True)
                         continue
                     if file.kind == "cloud":
                         self._button("show", partial(self._show, name)).props("flat dense")
@@ -472,11 +502,7 @@ class _OperatorPage:
                     self._button("about", partial(self._about, name)).props("flat dense")
 
     async def _show(self, name: str) -> None:
-        path = find_file(self._desk.folder, name)
-        cloud, total = await asyncio.to_thread(read_thinned_cloud, path, _MOST_OPENED)
-        if total > len(cloud):
-            self._board.say(f"{name} has {total:,} points: an even sample of {len(cloud):,} is measured", "warning")
-        self._desk.show_cloud(name, cloud, of=total, path=path if is_copc(path) else None)
+        await asyncio.to_thread(self._desk.open_cloud, name)
         self._view.mark([])
 
     async def _about(self, name: str) -> None:
@@ -487,21 +513,13 @@ class _OperatorPage:
             ui.button("close", on_click=dialog.close)
         dialog.open()
 
-    async def _reconstruct(self, name: str) -> None:
+    def _reconstruct(self, name: str) -> None:
         known = self._calibration.value
         if not known:
             raise DescriptionError("choose the calibration first, under Scan")
-        folder, board = self._desk.folder, self._board
-        capture, calibration = find_file(folder, name), find_file(folder, known)
-        out = new_path(folder, Path(name).stem, suffix=".cloud.h5")
-        refuse_unsuitable(out, overwrite=False)
-        board.say(f"reconstructing {name} with {known}")
-        cloud = await asyncio.to_thread(reconstruct, capture, calibration)
-        await asyncio.to_thread(write_cloud, out, cloud, overwrite=False)
-        for warning in cloud.warnings:
-            board.say(warning, "warning")
-        board.say(f"wrote {out.name}, {len(cloud):,} points")
-        self._desk.show_cloud(out.name, cloud)
+        self._desk.analyses.start("reconstruct", {"capture": name, "calibration": known}, name="", overwrite=False)
+        # Progress and result are there.
+        self._tabs.set_value("Inspect")
 
     # Measure
 

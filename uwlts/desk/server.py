@@ -50,6 +50,20 @@ def _nicegui() -> FastAPI:
     return app
 
 
+class _FirstError(logging.Handler):
+    """Keep the last line of the first error that the server logs; no other handler gets any."""
+
+    def __init__(self):
+        super().__init__(logging.ERROR)
+        self.text = ""
+        log = logging.getLogger("uvicorn.error")
+        log.handlers, log.propagate = [self], False
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep an error."""
+        self.text = self.text or record.getMessage().strip().rpartition("\n")[2]
+
+
 class DeskServer:
     """Server of a page that shows a board, from construction until the ``with`` ends. Only one at a time.
 
@@ -113,7 +127,7 @@ class DeskServer:
                 )
             self._open = True
             nicegui.state.show = show
-            # Only errors are logged: a browser that disconnects during a response is not an error.
+            self._errors = _FirstError()
             config = uvicorn.Config(
                 GuardedApp(self._app, self._access),
                 http=cast("type[asyncio.Protocol]", partial(LimitedHttp, PendingHeads())),
@@ -121,7 +135,9 @@ class DeskServer:
                 loop="asyncio",
                 backlog=BACKLOG,
                 h11_max_incomplete_event_size=HEAD_BYTES,
-                log_level=logging.CRITICAL,
+                # Nothing is printed: a browser that disconnects during a response is not an error.
+                log_config=None,
+                log_level=logging.ERROR,
                 ws_max_size=2**20,
             )
             self._server = uvicorn.Server(config)
@@ -138,7 +154,7 @@ class DeskServer:
         deadline = time.monotonic() + _START_S
         while not self._server.started:
             if time.monotonic() > deadline or not self._thread.is_alive():
-                raise SetupError("the page's server did not start")
+                raise SetupError(f"the page's server did not start: {self._errors.text or 'no reason is known'}")
             time.sleep(0.02)
 
     def _add_content(self, board: Board) -> None:

@@ -130,30 +130,30 @@ def gauge_study(
     table: str | os.PathLike[str] | Sequence[tuple[str, str, float]],
     *,
     tolerance: float | None = None,
-    reference: float | None = None,
+    true_value: float | None = None,
 ) -> GaugeStudy | RepeatedReference:
     """Evaluate a gauge from repeated measurements: repeatability, reproducibility and percentage of a tolerance.
 
     In a crossed study, each operator measures each part equally often. It is evaluated by analysis of variance with
     random effects (AIAG, Measurement Systems Analysis, 4th ed., chapter III-B and appendix A). An interaction with a
     p-value above 0.25 is pooled with the repeatability. The 95 % intervals are generalised confidence intervals (Hamada
-    and Weerahandi, J. Quality Technology 32, 2000). With a ``reference``, repeated measurements of one part form a
+    and Weerahandi, J. Quality Technology 32, 2000). With ``true_value``, repeated measurements of one part form a
     type-1 study.
 
     Parameters
     ----------
     table
         CSV file with the columns part, operator and value, one measurement per line; or a sequence of (part, operator,
-        value). With a reference, the column value suffices.
+        value). With ``true_value``, the column value suffices.
     tolerance
         Width of the tolerance, in the unit of the values.
-    reference
+    true_value
         True value of the only part, for a type-1 study with Cg and Cgk.
 
     Returns
     -------
     GaugeStudy or RepeatedReference
-        Components of variance; with ``reference`` the bias and the indices Cg and Cgk.
+        Components of variance; with ``true_value`` the bias and the indices Cg and Cgk.
 
     Raises
     ------
@@ -171,8 +171,8 @@ def gauge_study(
     )
     if not np.isfinite([value for *_, value in rows]).all():
         raise DescriptionError("the table contains values that are not finite; remove or correct these lines")
-    if reference is not None:
-        return _evaluate_repeats(rows, reference, tolerance)
+    if true_value is not None:
+        return _evaluate_repeats(rows, true_value, tolerance)
     return _evaluate_crossed(rows, tolerance)
 
 
@@ -206,7 +206,7 @@ def _evaluate_repeats(
     rows: Sequence[tuple[str, str, float]], reference: float, tolerance: float | None
 ) -> RepeatedReference:
     if len({part for part, *_ in rows}) > 1:
-        raise EvaluationError("a reference is the size of one part, but the table contains several parts")
+        raise EvaluationError("`true_value` is the size of one part, but the table contains several parts")
     if len(rows) < 10:
         raise EvaluationError(f"found {len(rows)} measurements; a type-1 study needs at least 10, usually 50")
     values = np.array([value for *_, value in rows])

@@ -206,11 +206,13 @@ def surface_patches(
 def find_disc_radius(points_mm: np.ndarray) -> float:
     """Find the radius of the smallest discs with enough points on several profiles.
 
-    EvaluationError if a tenth of the cloud's size does not suffice.
+    EvaluationError if a tenth of the cloud's size does not suffice, or points repeat.
     """
     size = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
     sample = points_mm[:: max(1, len(points_mm) // _SAMPLE)][:_SAMPLE]
     radius = float(np.median(KDTree(points_mm).query(sample, k=7)[0][:, 6])) * np.sqrt(_FEWEST)
+    if radius == 0:
+        raise EvaluationError("most points have six others at the same place: omit repeated points")
     while radius < _LARGEST_PATCH * size:
         means = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)[1]
         away, near = _nearest_within(KDTree(means), means[:: max(1, len(means) // _SAMPLE)], radius)

@@ -90,6 +90,9 @@ def find_welds(form: PipeForm, chosen: np.ndarray) -> list[PipeWeld]:
 
     def add(is_girth: bool, across: np.ndarray, length: np.ndarray, ridges: list[tuple[float, float]]) -> None:
         for middle, half in ridges:
+            # Cells are coarse: the points of the bead give its middle.
+            own = np.abs(across - middle) < half
+            middle = float(np.average(across[own], weights=np.maximum(heights[own], 0)))
             off, at = whole.copy(), whole.copy()
             off[chosen], at[chosen] = across - middle, length
             found.append(PipeWeld(is_girth, off, at, half))
@@ -111,13 +114,15 @@ def measure_weld(cloud: PointCloud, form: PipeForm, weld: PipeWeld, name: str) -
     on_bead = np.flatnonzero(np.abs(weld.across_mm) < weld.half_mm)
     axis, out = form.frame.axes[2], form.outwards
     angle = np.angle(np.mean(np.exp(1j * form.angle[on_bead])))
-    middle = form.points_at(np.array([np.median(form.along_mm[on_bead])]), np.array([angle]))[0]
+    nearest = on_bead[np.argmin(np.abs(np.angle(np.exp(1j * (form.angle[on_bead] - angle)))))]
+    # An inclined girth weld is elsewhere at each angle: its middle is taken at this one.
+    along = form.along_mm[nearest] - weld.across_mm[nearest] if weld.is_girth else np.median(form.along_mm[on_bead])
+    middle = form.points_at(np.array([along]), np.array([angle]))[0]
     around = np.cross(axis, out)
     tangents = np.stack([around, np.broadcast_to(axis, out.shape)], axis=1)
     if not weld.is_girth:
         tangents = np.stack([tangents[:, 1], -around], axis=1)
         local[:, 1] *= -1
-    nearest = on_bead[np.argmin(np.abs(np.angle(np.exp(1j * (form.angle[on_bead] - angle)))))]
     axes = np.array([*tangents[nearest], out[nearest]])
     bead = build_bead(cloud, local, axes, middle, tangents, half_mm=weld.half_mm)
     errors = PointErrors.along_normals(cloud, bead.chosen, out[bead.chosen])

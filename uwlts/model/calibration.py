@@ -30,7 +30,7 @@ _Rows = tuple[tuple[float, float, float, float], ...]
 def is_rigid(matrices: np.ndarray, *, within: float) -> bool:
     """Return whether matrices (..., 4, 4) are rigid transforms without reflection; ``within`` is the tolerance."""
     rotation = matrices[..., :3, :3]
-    if not (np.abs(rotation) < 2).all():
+    if not (np.abs(rotation) < 2).all() or not np.isfinite(matrices).all():
         return False
     square = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=within)
     last = np.allclose(matrices[..., 3, :], (0, 0, 0, 1), atol=within)

@@ -159,7 +159,7 @@ def _refuse_free_poses(scan: Capture) -> None:
         raise CalibrationError(
             f"{unplaced} laser images of {scan.path.name} have free poses, which are unknown: their stage_mm is only a "
             "number. Import them with positions of the stage or with poses, or give a trajectory; a capture of a "
-            "target with free poses is for `uwlts calibrate --poses free`"
+            "target with free poses is for `uwlts calibrate --target-poses free`"
         )
 
 

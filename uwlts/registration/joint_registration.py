@@ -163,7 +163,19 @@ class JointRegistration:
         return tuple((a, b, count) for a, b, count in counts if 0 < count < FEWEST_OF_PAIR)
 
     def solve(self, pairs: Sequence[PairEvidence]) -> PoseSolution:
-        """Solve for the least-squares step from the observations of pairs and the prior."""
+        """Solve for the least-squares step from the observations of pairs and the prior.
+
+        Raises EvaluationError if the uncertainties differ by too many orders of magnitude.
+        """
+        try:
+            return self._solve(pairs)
+        except np.linalg.LinAlgError as error:
+            raise EvaluationError(
+                f"the observations have no solution ({error}): uncertainties of the clouds differ by too many orders "
+                "of magnitude"
+            ) from error
+
+    def _solve(self, pairs: Sequence[PairEvidence]) -> PoseSolution:
         count, unknown = self.unknown_poses, len(self.units)
         normal, gradient, spurious = np.zeros((unknown, unknown)), np.zeros(unknown), np.zeros((count, count))
         for pair in pairs:

@@ -40,6 +40,8 @@ from uwlts.storage.pose_files import PoseFormat, read_poses, write_poses
 _ROUNDS = 60
 _STILL_MM = 1e-5
 """Rms shift of the points, mm, that ends the iteration: far below any measurable change."""
+_SMALLEST = 1e-6
+"""Smallest length in mm or angle in deg that is accepted, and the reciprocal of the largest: others are slips."""
 _REACH = 0.05
 """Default distance between overlapping surfaces at the initial poses, relative to the scan's size."""
 _ROUNDED = 1e-6
@@ -284,9 +286,10 @@ def register(
         poses = read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0]
     if len(scans) < 2:
         raise EvaluationError(f"found {len(scans)} cloud; a registration needs two or more")
-    for name, length in (("sphere_mm", sphere_mm), ("reach_mm", reach_mm), ("start_std_mm", start_std_mm)):
-        if length is not None and not 0 < length < np.inf:
-            raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
+    given = {"sphere_mm": sphere_mm, "reach_mm": reach_mm, "start_std_mm": start_std_mm, "start_std_deg": start_std_deg}
+    for name, size in given.items():
+        if size is not None and not _SMALLEST <= size <= 1 / _SMALLEST:
+            raise EvaluationError(f"`{name}` is {size:g}; expected {_SMALLEST:g} to {1 / _SMALLEST:g}")
     if (start_std_mm is None) != (start_std_deg is None):
         raise EvaluationError("the uncertainty of the initial poses needs both start_std_mm and start_std_deg")
     steps = len(scans) + _ROUNDS

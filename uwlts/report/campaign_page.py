@@ -71,7 +71,7 @@ class Report(Brief):
 def write_campaign(
     folder: str | Path,
     *,
-    reference: str | Path | None = None,
+    published: str | Path | None = None,
     out: str | Path | None = None,
     pictures: str | Path | None = None,
     workers: int = 1,
@@ -85,7 +85,7 @@ def write_campaign(
     folder : str or Path
         Folder with captures NAME.h5, coloured clouds NAME.ply (or .h5), evaluations NAME.evaluation.json and
         calibrations.
-    reference : str or Path, optional
+    published : str or Path, optional
         Published values to compare with: name (thesis) or path of a TOML file.
     out : str or Path, optional
         Page to write (default: FOLDER/report.html). The summary is written beside it, to summary.json.
@@ -119,13 +119,13 @@ def write_campaign(
     if out:
         require_ending(Path(out), HTML)
     campaign = gather_campaign(folder)
-    published = load_reference(reference) if reference else None
+    reference = load_reference(published) if published else None
     page = Path(out or campaign.folder / "report.html")
     refuse_unsuitable(page, overwrite=overwrite)
-    report = Report(page, page.with_name("summary.json"), campaign, published)
-    write_summary(report.summary, campaign, published, overwrite=overwrite)
+    report = Report(page, page.with_name("summary.json"), campaign, reference)
+    write_summary(report.summary, campaign, reference, overwrite=overwrite)
     drawn = draw_pictures(campaign, workers=workers)
-    write_page(page, report_page(campaign, published, pictures=drawn), overwrite=overwrite)
+    write_page(page, report_page(campaign, reference, pictures=drawn), overwrite=overwrite)
     if pictures:
         try:
             Path(pictures).mkdir(parents=True, exist_ok=True)

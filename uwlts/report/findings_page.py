@@ -348,7 +348,7 @@ def _finding_rows(
     for each in listed:
         verdict, names = judge_feature(each, order.limits)
         at = format_place(each, whole, start, order.datum) if each is not whole else (MISSING, MISSING)
-        size = {value.name: _format_interval(value) for value in each.values}
+        size = {value.name: format_interval(value) for value in each.values}
         first = next(iter(names), each.values[0].name)
         said = f"{verdict} ({', '.join(names)})" if names else verdict
         main = next((size[name] for name in ("depth", "height") if name in size), f"{first} {size[first]}")
@@ -359,7 +359,8 @@ def _finding_rows(
     return (*heads, "remaining wall / mm", "length / mm", "width / mm"), rows
 
 
-def _format_interval(value: FeatureValue) -> str:
+def format_interval(value: FeatureValue) -> str:
+    """Return a value with its 95 % coverage interval as text, with two digits of the uncertainty and no unit."""
     half = COVERAGE_FACTOR * value.uncertainty
     if half <= _SMALLEST:
         return f"{value.value:.4g}"
@@ -378,7 +379,7 @@ def _value_row(value: FeatureValue) -> tuple[str, ...]:
         MISSING if part is None else format_to_scale(part, part, digits=2) if part > _SMALLEST else "0"
         for part in parts
     ]
-    return value.name, value.unit, _format_interval(value), *fine
+    return value.name, value.unit, format_interval(value), *fine
 
 
 def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str, ...]]] | None:
@@ -390,7 +391,7 @@ def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str,
     rows = []
     for each in features:
         place = " ".join(f"{number:.1f}" for number in each.place_mm)
-        rows.append((each.name, place, *(_format_interval(each[name]) if name in each else MISSING for name in units)))
+        rows.append((each.name, place, *(format_interval(each[name]) if name in each else MISSING for name in units)))
     return ("finding", "place / mm", *(f"{name} / {unit}" for name, unit in units.items())), rows
 
 
@@ -401,18 +402,18 @@ def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
             worst = max(own, key=lambda each: each.values[0].value)
             value = worst.values[0]
             plural = f"{kind}s" if len(own) > 1 else str(kind)
-            note = f"largest {value.name} {_format_interval(value)} {value.unit} ({worst.name})"
+            note = f"largest {value.name} {format_interval(value)} {value.unit} ({worst.name})"
             tiles.append(Tile(plural, str(len(own)), note, accent=True))
     walls = [each["remaining wall"] for each in parts if "remaining wall" in each]
     if walls:
         least = min(walls, key=lambda value: value.value)
-        tiles.append(Tile("least remaining wall", f"{_format_interval(least)} {least.unit}", accent=True))
+        tiles.append(Tile("least remaining wall", f"{format_interval(least)} {least.unit}", accent=True))
     if whole and whole[0].kind == FeatureKind.PIPE and not parts:
         tiles.append(Tile("pits, dents, protrusions", "none found", accent=True))
     for each in whole[:1]:
         for value in each.values[:5]:
             if not value.name.startswith("axis"):
-                tiles.append(Tile(f"{each.name}: {value.name}", f"{_format_interval(value)} {value.unit}"))
+                tiles.append(Tile(f"{each.name}: {value.name}", f"{format_interval(value)} {value.unit}"))
     return tiles
 
 
@@ -491,5 +492,5 @@ def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
     sign = 1 if feature.kind == FeatureKind.PROTRUSION else -1
     cut.axhline(sign * value.value, color=RED, linewidth=1)
     cut.set(xlabel="along its length / mm", ylabel="deviation / mm")
-    cut.set_title(f"{value.name} {_format_interval(value)} {value.unit}; cut ±{width:.2g} mm", fontsize=8)
+    cut.set_title(f"{value.name} {format_interval(value)} {value.unit}; cut ±{width:.2g} mm", fontsize=8)
     return png_data_uri(figure_png(figure, dpi=110, few_colours=True))

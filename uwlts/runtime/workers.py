@@ -42,6 +42,9 @@ _GRACE_S = 5.0
 _LEAVE_S = 5.0
 """Further time, for a busy machine, before the process is killed."""
 
+_WAIT_S = 0.2
+"""Interval at which the caller may end jobs."""
+
 _AHEAD = 2
 """Jobs submitted to a cluster per worker: one running and one queued, so that no worker waits for this process."""
 
@@ -102,13 +105,15 @@ def run_jobs(
     *,
     workers: int | None = None,
     on_message: Send = lambda message: None,
+    on_wait: Callable[[], None] = lambda: None,
 ) -> list[Result]:
     """Return the results of ``work(job, send)`` for all jobs, in order, from several processes.
 
-    Jobs start in order. Messages that a job passes to ``send`` are passed to ``on_message`` in this process. If an
-    exception leaves this function, running jobs are stopped by KeyboardInterrupt, and no process is left. ``workers``
-    is the number of processes (default: one per processor); with 1, jobs run in this process. Each process uses one
-    thread for linear algebra, unless the environment sets another number.
+    Jobs start in order. Messages that a job passes to ``send`` are passed to ``on_message`` in this process. Several
+    times a second ``on_wait`` is called, which may end the jobs by an exception. If an exception leaves this function,
+    running jobs are stopped by KeyboardInterrupt, and no process is left. ``workers`` is the number of processes
+    (default: one per processor); with 1, jobs run in this process, without ``on_wait``. Each process uses one thread
+    for linear algebra, unless the environment sets another number.
 
     Raises the Error or OSError of the first job that fails; SetupError if a process ends before its job.
     """
@@ -116,7 +121,7 @@ def run_jobs(
         return [work(job, on_message) for job in jobs]
     results: dict[int, Result] = {}
     with _Processes(max(1, min(len(jobs), workers or count_processors())), threads=1) as pool:
-        for number, _, result in pool.run(work, jobs, on_message):
+        for number, _, result in pool.run(work, jobs, on_message, on_wait):
             if isinstance(result, Lost):
                 raise SetupError(result.reason)
             results[number] = result
@@ -188,7 +193,11 @@ class _Processes(Workers):
             yield from ((job, result) for _, _, result in self.run(silent, [job]))
 
     def run(
-        self, work: Callable[[Job, Send], Result], jobs: Iterable[Job], on_message: Send = lambda message: None
+        self,
+        work: Callable[[Job, Send], Result],
+        jobs: Iterable[Job],
+        on_message: Send = lambda message: None,
+        on_wait: Callable[[], None] = lambda: None,
     ) -> Iterator[tuple[int, Job, Result | Lost]]:
         """Iterate over number, job and result of each job as it is completed; its process has the next job by then."""
         waiting = enumerate(jobs)
@@ -204,7 +213,8 @@ class _Processes(Workers):
 
         hand_out()
         while busy:
-            for connection in wait([process.connection for process, _, _ in busy.values()]):
+            on_wait()
+            for connection in wait([process.connection for process, _, _ in busy.values()], _WAIT_S):
                 process, number, job = busy[connection]
                 match process.message():
                     case ("message", message):

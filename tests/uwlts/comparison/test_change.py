@@ -295,7 +295,7 @@ def test_wrong_references_are_refused(ball, tmp_path):
     trimesh.load(path).apply_scale(0.001).export(small)
     with pytest.raises(EvaluationError, match="`unit` m"):
         uwlts.compare_clouds(cloud, small)
-    assert uwlts.compare_clouds(cloud, small, unit="m").compared.any()
+    assert uwlts.compare_clouds(cloud, small, reference_unit="m").compared.any()
     (tmp_path / "text.stl").write_text("no mesh")
     with pytest.raises(CaptureError, match="text.stl"):
         uwlts.compare_clouds(cloud, tmp_path / "text.stl")

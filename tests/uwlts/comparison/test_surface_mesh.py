@@ -176,11 +176,11 @@ def test_wrong_requests_are_refused():
     with pytest.raises(EvaluationError, match="cube_mm is 0"):
         uwlts.mesh(cloud, cube_mm=0)
     with pytest.raises(EvaluationError, match="at most the patches' radius"):
-        uwlts.mesh(cloud, cube_mm=3, radius_mm=2)
+        uwlts.mesh(cloud, cube_mm=3, patch_radius_mm=2)
     with pytest.raises(EvaluationError, match="the directions are not valid; expected"):
         uwlts.mesh(cloud, towards=[(0, 0, -1), (0, 0, 1)])
     with pytest.raises(EvaluationError, match="points may be too sparse"):
-        uwlts.mesh(cloud, radius_mm=0.2)
+        uwlts.mesh(cloud, patch_radius_mm=0.2)
     few = PointCloud(cloud.points_mm[:9], cloud.intensity[:9], cloud.frame[:9], cloud.line[:9])
     with pytest.raises(EvaluationError, match="has 9 points"):
         uwlts.mesh(few)

@@ -65,7 +65,7 @@ def test_intervals_hold_the_truth(interaction):
 
 def test_a_reference_measured_again_and_again():
     values = 50.0 + 0.004 + 0.002 * np.sin(np.arange(50.0))
-    study = uwlts.gauge_study([("ball", "me", value) for value in values], tolerance=0.1, reference=50.0)
+    study = uwlts.gauge_study([("ball", "me", value) for value in values], tolerance=0.1, true_value=50.0)
     assert study.bias == pytest.approx(values.mean() - 50.0) and abs(study.bias) > study.bias_half_interval
     assert study.cg == pytest.approx(0.02 / (6 * values.std(ddof=1)))
     assert study.cgk == pytest.approx((0.01 - study.bias) / (3 * values.std(ddof=1)))
@@ -107,6 +107,6 @@ def test_wrong_numbers_are_refused():
     with pytest.raises(EvaluationError, match="tolerance is -1"):
         uwlts.gauge_study(ROWS, tolerance=-1.0)
     with pytest.raises(EvaluationError, match="the table contains several"):
-        uwlts.gauge_study(ROWS, reference=1.0)
+        uwlts.gauge_study(ROWS, true_value=1.0)
     with pytest.raises(EvaluationError, match="at least 10"):
-        uwlts.gauge_study(ROWS[:1], reference=1.0)
+        uwlts.gauge_study(ROWS[:1], true_value=1.0)

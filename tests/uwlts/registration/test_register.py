@@ -15,7 +15,7 @@ from uwlts.evaluation.artefact_figures import evaluate_pipe
 from uwlts.fitting.patches import distances_between, surface_patches
 from uwlts.model.artefacts import PipeStandard
 from uwlts.registration.joint_registration import FEWEST_OF_PAIR, JointRegistration
-from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 from uwlts.storage.pose_files import read_poses, write_poses
 
 SEED = 11
@@ -221,13 +221,37 @@ def test_wrong_input_is_refused(pits):
         uwlts.register(scans[:2], poses=np.zeros((2, 3, 4)))
     with pytest.raises(uwlts.Error, match="not a rigid transform"):
         uwlts.register(scans[:2], poses=np.array([np.eye(4), 2 * np.eye(4)]))
-    with pytest.raises(uwlts.Error, match="reach_mm is -1"):
+    with pytest.raises(uwlts.Error, match="`reach_mm` is -1"):
         uwlts.register(scans[:2], reach_mm=-1)
     with pytest.raises(uwlts.Error, match="needs both start_std_mm"):
         uwlts.register(scans[:2], start_std_mm=1.0)
     few = PointCloud(scans[0].points_mm[:50], *(np.zeros(50),) * 3)
     with pytest.raises(uwlts.Error, match="scan 2: the cloud has 50 points"):
         uwlts.register([scans[0], few])
+
+
+def test_degenerate_clouds_have_an_error():
+    """Repeated points have no spacing; uncertainties of a kilometre and a nanometre cannot be solved together."""
+    rng = np.random.default_rng(7)
+    x, y = rng.uniform(0, 60, 3000), rng.uniform(0, 50, 3000)
+    points = np.column_stack([x, y, 5 * np.sin(x / 6) + 4 * np.cos(y / 5)]) + rng.normal(0, 0.01, (3000, 3))
+
+    def cloud(places, pattern_mm):
+        variances = np.array([1e-4 if i == j else 0.0 for i, j in PAIRS]) * np.ones((len(places), 1))
+        patterns = np.full((2, len(places), 3), pattern_mm, np.float32)
+        known = PointUncertainty(variances.astype(np.float32), np.zeros_like(patterns[0]), patterns)
+        return PointCloud(places, *np.zeros((3, len(places))), uncertainty=known)
+
+    with pytest.raises(EvaluationError, match="omit repeated points"):
+        uwlts.register([cloud(np.repeat(points[:300], 10, axis=0), 0.01), cloud(points, 0.01)])
+    with pytest.raises(EvaluationError, match="differ by too many orders of magnitude"):
+        uwlts.register([cloud(points, 1e6), cloud(points + rng.normal(0, 0.01, points.shape), 0.01)])
+    shifted = np.tile(np.eye(4), (2, 1, 1))
+    shifted[1, 0, 3] = np.nan
+    with pytest.raises(EvaluationError, match="not a rigid transform"):
+        uwlts.register([cloud(points, 0.01), cloud(points, 0.01)], poses=shifted)
+    with pytest.raises(EvaluationError, match=r"`start_std_deg` is nan; expected 1e-06 to 1e\+06"):
+        uwlts.register([cloud(points, 0.01), cloud(points, 0.01)], start_std_mm=1.0, start_std_deg=np.nan)
 
 
 def test_the_command_writes_cloud_poses_and_page(tmp_path, monkeypatch):

@@ -760,7 +760,7 @@ def test_the_cloud_is_decimated_and_decoded_to_a_small_step():
     stored = np.frombuffer(unpacked(found["data"]), np.uint8).reshape(4, 2, MOST_POINTS).astype(np.uint16)
     numbers = np.cumsum((stored[:, 0] | stored[:, 1] << 8).astype(np.int64), axis=1).astype(np.int16)
     values = np.where(numbers == -(2**15), np.nan, numbers * np.c_[found["step"]] + np.c_[found["offset"]])
-    # Rounding is at most half a step; a range has 16382 steps.
+    # Each range has 16382 steps; rounding is at most half a step.
     assert found["step"] == pytest.approx(
         np.nanmax(np.diff(np.nanquantile(values, [0, 1], axis=1), axis=0), axis=0) / 16382
     )

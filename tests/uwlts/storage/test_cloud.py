@@ -43,6 +43,7 @@ def some_uncertainty(count: int = 40, patterns: int = 3) -> PointUncertainty:
     shapes = {"random_mm2": (count, 6), "patterns_mm": (patterns, count, 3), "poses_mm": (6, count, 3)}
     names = [part.name for part in fields(PointUncertainty) if part.name != "shared"]
     arrays = {name: rng.normal(size=shapes.get(name, (count, 3))).astype(np.float32) for name in names}
+    arrays["random_mm2"] = np.abs(arrays["random_mm2"])
     return PointUncertainty(**arrays, shared={"sensor": rng.normal(size=(patterns, 5)).round(6)})
 
 
@@ -107,6 +108,24 @@ def test_a_cloud_larger_than_memory_allows_is_read_thinned(tmp_path, name):
     read, total, last, grown_mb = done.stdout.split()
     assert (int(read), int(total), float(last)) == (100_000, count, 3.0 * (count - 40))
     assert int(grown_mb) < 50
+
+
+@pytest.mark.parametrize("name", ["random_mm2", "position_mm", "patterns_mm", "poses_mm"])
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e13])
+def test_uncertainties_that_are_no_numbers_are_refused(name: str, value: float):
+    known = some_uncertainty()
+    numbers = getattr(known, name).copy()
+    numbers[..., -1, 0] = value
+    with pytest.raises(CaptureError, match=f"{name} of the cloud's uncertainty has numbers that are not finite"):
+        some_cloud(uncertainty=replace(known, **{name: numbers}))
+
+
+def test_negative_variances_are_refused():
+    known = some_uncertainty()
+    numbers = known.random_mm2.copy()
+    numbers[3, 5] = -1e-6
+    with pytest.raises(CaptureError, match="negative variances"):
+        some_cloud(uncertainty=replace(known, random_mm2=numbers))
 
 
 @KINDS

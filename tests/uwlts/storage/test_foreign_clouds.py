@@ -200,6 +200,35 @@ def test_what_is_none_is_refused(tmp_path: Path, name: str, message: str):
         read_cloud(path)
 
 
+@pytest.mark.parametrize("name", ["a.xyz", "a.ply", "a.las", "a.e57", "a.pcd"])
+@pytest.mark.parametrize(("mark", "share"), [(-99.9999, 0.2), (0.0, 0.01), (1e5, 0.003)])
+def test_a_height_that_recurs_beyond_chance_is_doubted(tmp_path, name, mark, share):
+    """Points without a height have that of the mark, which is outside the others or between them."""
+    rng, marked = np.random.default_rng(9), int(share * 5000)
+    points = rng.normal(0, 30, (5000, 3)).astype(np.float32).astype(float)
+    rows = rng.permutation(5000)[:marked]
+
+    def warnings() -> list[str]:
+        cloud = PointCloud(points, *np.ones((3, 5000)))
+        if name == "a.pcd":
+            header = (
+                "VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 5000\nHEIGHT 1\nPOINTS 5000\n"
+            )
+            (tmp_path / name).write_bytes(header.encode() + b"DATA binary\n" + points.tobytes())
+        else:
+            write_cloud(tmp_path / name, cloud, overwrite=True)
+        return read_cloud(tmp_path / name).warnings
+
+    assert not any("have exactly" in each for each in warnings())
+    points[rows, 2] = mark
+    (said,) = (each for each in warnings() if "have exactly" in each)
+    assert said.startswith(f"{marked} of 5000 points have exactly z = ")
+    # Half a step of 32-bit numbers in m below 128 m.
+    assert float(said.split(" = ")[1].split(":")[0]) == pytest.approx(mark, abs=4e-3)
+    points[:, 2] = np.round(points[:, 2] / 10) * 10
+    assert not any("have exactly" in each for each in warnings())
+
+
 @pytest.mark.parametrize("name", ["a.las", "a.copc.laz"])
 @pytest.mark.parametrize("axes", [[0], [2], [0, 1, 2]])
 @pytest.mark.parametrize("scale", [1e-4, 1e-8, 1e-11, 0.98e-7])

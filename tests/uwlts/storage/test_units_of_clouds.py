@@ -63,7 +63,7 @@ def test_glb_is_in_metres(tmp_path: Path):
     change = uwlts.compare_clouds(tmp_path / "top.ply", tmp_path / "plate.glb")
     assert np.nanmedian(np.abs(change.distance_mm)) == pytest.approx(0.25, abs=0.01)
     with pytest.raises(uwlts.Error, match="is in m, as glTF prescribes"):
-        uwlts.compare_clouds(tmp_path / "top.ply", tmp_path / "plate.glb", unit="mm")
+        uwlts.compare_clouds(tmp_path / "top.ply", tmp_path / "plate.glb", reference_unit="mm")
 
 
 @pytest.mark.parametrize("which", ["profile_unit", "pose_unit"])

@@ -359,7 +359,7 @@ def compare_models(
     air: _Captures = (),
     water: _Captures = (),
     step: _Captures = (),
-    poses: Literal["stage", "free"] = "stage",
+    target_poses: Literal["stage", "free"] = "stage",
     index: float | None = None,
     stripe: StripeSettings = None,
     workers: int | None = None,
@@ -379,7 +379,7 @@ def compare_models(
         Captures of the target in the medium of use.
     step : sequence of Capture or path
         Captures of the step standard in the medium of use.
-    poses : {"stage", "free"}
+    target_poses : {"stage", "free"}
         stage: one target pose per capture, moved by the stage. free: every image has its own pose.
     index : float, optional
         Refractive index of the medium relative to air. Default: the index that follows from the captures.
@@ -413,12 +413,12 @@ def compare_models(
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
     if not (air or water):
         raise DescriptionError("no captures of a target to compare models with: give `air` or `water`")
-    options = CalibrationOptions(poses=poses, medium_index=index, stripe=stripe)
+    options = CalibrationOptions(poses=target_poses, medium_index=index, stripe=stripe)
     with open_captures([*air, *water]) as targets, open_captures(step) as steps:
         gathered = gather_jointly(targets, steps, options=options, progress=progress)
         problem = joint_problem(gathered, options=options)
         choice = choose(problem, workers=workers, progress=partial(progress, stage="models"))
-        score, why_none = _score_polynomials(gathered, problem, choice, targets, free=poses == "free")
+        score, why_none = _score_polynomials(gathered, problem, choice, targets, free=target_poses == "free")
         captures = [capture.path.name for capture in [*targets, *steps]]
     return Comparison(gathered.sensor.name, captures, choice, score, why_none, problem.warnings)
 

@@ -42,7 +42,7 @@ def calibrate_mount(
     profiles: str | Path | Sequence[np.ndarray] | CapturedProfiles,
     poses: str | Path | np.ndarray | None = None,
     *,
-    artefact: Artefact | None = None,
+    artefact_kind: Artefact | None = None,
     radius_mm: float | None = None,
     height_mm: float | None = None,
     calibration: Calibration | str | Path | None = None,
@@ -78,7 +78,7 @@ def calibrate_mount(
     poses
         CSV file with the pose of the platform in the base frame for each profile or target image, or
         ``T_base_platform`` (P, 4, 4), mm. Default: the poses of the capture.
-    artefact
+    artefact_kind
         Artefact in the profiles: a sphere, a plane, a step (two parallel faces), or a ring (a face and a perpendicular
         cylindrical wall of given radius). Default: a sphere, unless the capture or description has another.
     radius_mm
@@ -145,7 +145,7 @@ def calibrate_mount(
         assert not isinstance(table, str | Path)
         with Capture(profiles) as capture:
             if capture.header.target is not None and not capture.laser_on.all():
-                if artefact or radius_mm is not None or height_mm is not None or scale or time:
+                if artefact_kind or radius_mm is not None or height_mm is not None or scale or time:
                     raise DescriptionError(
                         "the capture shows a target: give no artefact, radius, height, scale or time"
                     )
@@ -158,7 +158,7 @@ def calibrate_mount(
     evidence = read_mount_evidence(
         profiles,
         poses,
-        artefact=artefact,
+        artefact=artefact_kind,
         radius_mm=radius_mm,
         height_mm=height_mm,
         pose_format=pose_format,

@@ -148,7 +148,7 @@ class PolynomialResult(Brief):
 
 
 def calibrate_polynomials(
-    target: Sequence[Capture | str | Path],
+    captures: Sequence[Capture | str | Path],
     *,
     degree: int = 6,
     stripe: StripeSettings = None,
@@ -158,7 +158,7 @@ def calibrate_polynomials(
 
     Parameters
     ----------
-    target : sequence of Capture or path
+    captures : sequence of Capture or path
         Captures of a target at rest, perpendicular to the laser's axis, while the stage moves the sensor along Z. Every
         stage position has one image with the lamp and one with the laser.
     degree : int
@@ -186,10 +186,10 @@ def calibrate_polynomials(
     """
     if degree < 1:
         raise RangeError(f"the polynomials' degree is {degree}; expected at least 1, usually 6")
-    with open_captures(target) as captures:
-        header = common_header(captures)
-        evidence = find_air_evidence(captures, stripe=stripe, progress=progress)
-        sources = [{"file": capture.path.name, "name": capture.header.name} for capture in captures]
+    with open_captures(captures) as opened:
+        header = common_header(opened)
+        evidence = find_air_evidence(opened, stripe=stripe, progress=progress)
+        sources = [{"file": capture.path.name, "name": capture.header.name} for capture in opened]
     return fit_polynomials(evidence, header, degree=degree, sources=sources)
 
 

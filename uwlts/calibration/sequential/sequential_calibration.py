@@ -14,6 +14,7 @@ from pydantic import JsonValue
 from uwlts._version import __version__
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
+from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_turned_travel, solve_camera
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
@@ -22,6 +23,7 @@ from uwlts.calibration.capture_evidence import (
     find_air_evidence,
     step_evidence,
 )
+from uwlts.calibration.sequential.plausibility import doubt_step_height, doubt_target_size
 from uwlts.calibration.sequential.sheet_fit import (
     SheetSolution,
     StripePoints,
@@ -257,6 +259,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
                 f"{described.distance_mm:.1f} ± {sensor.uncertainty.window_distance_mm:g} mm: check the medium and "
                 "step of each step capture, and the description"
             )
+        warnings += doubt_step_height(window, used, known=sensor.uncertainty)
     warnings += on_steps
     how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
     calibration = calibration.model_copy(
@@ -288,9 +291,20 @@ def _calibrate_camera(evidence: Evidence, options: CalibrationOptions, start: Ca
     solved = partial(
         solve_camera, width_px=width_px, height_px=height_px, approaching=approaching, circle_diameter_mm=diameter_mm
     )
+
+    def size_doubts(images: Sequence[TargetImage], estimated: CameraOptions) -> list[str]:
+        # Refraction in the focal length would change with distance.
+        if start is not None or options.poses == "free" or evidence.medium_kind != "air":
+            return []
+        with suppress(CalibrationError):
+            free = solved(images, poses="free", options=estimated)
+            return doubt_target_size(images, free, known=evidence.sensor.uncertainty)
+        return []
+
     if options.lens is None:
         estimated = options.camera.with_described_pixels(evidence.sensor.camera)
-        return _CameraResult(solved(air.images, poses=options.poses, options=estimated, start=start), None, air, [])
+        camera = solved(air.images, poses=options.poses, options=estimated, start=start)
+        return _CameraResult(camera, None, air, size_doubts(air.images, estimated))
     lens = calibrate_lens(
         air.images,
         width_px=width_px,
@@ -310,6 +324,7 @@ def _calibrate_camera(evidence: Evidence, options: CalibrationOptions, start: Ca
         air.names(),
     )
     warnings = [f"{names[place]}: left out, {reason}" for place, reason in lens.left_out.items()]
+    warnings += size_doubts(used.images, lens.options)
     if options.poses == "stage-normal" and lens.options.pixel_aspect is not None:
         freer = solved(used.images, poses="stage", options=lens.options)
         if freer.stage_tilt_rad is not None and freer.sigma_px <= _CLEARLY_LESS * camera.sigma_px:

@@ -182,7 +182,7 @@ def test_wrong_evidence_is_refused(thesis, capture_path):
     with pytest.raises(DescriptionError, match="shows a target: give no artefact"):
         uwlts.calibrate_mount(capture_path, calibration=calibration, radius_mm=3.0)
     with pytest.raises(DescriptionError, match="shows a target: give no artefact"):
-        uwlts.calibrate_mount(capture_path, calibration=calibration, artefact="plane")
+        uwlts.calibrate_mount(capture_path, calibration=calibration, artefact_kind="plane")
     with pytest.raises(DescriptionError, match="`pose_unit` describe a file of poses; there is none"):
         uwlts.calibrate_mount(capture_path, calibration=calibration, pose_unit="m")
 

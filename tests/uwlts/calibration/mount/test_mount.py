@@ -128,7 +128,7 @@ def test_smooth_errors_of_the_profiler_are_weighed(seed, radius):
 
 
 def test_a_plane_gives_the_mount(rng):
-    mount = mount_of(sphere_campaign(rng, poses=24, plane_only=True), artefact="plane")
+    mount = mount_of(sphere_campaign(rng, poses=24, plane_only=True), artefact_kind="plane")
     within(mount)
     assert isinstance(mount.artefact, PlaneFound)
     assert abs(mount.artefact.distance_mm) == pytest.approx(SPHERE_MM[2] - 1.1 * RADIUS_MM, abs=0.2)
@@ -137,13 +137,13 @@ def test_a_plane_gives_the_mount(rng):
 def test_a_plane_and_a_robot_that_scatters_give_the_mount():
     """The first steps reverse because the scatter changes; later steps must not remain damped."""
     campaign = sphere_campaign(np.random.default_rng([1, 3]), poses=24, plane_only=True, robot_mm=0.03)
-    within(mount_of(campaign, artefact="plane"))
+    within(mount_of(campaign, artefact_kind="plane"))
 
 
 @pytest.mark.parametrize("height", [12.0, None])
 def test_a_step_gives_the_mount(rng, height):
     """Two faces with a step of 12 mm; errors as in `within`, and the height within its stated uncertainty."""
-    mount = mount_of(step_campaign(rng, height_mm=12.0), artefact="step", height_mm=height)
+    mount = mount_of(step_campaign(rng, height_mm=12.0), artefact_kind="step", height_mm=height)
     within(mount)
     assert (mount.std()[:3] < 0.3).all() and (np.degrees(mount.std()[3:]) < 0.05).all()
     assert isinstance(mount.artefact, StepFound) and sum(pose.reason is None for pose in mount.poses) >= 18
@@ -156,9 +156,9 @@ def test_a_step_gives_the_mount(rng, height):
 
 def test_a_step_of_another_height_is_not_found(rng):
     with pytest.raises(CalibrationError, match="0 of 20 profiles show the step"):
-        mount_of(step_campaign(rng, height_mm=12.0), artefact="step", height_mm=40.0)
+        mount_of(step_campaign(rng, height_mm=12.0), artefact_kind="step", height_mm=40.0)
     with pytest.raises(DescriptionError, match="positive height of a step"):
-        mount_of(step_campaign(rng, height_mm=12.0, poses=8), artefact="plane", height_mm=12.0)
+        mount_of(step_campaign(rng, height_mm=12.0, poses=8), artefact_kind="plane", height_mm=12.0)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_a_step_of_another_height_is_not_found(rng):
 )
 def test_a_ring_gives_the_mount(rng, options, radius):
     """Bore or outside, with or without a table, z away from the sensor or towards it; errors as in `within`."""
-    mount = mount_of(ring_campaign(rng, **options), artefact="ring", radius_mm=radius)
+    mount = mount_of(ring_campaign(rng, **options), artefact_kind="ring", radius_mm=radius)
     within(mount)
     ideal = "robot_mm" not in options
     assert (mount.std()[:3] < (0.05 if ideal else 0.3)).all()
@@ -189,7 +189,7 @@ def test_wrong_poses_of_a_ring_are_left_out(rng):
     campaign = ring_campaign(rng)
     campaign.poses[3, :3, 3] += (0.8, -0.5, 0.6)
     campaign.profiles[11][:] = np.nan
-    mount = mount_of(campaign, artefact="ring", radius_mm=RING_MM["inner"])
+    mount = mount_of(campaign, artefact_kind="ring", radius_mm=RING_MM["inner"])
     within(mount)
     reasons = {number for number, pose in enumerate(mount.poses) if pose.reason is not None}
     assert {3, 11} <= reasons and len(reasons) < 6
@@ -197,13 +197,13 @@ def test_wrong_poses_of_a_ring_are_left_out(rng):
 
 def test_a_ring_of_another_radius_or_without_wall_is_refused(rng):
     with pytest.raises(CalibrationError, match="profiles show a wall of radius 30 mm .* check the radius"):
-        mount_of(ring_campaign(rng), artefact="ring", radius_mm=30.0)
+        mount_of(ring_campaign(rng), artefact_kind="ring", radius_mm=30.0)
     with pytest.raises(CalibrationError, match="of 24 profiles show a wall of radius 25 mm"):
-        mount_of(sphere_campaign(rng, poses=24, plane_only=True), artefact="ring", radius_mm=25.0)
+        mount_of(sphere_campaign(rng, poses=24, plane_only=True), artefact_kind="ring", radius_mm=25.0)
     with pytest.raises(DescriptionError, match="the radius of the ring is missing: give `radius_mm`"):
-        mount_of(ring_campaign(rng, poses=8), artefact="ring")
+        mount_of(ring_campaign(rng, poses=8), artefact_kind="ring")
     with pytest.raises(DescriptionError, match="positive height of a step"):
-        mount_of(ring_campaign(rng, poses=8), artefact="ring", height_mm=12.0)
+        mount_of(ring_campaign(rng, poses=8), artefact_kind="ring", height_mm=12.0)
 
 
 def test_the_scale_of_a_robot_is_found(rng):
@@ -282,7 +282,7 @@ def test_intervals_by_a_ring_hold_as_often_as_stated():
     held, campaigns = 0.0, 16
     for seed in range(campaigns):
         campaign = ring_campaign(np.random.default_rng([11, seed]), robot_mm=0.05)
-        mount = mount_of(campaign, artefact="ring", radius_mm=RING_MM["inner"])
+        mount = mount_of(campaign, artefact_kind="ring", radius_mm=RING_MM["inner"])
         errors = np.concatenate(errors_of(mount.transform()))
         held += np.mean(np.abs(errors) < mount.coverage_factor * mount.std())
     assert held >= binom.ppf(1e-4, campaigns, 0.95)
@@ -335,7 +335,7 @@ def test_a_description_names_everything(tmp_path, rng):
     description = described(tmp_path, sphere_campaign(rng), pose_format="euler-ZYX-deg")
     within(uwlts.calibrate_mount(description))
     with pytest.raises(DescriptionError, match="leave out `artefact`, `pose_unit`, or change the file"):
-        uwlts.calibrate_mount(description, artefact="plane", pose_unit="m")
+        uwlts.calibrate_mount(description, artefact_kind="plane", pose_unit="m")
     with pytest.raises(DescriptionError, match="`profile_unit` describes files of profiles"):
         uwlts.calibrate_mount([np.zeros((20, 2))], np.eye(4)[None], profile_unit="m")
 

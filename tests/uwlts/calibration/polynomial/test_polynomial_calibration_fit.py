@@ -548,7 +548,7 @@ def test_commands(files, tmp_path, monkeypatch, capsys):
     """The file that one command writes is input of the next; losses are reported."""
     out, cloud = tmp_path / "polynomials.json", tmp_path / "scan.ply"
     for line in (
-        ["polynomials", "--target", files["target"], "--degree", "4", "--out", out],
+        ["polynomials", "--captures", files["target"], "--degree", "4", "--out", out],
         ["reconstruct", files["scan"], "--calibration", out, "--out", cloud],
         ["info", out],
     ):

@@ -1,0 +1,129 @@
+"""Options of several commands of a program: the same name is the same kind of value with the same meaning."""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+import pytest
+
+import twin.cli
+import uwlts.cli
+from uwlts.runtime.command_line import PathText
+
+APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
+
+MEANING = {
+    "uwlts": {
+        "--air": "target in air",
+        "--calibration": "[Cc]alibration",
+        "--camera": "[Aa]ddress of (the|a) camera",
+        "--captures": "[Cc]aptures",
+        "--clock-drift-ppm": "Rate difference",
+        "--clock-offset-s": "Offset from the times",
+        "--cloud": "[Cc]loud",
+        "--capture": "Capture|Scan",
+        "--coloured": "write the (cloud coloured|points in the colours)",
+        "--datum": "Cloud of another face",
+        "--distortion": "Distortion coefficients to estimate",
+        "--folder": "Folder",
+        "--host": "Address of the page",
+        "--index": "[Rr]efractive index",
+        "--joint": "joint|all parameters together",
+        "--kind": "Kind of the object",
+        "--medium": "One of the sensor's media",
+        "--out": "to write|New folder",
+        "--overwrite": "Replace|replace",
+        "--pixels": "Whether pixels are square",
+        "--plan": "[Pp]lan of a scan|TOML file with sensor, medium, positions",
+        "--port": "[Pp]ort of the page",
+        "--pose-format": "euler-ZYX-deg",
+        "--pose-unit": "Unit of the .*positions",
+        "--poses": "[Pp]ose",
+        "--published": "[Pp]ublished",
+        "--resume": "[Cc]ontinue an (earlier|interrupted)",
+        "--section-mm": "section",
+        "--sensor": "sensor description",
+        "--stage": "[Ss]erial port of (the|a) stage",
+        "--step": "step standard",
+        "--stripe": "stripe",
+        "--stripe-method": "Method for the stripe's centre",
+        "--stripe-peak": "Which of several stripes",
+        "--target-poses": "every image has its own pose",
+        "--trajectory": "times and poses of the platform",
+        "--trust-edited": "edited after they were written",
+        "--unit": "Unit of (clouds|a cloud) of (an)?other programs?",
+        "--wall-mm": "wall",
+        "--false-alarm": "Probability of any finding",
+        "--largest-ovality": "ovality",
+        "--water": "target in the medium of use",
+        "--workers": "Number of .*(parallel|processes)",
+    },
+    "twin": {
+        "--as-built": "sensor to render",
+        "--campaign": "campaign's description",
+        "--effects": "Effects of real images to add",
+        "--every": "every",
+        "--ideal": "pinhole",
+        "--medium": "sensor's media",
+        "--out": "Folder|Capture to write",
+        "--overwrite": "again|Remove|Replace",
+        "--placement": "Named position of the objects",
+        "--scene": "scene",
+        "--seed": "Seed of",
+        "--sensor": "sensor description",
+        "--spp": "[Ss]amples",
+        "--variant": "variant",
+        "--water": "Optical properties of the water",
+        "--without": "Effects to (leave out|omit)",
+        "--workers": "Number of",
+    },
+}
+"""Words in every help of an option that several commands have."""
+
+
+def options(program: str) -> dict[str, list[tuple[str, Any, str]]]:
+    """Return command, type and help of each use of an option."""
+    found = defaultdict(list)
+    for command in APPS[program]:
+        if not command.startswith("-"):
+            for argument in APPS[program][command].assemble_argument_collection():
+                found[argument.name].append((command, argument.hint, argument.parameter.help))
+    return {name: uses for name, uses in found.items() if len(uses) > 1}
+
+
+def kinds_of(hint: Any) -> Iterator[object]:
+    """Return what a word of the option can be: a path or other text, a number, or certain words."""
+    if get_origin(hint) in (Union, UnionType, tuple):
+        for part in get_args(hint):
+            if part not in (NoneType, ...):
+                yield from kinds_of(part)
+    elif get_origin(hint) is Literal:
+        yield from get_args(hint)
+    else:
+        yield "text" if hint is str or issubclass(hint, PathText | Path) else hint
+
+
+@pytest.mark.parametrize("program", APPS)
+def test_the_same_option_has_one_kind_of_value(program: str):
+    """Words of a choice may be fewer in one command than in another."""
+    for name, uses in options(program).items():
+        kinds = [set(kinds_of(hint)) for _, hint, _ in uses]
+        largest = max(kinds, key=len)
+        assert all(each <= largest for each in kinds), (name, [(command, hint) for command, hint, _ in uses])
+
+
+@pytest.mark.parametrize("program", APPS)
+def test_the_same_option_has_one_meaning(program: str):
+    shared = options(program)
+    assert len(shared) > 10
+    for name, uses in shared.items():
+        for command, _, text in uses:
+            assert re.search(MEANING[program][name], text), (name, command, text)
+
+
+@pytest.mark.parametrize("program", APPS)
+def test_no_meaning_is_kept_without_its_option(program: str):
+    assert MEANING[program].keys() - options(program).keys() == set()
