@@ -137,7 +137,7 @@ def _make_field(each: AnalysisField, files: dict[str, list[str]]) -> Any:
     if each.switch:
         return ui.checkbox(each.label)
     made = ui.number(each.label).classes("w-full").props("dense")
-    # What was typed is kept as it is; limits are checked by the analysis.
+    # Keep the number as typed; the analysis checks limits.
     made.sanitize = lambda: None
     return made
 

@@ -119,6 +119,8 @@ class Blemish:
         Deepest places of neighbours that the search joined, the deepest first; empty for a single blemish.
     spacing_mm : (2,) float64
         Spacing of the points along both axes.
+    beneath_mm : float
+        Largest sum of its depth and the surface beneath it, minus its depth; zero without such a surface.
     """
 
     kind: FeatureKind
@@ -129,6 +131,7 @@ class Blemish:
     outline: np.ndarray
     hollows: np.ndarray
     spacing_mm: np.ndarray
+    beneath_mm: float
 
     def with_spacing(self) -> tuple[FeatureValue, ...]:
         """Return the values; length and width are known no better than the spacing of the points at both ends."""
@@ -145,6 +148,7 @@ def measure_blemish(
     *,
     diameter_mm: float,
     wall_mm: float | None = None,
+    beneath_mm: np.ndarray | None = None,
 ) -> Blemish:
     """Measure an indication.
 
@@ -162,6 +166,8 @@ def measure_blemish(
         Diameter of the pipe, which distinguishes dents from pits.
     wall_mm
         Thickness of the undamaged wall, for the remaining wall.
+    beneath_mm : (N,)
+        Heights of a smooth surface, of a dent for example, above which those of ``surface`` count.
 
     Raises
     ------
@@ -220,6 +226,10 @@ def measure_blemish(
         shared = None if common is None else common[0]
         values.append(plain_value(kind, "remaining wall", wall_mm - plain[0], random[0], shared))
     extent = np.array([length, width, depth])
+    beneath = 0.0
+    if beneath_mm is not None:
+        # On a slope the deepest place of both surfaces together is not that of the blemish.
+        beneath = field.find_total(heights, sign * beneath_mm[field.near]) - float(seen[0])
     level = float(np.sqrt(2) * np.median(by_noise[field.region]))
     spacing = measure_spacing(surface.places[field.near], np.flatnonzero(inside))
     return Blemish(
@@ -231,6 +241,7 @@ def measure_blemish(
         field.trace_outline(depths, edge, deepest),
         field.grid[field.find_hollows(depths, edge, std=level)],
         spacing,
+        beneath,
     )
 
 
@@ -370,12 +381,18 @@ class _Field:
             depths = depths + self.smooth @ (left - there)
         return depths
 
-    def find_deepest(self, heights: np.ndarray) -> tuple[int, float]:
+    def find_total(self, heights: np.ndarray, beneath: np.ndarray) -> float:
+        """Return the largest depth of the blemish and a smooth surface ``beneath`` (n,) together."""
+        base = self.smooth @ beneath
+        top, between = self.find_deepest(heights, base)
+        return float(self.depths(heights)[top] + base[top]) + between
+
+    def find_deepest(self, heights: np.ndarray, base: np.ndarray | float = 0.0) -> tuple[int, float]:
         """Return the deepest cell of the smooth surface, and the interpolated depth minus the depth of this cell.
 
-        The maximum of the corrected surface would be biased by its larger noise.
+        The maximum of the corrected surface would be biased by its larger noise. Depths ``base`` (G,) are added.
         """
-        smooth = self.depths(heights, steps=0)
+        smooth = self.depths(heights, steps=0) + base
         top = int(np.argmax(np.where(self.region, smooth, -np.inf)))
         return top, self.interpolate_depth(smooth, top) - float(smooth[top])
 

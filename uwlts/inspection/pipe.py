@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy import ndimage
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
@@ -141,14 +142,18 @@ def _check_size(diameter_mm: float, wall_mm: float | None) -> list[str]:
 
 
 def _search_form(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, false_alarm: float) -> BlemishSearch:
-    """Search the pipe, cut open at its widest gap. Both sides overlap if there is no such gap."""
+    """Search the pipe, cut open where the surface departs least; both sides overlap unless there is a gap.
+
+    A blemish at the cut would lack surroundings on one side.
+    """
     angle = form.angle[chosen]
-    inside = np.sort(np.unique(np.round(angle, 3)))
-    gaps = np.diff(np.append(inside, inside[0] + 2 * np.pi))
-    widest = int(np.argmax(gaps))
-    angle = np.mod(angle - inside[widest] - 0.5 * gaps[widest], 2 * np.pi)
+    sector = (np.mod(angle, 2 * np.pi) / (2 * np.pi) * (FORM_RULE.sectors - 1e-6)).astype(int)
+    departs = np.bincount(sector, np.abs(form.distance_mm[chosen]), FORM_RULE.sectors)
+    departs = ndimage.convolve1d(departs, np.ones(2 * int(_OVERLAP / (4 * np.pi) * FORM_RULE.sectors) + 1), mode="wrap")
+    cut = int(np.argmin(departs))
+    angle = np.mod(angle - (cut + 0.5) * 2 * np.pi / FORM_RULE.sectors, 2 * np.pi)
     copied = np.arange(len(chosen))
-    if gaps[widest] < _OVERLAP:
+    if departs[cut] > 0:
         first, last = np.flatnonzero(angle < _OVERLAP), np.flatnonzero(angle > 2 * np.pi - _OVERLAP)
         copied = np.concatenate([copied, first, last])
         angle = np.concatenate([angle, angle[first] + 2 * np.pi, angle[last] - 2 * np.pi])

@@ -8,6 +8,8 @@ _REACH_MM = 300.0
 """Distance of the surface at which a rotation counts as a motion: the stand-off of the reference sensor."""
 _SMALLEST_STEP_MM = 5e-3
 """Slower scans would take over a hundred images of each spot of the laser; positions in metres are a thousandth."""
+_LARGEST_STEP_MM = 300.0
+"""Scans with a profile every 300 mm show no surface; positions in mm that are read as metres are a thousandfold."""
 _LEAST_COVER = 5e-3
 """Least part of a trajectory's time with images, if it also has few poses among them; times in ms give a thousandth."""
 _OUTLIER, _LEAST_OUTLIER_MM = 30.0, 1.0
@@ -40,6 +42,8 @@ def find_trajectory_doubts(trajectory: Trajectory, times_s: np.ndarray, sensor_p
             f"the sensor moves by {way.sum():.3g} mm in {len(times_s)} images: does the platform stand still, or are "
             "positions in metres (`pose_unit`)?"
         )
+    if way.mean() > _LARGEST_STEP_MM:
+        doubts.append(f"the sensor moves by {way.mean():.4g} mm per image: are positions in mm (`pose_unit`)?")
     across = np.abs(np.einsum("ni,ni->n", moves, turns[:-1, :, 0]))
     if way.sum() > _REACH_MM * turned.sum() and across.sum() < _LEAST_ACROSS * way.sum():
         doubts.append(

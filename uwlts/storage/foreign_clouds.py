@@ -62,6 +62,8 @@ def _read_text(path: Path, unit: Unit | None) -> PointCloud:
         if "0" not in columns or len(columns) < 3:
             raise CaptureError(f"{path} has the columns {', '.join(columns)}; expected x, y and z in mm")
         axes = [columns[number] for number in "012"]
+        if len(columns) > 3 and len(axes[0]) > 2 and (np.diff(axes[0]) == 1).all():
+            raise CaptureError(f"{path} counts its rows in the first column: name the columns, such as n x y z")
     points, used = np.column_stack(axes), "xyz" if "x" in columns else "012"
     step = scale * max(find_float_step(points), *(table.steps.get(name, 0.0) for name in used))
     cloud = make_foreign_cloud(scale * points, intensity=columns.get("intensity"), step_mm=step)

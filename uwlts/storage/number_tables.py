@@ -40,6 +40,7 @@ _UNITS = _LENGTHS | _ANGLES | _TIMES
 _UNITS_OF = {"time_s": _TIMES} | dict.fromkeys("xyz", _LENGTHS) | dict.fromkeys(ROTATION_NAMES[4:], _ANGLES)
 """Units of the columns whose units are converted or checked."""
 _SAME_NAMES = {name: name for name in ROTATION_NAMES} | {"heading": "yaw"}
+_OF_NUMBERS = {"q0": "qw", "q1": "qx", "q2": "qy", "q3": "qz"}
 _TIME_NAMES = ("time", "t", "timestamp", "stamp", "time_s")
 _IN_BRACKETS = re.compile(r"(.*?)[\s_]*[\[(<](.*)[\])>]")
 _AT_END = re.compile(r"(.+?)[\s_/.\-]+([^\s_/.\-]+)|([xyz])(mm|cm|um|m)")
@@ -55,6 +56,7 @@ _DECIMAL_COMMA = re.compile(rb"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?")
 _UNIT_IN_COMMENT = re.compile(
     r"\b(?:in|units?)\b[\s:=;,]*(?:the |are |is )?[\[(]?(m|cm|um|µm|in|inch(?:es)?|ft|feet|(?:centi)?met(?:re|er)s?)\b"
 )
+_STATED_UNIT = re.compile(r"\W*(?:length[\s_]*)?units?[\s:=;,]+[\[(\"']*([a-zµμ]+)\W*")
 _NUMBER = re.compile(rb"[+-]?\d*(?:[.,](\d*))?")
 _FIRST, _FEWEST = 200, 10
 """Number of rows whose decimals are counted, and fewest rows that show them."""
@@ -68,6 +70,7 @@ class NumberTable:
     """Columns (N,) by name, the units that their names state, and notes on uncertain readings.
 
     Times are in s. Other columns are in the unit that their name states. ``steps`` are those of their decimals.
+    ``length_unit`` is that which a line beside the table states, as "unit: m"; empty without.
     """
 
     path: Path
@@ -75,9 +78,10 @@ class NumberTable:
     units: dict[str, str] = field(default_factory=dict)
     steps: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    length_unit: str = ""
 
     def mm_per_unit(self, axes: Iterable[str] = "xyz", *, unit: Unit | None = None) -> float:
-        """Return the length unit of columns in mm, from their names or else ``unit``; by default 1.
+        """Return the length unit of columns in mm, from their names or a line beside them, or ``unit``; by default 1.
 
         Raises DescriptionError if the names contradict each other or ``unit``.
         """
@@ -85,11 +89,12 @@ class NumberTable:
         if len(found := set(stated.values())) > 1:
             texts = ", ".join(f"{name} in {each or 'no stated unit'}" for name, each in stated.items())
             raise DescriptionError(f"{self.path} has {texts}; expected one unit in the names of all axes")
-        in_names = next(iter(found), "")
+        in_names = next(iter(found), "") or self.length_unit
+        if self.length_unit not in ("", in_names):
+            raise DescriptionError(f"{self.path} names columns in {in_names}, and states the unit {self.length_unit}")
         if unit is not None and in_names and _LENGTHS[in_names] != MM_PER_UNIT[check_unit(unit)]:
             raise DescriptionError(
-                f"{self.path} names columns in {in_names}, but the unit {unit} was given: leave the unit out, or "
-                "correct the names"
+                f"{self.path} states {in_names}, but the unit {unit} was given: leave the unit out, or correct the file"
             )
         return _LENGTHS[in_names] if in_names else MM_PER_UNIT[check_unit(unit or "mm")]
 
@@ -169,13 +174,18 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     if comma and delimiter == b" ":
         notes.append("commas between digits were read as decimal commas, blanks as separators")
     if block:
-        notes.append(f"{len(block)} lines before the names of columns are omitted: {shorten(_text(block[0]), 60)} ...")
-    said = [text for text in map(_text, [*block, *comments[:1000]]) if _UNIT_IN_COMMENT.search(text.lower())]
-    if said and not units.keys() & set("xyz"):
+        notes.append(
+            f"lines before the names of columns are omitted ({len(block)}): {shorten(_text(block[0]), 60)} ..."
+        )
+    texts = [*map(_text, [*block, *comments[:1000]])]
+    matches = (_STATED_UNIT.fullmatch(text.lower()) for text in texts)
+    lengths = {unit for match in matches if match and (unit := _plain_unit(match[1])) in _LENGTHS}
+    said = [text for text in texts if _UNIT_IN_COMMENT.search(text.lower())]
+    if said and not units.keys() & set("xyz") and len(lengths) != 1:
         notes.append(f"a comment may state another unit than that of the coordinates: {shorten(said[0], 100)}")
     decimals = [_decimals(row) for row in zip(*(_cells(line, delimiter) for line in lines[:_FIRST]), strict=False)]
     steps = {name: 10.0**-count for name, count in zip(names, decimals, strict=False) if count is not None}
-    return NumberTable(path, columns, units, steps, notes)
+    return NumberTable(path, columns, units, steps, notes, lengths.pop() if len(lengths) == 1 else "")
 
 
 def _parse(body: bytes, names: list[str], delimiter: bytes, comma: bool, path: Path) -> dict[str, np.ndarray]:
@@ -207,6 +217,8 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
             )
         names.append(name or f"column {number}")
         units |= {names[-1]: unit} if unit else {}
+    if {"q0", "q1", "q2", "q3"} <= set(names):  # the scalar is q0
+        names = [_OF_NUMBERS.get(name, name) for name in names]
     if "qw" in names:
         names = [f"q{name[1]}" if name in ("rx", "ry", "rz") else name for name in names]
     return names, units

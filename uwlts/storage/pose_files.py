@@ -68,6 +68,8 @@ _FORMATS = (
 )
 _COLMAP = "colmap"
 _IMAGE_ROW = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+_NEAR_HALF_TURN = 3.0
+"""Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _MOST_POSES = 1_000_000
 _LATEST_S = 1e11
 """Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns."""
@@ -361,6 +363,8 @@ def poses_from_rows(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarra
     else:
         if pose_format.endswith("-rad") and np.abs(turns).max() > 2 * np.pi + 0.01:
             raise DescriptionError(f"{path} has angles up to {np.abs(turns).max():g} rad: are they degrees (-deg)?")
+        if pose_format.endswith("-deg") and _NEAR_HALF_TURN < np.abs(turns).max(initial=0) < np.pi + 0.01:
+            log_warnings(path, [f"angles are at most {np.abs(turns).max():.4g} deg: are they radians (-rad)?"])
         angles = np.radians(turns) if pose_format.endswith("-deg") else turns
         rotations = Rotation.from_euler(euler[1], angles) if euler else Rotation.from_rotvec(angles)
     result[:, :3, :3] = rotations.as_matrix()

@@ -1,4 +1,4 @@
-"""Analyses of files in a worker process: results whole or not at all, errors in words, fields from the functions."""
+"""Analyses of files in a worker process: results whole or not at all, errors as text, fields from the functions."""
 
 import inspect
 import multiprocessing

@@ -69,6 +69,11 @@ def test_metres_are_noticed():
     assert "`pose_unit`" in doubts_of(times, places / 1000, turns)
 
 
+def test_millimetres_read_as_metres_are_noticed():
+    times, places, turns = trajectory("steady")
+    assert "per image: are positions in mm" in doubts_of(times, places * 1000, turns)
+
+
 @pytest.mark.parametrize("rate", [1.0, 10.0, 100.0])
 def test_milliseconds_are_noticed(rate):
     times, places, turns = trajectory("steady", np.arange(-1, 41, 1 / rate))

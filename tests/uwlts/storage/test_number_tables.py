@@ -98,6 +98,7 @@ X, Y, Z, W = (f"{value:.12f}" for value in TURN.as_quat())
         ("x_m,y_m,z_m,qw,qx,qy,qz", (W, X, Y, Z)),
         ("x [m],y [m],z [m],qx,qy,qz,qw", (X, Y, Z, W)),
         ("# p_x [m], p_y [m], p_z [m], q_z, q_y, q_x, q_w", (Z, Y, X, W)),
+        ("x_m,y_m,z_m,q0,q1,q2,q3", (W, X, Y, Z)),
         ("position.x_m,position.y_m,position.z_m,rotation.x,rotation.y,rotation.z,rotation.w", (X, Y, Z, W)),
     ],
 )
@@ -123,11 +124,20 @@ def test_names_decide_the_axes_of_euler_angles(tmp_path: Path, header: str, angl
     assert poses[0, :3, :3] == pytest.approx(TURN.as_matrix(), abs=1e-12)
 
 
+def test_radians_read_as_degrees_are_doubted(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    for top, doubted in ((3.14, True), (2.5, False), (30.0, False)):
+        caplog.clear()
+        rows = "".join(f"1,2,3,{angle},0,0\n" for angle in (-top, 0.1, top))
+        (tmp_path / "a.csv").write_text(f"x,y,z,roll,pitch,yaw\n{rows}")
+        read_poses(tmp_path / "a.csv", pose_format="euler-zyx-deg")
+        assert ("are they radians" in caplog.text) == doubted
+
+
 @pytest.mark.parametrize(
     ("header", "pose_format", "unit", "message"),
     [
-        ("x_m,y_m,z_m,roll,pitch,yaw", "euler-zyx-deg", "mm", "names columns in m"),
-        ("x_mm,y_mm,z_mm,roll,pitch,yaw", "euler-zyx-deg", "m", "names columns in mm"),
+        ("x_m,y_m,z_m,roll,pitch,yaw", "euler-zyx-deg", "mm", "states m, but the unit mm"),
+        ("x_mm,y_mm,z_mm,roll,pitch,yaw", "euler-zyx-deg", "m", "states mm, but the unit m"),
         ("x,y,z,roll_rad,pitch_rad,yaw_rad", "euler-zyx-deg", None, "roll|yaw in rad"),
         ("x,y,z,roll [deg],pitch [deg],yaw [deg]", "euler-zyx-rad", None, "in deg, but"),
         ("x,y,z,roll [turn],pitch [turn],yaw [turn]", "euler-zyx-rad", None, "unknown unit"),

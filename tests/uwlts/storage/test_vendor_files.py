@@ -166,13 +166,38 @@ def test_lines_before_the_names_of_columns_are_said_and_omitted(
         cloud = read_cloud(tmp_path / "a.csv")
         assert np.allclose(cloud.points_mm, scale * np.array(ROWS)[:, :3], rtol=1e-15)
         assert cloud.intensity.tolist() == [row[3] for row in ROWS]
-        assert "4 lines before the names of columns are omitted: scanCONTROL 2950-100" in cloud.warnings[0]
+        assert "lines before the names of columns are omitted (4): scanCONTROL 2950-100" in cloud.warnings[0]
 
 
-def test_a_block_of_lines_may_state_a_unit_or_profiles_without_positions(tmp_path: Path):
+@pytest.mark.parametrize("line", ["Unit;m", "# units = [m]", "// Length unit: metres", "Unit,m"])
+@pytest.mark.parametrize("names", ["X;Y;Z", ""])
+def test_a_line_beside_a_table_may_state_the_unit(tmp_path: Path, line: str, names: str):
+    if not names and line[0] not in "#/":
+        return
     rows = "\n".join(";".join(map(str, row[:3])) for row in ROWS)
-    (tmp_path / "a.csv").write_text(f"scanCONTROL\nUnit;m\nX;Y;Z\n{rows}\n")
+    (tmp_path / "a.csv").write_text(f"{line}\n{names}\n{rows}\n")
+    assert np.array_equal(read_cloud(tmp_path / "a.csv").points_mm, 1000 * np.array(ROWS)[:, :3])
+    assert np.array_equal(read_cloud(tmp_path / "a.csv", unit="m").points_mm, read_cloud(tmp_path / "a.csv").points_mm)
+    with pytest.raises(uwlts.Error, match="states m, but the unit mm was given"):
+        read_cloud(tmp_path / "a.csv", unit="mm")
+    (tmp_path / "a.csv").write_text(f"{line}\nX [mm];Y [mm];Z [mm]\n{rows}\n")
+    with pytest.raises(uwlts.Error, match="names columns in mm, and states the unit m"):
+        read_cloud(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text(f"# unit: mm\n{line}\nX;Y;Z\n{rows}\n")
     assert "may state another unit" in " ".join(read_cloud(tmp_path / "a.csv").warnings)
+
+
+def test_rows_that_are_counted_need_names(tmp_path: Path):
+    text = "".join(f"{number} {row[0]} {row[1]} {row[2]}\n" for number, row in enumerate(ROWS, start=1))
+    (tmp_path / "a.xyz").write_text(text)
+    with pytest.raises(uwlts.Error, match="counts its rows in the first column: name the columns"):
+        read_cloud(tmp_path / "a.xyz")
+    (tmp_path / "a.xyz").write_text(f"n x y z\n{text}")
+    assert np.array_equal(read_cloud(tmp_path / "a.xyz").points_mm, np.array(ROWS)[:, :3])
+
+
+def test_profiles_without_positions_and_repeated_names_are_refused(tmp_path: Path):
+    rows = "\n".join(";".join(map(str, row[:3])) for row in ROWS)
     (tmp_path / "a.csv").write_text(f"scanCONTROL\nProfile;X;Z\n{rows}\n")
     with pytest.raises(uwlts.Error, match="expected x, y and z"):
         read_cloud(tmp_path / "a.csv")

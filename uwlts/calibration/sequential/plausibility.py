@@ -76,7 +76,7 @@ def doubt_target_size(images: Sequence[TargetImage], free: CameraSolution, *, kn
         return []
     return [
         f"distances between the target's poses differ by {100 * error:+.2f} ± {100 * total:.2f} % from the stage's "
-        "positions, so that all lengths are doubtful: check the target's spacing, and the scale of the stage"
+        "positions, and all lengths with them: check the target's spacing, and the scale of the stage"
     ]
 
 
