@@ -29,7 +29,7 @@ from uwlts.report.findings_order import FindingOrder, judge_feature
 from uwlts.runtime.command_line import descriptions, option_type
 from uwlts.runtime.progress import ProgressListener
 from uwlts.runtime.workers import run_jobs
-from uwlts.storage.cloud_files import CLOUD_FORMATS, read_cloud, write_cloud
+from uwlts.storage.cloud_files import CLOUD_FORMATS, name_cloud, read_cloud, write_cloud
 
 _POLITE = 10
 """Reduction of the worker's priority in favour of a recording, as by ``nice``."""
@@ -173,7 +173,7 @@ def _compare(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
 
 def _register(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
     found = uwlts.register(**job.values, progress=progress)
-    found.cloud.save(job.path("-merged.cloud.h5"))
+    found.cloud.save(job.path(f"-merged{_CLOUD}"))
     uwlts.report.write_registration(job.path(".html"), found)
     return AnalysisOutcome(tuple(found.lines()))
 
@@ -189,18 +189,18 @@ def _export(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
 
 def _reconstruct(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
     cloud = uwlts.reconstruct(**job.values, progress=progress)
-    write_cloud(job.path(".cloud.h5"), cloud)
+    write_cloud(job.path(_CLOUD), cloud)
     return AnalysisOutcome((f"{len(cloud):,} points",), warnings=tuple(cloud.warnings))
 
 
 _REPORT = (uwlts.report, "write_findings", ("order", "calibration", "pdf"))
+_CLOUD = ".cloud.h5"
+"""Ending of clouds to measure, with the whole uncertainty."""
 _INSPECTED = (".html", ".findings.json", "-coloured.ply")
 _OPTIONS = {"pipe": ("wall_mm",), "weld": ("section_mm",), "flange": ("datum",)}
 ANALYSES: Mapping[str, Analysis] = MappingProxyType(
     {
-        "reconstruct": Analysis(
-            _reconstruct, ((uwlts, "reconstruct", ("capture", "calibration")),), "", (".cloud.h5",)
-        ),
+        "reconstruct": Analysis(_reconstruct, ((uwlts, "reconstruct", ("capture", "calibration")),), "", (_CLOUD,)),
         **{
             f"inspect {kind}": Analysis(
                 _inspect,
@@ -220,7 +220,7 @@ ANALYSES: Mapping[str, Analysis] = MappingProxyType(
             _register,
             ((uwlts, "register", ("clouds", "reach_mm", "sphere_mm")),),
             "-registered",
-            (".html", ".registration.json", "-merged.cloud.h5"),
+            (".html", ".registration.json", f"-merged{_CLOUD}"),
         ),
         "export": Analysis(_export, ((uwlts, "export", ("file", "at_most")),), "-export"),
     }
@@ -258,12 +258,7 @@ def name_results(kind: str, values: Mapping[str, Any]) -> str:
     first = next((values[each.name] for each in list_fields(kind) if each.file_kind), None)
     if isinstance(first, list):
         first = next(iter(first), None)
-    if not first:
-        return ""
-    stem = Path(first).stem
-    for ending in (".copc", ".cloud", ".full"):
-        stem = stem.removesuffix(ending)
-    return f"{stem}{ANALYSES[kind].suffix}"
+    return f"{name_cloud(first)}{ANALYSES[kind].suffix}" if first else ""
 
 
 class _Cancelled(Exception):
@@ -378,7 +373,7 @@ class Analyses:
             self.state = replace(self.state, running=False, outcome=outcome, files=names)
             board.say(f"wrote {', '.join(names)}")
             for each in targets:
-                if each.name.endswith((".ply", ".cloud.h5")):
+                if each.name.endswith((".ply", _CLOUD)):
                     self._show(each)
 
     def _analyse(

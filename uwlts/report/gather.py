@@ -20,7 +20,7 @@ from uwlts.model.sensor import Description, Sensor
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import is_cloud, read_cloud
+from uwlts.storage.cloud_files import is_cloud, name_cloud, read_cloud
 from uwlts.storage.truth import read_truth
 from uwlts.storage.verification_file import ENDING as VERIFICATION
 
@@ -139,7 +139,7 @@ def gather_campaign(folder: str | Path) -> GatheredCampaign:
     by_length = sorted(read, key=lambda name: (len(name), name))
     calibrations = [GatheredCalibration(name, read[name], calibration_digest(read[name])) for name in by_length]
     # Of a cloud in both formats, HDF5 is used.
-    clouds = {_name(path): read_cloud(path) for path in [*_files(folder, "*.ply"), *filter(is_cloud, in_hdf5)]}
+    clouds = {name_cloud(path): read_cloud(path) for path in [*_files(folder, "*.ply"), *filter(is_cloud, in_hdf5)]}
     judged = {path.name.removesuffix(_EVALUATION): read_evaluation(path) for path in _files(folder, f"*{_EVALUATION}")}
     if not (clouds or judged or calibrations):
         raise CaptureError(
@@ -170,10 +170,6 @@ def _files(folder: Path, pattern: str, *, but: str | tuple[str, ...] | None = No
             yield path
 
 
-def _name(cloud: Path) -> str:
-    return cloud.stem.removesuffix(".cloud").removesuffix(".full")
-
-
 def _capture(path: Path) -> GatheredCapture:
     with Capture(path) as capture:
         laser = tuple(np.flatnonzero(capture.laser_on).tolist())
@@ -189,7 +185,7 @@ def _pair_clouds(clouds: dict[str, PointCloud], judged: dict[str, EvaluationReco
     pairs: dict[str, PointCloud | None] = {}
     taken = set()
     for name, found in judged.items():
-        source = name if name in clouds else _name(Path(found.cloud))
+        source = name if name in clouds else name_cloud(found.cloud)
         pairs[name] = plain = clouds.get(source)
         taken.add(source)
         if plain is not None and plain.deviation_mm is None:

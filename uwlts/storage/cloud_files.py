@@ -314,6 +314,11 @@ def _every(count: int, at_most: int | None) -> slice:
     return slice(None, None, 1 if at_most is None else max(1, -(-count // at_most)))
 
 
+def name_cloud(path: str | os.PathLike[str]) -> str:
+    """Return the name of a cloud's file without its ending, such as ``.ply``, ``.cloud.h5`` or ``.copc.laz``."""
+    return re.sub(r"\.(cloud|full|copc)$", "", Path(path).stem)
+
+
 def is_lean(path: str | os.PathLike[str]) -> bool:
     """Return whether `write_cloud` writes no more of the uncertainty than the standard deviation along the normal."""
     name = str(path).lower()
