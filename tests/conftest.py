@@ -73,6 +73,7 @@ SERVING = {
     "test_desk.py",
     "test_desk_analyses.py",
     "test_desk_calibration.py",
+    "test_desk_screens.py",
     "test_serve.py",
     "test_gige_camera.py",
     "test_calibrate_live.py",

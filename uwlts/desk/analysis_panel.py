@@ -40,7 +40,7 @@ class AnalysisPanel:
         """Build the tab."""
         self._kind = ui.select(list(ANALYSES), label="analysis", value="inspect pipe").classes("w-full")
         self._kind.on_value_change(self._build_form)
-        self._form = ui.column().classes("w-full gap-1")
+        self._form = ui.element("div").classes("form")
         with ui.element("div").classes("fields"):
             self._name = ui.input("name of the results")
             self._replace = ui.checkbox("replace existing")
@@ -133,10 +133,10 @@ def _make_field(each: AnalysisField, files: dict[str, list[str]]) -> Any:
     """Return a new element for a field: a choice, a switch or a number."""
     if each.file_kind or each.choices:
         made = ui.select(_options(each, files), label=each.label, clearable=not each.required, multiple=each.several)
-        return made.classes("w-full").props("dense use-chips" if each.several else "dense")
+        return made.props("dense use-chips" if each.several else "dense")
     if each.switch:
         return ui.checkbox(each.label)
-    made = ui.number(each.label).classes("w-full").props("dense")
+    made = ui.number(each.label).props("dense")
     # Keep the number as typed; the analysis checks limits.
     made.sanitize = lambda: None
     return made
