@@ -217,7 +217,7 @@ def _estimate_surface(window: UnrolledSurface, bandwidth: float) -> np.ndarray:
     )
     unknown = ~known.reshape(counts)
     nearest: Any = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
-    return RectBivariateSpline(*sides, values.reshape(counts)[tuple(nearest)]).ev(*places.T)
+    return RectBivariateSpline(sides[0], sides[1], values.reshape(counts)[tuple(nearest)]).ev(*places.T)
 
 
 def _fit_quadratics(window: UnrolledSurface, nodes: np.ndarray, near: list[np.ndarray], bandwidth: float) -> np.ndarray:
