@@ -21,7 +21,8 @@ import lazy_loader
 
 from uwlts.errors import ArgumentError
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _SHORT = Repr()
 """Short texts of values, for messages."""
@@ -117,7 +118,7 @@ def _is_list(kind: Any) -> bool:
 
 def _is_path(kind: Any) -> bool:
     origin = get_origin(kind) or kind
-    return isinstance(origin, type) and issubclass(origin, os.PathLike)
+    return isinstance(origin, type) and issubclass(origin, os.PathLike)  # pyright: ignore[reportGeneralTypeIssues]
 
 
 def _convert(value: Any, hint: Any) -> Any:
