@@ -72,7 +72,7 @@ class AnalysisField:
 
 
 @dataclass(frozen=True)
-class Finding:
+class AnalysisFinding:
     """A finding: name, verdict if a limit is stated, place (mm, in the cloud's frame) and values with intervals."""
 
     name: str
@@ -86,7 +86,7 @@ class AnalysisOutcome:
     """Result of an analysis besides its files."""
 
     lines: tuple[str, ...]
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[AnalysisFinding, ...] = ()
     warnings: tuple[str, ...] = ()
 
 
@@ -141,7 +141,7 @@ def _inspect(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
         verdict = judge_feature(each, order.limits)[0]
         place = (float(each.place_mm[0]), float(each.place_mm[1]), float(each.place_mm[2]))
         values = tuple(f"{value.name} {format_interval(value)} {value.unit}" for value in each.values)
-        findings.append(Finding(each.name, "" if verdict == "no limit" else verdict, place, values))
+        findings.append(AnalysisFinding(each.name, "" if verdict == "no limit" else verdict, place, values))
     return AnalysisOutcome(tuple(f"note: {note}" for note in found.notes), tuple(findings))
 
 
@@ -155,7 +155,7 @@ def _compare(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
     title = f"{Path(job.values['cloud']).name} against {Path(job.values['reference']).name}"
     uwlts.report.write_change(job.path(".html"), change, title=title, coloured=job.path("-coloured.ply"))
     findings = tuple(
-        Finding(
+        AnalysisFinding(
             f"region {number}",
             "",
             each.centre_mm,

@@ -15,7 +15,7 @@ from uwlts.desk.analyses import (
     AnalysisField,
     AnalysisOutcome,
     AnalysisState,
-    Finding,
+    AnalysisFinding,
     list_fields,
     load_order,
     name_results,
@@ -119,7 +119,7 @@ class AnalysisPanel:
             for finding in state.outcome.findings:
                 self._show_finding(finding)
 
-    def _show_finding(self, finding: Finding) -> None:
+    def _show_finding(self, finding: AnalysisFinding) -> None:
         with ui.element("div").classes("finding w-full border-t pt-1"):
             with ui.row().classes("items-center gap-2"):
                 ui.label(f"{finding.name}{f': {finding.verdict}' if finding.verdict else ''}").classes("font-bold")
