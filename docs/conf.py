@@ -1,9 +1,12 @@
 """Settings of the documentation: Sphinx with MyST notebooks, which are executed when the site is built."""
 
+import json
 import re
 import shutil
 from importlib.metadata import version as version_of
 from pathlib import Path
+
+from sphinx.errors import ExtensionError
 
 import twin
 import uwlts
@@ -93,8 +96,17 @@ def _copy_notebooks(app, exception: Exception | None) -> None:
     tutorials = Path(app.outdir) / "tutorials"
     if exception is None and tutorials.is_dir():
         for notebook in (Path(app.outdir).parent / "jupyter_execute" / "tutorials").glob("*.ipynb"):
+            _require_pictures(notebook)
             shutil.copy(notebook, tutorials)
         shutil.make_archive(str(tutorials / "etna"), "zip", ROOT / "tests" / "data", "etna")
+
+
+def _require_pictures(notebook: Path) -> None:
+    """Stop the build if a cell that shows a plot has no picture in its output."""
+    for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        if "plt.show()" in source and not any("image/png" in each.get("data", {}) for each in cell["outputs"]):
+            raise ExtensionError(f"{notebook.name} shows no picture after:\n{source}")
 
 
 def setup(app) -> None:

@@ -21,6 +21,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import sys
 import warnings
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -216,8 +217,15 @@ class ComparisonTable:
     rows: tuple[tuple[str, str, tuple[str, ...]], ...]
 
 
-def make_figure(width: float, height: float, *, layout: Literal["constrained"] | None = "constrained") -> Figure:
-    """Return an empty matplotlib figure of a size in inches, which is not shown in a window."""
+def make_figure(
+    width: float, height: float, *, layout: Literal["constrained"] | None = "constrained", shown: bool = False
+) -> Figure:
+    """Return an empty matplotlib figure of a size in inches; if ``shown``, `pyplot.show` and notebooks show it."""
+    # Only programs that have imported pyplot, and notebooks, can show figures.
+    if shown and {"matplotlib.pyplot", "ipykernel"} & sys.modules.keys():
+        from matplotlib import pyplot
+
+        return pyplot.figure(figsize=(width, height), layout=layout)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -234,6 +242,7 @@ def new_figure(
     columns: int = 1,
     height_ratios: list[float] | None = None,
     width_ratios: list[float] | None = None,
+    shown: bool = False,
 ) -> tuple[Figure, list[Axes]]:
     """Return a matplotlib figure in the pages' style, and its axes row by row.
 
@@ -245,10 +254,12 @@ def new_figure(
         Number of axes.
     height_ratios, width_ratios
         Relative heights of the rows and widths of the columns; by default equal.
+    shown
+        Whether `pyplot.show` and notebooks show the figure.
     """
     import matplotlib
 
-    figure = make_figure(width, height)
+    figure = make_figure(width, height, shown=shown)
     with matplotlib.rc_context(_STYLE):
         axes = figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios, width_ratios=width_ratios)
         return figure, list(axes.flat)
@@ -302,6 +313,9 @@ def _save_figure(drawn: Drawn, **options: Any) -> bytes:
         # The font may lack characters in names of files; browsers have other fonts.
         warnings.filterwarnings("ignore", "Glyph .* missing")
         figure.savefig(data, **options)
+    if "matplotlib.pyplot" in sys.modules:
+        # Figures of pages are not shown beside them.
+        sys.modules["matplotlib.pyplot"].close(figure)
     return data.getvalue()
 
 

@@ -103,7 +103,7 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
     """
     if ax is None:
         # The axes are square, as wide as the space beside the colour bar, and clipped by the figure vertically.
-        figure, side, room = make_figure(11.2, 6.0, layout=None), 0.86, (0.84, 0.84 * 6.0 / (0.86 * 11.2))
+        figure, side, room = make_figure(11.2, 6.0, layout=None, shown=True), 0.86, (0.84, 0.84 * 6.0 / (0.86 * 11.2))
         height = side * 11.2 / 6.0
         ax = Axes3D(figure, (0.02, 0.5 - height / 2, side, height))
         figure.add_axes(ax)
@@ -470,4 +470,4 @@ def seconds(seconds: Mapping[str, float], ax: Axes | None = None) -> Axes:
 
 
 def _axes(ax: Axes | None, *size: float) -> Axes:
-    return new_figure(*size)[1][0] if ax is None else ax
+    return new_figure(*size, shown=True)[1][0] if ax is None else ax

@@ -6,6 +6,8 @@ import io
 import json
 import math
 import re
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -43,6 +45,14 @@ SPHERES = {"kind": "spheres", "diameters_mm": [50.12, 50.14], "spacings_mm": [99
 STEP = {"kind": "step", "height_mm": 23.17}
 # Exact points leave the fits only the rounding of their iteration, far below this.
 FIT_MM = 1e-6
+
+
+@pytest.fixture(autouse=True)
+def _close_figures() -> Iterator[None]:
+    """Close figures that pyplot would show: it warns of more than twenty."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 def small_sensor(window_mm: float = 47.3) -> Sensor:
@@ -742,6 +752,19 @@ def test_clouds_of_hardly_any_points_can_be_drawn(count):
     cloud = PointCloud(np.ones((count, 3)), nothing, nothing, nothing)
     assert figure_png(plot.cloud(cloud).figure).startswith(b"\x89PNG")
     assert json.loads(cloud_points(cloud)[0].to_json())["count"] == count
+
+
+def test_pyplot_shows_plots_and_no_figures_of_pages():
+    from matplotlib import pyplot
+
+    rng = np.random.default_rng(0)
+    cloud = PointCloud(rng.normal(size=(30, 3)), np.ones(30), np.zeros(30, int), np.arange(30))
+    cloud = replace(cloud, deviation_mm=rng.normal(size=30))
+    for draw in (plot.cloud, plot.deviation_histogram):
+        ax = draw(cloud)
+        assert pyplot.get_fignums() == [ax.figure.number]
+        figure_svg(ax)
+        assert pyplot.get_fignums() == []
 
 
 def test_the_cloud_is_decimated_and_decoded_to_a_small_step():
