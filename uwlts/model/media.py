@@ -84,11 +84,41 @@ GLASSES = {
 }
 
 
+_OTHER_NAMES = {
+    "BK7": "N-BK7",
+    "borosilicate crown": "N-BK7",
+    "quartz": "fused-silica",
+    "quartz glass": "fused-silica",
+    "silica": "fused-silica",
+    "float glass": "soda-lime",
+    "window glass": "soda-lime",
+    "acrylic": "PMMA",
+    "acrylic glass": "PMMA",
+    "plexiglas": "PMMA",
+    "plexiglass": "PMMA",
+    "perspex": "PMMA",
+}
+"""Common names of window materials, in any case and with - or _ in place of blanks."""
+
+
+def _plain_name(name: str) -> str:
+    return " ".join(name.replace("-", " ").replace("_", " ").casefold().split())
+
+
+_BY_PLAIN_NAME = {_plain_name(name): name for name in GLASSES} | {
+    _plain_name(other): name for other, name in _OTHER_NAMES.items()
+}
+
+
 def find_glass(name: str) -> Glass:
-    """Return the named window material; DescriptionError with the known names."""
-    if name not in GLASSES:
-        raise DescriptionError(f"unknown glass '{name}'; known are {', '.join(GLASSES)}, or give its index as a number")
-    return GLASSES[name]
+    """Return the named window material, also by a common name; DescriptionError with the known names."""
+    known = _BY_PLAIN_NAME.get(_plain_name(name))
+    if known is None:
+        raise DescriptionError(
+            f"unknown glass '{name}'; known are {', '.join(GLASSES)}, common names such as acrylic, or the "
+            "index as a number"
+        )
+    return GLASSES[known]
 
 
 def glass_index(name: str, *, wavelength_nm: float) -> float:

@@ -146,3 +146,16 @@ def test_water_absorption_is_refused_outside_the_table(wavelength):
 def test_water_scattering_is_refused_outside_the_table(outside):
     with pytest.raises(RangeError, match=next(iter(outside))):
         media.water_scattering_per_m(**{"wavelength_nm": 635.0} | outside)
+
+
+@pytest.mark.parametrize(
+    ("common", "name"),
+    [("acrylic", "PMMA"), ("Plexiglass", "PMMA"), ("bk7", "N-BK7"), ("Fused silica", "fused-silica")],
+)
+def test_common_names_of_window_materials(common, name):
+    assert media.find_glass(common) is media.GLASSES[name]
+
+
+def test_an_unknown_window_material_is_refused_with_the_known_ones():
+    with pytest.raises(DescriptionError, match="unknown glass 'sapphire'; known are N-BK7"):
+        media.find_glass("sapphire")
