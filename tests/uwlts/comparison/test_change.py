@@ -293,7 +293,7 @@ def test_wrong_references_are_refused(ball, tmp_path):
     path, cloud = ball
     small = tmp_path / "metres.stl"
     trimesh.load(path).apply_scale(0.001).export(small)
-    with pytest.raises(EvaluationError, match="`unit` m"):
+    with pytest.raises(EvaluationError, match="`reference_unit` m"):
         uwlts.compare_clouds(cloud, small)
     assert uwlts.compare_clouds(cloud, small, reference_unit="m").compared.any()
     (tmp_path / "text.stl").write_text("no mesh")
@@ -302,7 +302,7 @@ def test_wrong_references_are_refused(ball, tmp_path):
     away = PointCloud(cloud.points_mm + [0, 0, 200], cloud.intensity, cloud.frame, cloud.line)
     with pytest.raises(EvaluationError, match="do not overlap"):
         uwlts.compare_clouds(away, path)
-    with pytest.raises(EvaluationError, match="disc_mm is -1"):
+    with pytest.raises(EvaluationError, match="`?disc_mm`? is -1"):
         uwlts.compare_clouds(cloud, path, disc_mm=-1.0)
     few = PointCloud(cloud.points_mm[:9], cloud.intensity[:9], cloud.frame[:9], cloud.line[:9])
     with pytest.raises(EvaluationError, match="the cloud has 9 points"):

@@ -173,7 +173,7 @@ def test_wrong_requests_are_refused():
     cloud = scan(rng, lambda x, y: 0 * x, half=3.0)
     with pytest.raises(EvaluationError, match="at least one"):
         uwlts.mesh()
-    with pytest.raises(EvaluationError, match="cube_mm is 0"):
+    with pytest.raises(EvaluationError, match="`cube_mm` is 0"):
         uwlts.mesh(cloud, cube_mm=0)
     with pytest.raises(EvaluationError, match="at most the patches' radius"):
         uwlts.mesh(cloud, cube_mm=3, patch_radius_mm=2)
