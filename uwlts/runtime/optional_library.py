@@ -39,8 +39,20 @@ def optional_library(module: str, *, needed_by: str, extra: str, instead: str = 
 
 
 def pip_install(requirements: Iterable[str]) -> str:
-    """Return the command that installs libraries into the environment of this Python."""
-    return f"{shlex.quote(sys.executable)} -m pip install {' '.join(map(shlex.quote, requirements))}"
+    """Return the command that installs libraries into the environment of this Python, or that there are none for it.
+
+    Requirements may be options of pip, too.
+    """
+    from packaging.markers import Marker
+
+    wanted = []
+    for line in requirements:
+        name, _, marker = line.partition(";")
+        if not marker or Marker(marker).evaluate({"extra": ""}):
+            wanted.append(shlex.quote(name.strip()))
+    if not wanted:
+        return f"there is none for Python {sys.version_info.major}.{sys.version_info.minor}"
+    return f"{shlex.quote(sys.executable)} -m pip install {' '.join(wanted)}"
 
 
 def read_requirements() -> tuple[str, list[str], dict[str, list[str]]]:

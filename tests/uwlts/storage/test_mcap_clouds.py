@@ -162,8 +162,8 @@ def test_e57_times_that_are_marked_invalid_are_not_known(cloud, tmp_path):
 
 
 def test_ply_has_time_image_and_covariance(cloud, tmp_path):
-    cloud.save(tmp_path / "a.ply")
-    again = uwlts.read(tmp_path / "a.ply")
+    cloud.save(tmp_path / "a.full.ply")
+    again = uwlts.read(tmp_path / "a.full.ply")
     np.testing.assert_array_equal(again.time_s, cloud.time_s)
     np.testing.assert_array_equal(again.frame, cloud.frame)
     np.testing.assert_allclose(again.covariance_mm2, cloud.covariance_mm2, rtol=1e-6)

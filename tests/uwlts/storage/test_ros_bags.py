@@ -114,7 +114,7 @@ def test_other_files_are_refused(tmp_path, name):
 def test_without_the_library_the_extra_is_named(tmp_path, monkeypatch):
     path = write_ros2(tmp_path / "bag", {"/odom": "geometry_msgs/msg/PoseStamped"})
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    with pytest.raises(SetupError, match=r"uwlts\[ros\]"):
+    with pytest.raises(SetupError, match=r"-m pip install 'rosbags>="):
         uwlts.read(path, pose_format="ros")
 
 
