@@ -33,7 +33,7 @@ def test_controls_are_in_sight_and_large_enough_for_a_finger(desk, sized):
     step_cloud().save(desk.folder / "plate.ply")
     tab(page, "Files")
     page.get_by_role("button", name="show", exact=True).click()
-    page.locator(".cloud-view[data-points]").wait_for()
+    page.locator(".cloud-view .legend").wait_for()
     checked = 0
     for name in TABS:
         tab(page, name)

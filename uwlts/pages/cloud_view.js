@@ -147,7 +147,8 @@ export default {
     async refine() {
       const box = this.closer ? this.seenBox() : null;
       if (box === null) {
-        if (this.near.count) { this.clearNear(); this.draw(); }
+        this.clearNear();
+        this.draw();
         return;
       }
       const asked = (this.asked = box.map((value) => value.toFixed(4)).join());
@@ -155,6 +156,8 @@ export default {
       // The view may have changed meanwhile.
       if (answer.status !== 200 || asked !== this.asked) return;
       await this.take(this.near, answer);
+      if (this.asked === null) this.clearNear();
+      if (asked !== this.asked) return;
       this.colour();
       this.$el.dataset.detail = this.near.count;
     },
