@@ -102,7 +102,7 @@ def _copy_notebooks(app, exception: Exception | None) -> None:
 
 
 def _require_pictures(notebook: Path) -> None:
-    """Stop the build if a cell that shows a plot has no picture in its output."""
+    """Stop the build if a cell that shows a plot lacks a picture in its output."""
     for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
         source = "".join(cell["source"])
         if "plt.show()" in source and not any("image/png" in each.get("data", {}) for each in cell["outputs"]):

@@ -195,7 +195,9 @@ class ShardReader:
 def _texts(file: h5py.File, name: str) -> h5py.Dataset:
     texts = file[name]
     if not isinstance(texts, h5py.Dataset) or texts.dtype.kind != "S":
-        raise ValueError(f"'{name}' is not text of a fixed length; uwlts 0.2 and older wrote others: make it again")
+        raise ValueError(
+            f"'{name}' is not text of a fixed length, which earlier versions did not write: make the data set again"
+        )
     require_small_chunks(texts, name, path=file.filename)
     return texts
 

@@ -24,8 +24,7 @@ from uwlts.files.inputs import protect_inputs, record_input, record_made
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.inspection.features import Inspection
 from uwlts.inspection.inspect import INSPECTIONS
-from uwlts.model.library import read_table, validate_description
-from uwlts.report.findings_order import FindingOrder, judge_feature
+from uwlts.report.findings_order import judge_feature, load_order
 from uwlts.runtime.command_line import descriptions, option_type
 from uwlts.runtime.progress import ProgressListener
 from uwlts.runtime.workers import run_jobs
@@ -135,7 +134,7 @@ def _inspect(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
     cloud = replace(read_cloud(job.values["cloud"]), deviation_mm=found.deviation_mm)
     colours = deviation_colours(found.deviation_mm, surface_limit_mm(found.deviation_mm))
     write_cloud(job.path("-coloured.ply"), cloud, colours=colours)
-    order = FindingOrder() if "order" not in job.values else load_order(job.values["order"])
+    order = load_order(job.values.get("order"))
     findings = []
     for each in found.features:
         verdict = judge_feature(each, order.limits)[0]
@@ -143,11 +142,6 @@ def _inspect(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
         values = tuple(f"{value.name} {format_interval(value)} {value.unit}" for value in each.values)
         findings.append(AnalysisFinding(each.name, "" if verdict == "no limit" else verdict, place, values))
     return AnalysisOutcome(tuple(f"note: {note}" for note in found.notes), tuple(findings))
-
-
-def load_order(path: str | Path) -> FindingOrder:
-    """Return the order of an inspection from its file; raises DescriptionError if it is not one."""
-    return validate_description(FindingOrder, read_table(Path(path)), path)
 
 
 def _compare(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:

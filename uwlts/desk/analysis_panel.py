@@ -17,11 +17,11 @@ from uwlts.desk.analyses import (
     AnalysisOutcome,
     AnalysisState,
     list_fields,
-    load_order,
     name_results,
 )
 from uwlts.desk.desk_files import list_files
 from uwlts.errors import Error
+from uwlts.report.findings_order import load_order
 
 AddButton = Callable[[str, Callable[[], object]], ui.button]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydantic import Field
 
 from uwlts.errors import EvaluationError
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue
+from uwlts.model.library import read_table, validate_description
 from uwlts.model.sensor import Description, Positive, Vector
 
 Verdict = Literal["exceeds the limit", "undecided", "within the limit", "no limit"]
@@ -61,6 +63,11 @@ class FindingOrder(Description):
     water: str | None = None
     datum: FindingDatum = Field(default_factory=FindingDatum)
     limits: FindingLimits = Field(default_factory=FindingLimits)
+
+
+def load_order(path: str | Path | None) -> FindingOrder:
+    """Return the order in a TOML file, or an empty one; raises DescriptionError if the file is no order."""
+    return FindingOrder() if path is None else validate_description(FindingOrder, read_table(Path(path)), path)
 
 
 def judge_value(value: FeatureValue, limits: FindingLimits) -> Verdict:

@@ -28,7 +28,6 @@ from uwlts.inspection.features import (
 )
 from uwlts.inspection.inspect import InspectionKind, inspect_cloud
 from uwlts.model.any_calibration import calibration_digest
-from uwlts.model.library import read_table, validate_description
 from uwlts.model.sensor import Table
 from uwlts.pages.numbers import format_to_scale
 from uwlts.pages.pdf import print_pdf, refuse_unsuitable_pdf
@@ -45,7 +44,14 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import check_certificate
-from uwlts.report.findings_order import VERDICTS, FindingOrder, format_place, judge_feature, sort_by_severity
+from uwlts.report.findings_order import (
+    VERDICTS,
+    FindingOrder,
+    format_place,
+    judge_feature,
+    load_order,
+    sort_by_severity,
+)
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
@@ -163,7 +169,7 @@ def write_findings(
     if pdf:
         refuse_unsuitable_pdf(page.with_suffix(".pdf"))
         refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
-    stated = FindingOrder() if order is None else validate_description(FindingOrder, read_table(Path(order)), order)
+    stated = load_order(order)
     measured = read_cloud(path, unit=unit)
     sources = _sources(path, measured, captures, calibration, certificate)
     checks = [_artefact_check(each, measured) for each in verification]

@@ -5,9 +5,8 @@ The project is not published: advice names the libraries themselves, which works
 
 import shlex
 import sys
-import tomllib
 from collections.abc import Iterable
-from importlib import import_module, metadata
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -60,6 +59,10 @@ def read_requirements() -> tuple[str, list[str], dict[str, list[str]]]:
 
     In a checkout its pyproject.toml counts: the description that an editable installation keeps grows old.
     """
+    # Only advice needs these modules, and all readers of clouds import this one.
+    import tomllib
+    from importlib import metadata
+
     file = Path(__file__).parents[2] / "pyproject.toml"
     if file.is_file():
         project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
