@@ -221,6 +221,14 @@ PAGES_RUN = {
         texts={"diameters.csv": GAUGE, "runs/gauge/heights.csv": GAUGE},
         not_run={"python docs/studies/gauge_twin.py": "renders 18 scans"},
     ),
+    "docs/how-to/predict-uncertainty.md": Page(
+        texts={
+            "my-sensor.toml": 'base = "thesis-small"\nname = "mine"\n',
+            "small-pipe.toml": 'base = "pipe"\ntitle = "small pipe"\n',
+        },
+        tables={"small-pipe-campaign.toml": 0},
+        instead={"--campaigns 2 --every 4": "--campaigns 1 --every 40", "--campaigns 10": "--campaigns 1"},
+    ),
     "docs/how-to/inspect-a-pipe.md": Page(
         given={name: name for name in ("pipe.cloud.h5", "pipe.h5", "weld.cloud.h5", "flange.cloud.h5")}
         | {"other-flange.cloud.h5": "flange.cloud.h5", "plate.cloud.h5": "step-scan.cloud.h5"}
