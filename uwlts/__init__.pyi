@@ -33,6 +33,7 @@ from .reconstruction.verify import verify as verify
 from .registration.register import register as register
 from .report import plot as plot
 from .report.any_file import read as read
+from .report.frames import to_frame as to_frame
 from .report.inventory import describe as describe
 from .storage.capture import Capture as Capture
 from .storage.cloud import PointCloud as PointCloud
