@@ -45,8 +45,8 @@ class CalibrationParameter:
 def to_frame(result: object) -> DataFrame:
     """Return a result as a table of pandas, an optional library.
 
-    There is one row for each figure of an `Evaluation`, value of a feature of an `Inspection`, parameter of a
-    `Calibration`, point of a `PointCloud`, and design of `twin.sweep`. A list of records has a row for each: a row of
+    Rows are the figures of an `Evaluation`, the features' values of an `Inspection`, the parameters of a `Calibration`,
+    the points of a `PointCloud`, and the designs of `twin.sweep`. A list of records has a row for each: a row of
     `design`, or an entry of ``Verification.verdicts`` or ``SurfaceChange.regions()``. Parameters have their standard
     uncertainties, those of a joint estimate in the units of pages. Points have the standard uncertainty of each
     coordinate, or that along the normal.
