@@ -11,6 +11,7 @@ from .comparison.surface_mesh import mesh as mesh
 from .desk.guided import record_guided as record_guided
 from .desk.operator_page import serve_desk as serve_desk
 from .desk.recording_view import watch as watch
+from .desk.ros_node import serve_ros as serve_ros
 from .desk.scan import scan as scan
 from .doctor import examine as examine
 from .errors import Error as Error
@@ -33,6 +34,7 @@ from .reconstruction.verify import verify as verify
 from .registration.register import register as register
 from .report import plot as plot
 from .report.any_file import read as read
+from .report.frames import to_frame as to_frame
 from .report.inventory import describe as describe
 from .storage.capture import Capture as Capture
 from .storage.cloud import PointCloud as PointCloud

@@ -22,7 +22,7 @@ from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.board import Board, Picture
 from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.recording_view import RecordingView
+from uwlts.desk.recording_view import BackgroundView, RecordingView
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
@@ -38,12 +38,10 @@ from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
+from uwlts.storage.capture import Capture, drawable_image, part_path
 
 _PREVIEW_S = 0.15
 """Pause between two live images."""
-_WAITING = 64
-"""Images in the queue for display during a scan; further ones are recorded but not shown."""
 _MOST_LOST = 2
 """Consecutive live images that may be lost before an error is reported."""
 _EARLIER = 200
@@ -428,7 +426,7 @@ class Instrument:
         self.state, self._rig, kept_light = InstrumentState.SCANNING, None, self.light
         self._show_laser()
         try:
-            with _BackgroundView(view) as shown:
+            with BackgroundView(view.show) as shown:
                 seen = record_scan(
                     plan,
                     out,
@@ -491,35 +489,3 @@ class Instrument:
         if self._stop.is_set():
             raise Ended
         self._show_laser()
-
-
-class _BackgroundView:
-    """Display of recorded images in its own thread, so that recording never waits for it."""
-
-    def __init__(self, view: RecordingView):
-        self._view = view
-        self._waiting: queue.Queue[tuple[Frame, int] | None] = queue.Queue(_WAITING)
-        self._fault: Exception | None = None
-
-    def put(self, frame: Frame, number: int) -> None:
-        """Queue an image for display, unless too many wait."""
-        if not self._waiting.full():
-            self._waiting.put((frame, number))
-
-    def _show(self) -> None:
-        while (seen := self._waiting.get()) is not None:
-            try:
-                self._view.show(*seen)
-            except Exception as error:
-                self._fault = self._fault or error
-
-    def __enter__(self) -> "_BackgroundView":
-        self._thread = threading.Thread(target=self._show, name="view", daemon=True)
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        self._waiting.put(None)
-        self._thread.join()
-        if self._fault is not None and kind is None:
-            raise self._fault

@@ -1,10 +1,12 @@
 """Display of a recording in progress on the page: its latest image with the stripe, warnings, and the cloud so far."""
 
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -15,10 +17,13 @@ from uwlts.model.any_calibration import AnyCalibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, drawable_image, part_path
-from uwlts.stripe import CaptureStripes, find_stripe, warm_up
+from uwlts.storage.cloud import PointCloud
+from uwlts.stripe import CaptureStripes, Stripe, find_stripe, warm_up
 
 LOOK_S = 0.1
 """Interval between checks for new images; a check takes a few ms."""
+_WAITING = 64
+"""Images in the queue for display during a scan; further ones are recorded but not shown."""
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
 """Limits of a laser image: faint below this fraction of full scale; saturated above this fraction of saturated lines;
 too little of the stripe below this fraction of lines with a point."""
@@ -84,11 +89,8 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
     along, full = header.sensor.camera.stripe_along, header.saturation_dn
     stripe = find_stripe(frame.seen, stripe_along=along, saturation=full)
     line, points, intensity = stripe.lines, np.empty((0, 3)), np.empty(0)
-    centre = stripe.centre_px[line]
     if calibration is not None and len(line):
-        own = np.zeros(len(line), dtype=int)
-        stripes = CaptureStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
-        cloud = reconstruct_stripes(FrameTable.from_frames(header, [frame]), stripes, calibration)
+        cloud = reconstruct_frame(frame, stripe, header, calibration)
         points, intensity = cloud.points_mm, cloud.intensity
     saturated, remarks = None, []
     if isinstance(frame.seen, np.ndarray):
@@ -101,6 +103,17 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
     if len(line) < _FEW * len(stripe.status):
         remarks.append("almost no stripe: is the object in the volume?")
     return _Profile(stripe.pixels(), points, intensity, len(stripe.status), saturated, tuple(remarks))
+
+
+def reconstruct_frame(
+    frame: Frame, stripe: Stripe, header: CaptureHeader, calibration: AnyCalibration, *, with_uncertainty: bool = False
+) -> PointCloud:
+    """Triangulate the stripe of a single laser image of a recording; the errors are those of `reconstruct_stripes`."""
+    line = stripe.lines
+    own = np.zeros(len(line), dtype=int)
+    stripes = CaptureStripes(own, line, stripe.centre_px[line], stripe.amplitude[line], stripe.width_px[line], {})
+    table = FrameTable.from_frames(header, [frame])
+    return reconstruct_stripes(table, stripes, calibration, with_uncertainty=with_uncertainty)
 
 
 def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:
@@ -124,6 +137,41 @@ def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | Non
         if finished:
             return
         yield None
+
+
+class BackgroundView:
+    """Display of recorded images in a thread of its own, so that recording never waits for it.
+
+    ``show`` is called with images and their numbers. Its first error is raised when the ``with`` ends.
+    """
+
+    def __init__(self, show: Callable[[Frame, int], None]):
+        self._show = show
+        self._waiting: queue.Queue[tuple[Frame, int] | None] = queue.Queue(_WAITING)
+        self._fault: Exception | None = None
+
+    def put(self, frame: Frame, number: int) -> None:
+        """Queue an image for display, unless too many wait."""
+        if not self._waiting.full():
+            self._waiting.put((frame, number))
+
+    def _run(self) -> None:
+        while (seen := self._waiting.get()) is not None:
+            try:
+                self._show(*seen)
+            except Exception as error:
+                self._fault = self._fault or error
+
+    def __enter__(self) -> Self:
+        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        self._waiting.put(None)
+        self._thread.join()
+        if self._fault is not None and kind is None:
+            raise self._fault
 
 
 def watch(
