@@ -18,7 +18,6 @@ from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan
 from uwlts.hardware.scanning import record_scan
 from uwlts.model.any_calibration import AnyCalibration
-from uwlts.model.calibration import Calibration
 from uwlts.optics.fitness import check_fits
 from uwlts.storage.capture import CaptureHeader, Frame, part_path
 from uwlts.storage.cloud import PointCloud
@@ -64,7 +63,6 @@ class ScanService:
     ):
         self._source, self._calibration, self._publish, self._report = source, calibration, publish, report
         self._folder, self._camera, self._stage, self._home, self._unlock = folder, camera, stage, home, unlock
-        self._uncertain = isinstance(calibration, Calibration) and calibration.joint is not None
         self._stop, self._thread = threading.Event(), threading.Thread()
         warm_up()
 
@@ -160,8 +158,7 @@ class ScanService:
         stripe = find_stripe(
             frame.seen, stripe_along=header.sensor.camera.stripe_along, saturation=header.saturation_dn
         )
-        if len(stripe.lines):
-            cloud = reconstruct_frame(frame, stripe, header, self._calibration, with_uncertainty=self._uncertain)
+        if (cloud := reconstruct_frame(frame, stripe, header, self._calibration)) is not None:
             times_s = np.full(len(cloud), frame.time_s)
             self._publish(replace(cloud, frame=np.full(len(cloud), number), time_s=times_s))
 
