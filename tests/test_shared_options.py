@@ -37,7 +37,7 @@ MEANING = {
         "--out": "to write|New folder",
         "--overwrite": "Replace|replace",
         "--pixels": "Whether pixels are square",
-        "--plan": "[Pp]lan of a scan|TOML file with sensor, medium, positions",
+        "--plan": "[Pp]lan of (a scan|an acceptance test)|TOML file with sensor, medium, positions",
         "--port": "[Pp]ort of the page",
         "--pose-format": "euler-ZYX-deg",
         "--pose-unit": "Unit of the .*positions",
