@@ -37,6 +37,7 @@ MEANING = {
         "--out": "to write|New folder",
         "--overwrite": "Replace|replace",
         "--pixels": "Whether pixels are square",
+        "--pdf": "Also print the page",
         "--plan": "[Pp]lan of (a scan|an acceptance test)|TOML file with sensor, medium, positions",
         "--port": "[Pp]ort of the page",
         "--pose-format": "euler-ZYX-deg",
