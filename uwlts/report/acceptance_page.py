@@ -146,6 +146,7 @@ def _position_row(acceptance: Acceptance, number: int) -> tuple[str, ...]:
     for symbol in NAMES:
         own = [value.value_mm for value in each.values if value.symbol == symbol]
         values.append(" / ".join(format_fixed(value, 4, signed=symbol in _SIGNED) for value in own) or MISSING)
+    values = [each.replace("-", "−") if each != MISSING else each for each in values]
     return f"{number + 1}", each.name, each.artefact, state, *values
 
 
@@ -233,7 +234,8 @@ def _draw_places(acceptance: Acceptance) -> Markup:
             if value.length_mm is not None and value.direction is not None:
                 half = value.length_mm / 2 * np.array(value.direction)
                 ends = np.array([place - half, place + half])
-                axes.plot(ends[:, across], ends[:, 2], "-", color=colour, linewidth=1.6)
+                name = plain_text(f"{artefact_of[value.position]} (length)")
+                axes.plot(ends[:, across], ends[:, 2], "-", color=colour, linewidth=1.6, label=name)
             elif value.symbol in ("PF", "F"):
                 name = plain_text(artefact_of[value.position])
                 axes.plot(place[across], place[2], "os"[value.symbol == "F"], color=colour, markersize=6, label=name)
