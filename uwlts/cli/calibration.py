@@ -214,8 +214,8 @@ def accept(
     out: Annotated[
         Path | None,
         Parameter(
-            help="Page to write, with the result as sealed JSON beside it; by default PLAN.acceptance.html. An earlier "
-            "result of the same plan there is continued and replaced."
+            help="Page to write, with the result as sealed JSON beside it; by default PLAN.acceptance.html, or PLAN.html "
+            "if PLAN ends with acceptance. An earlier result of the same plan there is continued and replaced."
         ),
     ] = None,
     pdf=False,
@@ -232,7 +232,7 @@ def accept(
     from uwlts.report.acceptance_page import KIND
 
     plan = Path(call.given["plan"])
-    page = out or plan.with_suffix(f".{KIND}.html")
+    page = out or plan.with_suffix(".html" if plan.stem.endswith(KIND) else f".{KIND}.html")
     result = json_beside(page, KIND)
     if result.is_file() and not overwrite:
         # The command continues its own result.
