@@ -214,8 +214,8 @@ def accept(
     out: Annotated[
         Path | None,
         Parameter(
-            help="Page to write, with the result as sealed JSON beside it; by default PLAN.acceptance.html, or PLAN.html "
-            "if PLAN ends with acceptance. An earlier result of the same plan there is continued and replaced."
+            help="Page to write, with the result as sealed JSON beside it; by default PLAN.acceptance.html, or "
+            "PLAN.html if PLAN ends with acceptance. An earlier result of the same plan is continued and replaced."
         ),
     ] = None,
     pdf=False,
