@@ -20,7 +20,7 @@ from matplotlib.tri import Triangulation
 
 from twin.design.choice import StudyResults, find_pareto_front
 from twin.design.designs import HighlightedDesign
-from twin.design.figures_of_merit import CLASS_NAMES
+from twin.design.figures_of_merit import CLASS_NAMES, RENDERED_SCATTERING_DEPTH
 from twin.design.report import study_tables as tables
 from twin.design.study import Variable
 from twin.design.verification import Agreement
@@ -376,7 +376,8 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
             )
             figure.add_trace(trace)
     order = np.flatnonzero(front)[np.argsort(values[front, 0])]
-    names = list(dict.fromkeys([*judged.study.free(), x, y]))
+    names = list(dict.fromkeys([*judged.study.free(), x, y, "scattering_depth"]))
+    names = [name for name in names if name in judged.columns]
     figure.add_scatter(
         **select_points(order),
         name=f"Pareto front ({len(order):,} of the designs)",
@@ -438,8 +439,18 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
     none = (
         "" if judged.feasible.any() else " No design meets all constraints: the front is that of all working designs."
     )
+    turbid = int((judged.figure("scattering_depth")[known] > RENDERED_SCATTERING_DEPTH).sum())
+    deep = (
+        f" {turbid:,} of the designs are beyond the optical depth of scattering, {RENDERED_SCATTERING_DEPTH:g}, up to "
+        "which formulas and rendering were compared."
+        if turbid
+        else ""
+    )
     more = " Further objectives are not shown." if len(judged.study.objectives) > 2 else ""
-    return figure, f"Better is {better}. No design is better in both than a design on the green line.{more}{none}{thin}"
+    return (
+        figure,
+        f"Better is {better}. No design is better in both than a design on the green line.{more}{none}{thin}{deep}",
+    )
 
 
 def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:

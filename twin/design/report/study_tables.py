@@ -11,7 +11,7 @@ import numpy as np
 
 from twin.design.choice import StudyResults
 from twin.design.designs import HighlightedDesign
-from twin.design.figures_of_merit import CLASS_NAMES, FIGURES
+from twin.design.figures_of_merit import CLASS_NAMES, FIGURES, RENDERED_SCATTERING_DEPTH
 from twin.design.study import Study, Variable
 from twin.design.verification import Agreement
 from twin.scene.paths import Value
@@ -98,6 +98,8 @@ def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
         return CLASS_NAMES.get(round(value), MISSING)
     if name == "coverage" and math.isfinite(value):
         return f"{100 * value:.0f} %"
+    if name == "scattering_depth" and value > RENDERED_SCATTERING_DEPTH:
+        return f"{number_text(value, 2)} (beyond the rendered)"
     text, of = number_text(value), words_and_unit(name)[1]
     if not unit or not of or text == MISSING:
         return text
@@ -197,7 +199,10 @@ def _range_text(name: str, variable: Variable) -> str:
     return f"{words_of(name)} from {value_text(name, variable.least)} to {value_text(name, variable.most)}{scale}"
 
 
-_ALWAYS_SHOWN = ("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm", "line_mm", "depth_mm", "standoff_mm")
+_ALWAYS_SHOWN = (
+    *("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm"),
+    *("line_mm", "depth_mm", "standoff_mm", "scattering_depth"),
+)
 
 
 def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign | None) -> list[Tile]:
