@@ -53,7 +53,7 @@ _BRIGHT_LINES = 2.05
 """Level of automatic exposure in standard deviations of speckle above the mean: 2 % of the lines are brighter."""
 _UNMODELLED = 0.02
 """Deviation of a stripe from the fitted Gaussian, relative to its height; it limits the weight of the flanks."""
-RENDERED_SCATTERING_DEPTH = 3.0
+RENDERED_SCATTERING_DEPTH = 5.0
 """Largest optical depth of scattering at which formulas and rendering agreed, see docs/results/designs.md."""
 _FLANK = 4.0
 """Limit of the sum over the stripe's profile in standard deviations; less than 1e-4 of the light is outside."""
