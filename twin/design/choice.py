@@ -214,7 +214,7 @@ def choose(study: Study, columns: Columns) -> DesignChoice:
                 "refined along the gradient", build_sensor(study, end), select_design(evaluate_designs(study, [end]), 0)
             )
         )
-    notes += [note for one in marked if (note := describe_turbidity(one))]
+    notes += [note] if (note := describe_turbidity(marked[-1])) else []
     front = np.flatnonzero(found.front(meets))
     front = front[np.argsort(found.cost()[front])]
     spread = front[np.unique(np.linspace(0, len(front) - 1, study.verify + 1).round().astype(int))]
@@ -230,7 +230,7 @@ def describe_turbidity(one: HighlightedDesign) -> str:
         return ""
     return (
         f"{one.label}: the optical depth of scattering is {depth:.1f}, but formulas and rendering were compared only "
-        f"up to {RENDERED_SCATTERING_DEPTH:g}: do not rely on its sigmas unless it is rendered (`verify`) and agrees."
+        f"up to {RENDERED_SCATTERING_DEPTH:g}: do not rely on its sigmas unless it is rendered (verify) and agrees."
     )
 
 

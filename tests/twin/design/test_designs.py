@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.design.choice import describe_turbidity
+from twin.design.choice import StudyResults, describe_turbidity
 from twin.design.designs import (
     Design,
     HighlightedDesign,
@@ -19,7 +19,7 @@ from twin.design.designs import (
     select_design,
 )
 from twin.design.figures_of_merit import FIGURES, RENDERED_SCATTERING_DEPTH
-from twin.design.report.study_tables import value_text
+from twin.design.report.study_tables import format_design_value
 from twin.design.screening import encode_part, read_parts, write_csv, write_part
 from twin.design.study import Study, load_study
 from uwlts.errors import CaptureError, DescriptionError, DesignError
@@ -205,7 +205,9 @@ def test_a_design_in_more_turbid_water_than_the_rendered_ones_is_marked(study, s
     depth = one.design.number_of("scattering_depth")
     assert depth == pytest.approx(share * RENDERED_SCATTERING_DEPTH)
     assert ("compared only up to" in describe_turbidity(one)) == marked
-    assert ("beyond the rendered" in value_text("scattering_depth", depth)) == marked
+    columns = evaluate_designs(study, sample_designs(study, 0, 1)) | {"scattering_depth": np.array([depth])}
+    judged = StudyResults(study, columns)
+    assert ("not verified" in format_design_value(judged, "scattering_depth", 0)) == marked
 
 
 def test_designs_that_fail_are_reported_with_their_reason(study):
