@@ -81,12 +81,14 @@ def sweep(call: Call) -> None:
 
 @app.command(group=JOBS["Design"])
 def scenes() -> None:
-    """List the scenes, sensors, campaigns, data sets, studies and waters that ship with the program.
+    """List scenes, sensors, campaigns, data sets, studies and their figures, waters, and window materials.
 
     Example: twin scenes
     """
+    from twin.design.figures_of_merit import FIGURES
     from twin.scene.description import load_scene
     from uwlts.model.library import list_names
+    from uwlts.model.media import GLASSES
     from uwlts.model.waters import WATERS
 
     for name in list_names():
@@ -94,6 +96,8 @@ def scenes() -> None:
         say(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
     for folder in ("sensors", "campaigns", "datasets", "studies"):
         say(f"{folder}: {', '.join(list_names(folder))}")
+    say(f"figures of studies: {', '.join(FIGURES)}")
+    say(f"window materials: {', '.join(GLASSES)}; also by common names such as acrylic or float glass")
     say(f"waters: {', '.join(WATERS)}, or a turbidity from 0 to 3")
     for name, water in WATERS.items():
         say(f"  {name}: {water.sentence}")

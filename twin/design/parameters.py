@@ -118,6 +118,7 @@ class SensorArrays:
     laser_window_aperture_mm: Array
     medium_index: Array
     extinction_per_mm: Array
+    scattering_per_mm: Array
     quantum_efficiency: Array
     full_well_e: Array
     read_noise_e: Array
@@ -317,6 +318,7 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
         "beam_quality": laser.beam_quality_m2,
         "medium_index": index,
         "extinction_per_mm": medium.extinction_per_mm(wavelength),
+        "scattering_per_mm": medium.scattering_per_mm(wavelength),
         "quantum_efficiency": detector.quantum_efficiency,
         "full_well_e": detector.full_well_e,
         "read_noise_e": detector.read_noise_e,

@@ -88,7 +88,7 @@ class _Inherited:
         """Return as text the keys among ``paths`` whose values differ from those at a level."""
         pairs = ((path, _value(origin.merged, path), _value(self._last.merged, path)) for path in paths)
         return [
-            f"{path} ({_text(before) if before is not None else 'none'} to {_text(after)})"
+            f"{path} ({f'{_text(before)} to ' if before is not None else 'now '}{_text(after)})"
             for path, before, after in pairs
             if after is not None and _differ(path, before, after)
         ]

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from twin.design.choice import StudyResults
+from twin.design.choice import StudyResults, describe_turbidity
 from twin.design.designs import HighlightedDesign
-from twin.design.figures_of_merit import CLASS_NAMES, FIGURES
+from twin.design.figures_of_merit import CLASS_NAMES, FIGURES, RENDERED_SCATTERING_DEPTH
 from twin.design.study import Study, Variable
 from twin.design.verification import Agreement
 from twin.scene.paths import Value
@@ -98,7 +98,8 @@ def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
         return CLASS_NAMES.get(round(value), MISSING)
     if name == "coverage" and math.isfinite(value):
         return f"{100 * value:.0f} %"
-    text, of = number_text(value), words_and_unit(name)[1]
+    # Three digits of values below 0.01 are as wide as four of others, so that they fit in a tile.
+    text, of = number_text(value, 3 if abs(value) < 0.01 else 4), words_and_unit(name)[1]
     if not unit or not of or text == MISSING:
         return text
     return text + (of if of == "°" else "\N{NO-BREAK SPACE}" + of)
@@ -121,8 +122,10 @@ def without_numbers(text: str) -> str:
 
 
 def format_design_value(judged: StudyResults, name: str, place: int, *, unit: bool = True) -> str:
-    """Format a design's value with its unit."""
-    return value_text(name, judged.columns[name][place : place + 1].tolist()[0], unit=unit)
+    """Format a design's value with its unit; values beyond those of the rendered designs are marked."""
+    value = judged.columns[name][place : place + 1].tolist()[0]
+    mark = " (not verified)" if name == "scattering_depth" and value > RENDERED_SCATTERING_DEPTH else ""
+    return value_text(name, value, unit=unit) + mark
 
 
 def failure_counts(judged: StudyResults) -> list[tuple[str, str]]:
@@ -197,7 +200,10 @@ def _range_text(name: str, variable: Variable) -> str:
     return f"{words_of(name)} from {value_text(name, variable.least)} to {value_text(name, variable.most)}{scale}"
 
 
-_ALWAYS_SHOWN = ("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm", "line_mm", "depth_mm", "standoff_mm")
+_ALWAYS_SHOWN = (
+    *("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm"),
+    *("line_mm", "depth_mm", "standoff_mm", "scattering_depth"),
+)
 
 
 def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign | None) -> list[Tile]:
@@ -214,6 +220,7 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
         notes = (
             note,
             f"misses its bound: {missed[name][1]}" if name in missed else "",
+            "beyond the rendered designs" if describe_turbidity(chosen) and name == "scattering_depth" else "",
             "not reached by camera or laser" if name.startswith("sigma_z_") and text == MISSING else "",
             f"{label}: {beside}" if beside not in (MISSING, label, "base") else "",
         )
