@@ -30,12 +30,16 @@ EVERY_S = 0.15
 LASER_ON = (True, True, False, True)
 
 
-@pytest.fixture(scope="module")
-def calibration(thesis: Sensor) -> Calibration:
+def joint_calibration(sensor: Sensor) -> Calibration:
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
     series = target_series(built_sensor(), medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise)
     options = CalibrationOptions(poses="stage", correct_circles=False)
-    return solve_jointly(gathered(thesis, [series]), options=options).calibration
+    return solve_jointly(gathered(sensor, [series]), options=options).calibration
+
+
+@pytest.fixture(scope="module")
+def calibration(thesis: Sensor) -> Calibration:
+    return joint_calibration(thesis)
 
 
 def write_images(path: Path, sensor: Sensor, laser_on: tuple[bool, ...]) -> Path:
