@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from uwlts._version import __version__
 from uwlts.acceptance.characteristics import (
@@ -102,6 +102,17 @@ class Acceptance(Brief, _Stored):
     software: str
     date: str
     edited: bool = False
+
+    @model_validator(mode="after")
+    def _names_fit(self) -> "Acceptance":
+        for each in self.positions:
+            if each.artefact not in self.plan.artefacts:
+                raise ValueError(
+                    f"the position {each.name!r} is of the artefact {each.artefact!r}, which has no certificate"
+                )
+            if others := {value.position for value in each.values} - {each.name}:
+                raise ValueError(f"the position {each.name!r} has values of {sorted(others)[0]!r}")
+        return self
 
     @model_serializer(mode="wrap")
     def _without_default(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -6,17 +6,17 @@ the sensor is what is tested, and does not contribute.
 """
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from uwlts.acceptance.plan import REFERENCE_C, CertifiedArtefact, Symbol, Temperature
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import PlaneEvaluation, StepEvaluation, evaluate_cloud
 from uwlts.evaluation.spheres import SphereEvaluation
 from uwlts.model.artefacts import PlaneStandard, SphereStandard, StepStandard
-from uwlts.model.sensor import Vector
+from uwlts.model.sensor import NotNegative, Positive, UnitVector, Vector
 from uwlts.storage.cloud import PointCloud
 
 Decision = Literal[
@@ -72,11 +72,11 @@ class MeasuredValue(_Stored):
     position: str
     label: str
     value_mm: float
-    expanded_mm: float | None
+    expanded_mm: NotNegative | None
     place_mm: Vector
-    length_mm: float | None = None
-    direction: Vector | None = None
-    calibration_std_mm: float | None = None
+    length_mm: Positive | None = None
+    direction: UnitVector | None = None
+    calibration_std_mm: NotNegative | None = None
 
 
 class Characteristic(_Stored):
@@ -99,9 +99,9 @@ class Characteristic(_Stored):
 
     symbol: Symbol
     worst: MeasuredValue | None
-    count: int
-    wanted: int
-    mpe_mm: float | None
+    count: Annotated[int, Field(ge=0)]
+    wanted: Annotated[int, Field(ge=0)]
+    mpe_mm: Positive | None
     decision: Decision
 
 
