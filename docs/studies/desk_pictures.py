@@ -107,9 +107,10 @@ def drive(page: Page, tank: Path, pictures: Path) -> None:
     for row in reversed(rows.filter(has_text="standard deviation").all()):
         row.get_by_role("button", name="remove").click()
         page.wait_for_timeout(1000)
-    for label, limit in (("lower, mm", "98.9"), ("upper, mm", "99.1")):
-        page.get_by_label(label).last.fill(limit)
-        page.keyboard.press("Tab")
+    for sphere in range(2):
+        for label, limit in (("lower, mm", "50.0"), ("upper, mm", "50.2")):
+            page.get_by_label(label).nth(sphere).fill(limit)
+            page.keyboard.press("Tab")
     page.wait_for_timeout(3000)
     page.screenshot(path=pictures / "desk-measure.png")
     press(page, "section")
