@@ -352,6 +352,7 @@ def sized(request: pytest.FixtureRequest, desk: Desk, chromium: "Browser") -> "I
         opened.set_default_timeout(SLOW_MS)
         opened.goto(desk.operator_address)
         yield opened
+        print(opened.locator("header").inner_text(), opened.locator(".log").inner_text(), sep="\n")
 
 
 class LaserOff:
@@ -368,7 +369,8 @@ class LaserOff:
 
     def ends_flashes(self, state: str) -> None:
         """Press while the program itself takes laser images: no light follows."""
-        assert within(60.0, lambda: self.controller.state().laser_on), state
+        before = len(self.controller.lights)
+        assert within(60.0, lambda: len(self.controller.lights) > before), state
         self.press(state)
 
         def quiet() -> bool:

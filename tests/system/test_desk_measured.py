@@ -136,6 +136,11 @@ def test_values_are_measured_limited_undone_and_saved(page, place):
     assert [each["name"] for each in kept] == ["plate, across", "step 1"]
     assert [each["quantity"] for each in kept] == ["distance", "height"]
     assert float(kept[1]["value_mm"]) == pytest.approx(height, abs=half)
+    tab(page, "Files")
+    press(page, "list")
+    says(page, "plate.measured.json: 2 values")
+    tab(page, "Measure")
+    page.wait_for_function("document.querySelectorAll('[aria-label=\"name\"]')[0].value === 'plate, across'")
     # The list appears in the report of an inspection.
     tab(page, "Inspect")
     choose(page, "analysis", "inspect step")

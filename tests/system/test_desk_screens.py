@@ -119,12 +119,25 @@ def write_large_step(path: Path) -> None:
     replace(cloud, points_mm=points, **columns).save(path)
 
 
-def unlock(page: "Page", times: int) -> None:
+def unlock(page: "Page") -> None:
     """Accept the stage's position, as after Laser off."""
     shows(page, "has to be homed")
     tab(page, "Stage")
     press(page, "unlock")
-    page.locator(".log").get_by_text("unlocking done").nth(times).wait_for()
+    shows(page, "ready")
+
+
+def show_laser(page: "Page") -> None:
+    """Show live images with the laser, again if the second path of an earlier press ends them on a busy machine."""
+    for _ in range(3):
+        unlock(page)
+        tab(page, "Connect")
+        press(page, "laser")
+        shows(page, "laser ON for images")
+        page.wait_for_timeout(2000)
+        if "laser ON for images" in page.locator("header").inner_text():
+            return
+    raise AssertionError("live images with the laser do not last")
 
 
 def test_laser_off_works_in_every_phase(desk, sized: "Page", served: "ServedTwin"):
@@ -151,32 +164,27 @@ def test_laser_off_works_in_every_phase(desk, sized: "Page", served: "ServedTwin
     press(page, "lamp")
     page.locator(".image").get_by_text(re.compile("^live, lamp")).wait_for()
     off.works("live-lamp")
-    unlock(page, 0)
-    tab(page, "Connect")
-    press(page, "laser")
+    show_laser(page)
     off.ends_flashes("live-laser")
-    unlock(page, 1)
-    tab(page, "Connect")
-    press(page, "laser")
-    shows(page, "laser ON for images")
+    show_laser(page)
     page.reload()
     page.get_by_role("tab", name="Connect").wait_for()
     off.ends_flashes("live-laser-reloaded")
-    unlock(page, 2)
+    unlock(page)
     tab(page, "Scan")
     page.get_by_label("positions").fill("60")
     page.get_by_label("step, mm").fill("0.2")
     press(page, "start")
     shows(page, "of 60")
     off.ends_flashes("scanning")
-    unlock(page, 3)
+    unlock(page)
     tab(page, "Scan")
     press(page, "continue interrupted")
     shows(page, "of 60")
     press(page, "pause")
     says(page, "paused, the laser is off")
     off.works("paused")
-    unlock(page, 4)
+    unlock(page)
     tab(page, "Inspect")
     choose(page, "analysis", "inspect step")
     choose(page, "cloud", "plate.ply")

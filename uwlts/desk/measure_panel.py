@@ -71,12 +71,12 @@ class MeasurePanel:
             "text-sm"
         )
         self._places = ui.label("no point is picked").classes("text-sm font-mono whitespace-pre-wrap")
-        with ui.row().classes("gap-2"):
-            self._button("length", self._length)
-            self._button("section", self._cut).props("outline")
-            self._button("live profile", self._follow).props("outline")
-            self._button("forget points", self._forget).props("flat dense")
-        with ui.row().classes("items-center gap-2"):
+        with ui.row().classes("gap-1"):
+            self._button("length", self._length).props("dense")
+            self._button("section", self._cut).props("outline dense")
+            self._button("live profile", self._follow).props("outline dense")
+            self._button("forget", self._forget).props("flat dense")
+        with ui.element("div").classes("fields"):
             self._radius = NumberField("radius about the point, mm", value=_DEFAULT_RADIUS_MM, min=0.01)
             for shape in get_args(Shape):
                 self._button(shape, partial(self._shape, shape)).props("outline dense")
