@@ -7,16 +7,18 @@ gives the noise of distances and slopes.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.storage.cloud import PointUncertainty, project_variance
+from uwlts.fitting.patch_errors import PatchErrors
+from uwlts.storage.cloud import PointUncertainty, project_image_errors, project_variance
 
 _CELLS_PER_RADIUS = 3.0
 """Averaging cubes per disc radius: a disc contains 28 averages for 6 coefficients."""
@@ -64,8 +66,10 @@ class Patches:
         Number of a point near the centre of the patch.
     radius_mm : float
         Radius of the discs.
+    errors : PatchErrors
+        Independent errors of the cloud, and their effect on the patches.
     shared : float
-        Mean number of patches that contain a point; overlapping patches are correlated.
+        Variance of the mean height of all patches by noise, relative to that of as many independent patches.
     one_sided : bool
         True if all normals point to the sensor (-Z); otherwise their signs have no meaning.
     by_images : float
@@ -81,6 +85,7 @@ class Patches:
     patterns_mm: np.ndarray
     numbers: np.ndarray
     radius_mm: float
+    errors: PatchErrors
     shared: float
     one_sided: bool
     by_images: float = 0.0
@@ -113,6 +118,7 @@ class Patches:
             self.patterns_mm[:, selection],
             self.numbers[selection],
             self.radius_mm,
+            self.errors[selection],
             self.shared,
             self.one_sided,
             self.by_images,
@@ -129,8 +135,8 @@ def surface_patches(
 ) -> Patches:
     """Fit patches to the surface of a cloud.
 
-    Pose errors of images (`PointUncertainty.poses_mm`) average only over the images of a disc, and are common to all
-    patches along an image.
+    Errors of an image's position and pose average only over the images of a disc, and are common to all patches along
+    an image.
 
     Parameters
     ----------
@@ -172,21 +178,19 @@ def surface_patches(
     freedom = np.maximum(held.sum(axis=1) - 6, 1)
     # Variance of one point: the variance of an average of n points is 1/n of it.
     variance = np.einsum("pk,pk,pk->p", weight, left, left) / freedom
-    typical = np.median(variance)
-    kept = variance <= _ROUGH**2 * max(typical, 1e-30)
+    kept = variance <= _ROUGH**2 * max(np.median(variance), 1e-30)
+    first, grouped = _first_points(owner), frame is not None and bool(np.any(frame >= 0))
     if uncertainty is not None:
-        variance = np.maximum(variance, _stated_variance(uncertainty, points_mm, owner, middle, axes[:, 2]) / radius**2)
-    variance = np.maximum(variance, typical)
+        known = uncertainty[first[middle]]
+        stated = project_variance(known.random_mm2, axes[:, 2]) / radius**2
+        of_images = np.sum(project_image_errors(known, axes[:, 2]) ** 2, axis=0) / radius**2
+        # Errors of images scatter too, without averaging over the points of an image. They are added below.
+        scatter = variance - of_images * weight.sum(axis=1) / held.sum(axis=1) if grouped else variance
+        variance = np.maximum(scatter, stated if grouped else stated + of_images)
+    variance = np.maximum(variance, np.median(variance))
     covariance = variance[:, None, None] * inverse
-    shared, share, strips = max(float(weight.sum() / counts.sum()), 1.0), 0.0, 1.0
-    if uncertainty is not None and uncertainty.poses_mm is not None and frame is not None:
-        first = _first_points(owner)
-        by_image, images = _pose_variance(uncertainty.poses_mm, frame, first[middle], first[near], held, axes[:, 2])
-        own, moved = covariance[:, 0, 0], by_image / radius**2 / images
-        share = float(np.median(moved) / (np.median(moved) + np.median(own)))
-        strips = max(len(np.unique(frame)) / float(np.median(images)), 1.0)
-        covariance[:, 0, 0] = own + moved
     units = radius ** np.array([1.0, 0, 0, -1, -1, -1])
+    by_height = np.einsum("pab,pkb,pk->pak", inverse, columns, weight) * (units / radius)[:, None]
     places, axes, shape = _level(means[middle], axes, shape * units)
     flipped = axes[:, 2, 2] > 0
     one_sided = bool(np.mean(np.abs(axes[:, 2, 2]) > _FACING) > 0.98)
@@ -197,10 +201,17 @@ def surface_patches(
     shape = shape * signs
     covariance = covariance * np.outer(units, units) * signs[:, :, None] * signs[:, None]
     patterns = _patch_patterns(uncertainty, owner, middle, len(counts))
-    parts = (places, axes, shape, covariance, patterns, _first_points(owner)[middle])
-    patches = Patches(*parts, radius, shared, one_sided, share, strips)
+    errors = PatchErrors(
+        near,
+        (by_height * (signs * sign[:, None])[:, :, None]).astype(np.float32),
+        radius * np.sqrt(variance),
+        counts,
+        *(_image_errors(uncertainty, frame, owner, first) if grouped else _no_image_errors(len(counts))),
+    )
+    parts = (places, axes, shape, covariance, patterns, first[middle])
+    patches = Patches(*parts, radius, errors, 1.0, one_sided)
     chosen = np.flatnonzero(kept)
-    return patches[chosen[:: max(1, -(-len(chosen) // _MOST))]]
+    return _with_correlation(patches[chosen[:: max(1, -(-len(chosen) // _MOST))]])
 
 
 def find_disc_radius(points_mm: np.ndarray) -> float:
@@ -236,6 +247,8 @@ class PatchDistances:
     ----------
     source, target : (Q,) int
         Numbers of the patches.
+    columns : (Q, 6) float64
+        Terms of the second-order target surface at the foot of the distance.
     places_mm, normals : (Q, 3) float64
         Centre of the source patch, and normal of the target surface below it.
     distance_mm, std_mm : (Q,) float64
@@ -246,6 +259,7 @@ class PatchDistances:
 
     source: np.ndarray
     target: np.ndarray
+    columns: np.ndarray
     places_mm: np.ndarray
     normals: np.ndarray
     distance_mm: np.ndarray
@@ -301,6 +315,7 @@ def distances_between(
     return PatchDistances(
         rows,
         nearest,
+        columns,
         places[rows],
         normals[good],
         distance[good],
@@ -417,15 +432,6 @@ def _level(places: np.ndarray, axes: np.ndarray, shape: np.ndarray) -> tuple[np.
     return moved, np.stack([first, np.cross(normal, first), normal], axis=1), level
 
 
-def _stated_variance(
-    known: PointUncertainty, points: np.ndarray, owner: np.ndarray, middle: np.ndarray, normals: np.ndarray
-) -> np.ndarray:
-    """Return the stated variance (P,) of a point along the normals of patches, by noise and image position."""
-    at = _first_points(owner)[middle]
-    of_image = np.einsum("pi,pi->p", known.position_mm[at], normals)
-    return of_image**2 + project_variance(known.random_mm2[at], normals)
-
-
 def _first_points(owner: np.ndarray) -> np.ndarray:
     """Return the number of the first point in each cube, from the cubes (N,) of the points."""
     first = np.zeros(int(owner.max()) + 1, np.int64)
@@ -433,13 +439,42 @@ def _first_points(owner: np.ndarray) -> np.ndarray:
     return first
 
 
-def _pose_variance(
-    poses_mm: np.ndarray, frame: np.ndarray, at: np.ndarray, near: np.ndarray, held: np.ndarray, normals: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the variance (P,) along normals by pose errors of one image, and the number of images (P,) in a patch."""
-    variance = np.sum(np.einsum("kpi,pi->kp", poses_mm[:, at], normals) ** 2, axis=0)
-    images = np.sort(np.where(held, frame[near], frame[at][:, None]), axis=1)
-    return variance, 1 + np.count_nonzero(np.diff(images, axis=1), axis=1)
+def _no_image_errors(count: int) -> tuple[csr_array, np.ndarray]:
+    return csr_array((count, 0)), np.zeros((0, count, 3))
+
+
+def _image_errors(
+    known: PointUncertainty | None, frame: np.ndarray | None, owner: np.ndarray, first: np.ndarray
+) -> tuple[csr_array, np.ndarray]:
+    """Return the fraction (C, I) of the points of each average by image, and shifts (J, C, 3) by errors of the image."""
+    if known is None or frame is None:
+        return _no_image_errors(len(first))
+    shifts = known[first].image_errors_mm()
+    shifts = shifts[shifts.any(axis=(1, 2))]
+    numbers = np.unique(frame, return_inverse=True)[1].ravel()
+    counts = np.bincount(owner)
+    return csr_array((1 / counts[owner], (owner, numbers))), shifts.astype(np.float64)
+
+
+def _with_correlation(patches: Patches) -> Patches:
+    """Return patches with the variance by image errors and with the correlation of their heights."""
+    errors, count = patches.errors, len(patches)
+    shared = errors.correlation()
+    if not len(errors.image_shifts_mm):
+        return replace(patches, shared=shared)
+    centres = np.tile(np.eye(6)[0], (count, 1))
+    moved = errors.loadings(np.arange(count), centres, patches.normals)[:, len(errors.counts) :]
+    of_images = np.asarray((moved * moved).sum(axis=1)).ravel()
+    covariance = patches.covariance.copy()
+    covariance[:, 0, 0] += of_images
+    together = np.sum(np.asarray(moved.sum(axis=0)) ** 2)
+    return replace(
+        patches,
+        covariance=covariance,
+        shared=shared,
+        by_images=float(np.median(of_images) / np.median(covariance[:, 0, 0])),
+        strips=max(float(count * of_images.sum() / together), 1.0) if together > 0 else 1.0,
+    )
 
 
 def _patch_patterns(known: PointUncertainty | None, owner: np.ndarray, middle: np.ndarray, cells: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, pairwise, permutations
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -56,6 +57,8 @@ class PairEvidence:
         Ratio of the robust scatter of the distances to their stated noise, at least 1.
     spurious : (P, P) float64
         Information on the poses that noise of the normals alone would produce.
+    ways : tuple of (int, int, PatchDistances)
+        Source, target and distances in both directions, in the order of the rows.
     places_mm : (patches, 3) float64
         Positions of the surface distances.
     patches, spheres : int
@@ -68,6 +71,7 @@ class PairEvidence:
     std: np.ndarray
     spread: float
     spurious: np.ndarray
+    ways: tuple[tuple[int, int, PatchDistances], ...]
     places_mm: np.ndarray
     patches: int
     spheres: int
@@ -88,10 +92,22 @@ class PairEvidence:
 
 @dataclass(frozen=True, eq=False)
 class PoseSolution:
-    """Step (U,) in the determined directions, joint covariance (U, U), and undetermined directions (K, P) of poses."""
+    """Step of all unknowns in the determined directions.
+
+    Attributes
+    ----------
+    step : (U,) float64
+    response : (U, U) float64
+        Derivatives of the step by the negative gradient.
+    by_prior : (U, U) float64
+        Covariance of the step by errors of the initial poses and by the true pattern amplitudes.
+    open_directions : (K, P) float64
+        Undetermined directions of the poses.
+    """
 
     step: np.ndarray
-    covariance: np.ndarray
+    response: np.ndarray
+    by_prior: np.ndarray
     open_directions: np.ndarray
 
 
@@ -193,29 +209,53 @@ class JointRegistration:
         values, vectors, metric = decompose_motions(reduced, spurious)
         known = values > LEAST_INFORMATION
         ways, strengths = vectors[:, known], values[known]
-        down = gradient[:count] - within.T @ gradient[count:]
         open_ways = np.linalg.qr(vectors[:, np.logical_not(known)])[0]
         off = self._offset_from_start()
         if self.start_std is None:
             ways = ways - open_ways @ (open_ways.T @ ways)
-            covariance = (ways / strengths) @ ways.T
+            inverse, by, beforehand = (ways / strengths) @ ways.T, np.eye(count), np.zeros(count)
         else:
             beforehand = np.tile(np.repeat(1 / np.square(self.start_std), 3), count // 6) * self.units[:count] ** 2
             by = metric @ ways
-            covariance = np.linalg.inv((by * strengths) @ by.T + np.diag(beforehand))
-            down = by @ (ways.T @ down) + beforehand * off / self.units[:count]
-        step = -covariance @ down
+            inverse = np.linalg.inv((by * strengths) @ by.T + np.diag(beforehand))
+            by = by @ ways.T
+        poses = np.vstack([inverse, -within @ inverse])
+        response = poses @ by @ np.hstack([np.eye(count), -within.T])
+        response[count:, count:] += np.linalg.inv(beside)
+        step = -response @ gradient - poses @ (beforehand * off / self.units[:count])
         if self.start_std is None:
             # Undetermined directions return to the initial pose: far from the solution they may appear determined.
-            step = step - open_ways @ (open_ways.T @ (off / self.units[:count]))
-        rest = -np.linalg.solve(beside, gradient[count:]) - within @ step
-        whole = np.block(
-            [
-                [covariance, -covariance @ within.T],
-                [-within @ covariance, np.linalg.inv(beside) + within @ covariance @ within.T],
-            ]
+            back = open_ways @ (open_ways.T @ (off / self.units[:count]))
+            step -= np.append(back, -within @ back)
+        by_prior = response[:, count:] @ self.prior_information @ response[:, count:].T
+        by_prior += (poses * beforehand) @ poses.T
+        return PoseSolution(
+            self.units * step, response * scale, by_prior * scale, open_ways.T * self.units[:count]
         )
-        return PoseSolution(self.units * np.append(step, rest), whole * scale, open_ways.T * self.units[:count])
+
+    def covariance(self, pairs: Sequence[PairEvidence], solution: PoseSolution) -> np.ndarray:
+        """Return the joint covariance (U, U) of a step by all independent errors of the scans and by the prior."""
+        information = np.zeros((len(self.units),) * 2)
+        loads: list[Any] = [0.0] * len(self.patches)
+        for pair in pairs:
+            loaded = pair.spread * pair.weights[:, None] * pair.derivatives
+            of_spheres = pair.derivatives[pair.patches :]
+            information += of_spheres.T @ (pair.weights[pair.patches :, None] * of_spheres)
+            ends = np.cumsum([0, *(len(found.source) for *_, found in pair.ways)])
+            for (source, target, found), first, last in zip(pair.ways, ends, ends[1:], strict=False):
+                own, other = self.patches[source], self.patches[target]
+                normals = found.normals @ self.poses[source, :3, :3]
+                # Without a known side, the normals of both surfaces may have opposite signs.
+                sign = np.sign(np.einsum("qi,qi->q", normals, own.normals[found.source]))
+                centres = sign[:, None] * np.eye(6)[0]
+                loads[source] += own.errors.loadings(found.source, centres, own.normals[found.source]).T @ loaded[first:last]
+                loads[target] -= (
+                    other.errors.loadings(found.target, found.columns, other.normals[found.target]).T @ loaded[first:last]
+                )
+        for each in loads:
+            if not np.isscalar(each):
+                information += each.T @ each
+        return solution.response @ information @ solution.response.T + solution.by_prior
 
     def move(self, step: np.ndarray) -> None:
         """Update poses and pattern amplitudes by a step (U,)."""
@@ -311,6 +351,7 @@ class JointRegistration:
             np.concatenate(deviations),
             spread,
             spurious,
+            tuple(ways),
             np.vstack([found.places_mm for *_, found in ways]) if ways else np.empty((0, 3)),
             len(relative),
             len(spheres),

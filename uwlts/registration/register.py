@@ -327,10 +327,11 @@ def register(
     distances = joint.measure_distances(reach)
     pairs = joint.collect_evidence(distances)
     solution = joint.solve(list(pairs.values()))
-    _require_settled(solution, joint.unknown_poses)
+    known = joint.covariance(list(pairs.values()), solution)
+    _require_settled(solution.step[: joint.unknown_poses], known)
     amounts = np.concatenate(joint.patterns)
     covariance = np.zeros((6 * len(scans),) * 2)
-    covariance[6:, 6:] = solution.covariance[: joint.unknown_poses, : joint.unknown_poses]
+    covariance[6:, 6:] = known[: joint.unknown_poses, : joint.unknown_poses]
     return RegisteredScans(
         names=names,
         poses=joint.poses,
@@ -341,14 +342,14 @@ def register(
         overlaps=tuple(_overlap(pair) for pair in pairs.values()),
         narrow_overlaps=joint.find_narrow_overlaps(distances),
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
-        cloud=merge_clouds(scans, names, joint, solution.covariance),
+        cloud=merge_clouds(scans, names, joint, known),
     )
 
 
-def _require_settled(solution: PoseSolution, unknown: int) -> None:
-    """Raise EvaluationError if a further step would move the poses by more than their uncertainty."""
-    std = np.sqrt(np.diag(solution.covariance)[:unknown])
-    moves = float(np.max(np.abs(solution.step[:unknown]) / np.where(std > 0, std, np.inf), initial=0.0))
+def _require_settled(step: np.ndarray, covariance: np.ndarray) -> None:
+    """Raise EvaluationError if a further step (P,) would move the poses by more than their uncertainty."""
+    std = np.sqrt(np.diag(covariance)[: len(step)])
+    moves = float(np.max(np.abs(step) / np.where(std > 0, std, np.inf), initial=0.0))
     if moves > 1:
         raise EvaluationError(
             f"the registration does not converge: after {_ROUNDS} rounds the next one would move a scan by "
