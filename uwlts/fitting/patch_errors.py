@@ -1,8 +1,8 @@
-"""Propagation of the independent errors of a cloud to its surface patches.
+"""Propagation of the independent errors of a cloud to the heights of its surface patches.
 
 Overlapping patches share points, and patches along an image share its position. Their heights are therefore correlated:
-positively by image errors, and negatively in part by noise, because a second-order fit weights points at the border of
-its disc against those in the middle. Sums over patches are propagated from the errors themselves.
+positively by errors of images. Noise correlates some of them negatively, because a second-order fit subtracts points
+near the border of its disc. The variance of a sum of heights follows from the errors themselves.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ from scipy.sparse import csr_array, hstack
 
 @dataclass(frozen=True, eq=False)
 class PatchErrors:
-    """Independent errors of a cloud, as heights along normals, and the change of P patches by them.
+    """Independent errors of a cloud, and the changes of the heights of P patches by them.
 
     Attributes
     ----------
     near : (P, K) int
         Averages of points in each disc.
-    rows : (P, 6, K) float32
-        Derivatives of the shape's coefficients by the heights of these averages.
+    rows : (P, K) float32
+        Derivatives of the height in the middle of a disc by the heights of these averages.
     noise_mm : (P,) float64
-        Standard deviation of one point of a patch along its normal.
+        Standard deviation of one point along the normal.
+    normals : (P, 3) float64
+        Normals of the patches in the cloud's frame.
     counts : (C,) float64
         Number of points in each average.
     images : (C, I) sparse
@@ -37,43 +39,42 @@ class PatchErrors:
     near: np.ndarray
     rows: np.ndarray
     noise_mm: np.ndarray
+    normals: np.ndarray
     counts: np.ndarray
     images: csr_array
     image_shifts_mm: np.ndarray
 
     def __getitem__(self, selection: Any) -> PatchErrors:
         """Select patches by a slice, indices or a mask."""
-        return replace(
-            self, near=self.near[selection], rows=self.rows[selection], noise_mm=self.noise_mm[selection]
-        )
+        names = ("near", "rows", "noise_mm", "normals")
+        return replace(self, **{name: getattr(self, name)[selection] for name in names})
 
-    def loadings(self, rows: np.ndarray, columns: np.ndarray, normals: np.ndarray) -> csr_array:
-        """Return the changes (Q, E) of heights of patches for one standard deviation of each independent error.
+    def height_changes(self) -> csr_array:
+        """Return the changes (P, C + J I), mm, of the heights for one standard deviation of each independent error."""
+        return csr_array(hstack([self._by_noise(), *self._by_images()], format="csr"))
 
-        Parameters
-        ----------
-        rows : (Q,) int
-            Numbers of the patches.
-        columns : (Q, 6)
-            Terms of the second-order surface at the place of each height.
-        normals : (Q, 3)
-            Normals of the patches in the cloud's frame.
-        """
-        near = self.near[rows]
-        by_average = np.einsum("qa,qak->qk", columns, self.rows[rows])
-        noise = by_average * self.noise_mm[rows, None] / np.sqrt(self.counts[near])
-        parts = [self._sparse(noise, near)]
-        for shift in self.image_shifts_mm:
-            moved = by_average * np.einsum("qki,qi->qk", shift[near], normals)
-            parts.append(self._sparse(moved, near) @ self.images)
-        return csr_array(hstack(parts, format="csr"))
+    def noise_variance(self) -> np.ndarray:
+        """Return the variance (P,), mm2, of the heights by noise."""
+        return self.noise_mm**2 * np.sum(self.rows**2 / self.counts[self.near], axis=1)
 
-    def correlation(self) -> float:
-        """Return the variance of the mean height by noise, relative to that of as many independent patches."""
-        noise = self.rows[:, 0] * self.noise_mm[:, None] / np.sqrt(self.counts[self.near])
-        together = np.bincount(self.near.ravel(), noise.ravel(), len(self.counts))
-        return float(np.sum(together**2) / np.sum(noise**2))
+    def image_variance(self) -> np.ndarray:
+        """Return the variance (P,), mm2, of the heights by errors of images."""
+        return sum((np.asarray((each * each).sum(axis=1)).ravel() for each in self._by_images()), np.zeros(len(self.rows)))
 
-    def _sparse(self, values: np.ndarray, near: np.ndarray) -> csr_array:
-        ends = np.arange(0, near.size + 1, near.shape[1])
-        return csr_array((values.ravel(), near.ravel(), ends), shape=(len(near), len(self.counts)))
+    def correlation(self, *, by_images: bool) -> float:
+        """Return the variance of the sum of all heights relative to the sum of their variances, by noise or images."""
+        parts = self._by_images() if by_images else [self._by_noise()]
+        together = sum(float(np.sum(np.asarray(each.sum(axis=0)) ** 2)) for each in parts)
+        apart = sum(float((each * each).sum()) for each in parts)
+        return together / apart if apart > 0 else 1.0
+
+    def _by_noise(self) -> csr_array:
+        return self._sparse(self.rows * self.noise_mm[:, None] / np.sqrt(self.counts[self.near]))
+
+    def _by_images(self) -> list[csr_array]:
+        along = (np.einsum("pki,pi->pk", shift[self.near], self.normals) for shift in self.image_shifts_mm)
+        return [csr_array(self._sparse(self.rows * each) @ self.images) for each in along]
+
+    def _sparse(self, values: np.ndarray) -> csr_array:
+        ends = np.arange(0, self.near.size + 1, self.near.shape[1])
+        return csr_array((values.ravel(), self.near.ravel(), ends), shape=(len(self.near), len(self.counts)))

@@ -11,19 +11,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, pairwise, permutations
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
+from uwlts.fitting.least_squares import biweight, rms_distance, robust_std
 from uwlts.fitting.patches import (
     LEAST_INFORMATION,
     PatchDistances,
     Patches,
     decompose_motions,
     distances_between,
+    refit_distances,
     rigid_derivatives,
     slope_information,
 )
@@ -39,6 +39,8 @@ _PAIR_REACH = 4.0
 """Matching distance in the first round of a pair fit (unit: patch radius); a search is accurate to about one radius."""
 _PAIR_ROUNDS = 12
 """Rounds of a pair fit; after seven the matching distance is one patch radius."""
+_LEAST_SPREAD = 0.05
+"""Lower bound of the scatter relative to noise that is not stated: exact surfaces agree better than their patches."""
 _SPHERE_REACH = 0.25
 """Largest distance between the centres of one sphere in two scans, relative to its diameter."""
 
@@ -54,7 +56,7 @@ class PairEvidence:
     residuals, weights, std : (Q,) float64
         Residuals, their weights and their stated standard deviations.
     spread : float
-        Ratio of the robust scatter of the distances to their stated noise, at least 1.
+        Ratio of the robust scatter of the distances to their noise; at least 1 if both scans state their noise.
     spurious : (P, P) float64
         Information on the poses that noise of the normals alone would produce.
     ways : tuple of (int, int, PatchDistances)
@@ -149,13 +151,21 @@ class JointRegistration:
         """Centroids (N, 3) of the scans in the common frame."""
         return np.einsum("nij,nj->ni", self.poses[:, :3, :3], self.local_middles) + self.poses[:, :3, 3]
 
-    def measure_distances(self, reach_mm: float) -> dict[tuple[int, int], PatchDistances]:
-        """Measure the patch distances of each ordered pair of scans that overlap within ``reach_mm``."""
-        moved = [self._corrected_patches(number) for number in range(len(self.patches))]
+    def measure_distances(self, reach_mm: float, *, refit: bool = False) -> dict[tuple[int, int], PatchDistances]:
+        """Measure the patch distances of each ordered pair of scans that overlap within ``reach_mm``.
+
+        With ``refit``, the target's surface is fitted anew at each distance (`refit_distances`).
+        """
+        moved = [patches.corrected(amounts) for patches, amounts in zip(self.patches, self.patterns, strict=True)]
         found = {
             (a, b): distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
             for a, b in permutations(range(len(moved)), 2)
         }
+        if refit:
+            found = {
+                (a, b): refit_distances(distances, moved[a], moved[b], self.poses[b])
+                for (a, b), distances in found.items()
+            }
         return {pair: distances for pair, distances in found.items() if len(distances.source)}
 
     def collect_evidence(self, found: dict[tuple[int, int], PatchDistances]) -> dict[tuple[int, int], PairEvidence]:
@@ -234,27 +244,28 @@ class JointRegistration:
         )
 
     def covariance(self, pairs: Sequence[PairEvidence], solution: PoseSolution) -> np.ndarray:
-        """Return the joint covariance (U, U) of a step by all independent errors of the scans and by the prior."""
+        """Return the joint covariance (U, U) of a step by all independent errors of the scans and by the prior.
+
+        The distances of the pairs must be refitted (`measure_distances`).
+        """
         information = np.zeros((len(self.units),) * 2)
-        loads: list[Any] = [0.0] * len(self.patches)
+        changes: dict[int, np.ndarray] = {}
         for pair in pairs:
-            loaded = pair.spread * pair.weights[:, None] * pair.derivatives
-            of_spheres = pair.derivatives[pair.patches :]
-            information += of_spheres.T @ (pair.weights[pair.patches :, None] * of_spheres)
-            ends = np.cumsum([0, *(len(found.source) for *_, found in pair.ways)])
-            for (source, target, found), first, last in zip(pair.ways, ends, ends[1:], strict=False):
-                own, other = self.patches[source], self.patches[target]
-                normals = found.normals @ self.poses[source, :3, :3]
+            weighted = pair.weights[:, None] * pair.derivatives
+            information += weighted[pair.patches :].T @ pair.derivatives[pair.patches :]
+            first = 0
+            for source, target, found in pair.ways:
+                rows = pair.spread * weighted[first : first + len(found.source)]
+                first += len(found.source)
+                own = self.patches[source].errors[found.source]
                 # Without a known side, the normals of both surfaces may have opposite signs.
-                sign = np.sign(np.einsum("qi,qi->q", normals, own.normals[found.source]))
-                centres = sign[:, None] * np.eye(6)[0]
-                loads[source] += own.errors.loadings(found.source, centres, own.normals[found.source]).T @ loaded[first:last]
-                loads[target] -= (
-                    other.errors.loadings(found.target, found.columns, other.normals[found.target]).T @ loaded[first:last]
-                )
-        for each in loads:
-            if not np.isscalar(each):
-                information += each.T @ each
+                seen = found.normals @ self.poses[source, :3, :3]
+                sign = np.sign(np.einsum("qi,qi->q", seen, own.normals))
+                changes[source] = changes.get(source, 0.0) + own.height_changes().T @ (sign[:, None] * rows)
+                if found.target_errors is not None:
+                    changes[target] = changes.get(target, 0.0) - found.target_errors.height_changes().T @ rows
+        for by_errors in changes.values():
+            information += by_errors.T @ by_errors
         return solution.response @ information @ solution.response.T + solution.by_prior
 
     def move(self, step: np.ndarray) -> None:
@@ -281,10 +292,6 @@ class JointRegistration:
                 "reach or spheres, or search for the initial poses (search)"
             )
 
-    def _corrected_patches(self, number: int) -> Patches:
-        patches, amounts = self.patches[number], self.patterns[number]
-        return replace(patches, places_mm=patches.places_mm + np.tensordot(amounts, patches.patterns_mm, axes=1))
-
     def _common_centres(self, number: int) -> list[MarkerSphere]:
         """Transform the spheres of a scan into the common frame."""
         pose, amounts, turned = self.poses[number], self.patterns[number], []
@@ -310,7 +317,8 @@ class JointRegistration:
     ) -> PairEvidence:
         unknown, middles = len(self.units), self.middles_mm
         relative = np.concatenate([each.distance_mm / each.std_mm for *_, each in ways]) if ways else np.empty(0)
-        spread = noise_factor(relative)
+        stated = self.patches[a].noise_stated and self.patches[b].noise_stated
+        spread = max(robust_std(relative) if ways else 1.0, 1.0 if stated else _LEAST_SPREAD)
         blocks, residuals, weights, deviations = [], [], [], []
         spurious = np.zeros((self.unknown_poses, self.unknown_poses))
         for source, target, found in ways:
@@ -342,7 +350,7 @@ class JointRegistration:
             blocks.append(block)
             residuals.append(off)
             # Spheres are scaled by the same spread as surfaces, since they would otherwise dominate a poor fit.
-            weights.append(np.full(3, 2 / views / spread**2))
+            weights.append(np.full(3, 2 / views / max(spread, 1.0) ** 2))
             deviations.append(np.ones(3))
         return PairEvidence(
             np.vstack(blocks),
