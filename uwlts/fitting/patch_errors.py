@@ -59,7 +59,9 @@ class PatchErrors:
 
     def image_variance(self) -> np.ndarray:
         """Return the variance (P,), mm2, of the heights by errors of images."""
-        return sum((np.asarray((each * each).sum(axis=1)).ravel() for each in self._by_images()), np.zeros(len(self.rows)))
+        return sum(
+            (np.asarray((each * each).sum(axis=1)).ravel() for each in self._by_images()), np.zeros(len(self.rows))
+        )
 
     def correlation(self, *, by_images: bool) -> float:
         """Return the variance of the sum of all heights relative to the sum of their variances, by noise or images."""

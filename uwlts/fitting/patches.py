@@ -122,8 +122,7 @@ class Patches:
     def corrected(self, amounts: np.ndarray) -> Patches:
         """Return the patches moved by amounts (M,) of the systematic patterns."""
         moved = replace(
-            self.averages,
-            places_mm=self.averages.places_mm + np.tensordot(amounts, self.averages.patterns_mm, axes=1),
+            self.averages, places_mm=self.averages.places_mm + np.tensordot(amounts, self.averages.patterns_mm, axes=1)
         )
         places = self.places_mm + np.tensordot(amounts, self.patterns_mm, axes=1)
         return replace(self, places_mm=places, averages=moved)
@@ -338,6 +337,8 @@ class PatchDistances:
         Variance of the normal's slope in each tangential direction.
     target_errors : PatchErrors or None
         Effect of the target's errors on its heights, if its surface was fitted anew.
+    target_patterns_mm : (Q, M, 3) float64 or None
+        Systematic patterns of the target at the foot of each distance, if its surface was fitted anew.
     """
 
     source: np.ndarray
@@ -348,6 +349,7 @@ class PatchDistances:
     std_mm: np.ndarray
     slope_variance: np.ndarray
     target_errors: PatchErrors | None = None
+    target_patterns_mm: np.ndarray | None = None
 
     def __getitem__(self, selection: np.ndarray) -> PatchDistances:
         """Select distances by indices or a mask."""
@@ -407,18 +409,22 @@ def distances_between(
     )
 
 
-def refit_distances(
-    found: PatchDistances, source: Patches, target: Patches, target_pose: np.ndarray
-) -> PatchDistances:
+def refit_distances(found: PatchDistances, source: Patches, target: Patches, target_pose: np.ndarray) -> PatchDistances:
     """Measure distances again, from second-order fits to the target's points about the foot of each distance.
 
     Both surfaces are then smoothed alike, so that errors of their second-order approximation cancel. Feet whose height
     is less certain than a single point are omitted.
     """
     rotation, radius = target_pose[:3, :3], target.radius_mm
-    places = (found.places_mm - target_pose[:3, 3]) @ rotation
-    feet = places - found.distance_mm[:, None] * (found.normals @ rotation)
-    discs, axes = _gather_discs(target.averages, feet, radius), target.axes[found.target]
+
+    def gather(found: PatchDistances) -> tuple[np.ndarray, np.ndarray, _Discs]:
+        places = (found.places_mm - target_pose[:3, 3]) @ rotation
+        feet = places - found.distance_mm[:, None] * (found.normals @ rotation)
+        return places, feet, _gather_discs(target.averages, feet, radius)
+
+    found = found[gather(found)[2].held.sum(axis=1) >= _FEWEST]
+    places, feet, discs = gather(found)
+    axes = target.axes[found.target]
     fit = _fit_discs(discs, axes, radius)
     slopes = fit.shape[:, 1:3]
     normals = np.column_stack([-slopes, np.ones(len(slopes))]) / np.sqrt(1 + np.sum(slopes**2, axis=1))[:, None]
@@ -434,8 +440,13 @@ def refit_distances(
         distance_mm=np.einsum("qi,qi->q", places - feet, normals),
         std_mm=np.sqrt(np.maximum(variance, 1e-12)),
         target_errors=errors,
+        target_patterns_mm=np.stack(
+            [np.einsum("qk,qki->qi", fit.heights, pattern[discs.near]) for pattern in target.averages.patterns_mm]
+            or [np.zeros((len(feet), 0))],
+            axis=1,
+        ),
     )
-    return again[(discs.held.sum(axis=1) >= _FEWEST) & (fit.inverse[:, 0, 0] < 1)]
+    return again[fit.inverse[:, 0, 0] < 1]
 
 
 def rigid_derivatives(places_mm: np.ndarray, directions: np.ndarray, middle_mm: np.ndarray) -> np.ndarray:

@@ -239,9 +239,7 @@ class JointRegistration:
             step -= np.append(back, -within @ back)
         by_prior = response[:, count:] @ self.prior_information @ response[:, count:].T
         by_prior += (poses * beforehand) @ poses.T
-        return PoseSolution(
-            self.units * step, response * scale, by_prior * scale, open_ways.T * self.units[:count]
-        )
+        return PoseSolution(self.units * step, response * scale, by_prior * scale, open_ways.T * self.units[:count])
 
     def covariance(self, pairs: Sequence[PairEvidence], solution: PoseSolution) -> np.ndarray:
         """Return the joint covariance (U, U) of a step by all independent errors of the scans and by the prior.
@@ -330,9 +328,15 @@ class JointRegistration:
             by_poses = partial(self._derivatives_by_poses, source, target, found.places_mm)
             block = np.zeros((len(weight), unknown))
             block[:, : self.unknown_poses] = by_poses(found.normals)
-            for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):
-                turned = self.patches[number].patterns_mm[:, rows] @ self.poses[number, :3, :3].T
-                block[:, self.pattern_columns[number]] = sign * np.einsum("mqi,qi->qm", turned, found.normals)
+            own, other = (
+                self.patches[n].patterns_mm[:, rows].transpose(1, 0, 2)
+                for n, rows in ((source, found.source), (target, found.target))
+            )
+            if found.target_patterns_mm is not None:
+                other = found.target_patterns_mm
+            for number, shifts, sign in ((source, own, 1.0), (target, other, -1.0)):
+                turned = shifts @ self.poses[number, :3, :3].T
+                block[:, self.pattern_columns[number]] = sign * np.einsum("qmi,qi->qm", turned, found.normals)
             blocks.append(block)
             residuals.append(found.distance_mm)
             weights.append(weight)

@@ -39,7 +39,7 @@ from uwlts.storage.pose_files import PoseFormat, read_poses, write_poses
 
 _ROUNDS = 60
 _REFITS = 12
-"""Largest number of further rounds with surfaces fitted anew at each distance; most registrations need three."""
+"""Largest number of further rounds with surfaces fitted anew at each distance; most registrations need three to six."""
 _SETTLED = 0.1
 """Step, in standard uncertainties, below which a pose is settled: it would add 0.5 % to the standard uncertainty."""
 _STILL_MM = 1e-5
@@ -328,20 +328,20 @@ def register(
             break
         reach = max(NARROWER * reach, least)
     progress(steps, steps)
-    for _ in range(_REFITS):
+    for refits in range(_REFITS + 1):
         distances = joint.measure_distances(reach, refit=True)
         pairs = joint.collect_evidence(distances)
         joint.require_connected(list(pairs), names)
         solution = joint.solve(list(pairs.values()))
         known = joint.covariance(list(pairs.values()), solution)
         moves = _largest_move(solution.step[: joint.unknown_poses], known)
-        if moves < _SETTLED:
+        if moves < _SETTLED or refits == _REFITS:
             break
         joint.move(solution.step)
-    else:
+    if moves > 1:
         raise EvaluationError(
-            f"the registration does not converge: after {done + 1} rounds and {_REFITS} refits the next one would move "
-            f"a scan by {moves:.2g} standard uncertainties. Give more accurate initial poses, or scans with more overlap"
+            f"the registration does not converge: after {done + 1 + _REFITS} rounds the next one would move a scan by "
+            f"{moves:.2g} standard uncertainties. Give more accurate initial poses, or scans with more overlap"
         )
     amounts = np.concatenate(joint.patterns)
     covariance = np.zeros((6 * len(scans),) * 2)

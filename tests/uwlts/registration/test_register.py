@@ -80,10 +80,11 @@ def test_overlaps_of_few_patches_are_named_and_do_not_count():
 
 
 def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):
-    """One round from poses that are wrong by 2 mm, where some ten are needed."""
+    """Two rounds from poses that are wrong by 2 mm, where some ten are needed."""
     scans, _, wrong = views(np.random.default_rng(SEED), radius=pitted)
     monkeypatch.setattr("uwlts.registration.register._ROUNDS", 1)
-    with pytest.raises(EvaluationError, match="after 1 rounds the next one would move a scan by"):
+    monkeypatch.setattr("uwlts.registration.register._REFITS", 1)
+    with pytest.raises(EvaluationError, match="after 2 rounds the next one would move a scan by"):
         uwlts.register(scans, poses=wrong)
 
 
