@@ -11,8 +11,16 @@ import numpy as np
 
 from tests.oracles.profilers import pose_of, turn_by
 
-Shape = Literal["free form", "pipe"]
-Errors = Literal["white", "white, not stated", "correlated along profiles", "offsets of profiles", "systematic"]
+Shape = Literal["free form", "pipe", "dome"]
+Errors = Literal[
+    "white",
+    "white, not stated",
+    "correlated along profiles",
+    "offsets of profiles",
+    "systematic",
+    "heavy tails",
+    "offsets and tilts of profiles",
+]
 SHAPES, ERRORS = get_args(Shape), get_args(Errors)
 
 
@@ -21,8 +29,8 @@ class View:
     """Points (N, 3) of a view in its own frame, their profile (N,) and place in it (N,), and its true pose (4, 4).
 
     ``towards`` (3,) is the viewing direction in the view's frame, along which all errors lie. Stated standard
-    deviations are those of a point's own error, of the offset of a profile, and of systematic errors (M, N).
-    ``stated`` is False if the view comes without uncertainty.
+    deviations are those of a point's own error, of the independent errors of a profile (J, N), and of systematic errors
+    (M, N). ``stated`` is False if the view comes without uncertainty.
     """
 
     points_mm: np.ndarray
@@ -31,7 +39,7 @@ class View:
     pose: np.ndarray
     towards: np.ndarray
     own_mm: float
-    offset_mm: float
+    profile_mm: np.ndarray
     systematic_mm: np.ndarray
     stated: bool
 
@@ -39,7 +47,7 @@ class View:
 def draw_views(seed: int | list[int], shape: Shape, errors: Errors) -> list[View]:
     """Draw the views of a surface: their number, overlap, spacing, noise and poses, and the surface itself."""
     rng = np.random.default_rng(seed)
-    count = int(rng.integers(2, 5)) if shape == "free form" else int(rng.integers(4, 6))
+    count = int(rng.integers(4, 6)) if shape == "pipe" else int(rng.integers(2, 5))
     radius = float(rng.uniform(40, 90))
     # Lengths of the waves, mm, and their heights: slopes of some 10 deg in all.
     length = np.exp(rng.uniform(np.log(14), np.log(60), 14))
@@ -47,19 +55,23 @@ def draw_views(seed: int | list[int], shape: Shape, errors: Errors) -> list[View
     waves = 2 * np.pi / length[:, None] * np.column_stack([np.cos(way), np.sin(way)])
     size, phase = rng.uniform(0.3, 1.0) * 0.012 * length * rng.standard_normal(14), rng.uniform(0, 2 * np.pi, 14)
 
+    dome = 1 / rng.uniform(150, 400) if shape == "dome" else 0.0
+
     def height(u: np.ndarray, v: np.ndarray) -> np.ndarray:
         if shape == "pipe":
             # Only whole waves around the pipe close.
             around = np.round(waves[:, 1] * radius) / radius
             return np.sin(np.multiply.outer(u, waves[:, 0]) + np.multiply.outer(v, around) + phase) @ size
-        return np.sin(np.multiply.outer(u, waves[:, 0]) + np.multiply.outer(v, waves[:, 1]) + phase) @ size
+        return np.sin(
+            np.multiply.outer(u, waves[:, 0]) + np.multiply.outer(v, waves[:, 1]) + phase
+        ) @ size + dome / 2 * (u**2 + v**2)
 
     step, spacing = rng.uniform(0.8, 1.5, 2)
     noise = float(np.exp(rng.uniform(np.log(0.005), np.log(0.05))))
     amount, apart = rng.uniform(0.3, 2.0), rng.uniform(0.3, 0.6)
     views = []
     for number in range(count):
-        if shape == "free form":
+        if shape != "pipe":
             half = 32.0
             turn = rng.uniform(-np.pi, np.pi)
             along, across = _profiles(rng, half, half, step, spacing)
@@ -78,7 +90,7 @@ def draw_views(seed: int | list[int], shape: Shape, errors: Errors) -> list[View
             towards = -np.array([0.0, np.cos(centre), np.sin(centre)])
         profile = np.unique(np.round(along, 9), return_inverse=True)[1].ravel()
         line = np.unique(np.round(across, 9), return_inverse=True)[1].ravel()
-        error, offset, systematic = _errors(rng, errors, profile, line, along, across, noise, amount)
+        error, profile_mm, systematic = _errors(rng, errors, profile, line, along, across, noise, amount)
         world = world + error[:, None] * towards
         pose = _pose_seeing(rng, towards, world.mean(axis=0))
         kept = rng.random(len(world)) > 0.02
@@ -90,7 +102,7 @@ def draw_views(seed: int | list[int], shape: Shape, errors: Errors) -> list[View
                 pose=pose,
                 towards=towards @ pose[:3, :3],
                 own_mm=noise,
-                offset_mm=offset,
+                profile_mm=profile_mm[:, kept],
                 systematic_mm=systematic[:, kept],
                 stated=errors != "white, not stated",
             )
@@ -117,24 +129,28 @@ def _errors(
     across: np.ndarray,
     noise: float,
     amount: float,
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Return errors (N,), the standard deviation of the offset of a profile, and systematic patterns (M, N)."""
-    own, patterns = rng.standard_normal(len(profile)), np.zeros((0, len(profile)))
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return errors (N,), and standard deviations of those of a profile (J, N) and of systematic ones (M, N)."""
+    x, y = along / np.abs(along).max(), across / np.abs(across).max()
+    own, by_profile, systematic = rng.standard_normal(len(x)), np.zeros((0, len(x))), np.zeros((0, len(x)))
     if kind == "correlated along profiles":
         # Moving average over a few points: errors of one profile have a common part with their neighbours.
         wide = int(rng.integers(3, 9))
         drawn = rng.standard_normal((profile.max() + 1, line.max() + wide + 1))
         total = np.cumsum(np.pad(drawn, ((0, 0), (1, 0))), axis=1)
         own = (total[:, wide:] - total[:, :-wide])[profile, line] / np.sqrt(wide)
-    error, offset = noise * own, 0.0
-    if kind == "offsets of profiles":
-        offset = 0.5 * amount * noise
-        error = error + offset * rng.standard_normal(profile.max() + 1)[profile]
-    if kind == "systematic":
-        x, y = along / np.abs(along).max(), across / np.abs(across).max()
-        patterns = amount * noise * np.stack([y**2, x * y, y**3, x**2])
-        error = error + rng.standard_normal(4) @ patterns
-    return error, offset, patterns
+    elif kind == "heavy tails":
+        own = rng.standard_t(4, len(x)) / np.sqrt(2)
+    elif kind == "offsets of profiles":
+        by_profile = np.full((1, len(x)), 0.5 * amount * noise)
+    elif kind == "offsets and tilts of profiles":
+        by_profile = 0.5 * amount * noise * np.stack([np.ones(len(x)), y])
+    elif kind == "systematic":
+        systematic = amount * noise * np.stack([y**2, x * y, y**3, x**2])
+    error = noise * own + rng.standard_normal(len(systematic)) @ systematic
+    for each in by_profile:
+        error = error + each * rng.standard_normal(profile.max() + 1)[profile]
+    return error, by_profile, systematic
 
 
 def _pose_seeing(rng: np.random.Generator, towards: np.ndarray, middle: np.ndarray) -> np.ndarray:

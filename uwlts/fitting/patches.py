@@ -434,17 +434,17 @@ def refit_distances(found: PatchDistances, source: Patches, target: Patches, tar
     errors = replace(target.errors, near=discs.near, rows=fit.heights, noise_mm=noise, normals=normals)
     variance = source.errors[found.source].noise_variance() + errors.noise_variance()
     variance += source.image_variance_mm2[found.source] + target.image_variance_mm2[found.target]
+    patterns = np.zeros((len(feet), len(target.patterns_mm), 3))
+    for number, pattern in enumerate(target.averages.patterns_mm):
+        patterns[:, number] = np.einsum("qk,qki->qi", fit.heights, pattern[discs.near])
     again = replace(
         found,
         normals=normals @ rotation.T,
         distance_mm=np.einsum("qi,qi->q", places - feet, normals),
         std_mm=np.sqrt(np.maximum(variance, 1e-12)),
+        slope_variance=(noise / radius) ** 2 * (fit.inverse[:, 1, 1] + fit.inverse[:, 2, 2]) / 2,
         target_errors=errors,
-        target_patterns_mm=np.stack(
-            [np.einsum("qk,qki->qi", fit.heights, pattern[discs.near]) for pattern in target.averages.patterns_mm]
-            or [np.zeros((len(feet), 0))],
-            axis=1,
-        ),
+        target_patterns_mm=patterns,
     )
     return again[fit.inverse[:, 0, 0] < 1]
 

@@ -13,6 +13,7 @@ from functools import partial
 from itertools import combinations, pairwise, permutations
 
 import numpy as np
+from scipy.sparse import csr_array, diags_array
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
@@ -255,16 +256,21 @@ class JointRegistration:
             for source, target, found in pair.ways:
                 rows = pair.spread * weighted[first : first + len(found.source)]
                 first += len(found.source)
-                own = self.patches[source].errors[found.source]
-                # Without a known side, the normals of both surfaces may have opposite signs.
-                seen = found.normals @ self.poses[source, :3, :3]
-                sign = np.sign(np.einsum("qi,qi->q", seen, own.normals))
-                changes[source] = changes.get(source, 0.0) + own.height_changes().T @ (sign[:, None] * rows)
-                if found.target_errors is not None:
-                    changes[target] = changes.get(target, 0.0) - found.target_errors.height_changes().T @ rows
-        for by_errors in changes.values():
-            information += by_errors.T @ by_errors
+                for number, by_errors in self._height_changes(source, target, found):
+                    changes[number] = changes.get(number, 0.0) + by_errors.T @ rows
+        for each in changes.values():
+            information += each.T @ each
         return solution.response @ information @ solution.response.T + solution.by_prior
+
+    def _height_changes(self, source: int, target: int, found: PatchDistances) -> list[tuple[int, csr_array]]:
+        """Return the changes (Q, E) of distances by the independent errors of both scans, with the scans' numbers."""
+        own = self.patches[source].errors[found.source]
+        # Without a known side, the normals of both surfaces may have opposite signs.
+        sign = np.sign(np.einsum("qi,qi->q", found.normals @ self.poses[source, :3, :3], own.normals))
+        parts = [(source, csr_array(diags_array(sign) @ own.height_changes()))]
+        if found.target_errors is not None:
+            parts.append((target, -found.target_errors.height_changes()))
+        return parts
 
     def move(self, step: np.ndarray) -> None:
         """Update poses and pattern amplitudes by a step (U,)."""
@@ -341,7 +347,7 @@ class JointRegistration:
             residuals.append(found.distance_mm)
             weights.append(weight)
             deviations.append(found.std_mm)
-            spurious += slope_information(found.normals, weight * found.slope_variance, by_poses)
+            spurious += slope_information(found.normals, weight * spread**2 * found.slope_variance, by_poses)
         for first, second, views in spheres:
             covariance = first.covariance + second.covariance
             root = np.linalg.cholesky(np.linalg.inv(covariance)).T
