@@ -1,7 +1,7 @@
 """Views of free-form surfaces and of uneven pipes with errors of several kinds, with NumPy only.
 
-A surface is a sum of waves of random direction and length. Each view samples it anew, in profiles of its own direction
-and phase, so that no two views share a point.
+A surface is a sum of waves of random direction and length. Each view has profiles of its own direction and phase, so
+that no two views share a point.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,10 @@ Errors = Literal[
     "systematic",
     "heavy tails",
     "offsets and tilts of profiles",
+    "none",
 ]
-SHAPES, ERRORS = get_args(Shape), get_args(Errors)
+SHAPES = get_args(Shape)
+ERRORS = tuple(each for each in get_args(Errors) if each != "none")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -147,6 +149,8 @@ def _errors(
         by_profile = 0.5 * amount * noise * np.stack([np.ones(len(x)), y])
     elif kind == "systematic":
         systematic = amount * noise * np.stack([y**2, x * y, y**3, x**2])
+    elif kind == "none":
+        own = np.zeros(len(x))
     error = noise * own + rng.standard_normal(len(systematic)) @ systematic
     for each in by_profile:
         error = error + each * rng.standard_normal(profile.max() + 1)[profile]

@@ -50,7 +50,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Averages:
-    """Averages of a cloud's points in cubes: positions (C, 3) and systematic patterns (M, C, 3), mm, and counts (C,)."""
+    """Averages of points in cubes: positions (C, 3) and systematic patterns (M, C, 3), mm, and point counts (C,)."""
 
     places_mm: np.ndarray
     counts: np.ndarray
@@ -94,6 +94,8 @@ class Patches:
         second-order surfaces.
     shared : float
         Variance of the sum of all heights by noise, relative to the sum of their variances.
+    overlap : float
+        Mean number of patches that contain a point.
     strips : float
         Number of independent groups of patches with regard to errors of images.
     """
@@ -111,6 +113,7 @@ class Patches:
     one_sided: bool
     noise_stated: bool
     shared: float
+    overlap: float
     strips: float
 
     def correlated_count(self, count: int) -> float:
@@ -155,6 +158,7 @@ class Patches:
             self.one_sided,
             self.noise_stated,
             self.shared,
+            self.overlap,
             self.strips,
         )
 
@@ -238,6 +242,7 @@ def surface_patches(
         one_sided,
         uncertainty is not None,
         errors.correlation(by_images=False),
+        max(float(discs.weight.sum() / counts.sum()), 1.0),
         len(chosen) / errors.correlation(by_images=True),
     )
 
@@ -336,9 +341,9 @@ class PatchDistances:
     slope_variance : (Q,) float64
         Variance of the normal's slope in each tangential direction.
     target_errors : PatchErrors or None
-        Effect of the target's errors on its heights, if its surface was fitted anew.
+        Effect of the target's errors on its heights, if its surface was fitted again.
     target_patterns_mm : (Q, M, 3) float64 or None
-        Systematic patterns of the target at the foot of each distance, if its surface was fitted anew.
+        Systematic patterns of the target at the foot of each distance, if its surface was fitted again.
     """
 
     source: np.ndarray
@@ -353,7 +358,7 @@ class PatchDistances:
 
     def __getitem__(self, selection: np.ndarray) -> PatchDistances:
         """Select distances by indices or a mask."""
-        return PatchDistances(*(None if values is None else values[selection] for values in vars(self).values()))
+        return replace(self, **{name: value[selection] for name, value in vars(self).items() if value is not None})
 
 
 def distances_between(
@@ -412,8 +417,8 @@ def distances_between(
 def refit_distances(found: PatchDistances, source: Patches, target: Patches, target_pose: np.ndarray) -> PatchDistances:
     """Measure distances again, from second-order fits to the target's points about the foot of each distance.
 
-    Both surfaces are then smoothed alike, so that errors of their second-order approximation cancel. Feet whose height
-    is less certain than a single point are omitted.
+    Both surfaces are then smoothed in the same way, and errors of their second-order approximation cancel. Feet whose
+    height is less certain than a single point are omitted.
     """
     rotation, radius = target_pose[:3, :3], target.radius_mm
 
@@ -567,7 +572,7 @@ def _first_points(owner: np.ndarray) -> np.ndarray:
 def _image_errors(
     known: PointUncertainty | None, frame: np.ndarray | None, owner: np.ndarray, first: np.ndarray
 ) -> tuple[csr_array, np.ndarray]:
-    """Return the fraction (C, I) of the points of each average by image, and shifts (J, C, 3) by errors of the image."""
+    """Return the fraction (C, I) of points of each average by image, and shifts (J, C, 3) by errors of the image."""
     if known is None or frame is None:
         return csr_array((len(first), 0)), np.zeros((0, len(first), 3))
     shifts = known[first].image_errors_mm()
@@ -578,8 +583,10 @@ def _image_errors(
 
 def _average_patterns(known: PointUncertainty | None, owner: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return the systematic patterns (M, C, 3) of averages."""
-    patterns = np.zeros((0 if known is None else len(known.patterns_mm), len(counts), 3))
-    for number in range(len(patterns)):
-        for axis, column in enumerate(known.patterns_mm[number].T):
+    if known is None:
+        return np.zeros((0, len(counts), 3))
+    patterns = np.zeros((len(known.patterns_mm), len(counts), 3))
+    for number, pattern in enumerate(known.patterns_mm):
+        for axis, column in enumerate(pattern.T):
             patterns[number, :, axis] = np.bincount(owner, column) / counts
     return patterns

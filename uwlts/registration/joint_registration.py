@@ -8,7 +8,7 @@ share a calibration of the sensor or mount share its errors. The prior correlate
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, pairwise, permutations
 
@@ -155,7 +155,7 @@ class JointRegistration:
     def measure_distances(self, reach_mm: float, *, refit: bool = False) -> dict[tuple[int, int], PatchDistances]:
         """Measure the patch distances of each ordered pair of scans that overlap within ``reach_mm``.
 
-        With ``refit``, the target's surface is fitted anew at each distance (`refit_distances`).
+        With ``refit``, the target's surface is fitted again at each distance (`refit_distances`).
         """
         moved = [patches.corrected(amounts) for patches, amounts in zip(self.patches, self.patterns, strict=True)]
         found = {

@@ -17,7 +17,7 @@ import numpy as np
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError
-from uwlts.fitting.patches import surface_patches
+from uwlts.fitting.patches import PatchDistances, surface_patches
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Table
@@ -39,7 +39,7 @@ from uwlts.storage.pose_files import PoseFormat, read_poses, write_poses
 
 _ROUNDS = 60
 _REFITS = 12
-"""Largest number of further rounds with surfaces fitted anew at each distance; most registrations need three to six."""
+"""Largest number of further rounds, with surfaces fitted again at each distance."""
 _SETTLED = 0.1
 """Step, in standard uncertainties, below which a pose is settled: it would add 0.5 % to the standard uncertainty."""
 _STILL_MM = 1e-5
@@ -328,21 +328,7 @@ def register(
             break
         reach = max(NARROWER * reach, least)
     progress(steps, steps)
-    for refits in range(_REFITS + 1):
-        distances = joint.measure_distances(reach, refit=True)
-        pairs = joint.collect_evidence(distances)
-        joint.require_connected(list(pairs), names)
-        solution = joint.solve(list(pairs.values()))
-        known = joint.covariance(list(pairs.values()), solution)
-        moves = _largest_move(solution.step[: joint.unknown_poses], known)
-        if moves < _SETTLED or refits == _REFITS:
-            break
-        joint.move(solution.step)
-    if moves > 1:
-        raise EvaluationError(
-            f"the registration does not converge: after {done + 1 + _REFITS} rounds the next one would move a scan by "
-            f"{moves:.2g} standard uncertainties. Give more accurate initial poses, or scans with more overlap"
-        )
+    distances, pairs, solution, known = _settle(joint, reach, names)
     amounts = np.concatenate(joint.patterns)
     covariance = np.zeros((6 * len(scans),) * 2)
     covariance[6:, 6:] = known[: joint.unknown_poses, : joint.unknown_poses]
@@ -358,6 +344,32 @@ def register(
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
         cloud=merge_clouds(scans, names, joint, known),
     )
+
+
+def _settle(
+    joint: JointRegistration, reach: float, names: Sequence[str]
+) -> tuple[dict[tuple[int, int], PatchDistances], dict[tuple[int, int], PairEvidence], PoseSolution, np.ndarray]:
+    """Move the poses until they are settled; return distances, evidence, the last solution, and its covariance (U, U).
+
+    Raises EvaluationError if a further step would move a pose by more than its standard uncertainty.
+    """
+    rounds = 0
+    while True:
+        distances = joint.measure_distances(reach, refit=True)
+        pairs = joint.collect_evidence(distances)
+        joint.require_connected(list(pairs), names)
+        solution = joint.solve(list(pairs.values()))
+        covariance = joint.covariance(list(pairs.values()), solution)
+        moves = _largest_move(solution.step[: joint.unknown_poses], covariance)
+        if moves < _SETTLED or (rounds == _REFITS and moves <= 1):
+            return distances, pairs, solution, covariance
+        if rounds == _REFITS:
+            raise EvaluationError(
+                f"the registration does not converge: the next round would move a scan by {moves:.2g} standard "
+                "uncertainties. Give more accurate initial poses, or scans with more overlap"
+            )
+        joint.move(solution.step)
+        rounds += 1
 
 
 def _largest_move(step: np.ndarray, covariance: np.ndarray) -> float:
