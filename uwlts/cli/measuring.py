@@ -135,3 +135,21 @@ def mesh(
     surface = call()
     surface.save(out, overwrite=overwrite)
     wrote(surface.lines(), [], out)
+
+
+@command_from(app, uwlts, "fit_radiometry", job="Scan")
+def radiometry(
+    call: Call,
+    *,
+    out: Annotated[
+        Path,
+        a_file(".toml", beside=".json"),
+        Parameter(help="Description of the sensor to write (TOML), with all estimates as JSON beside it."),
+    ],
+    overwrite: Overwrite = False,
+) -> None:
+    """Example: uwlts radiometry wall.h5 --calibration calibration.json --out followed.toml"""
+    found = call()
+    show(found.lines())
+    found.save(out, overwrite=overwrite)
+    say(f"wrote {out} and {out.with_suffix('.json').name}")
