@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -15,11 +16,10 @@ from scipy.special import erf
 
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.files.json_files import trusting
-from uwlts.model.any_calibration import AnyCalibration, calibration_digest
+from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.phase_functions import PetzoldAverage, PhaseFunction
 from uwlts.model.sensor import CaptureHeader, Sensor
-from uwlts.optics.brightness import sheet_sigma_mm
 from uwlts.optics.fitness import check_fits
 from uwlts.radiometry.followed_sensor import follow_sensor
 from uwlts.radiometry.result import Estimate, Radiometry, StripeStatistics, compare_estimates, read_radiometry
@@ -29,6 +29,7 @@ from uwlts.radiometry.stripe_images import (
     TAIL_FIRST_PX,
     TAIL_PX,
     StripeImages,
+    fill_gaps,
     measure_noise,
     measure_stripes,
 )
@@ -42,12 +43,17 @@ from uwlts.stripe import StripeSettings, find_stripes
 _MOST_SCATTERING_PER_M = 6.0
 """Limit of the scattering coefficient, far beyond water in which a stripe is found at 0.5 m."""
 _SCATTERING_NODES = 25
-_TOLD_APART = 0.9
-"""Absolute correlation of two estimates from which they are listed as not told apart."""
+_INSEPARABLE = 0.9
+"""Absolute correlation of two estimates from which they are listed as not separable."""
 _KNOWN_ATTENUATION = 0.3
 """Standard uncertainty of the attenuation in 1/m from which the described water is kept: over 0.7 m of path, the laser
 power then changes by a fifth."""
 _ROUNDS = 3
+_WIDTH_STD = 0.01
+"""Relative standard uncertainty of the sheet's radius by the neglected light that is scattered by less than a pixel."""
+_LEAST_SIGMA_PX = 0.5
+"""Least standard deviation of the sheet in the image for which its radius is separable from pixel and blur."""
+_AS_DESCRIBED = np.zeros(2)
 _FAN_STD = 0.1
 """Standard uncertainty of the described power along the fan, relative, at its edges: line lasers are specified so."""
 
@@ -74,8 +80,8 @@ def fit_radiometry(
     Parameters
     ----------
     capture : Capture or path
-        Scan by a stage of a smooth, matt surface; one that extends over depth, such as an inclined plate, tells
-        attenuation from laser power.
+        Scan by a stage of a smooth, matt surface; one that extends over depth, such as an inclined plate, separates
+        attenuation and laser power.
     calibration : Calibration or path
         Calibration of the sensor (uwlts calibrate).
     reflectance : float
@@ -95,8 +101,8 @@ def fit_radiometry(
     Returns
     -------
     Radiometry
-        Estimates with standard uncertainties and correlations, what cannot be told apart, the outlook for the operator,
-        and the description of the sensor.
+        Estimates with standard uncertainties and correlations, quantities that the images do not separate, the outlook
+        for the operator, and the description of the sensor.
 
     Raises
     ------
@@ -121,7 +127,7 @@ def fit_radiometry(
         check_fits(scan.header, known, source=scan.path.name)
         if np.isfinite(scan.pose).any():
             raise CaptureError(f"{scan.path.name} has poses of a platform: give a scan by a stage")
-        stripes = find_stripes(scan, options=stripe, progress=progress)
+        stripes, gaps = fill_gaps(find_stripes(scan, options=stripe, progress=progress))
         light = stripe_light(scan.header, known, stripes, scan.stage_mm)
         images = measure_stripes(scan, stripes, light.usable, progress)
         evidence = _Evidence.gather(scan.header, known, light, images)
@@ -149,7 +155,7 @@ def fit_radiometry(
         scale = np.where(std > 0, std, 1.0)
         correlation = covariance / np.outer(scale, scale)
         kept = tuple(estimate for estimate in estimates if math.isfinite(estimate.value))
-        statistics = StripeStatistics.from_estimates(kept, gaps=images.gaps, tail=evidence.tail_shares())
+        statistics = StripeStatistics.from_estimates(kept, gaps=gaps, tail=evidence.tail_shares())
         by_name = {estimate.name: estimate for estimate in kept}
         sensor = follow_sensor(
             scan.header,
@@ -159,6 +165,7 @@ def fit_radiometry(
             sheet_distance_mm=evidence.distance_mm,
             attenuation_per_m=by_name["attenuation_per_m"].value if determined else described,
             dark_e=evidence.dark_e,
+            exposure_ms=float(np.median(images.exposure_ms)),
         )
         return Radiometry(
             date=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -168,10 +175,8 @@ def fit_radiometry(
             estimates=kept,
             correlation=correlation,
             statistics=statistics,
-            not_told_apart=_not_told_apart(correlation, by_name, determined, described),
-            outlook=outlook(
-                scan.header, known, by_name, images, determined=determined
-            ),
+            not_separable=_not_separable(correlation, by_name, determined, described),
+            outlook=outlook(scan.header, known, by_name, images, determined=determined),
             changes=() if earlier is None else compare_estimates(kept, earlier),
             sources={
                 "capture": describe_source(scan).model_dump(mode="json"),
@@ -262,7 +267,10 @@ class _Evidence:
             paths=to_laser + to_camera,
             distance_mm=float(np.mean(mean(light.distance_mm))),
             path_mm=float(np.mean(to_laser + to_camera)),
-            dark_e=1e-3 * float(images.exposure_ms.mean()) * detector.dark_current_e_per_s * detector.dark_current_growth(),
+            dark_e=1e-3
+            * float(np.median(images.exposure_ms))
+            * detector.dark_current_e_per_s
+            * detector.dark_current_growth(),
             nodes=nodes,
             tails=CubicSpline(nodes, np.array(tails), axis=1),
             within=CubicSpline(nodes, np.array(within), axis=1),
@@ -271,7 +279,8 @@ class _Evidence:
     def estimate_with_covariance(self, attenuation_per_m: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the estimates in the order of `_NAMES`, and their covariance; with a given attenuation, if any.
 
-        The covariance is that of the jackknife over the blocks, and of the described profile of the fan.
+        The covariance of the jackknife over the blocks is added to those of the described profile of the fan and of the
+        model of the halo. The latter is the change of all estimates if the tail begins at twice the distance.
         """
         every = np.ones(BLOCKS, bool)
         whole = self.estimate(every, attenuation_per_m)
@@ -281,21 +290,30 @@ class _Evidence:
         for fan in np.eye(2):
             moved = self.estimate(every, attenuation_per_m, fan=_FAN_STD * fan) - whole
             covariance += np.outer(moved, moved)
+        moved = self.estimate(every, attenuation_per_m, first_px=2 * TAIL_FIRST_PX) - whole
+        covariance += np.outer(moved, moved)
+        radius = _NAMES.index("sheet_radius_mm")
+        covariance[radius, radius] += (_WIDTH_STD * whole[radius]) ** 2
         return whole, covariance
 
     def estimate(
-        self, kept: np.ndarray, attenuation_per_m: float | None = None, fan: np.ndarray = np.zeros(2)
+        self,
+        kept: np.ndarray,
+        attenuation_per_m: float | None = None,
+        fan: np.ndarray = _AS_DESCRIBED,
+        first_px: int = TAIL_FIRST_PX,
     ) -> np.ndarray:
         """Return the estimates from some of the blocks (BLOCKS,).
 
-        ``fan`` is the expected deviation of the fan's power from its description, odd and even part.
+        ``fan`` is the expected deviation of the fan's power from its description, odd and even part; ``first_px`` is
+        the least distance of the tail.
         """
         images, some = self.images, kept[self.images.block]
         background, scattering = float(np.min(images.tail[kept])), 0.0
         for _ in range(_ROUNDS):
             light = images.light - images.width * background
             of_block = np.bincount(images.block, light) / np.bincount(images.block)
-            scattering, background = self._fit_tail(kept, of_block)
+            scattering, background = self._fit_tail(kept, of_block, first_px)
         share = self.within(scattering)[images.block]
         bright = np.maximum(images.light - images.width * background, 1e-3) / (self.model * share)
         path_m = 1e-3 * (self.paths - self.path_mm)
@@ -323,9 +341,9 @@ class _Evidence:
             float(np.mean(sigma)), math.sqrt(max(grain[0], 0.0)), length, slope, curve,
         ])  # fmt: skip
 
-    def _fit_tail(self, kept: np.ndarray, light: np.ndarray) -> tuple[float, float]:
+    def _fit_tail(self, kept: np.ndarray, light: np.ndarray, first_px: int) -> tuple[float, float]:
         """Return the scattering coefficient in 1/m, and the grey value of the background, from the tails."""
-        first = max(self.images.width // 2, TAIL_FIRST_PX)
+        first = max(self.images.width // 2, first_px)
         tail, count = self.images.tail[kept, first:], self.images.tail_count[kept, first:]
 
         def background_and_misfit(b: float) -> tuple[float, float]:
@@ -334,7 +352,7 @@ class _Evidence:
             level = float(np.sum(count * rest) / np.sum(count))
             return level, float(np.sum(count * (rest - level) ** 2))
 
-        found = minimize_scalar(
+        found: Any = minimize_scalar(
             lambda b: background_and_misfit(b)[1], bounds=(0.0, _MOST_SCATTERING_PER_M), method="bounded",
             options={"xatol": 1e-5},
         )  # fmt: skip
@@ -388,7 +406,8 @@ def _fit_sigma(place_px: np.ndarray, profile: np.ndarray) -> float:
         return float(np.sum((y - design @ np.linalg.lstsq(design, y, rcond=None)[0]) ** 2))
 
     limits = math.log(0.1), math.log(float(x[-1]))
-    return math.exp(float(minimize_scalar(misfit, bounds=limits, method="bounded").x))
+    found: Any = minimize_scalar(misfit, bounds=limits, method="bounded")
+    return math.exp(float(found.x))
 
 
 def _huber_weights(design: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -409,10 +428,10 @@ def _scatter(design: np.ndarray, values: np.ndarray, weight: np.ndarray) -> floa
     return float(np.sqrt(np.average(rest**2, weights=weight)))
 
 
-def _not_told_apart(
+def _not_separable(
     correlation: np.ndarray, by_name: dict[str, Estimate], determined: bool, described: float
 ) -> tuple[str, ...]:
-    """Return what the images do not tell apart, in words."""
+    """Return the quantities that the images do not separate, as text."""
     found = ["laser power, exposure scale, transmission of lens and windows, and reflectance: only their product"]
     attenuation = by_name["attenuation_per_m"]
     if not determined:
@@ -422,7 +441,7 @@ def _not_told_apart(
             "that extends over more depth"
         )
     for i, j in zip(*np.triu_indices(len(_NAMES), 1), strict=True):
-        if abs(correlation[i, j]) > _TOLD_APART:
+        if abs(correlation[i, j]) > _INSEPARABLE:
             a, b = (_TEXTS[_NAMES[k]][1] for k in (i, j))
             found.append(f"{a}, and {b}: correlated by {correlation[i, j]:.2f}")
     scattering = by_name["scattering_per_m"]
@@ -431,8 +450,8 @@ def _not_told_apart(
         found.append(f"scattering and none: below {most:.2g}/m no halo is seen beside the stripe")
     if "gain_dn_per_e" not in by_name:
         found.append("gain and speckle: repeat laser images at one position and exposure to measure the gain")
+    if by_name["stripe_sigma_px"].value < _LEAST_SIGMA_PX:
+        found.append("radius of the sheet and pixel: the stripe is narrower than a pixel, and the radius is its limit")
     found.append("waist and focus of the sheet: only its radius at the surface; the described focus is kept")
     found.append("background by dark current, black level and daylight: only their sum at this exposure")
     return tuple(found)
-
-

@@ -25,6 +25,7 @@ def follow_sensor(
     sheet_distance_mm: float,
     attenuation_per_m: float,
     dark_e: float,
+    exposure_ms: float,
 ) -> Sensor:
     """Return the described sensor with calibrated lens, window and sheet, and fitted laser, water and detector.
 
@@ -43,7 +44,9 @@ def follow_sensor(
     attenuation_per_m
         Attenuation to describe, for which the power was fitted.
     dark_e
-        Dark current in electrons during the mean exposure.
+        Dark current in electrons during the exposure.
+    exposure_ms
+        Exposure of the laser images.
     """
     sensor, value = header.sensor, {name: each.value for name, each in found.items()}
     index = calibration.medium_index(header.medium)
@@ -61,8 +64,10 @@ def follow_sensor(
     if "dark_noise_dn" in value:
         detector["read_noise_e"] = math.sqrt(max((value["dark_noise_dn"] / gain) ** 2 - dark_e, 0.0))
     detector["black_level_dn"] = max(value["background_dn"] - gain * dark_e, 0.0)
+    exposure = sensor.exposure.model_copy(update={"laser_ms": exposure_ms})
     return sensor.model_copy(
         update={
+            "exposure": exposure,
             "name": f"{sensor.name}-followed",
             "camera": _calibrated_camera(sensor, calibration),
             "laser": sensor.laser.model_copy(update=laser),

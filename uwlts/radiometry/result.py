@@ -61,9 +61,18 @@ class Change:
 class StripeStatistics:
     """Statistics of the stripe for comparisons with rendered images.
 
-    ``fwhm_px`` is its width, ``grain_contrast`` the contrast of its light along it, ``grain_length_lines`` the
-    correlation length of this light, ``tail_per_px`` its light per px at 8, 16 and 32 px beside it divided by all of
-    it, ``background_dn`` the grey value without it, and ``gaps`` the fraction of lines between its ends without it.
+    Attributes
+    ----------
+    fwhm_px : float
+        Full width at half maximum of the mean stripe.
+    grain_contrast, grain_length_lines : float
+        Contrast of the stripe's light along it, and the correlation length of this light.
+    tail_per_px : tuple of float
+        Light per px at 8, 16 and 32 px beside the stripe, divided by all of its light.
+    background_dn : float
+        Grey value without the stripe.
+    gaps : float
+        Fraction of the lines between the ends of the stripe that have no stripe centre.
     """
 
     fwhm_px: float
@@ -74,9 +83,7 @@ class StripeStatistics:
     gaps: float
 
     @classmethod
-    def from_estimates(
-        cls, estimates: Sequence[Estimate], *, gaps: float, tail: tuple[float, ...]
-    ) -> StripeStatistics:
+    def from_estimates(cls, estimates: Sequence[Estimate], *, gaps: float, tail: tuple[float, ...]) -> StripeStatistics:
         """Return the statistics from estimates, the fraction of gaps and the tail."""
         value = {each.name: each.value for each in estimates}
         width = 2 * math.sqrt(2 * math.log(2)) * value["stripe_sigma_px"]
@@ -109,9 +116,10 @@ class Outlook:
                 water += f" (light falls to a tenth in {math.log(10) / self.attenuation_per_m:.1f} m)"
         whole = self.reach_mm >= self.view_mm - 1.0
         reach = f"the whole view, {self.view_mm:.0f} mm" if whole else f"{self.reach_mm:.0f} of {self.view_mm:.0f} mm"
+        found = f"at {self.exposure_ms:.3g} ms the stripe is found to a depth of {reach}"
         return [
             f"water: {water}, scattering {self.scattering_per_m:.2f}/m",
-            f"at {self.exposure_ms:.3g} ms the stripe is found to a depth of {reach}; use {self.advised_exposure_ms:.3g} ms",
+            f"{found}; use {self.advised_exposure_ms:.3g} ms",
         ]
 
 
@@ -133,8 +141,8 @@ class Radiometry(Brief):
     correlation : (P, P) float64
         Correlation of the first P estimates, those of the stripe.
     statistics : StripeStatistics
-    not_told_apart : tuple of str
-        What the images do not tell apart.
+    not_separable : tuple of str
+        Quantities that the images do not separate.
     outlook : Outlook
     changes : tuple of Change
         Changes since an earlier result, if one was given.
@@ -151,7 +159,7 @@ class Radiometry(Brief):
     estimates: tuple[Estimate, ...]
     correlation: np.ndarray
     statistics: StripeStatistics
-    not_told_apart: tuple[str, ...]
+    not_separable: tuple[str, ...]
     outlook: Outlook
     changes: tuple[Change, ...]
     sources: Table
@@ -168,15 +176,15 @@ class Radiometry(Brief):
             *self.outlook.lines(),
             f"from paths of {low:.0f} to {high:.0f} mm in the water:",
             *(f"  {each.line()}" for each in self.estimates),
-            "not told apart by these images:",
-            *(f"  {text}" for text in self.not_told_apart),
+            "not separable in these images:",
+            *(f"  {text}" for text in self.not_separable),
             *([f"changes since {self.sources.get('compared_with')}:"] if self.changes else []),
             *(f"  {each.line()}" for each in self.changes),
         ]
 
     def record(self) -> Table:
         """Return everything but the sensor as JSON."""
-        return {
+        content: Any = {
             "format": FORMAT,
             "version": VERSION,
             "date": self.date,
@@ -186,11 +194,12 @@ class Radiometry(Brief):
             "estimates": [asdict(each) for each in self.estimates],
             "correlation": self.correlation.tolist(),
             "statistics": asdict(self.statistics) | {"tail_per_px": list(self.statistics.tail_per_px)},
-            "not_told_apart": list(self.not_told_apart),
+            "not_separable": list(self.not_separable),
             "outlook": asdict(self.outlook),
             "changes": [asdict(each) for each in self.changes],
             "path_mm": list(self.path_mm),
         }
+        return content
 
     @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
@@ -207,7 +216,7 @@ class Radiometry(Brief):
             f"capture {source['file']}, SHA-256 {source['sha256']}",
             f"calibration {self.sources['calibration']}; reflectance of the surface taken as {self.reflectance:g}",
             *(each.line() for each in self.estimates),
-            *(f"not told apart: {text}" for text in self.not_told_apart),
+            *(f"not separable: {text}" for text in self.not_separable),
         ]
         table = _without_none(self.sensor.model_dump(mode="json"))
         text = "".join(f"# {line}\n" for line in head) + "\n" + tomli_w.dumps(table)

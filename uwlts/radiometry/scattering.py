@@ -44,7 +44,8 @@ def line_spread(per_sr: Callable[[np.ndarray], np.ndarray], distance_mm: np.ndar
     across = np.geomspace(1e-2 * _LEAST_MM, path_mm, _ACROSS)
     aside = np.sqrt(x**2 + across**2)
     value = per_sr(np.clip(np.arctan2(aside, along), 1e-7, np.pi - 1e-7)) / (aside**2 + along**2)
-    return 2 * np.trapezoid(np.trapezoid(value * across, np.log(across), axis=2) * along[:, 0], np.log(along[:, 0]))
+    over_y = np.trapezoid(value * across, np.log(across), axis=2)
+    return 2 * np.asarray(np.trapezoid(over_y * along[:, 0], np.log(along[:, 0])))
 
 
 class HaloKernel:

@@ -1,10 +1,11 @@
-"""What the images show of a stripe: light across it, tail, width, grain along it, and noise of the camera."""
+"""Light across a stripe and beside it, grain along it, and noise of the camera, measured in images."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -16,7 +17,7 @@ from uwlts.storage.capture import Capture
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 
 TAIL_PX = 90
-"""Largest distance from the stripe of the tail, where halo and background are told apart."""
+"""Largest distance from the stripe of the tail, where halo and background are separated."""
 TAIL_FIRST_PX = 12
 """Least distance of the tail. Closer to the stripe, flare of the lens and blur add to the halo, and rendered halos are
 smoothed over cells of 8 px."""
@@ -32,6 +33,11 @@ BLOCKS = 20
 """Blocks of consecutive groups for the jackknife: a standard uncertainty is then known to a sixth."""
 _CLIPPED = 0.98
 """Fraction of full scale above which a pixel may be clipped."""
+_MOST_CLIPPED = 0.02
+"""Largest fraction of lines with clipped pixels in a run; their light is too low by about a tenth."""
+_LONGEST_GAP = 8
+"""Longest gap along the stripe, lines, in which centres are interpolated."""
+_ROUNDS = 5
 _BINS = 24
 """Bins of the photon transfer."""
 
@@ -60,8 +66,6 @@ class StripeImages:
         Number of pixels of ``tail``.
     grain : (J, _LAGS + 1)
         Mean product of the relative deviations of ``light`` from smooth at lags along the stripe, lines.
-    gaps : float
-        Fraction of the lines between the ends of the stripe that have no stripe centre.
     peak_dn : float
         Grey value that one of two hundred stripe centres exceeds.
     """
@@ -76,14 +80,36 @@ class StripeImages:
     tail: np.ndarray
     tail_count: np.ndarray
     grain: np.ndarray
-    gaps: float
     peak_dn: float
+
+
+def fill_gaps(stripes: CaptureStripes) -> tuple[CaptureStripes, float]:
+    """Interpolate centres in short gaps, and return the fraction of lines in gaps of any length.
+
+    Lines without a centre are dim by chance; without them, a faint stripe would seem brighter than it is.
+    """
+    same = np.diff(stripes.frame) == 0
+    missing = np.where(same, np.diff(stripes.line) - 1, 0)
+    short = (missing > 0) & (missing <= _LONGEST_GAP)
+    before = np.repeat(np.flatnonzero(short), missing[short])
+    step = np.concatenate([np.arange(1, count + 1) for count in missing[short].tolist()] or [np.empty(0, int)])
+    share = step / (missing[before] + 1)
+    place = np.concatenate([np.arange(len(stripes.line)), before + share])
+    order, source = np.argsort(place, kind="stable"), np.concatenate([np.arange(len(stripes.line)), before])
+    filled = stripes[source[order]]
+    line = np.concatenate([stripes.line, stripes.line[before] + step])[order]
+    centre = np.interp(place[order], np.arange(len(stripes.line)), stripes.centre_px)
+    whole = replace(filled, line=line, centre_px=centre)
+    return whole, float(missing.sum() / (missing.sum() + len(stripes.line)))
 
 
 def measure_stripes(
     capture: Capture, stripes: CaptureStripes, usable: np.ndarray, progress: ProgressListener
 ) -> StripeImages:
     """Measure the light across the stripe at its usable centres (N,) and beside it.
+
+    Runs of lines with more than a few clipped pixels are left out as a whole: to leave out single bright lines would
+    make the stripe seem darker.
 
     Raises
     ------
@@ -94,29 +120,27 @@ def measure_stripes(
     core = math.ceil(3 * float(np.nanmedian(stripes.width_px)) / FWHM_PER_SIGMA) + 3
     of_group, light, exposure = np.full(len(stripes.line), -1), [], []
     parts: list[_Part] = []
-    gaps = [0, 0]
     frames = np.unique(stripes.frame).tolist()
     peaks = []
     for number, frame in enumerate(frames):
         own = np.flatnonzero(stripes.frame == frame)
         line = stripes.line[own]
-        gaps[0] += int(line[-1] - line[0] + 1 - len(line))
-        gaps[1] += int(line[-1] - line[0] + 1)
         image = capture.image(frame)
         profiles = (image if along == "height" else image.T).astype(np.float32)
         for run in _runs(line, usable[own]):
             chosen = own[run]
             part = _measure_run(profiles, stripes.line[chosen], stripes.centre_px[chosen], core, _CLIPPED * full_dn)
-            whole = np.array_split(np.arange(len(chosen)), max(1, len(chosen) // GROUP_LINES))
-            for some in whole:
-                kept = some[part.unclipped[some]]
+            peaks.append(part.values[:, part.middle])
+            if np.mean(part.clipped) > _MOST_CLIPPED:
+                continue
+            for some in np.array_split(np.arange(len(chosen)), max(1, len(chosen) // GROUP_LINES)):
+                kept = some[np.isfinite(part.light[some])]
                 if len(kept) < GROUP_LINES / 2:
                     continue
                 of_group[chosen[kept]] = len(light)
                 light.append(float(part.light[kept].mean()))
                 exposure.append(float(capture.exposure_ms[frame]))
                 parts.append(part.select(kept))
-            peaks.append(part.values[:, part.middle])
         progress(number + 1, len(frames), "brightness of the stripe")
     if len(light) < BLOCKS:
         raise CaptureError(
@@ -138,31 +162,46 @@ def measure_stripes(
         np.array([mean for mean, _ in tails]),
         np.array([count for _, count in tails]),
         np.array([part.grain() for part in of_block]),
-        gaps[0] / max(gaps[1], 1),
         float(np.quantile(np.concatenate(peaks), 0.995)),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Pixels (N, 2 TAIL_PX + 1) about N neighbouring centres, at offsets ``offset`` (N,) of the middle pixel from the
-    centre; NaN outside the image."""
+    """Pixels about N neighbouring centres.
+
+    Attributes
+    ----------
+    values : (N, 2 TAIL_PX + 1)
+        Grey values, NaN outside the image.
+    offset : (N,)
+        Distance of the middle pixel from the centre.
+    light, deviation : (N,)
+        Light added across the stripe, and its relative deviation from smooth.
+    clipped : (N,) bool
+    middle : int
+        Number of the middle pixel.
+    """
 
     values: np.ndarray
     offset: np.ndarray
     light: np.ndarray
     deviation: np.ndarray
-    unclipped: np.ndarray
+    clipped: np.ndarray
     middle: int = TAIL_PX
 
     def select(self, kept: np.ndarray) -> _Part:
-        columns = self.values, self.offset, self.light, self.deviation, self.unclipped
-        return _Part(*(column[kept] for column in columns))
+        """Return the pixels of some centres."""
+        columns = self.values, self.offset, self.light, self.deviation, self.clipped
+        values, offset, light, deviation, clipped = (column[kept] for column in columns)
+        return _Part(values, offset, light, deviation, clipped)
 
     @classmethod
     def join(cls, parts: list[_Part]) -> _Part:
-        names = "values", "offset", "light", "deviation", "unclipped"
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        """Join the pixels of several runs."""
+        names = "values", "offset", "light", "deviation", "clipped"
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return cls(**columns)
 
     def mean_profile(self, edges: np.ndarray) -> np.ndarray:
         """Return the mean grey value (K,) in cells of the distance from the centre; NaN in empty cells."""
@@ -196,7 +235,7 @@ def _runs(line: np.ndarray, usable: np.ndarray) -> Iterator[np.ndarray]:
 
 def _measure_run(profiles: np.ndarray, line: np.ndarray, centre_px: np.ndarray, core: int, most: float) -> _Part:
     """Measure a run of neighbouring lines. Their centres are smoothed: grains move a centre, not the stripe."""
-    smooth = savgol_filter(centre_px, SMOOTH_LINES, 2)
+    smooth = np.asarray(savgol_filter(centre_px, SMOOTH_LINES, 2))
     middle = np.rint(smooth).astype(int)
     places = middle[:, None] + np.arange(-TAIL_PX, TAIL_PX + 1)
     inside = (places >= 0) & (places < profiles.shape[1])
@@ -204,12 +243,12 @@ def _measure_run(profiles: np.ndarray, line: np.ndarray, centre_px: np.ndarray, 
     centre = values[:, TAIL_PX - core : TAIL_PX + core + 1]
     light = centre.sum(axis=1)
     with np.errstate(invalid="ignore"):
-        unclipped = np.isfinite(light) & (centre.max(axis=1) < most)
+        clipped = centre.max(axis=1) >= most
     known = np.where(np.isfinite(light), light, np.nanmean(light))
     # The deviation refers to the light above the surroundings.
     above = known - centre.shape[1] * np.nanmedian(np.where(inside, values, np.nan))
-    deviation = above / np.maximum(savgol_filter(above, SMOOTH_LINES, 2), 1e-3) - 1.0
-    return _Part(values, middle - smooth, light, deviation, unclipped)
+    deviation = above / np.maximum(np.asarray(savgol_filter(above, SMOOTH_LINES, 2)), 1e-3) - 1.0
+    return _Part(values, middle - smooth, light, deviation, clipped)
 
 
 @dataclass(frozen=True)
@@ -234,40 +273,35 @@ def measure_noise(
     noise of pixels far from the stripe is measured, from differences of successive images.
     """
     source = capture if repeats is None else repeats
-    pairs = _repeated(source)
     full_dn = source.header.saturation_dn
-    if pairs:
-        parts = []
-        for first, second in pairs:
-            a, b = (source.image(number).astype(np.float32) for number in (first, second))
-            parts.append(np.stack([0.5 * (a + b), 0.5 * (a - b) ** 2]))
-        mean, half = np.stack(parts, axis=1)
+    parts = []
+    for numbers in _repeated(source):
+        images = np.stack([source.image(number) for number in numbers.tolist()]).astype(np.float32)
+        parts.append(np.stack([images.mean(axis=0), images.var(axis=0, ddof=1)]))
+    if parts:
+        mean, variance = np.stack(parts, axis=1)
+        noise_dn = math.sqrt(float(np.median(variance)))
+        # The means of dark pixels differ by noise alone: they are one bin.
+        dark_dn = max(6.0 * noise_dn / math.sqrt(2.0), 2.0)
+        edges = background_dn + np.concatenate([[-math.inf], np.geomspace(dark_dn, 0.85 * full_dn, _BINS)])
         # Each part of the jackknife has a piece of the stripe: all images of some of its lines.
         across = 1 if source.header.sensor.camera.stripe_along == "height" else 2
-        pieces = zip(*(np.array_split(each, BLOCKS, axis=across) for each in (mean, half)), strict=True)
-        bands = [np.stack([piece.ravel() for piece in pair]) for pair in pieces]
-        edges = background_dn + np.concatenate([[-1e9], np.geomspace(2.0, 0.85 * full_dn, _BINS)])
-        counted = np.array([_bin_variance(mean, variance, edges) for mean, variance in bands])
+        pieces = zip(*(np.array_split(each, BLOCKS, axis=across) for each in (mean, variance)), strict=True)
+        counted = np.array([_bin_variance(m.ravel(), v.ravel(), edges) for m, v in pieces])
         whole = _fit_transfer(counted.sum(axis=0), background_dn)
         if whole is not None:
-            left = np.array([
-                _fit_transfer(counted.sum(axis=0) - part, background_dn) or whole for part in counted
-            ])  # fmt: skip
+            left = np.array([_fit_transfer(counted.sum(axis=0) - part, background_dn) or whole for part in counted])
             std = np.sqrt((BLOCKS - 1) / BLOCKS * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
             dark = math.sqrt(max(whole[1], 0.0))
             return CameraNoise(whole[0], float(std[0]), dark, float(std[1]) / max(2 * dark, 1e-3))
     return _dark_noise(capture, stripes)
 
 
-def _repeated(capture: Capture) -> list[tuple[int, int]]:
-    """Return pairs of successive laser images at the same place and exposure."""
+def _repeated(capture: Capture) -> list[np.ndarray]:
+    """Return the numbers of successive laser images at the same place and exposure, two or more each."""
     lit = np.flatnonzero(capture.laser_on & capture.has_image)
-    same = [
-        (int(a), int(b))
-        for a, b in zip(lit[:-1], lit[1:], strict=True)
-        if capture.stage_mm[a] == capture.stage_mm[b] and capture.exposure_ms[a] == capture.exposure_ms[b]
-    ]
-    return [pair for number, pair in enumerate(same) if number % 2 == 0 or pair[0] != same[number - 1][1]]
+    moved = (np.diff(capture.stage_mm[lit]) != 0) | (np.diff(capture.exposure_ms[lit]) != 0)
+    return [numbers for numbers in np.split(lit, np.flatnonzero(moved) + 1) if len(numbers) > 1]
 
 
 def _bin_variance(mean: np.ndarray, variance: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -285,10 +319,13 @@ def _fit_transfer(counted: np.ndarray, background_dn: float) -> tuple[float, flo
     if np.count_nonzero(held) < 4:
         return None
     mean, variance = means[held] / count[held] - background_dn, variances[held] / count[held]
-    # The variance of a variance from pairs is twice its square.
-    root = np.sqrt(count[held]) / np.maximum(variance, 1e-3)
-    design = np.column_stack([mean, np.ones_like(mean)])
-    gain, dark = np.linalg.lstsq(design * root[:, None], variance * root, rcond=None)[0]
+    design, expected = np.column_stack([mean, np.ones_like(mean)]), np.full_like(mean, float(np.mean(variance)))
+    gain = dark = 0.0
+    for _ in range(_ROUNDS):
+        # The standard deviation of a variance is proportional to its expectation.
+        root = np.sqrt(count[held]) / np.maximum(expected, 1e-3)
+        gain, dark = np.linalg.lstsq(design * root[:, None], variance * root, rcond=None)[0]
+        expected = gain * mean + dark
     return float(gain), float(dark) - 1.0 / 12.0
 
 

@@ -129,7 +129,9 @@ def light_at(
         # A ray one pixel further meets the surface at this distance along the ray from its crossing of the sheet.
         shift = -_dot(normal, along) / _dot(normal, ray)
         sheet_per_px = np.abs(slope * shift)
-        grey = _grey_per_radiance(sensor, medium_index) * in_air[:, 2] ** 4 * fan.per_mm * lit / (math.pi * sheet_per_px)
+        grey = (
+            _grey_per_radiance(sensor, medium_index) * in_air[:, 2] ** 4 * fan.per_mm * lit / (math.pi * sheet_per_px)
+        )
     across = along - _dot(along, ray)[:, None] * ray
     good = (found.status[:count] == RayStatus.OK) & (found.status[count:] == RayStatus.OK)
     good &= (lit > _GRAZING) & (seen > _GRAZING) & np.isfinite(grey) & (grey > 0)
@@ -179,8 +181,8 @@ class _FanLight:
 def _fan_light(laser: Laser, pose: LaserPose, point: np.ndarray, *, medium_index: float) -> _FanLight:
     """Return the fan's light at points (N, 3), by refraction at a window normal to the axis.
 
-    The ray at the angle a in air reaches y = d tan a + t tan g + w tan m at depth d + t + w, with Snell's angles in
-    glass and medium. The power per length across a ray is P'(a) / (dy/da cos m).
+    The ray at the angle a in air has the angles g in glass and m in the medium. Behind the lengths d, t and w along the
+    axis, it is at y = d tan a + t tan g + w tan m. The power per length across a ray is P'(a) / (dy/da cos m).
     """
     away = point - pose.origin_mm
     y, z = away @ pose.fan, away @ pose.axis
@@ -190,7 +192,7 @@ def _fan_light(laser: Laser, pose: LaserPose, point: np.ndarray, *, medium_index
         glass = window.index(laser.wavelength_nm)
         inside = window.distance_mm, window.thickness_mm
         parts = [(inside[0], 1.0), (inside[1], glass), (z - sum(inside), medium_index)]
-    sine = y / np.hypot(y, z)
+    sine, by_sine = y / np.hypot(y, z), np.ones_like(y)
     for _ in range(_NEWTON_STEPS):
         reach, by_sine = np.zeros_like(y), np.zeros_like(y)
         for length, n in parts:
