@@ -77,7 +77,11 @@ def draw(seed: int) -> dict[str, float]:
 
 
 def record(folder: Path, seed: int, drawn: dict[str, float]) -> tuple[Path, Path]:
-    """Render a scan, and repeated images at one position; the captures state a sensor with other values."""
+    """Render a scan, and repeated images at one position; the captures state a sensor with other values.
+
+    The repeated images are rendered without multiple scattering: its random walks differ from image to image, and would
+    add to the camera's noise.
+    """
     keys = {name: drawn[name] for name in DESCRIBED if name != "water"}
     water = f"absorption_per_m = {drawn['absorption']}\nscattering_per_m = {drawn['scattering']}\nphase = 'petzold'"
     (folder / "described.toml").write_text(SENSOR.format(**DESCRIBED))
@@ -88,7 +92,9 @@ def record(folder: Path, seed: int, drawn: dict[str, float]) -> tuple[Path, Path
         moved = dict(zip(("start", "step", "count"), motion, strict=True))
         scene.write_text(SCENE.format(**moved, reflectance=drawn["reflectance"], turn=drawn["turn"]))
         if not out.exists():
-            twin.simulate(scene, sensor=folder / "described.toml", as_built=folder / "built.toml", seed=seed, out=out)
+            sensors = {"sensor": folder / "described.toml", "as_built": folder / "built.toml"}
+            without = ("multiple-scattering",) if name == "repeats" else ()
+            twin.simulate(scene, **sensors, seed=seed, without=without, out=out)
         paths.append(out)
     return paths[0], paths[1]
 

@@ -150,6 +150,6 @@ def radiometry(
 ) -> None:
     """Example: uwlts radiometry wall.h5 --calibration calibration.json --out followed.toml"""
     found = call()
-    show(found.lines())
     found.save(out, overwrite=overwrite)
+    show(found.lines())
     say(f"wrote {out} and {out.with_suffix('.json').name}")

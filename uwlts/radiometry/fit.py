@@ -49,6 +49,11 @@ _KNOWN_ATTENUATION = 0.3
 """Standard uncertainty of the attenuation in 1/m from which the described water is kept: over 0.7 m of path, the laser
 power then changes by a fifth."""
 _ROUNDS = 3
+_SCATTERING_STD = 0.04
+"""Relative standard uncertainty of the scattering coefficient by the model of the halo, for a known phase function.
+
+Both relative uncertainties were chosen on drawn captures 0 to 11 of docs/studies/radiometry.py, and are judged on others.
+"""
 _WIDTH_STD = 0.01
 """Relative standard uncertainty of the sheet's radius by the neglected light that is scattered by less than a pixel."""
 _LEAST_SIGMA_PX = 0.5
@@ -280,7 +285,8 @@ class _Evidence:
         """Return the estimates in the order of `_NAMES`, and their covariance; with a given attenuation, if any.
 
         The covariance of the jackknife over the blocks is added to those of the described profile of the fan and of the
-        model of the halo. The latter is the change of all estimates if the tail begins at twice the distance.
+        model of the halo. The latter is the change of the estimates if the tail begins at twice the distance; for the
+        scattering it is a fraction.
         """
         every = np.ones(BLOCKS, bool)
         whole = self.estimate(every, attenuation_per_m)
@@ -291,6 +297,8 @@ class _Evidence:
             moved = self.estimate(every, attenuation_per_m, fan=_FAN_STD * fan) - whole
             covariance += np.outer(moved, moved)
         moved = self.estimate(every, attenuation_per_m, first_px=2 * TAIL_FIRST_PX) - whole
+        scattering = _NAMES.index("scattering_per_m")
+        moved[scattering] = math.copysign(_SCATTERING_STD * whole[scattering], moved[scattering])
         covariance += np.outer(moved, moved)
         radius = _NAMES.index("sheet_radius_mm")
         covariance[radius, radius] += (_WIDTH_STD * whole[radius]) ** 2
