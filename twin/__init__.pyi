@@ -5,5 +5,6 @@ from .design.sweep import SweepResult as SweepResult, sweep as sweep
 from .devices.serve import ServedTwin as ServedTwin, serve as serve
 from .recording.campaigns import record as record
 from .recording.demonstration import demo as demo
+from .recording.follow import follow as follow
 from .recording.render import Recording as Recording, render as render, simulate as simulate
 from .recording.reproduce import reproduce as reproduce

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,7 +23,7 @@ from uwlts.model.phase_functions import PetzoldAverage, PhaseFunction
 from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.optics.fitness import check_fits
 from uwlts.radiometry.followed_sensor import follow_sensor
-from uwlts.radiometry.result import Estimate, Radiometry, StripeStatistics, compare_estimates, read_radiometry
+from uwlts.radiometry.result import Estimate, Radiometry, StripeStatistics, compare_estimates, read_estimates
 from uwlts.radiometry.scattering import STEP_PX, HaloKernel
 from uwlts.radiometry.stripe_images import (
     BLOCKS,
@@ -52,7 +53,8 @@ _ROUNDS = 3
 _SCATTERING_STD = 0.04
 """Relative standard uncertainty of the scattering coefficient by the model of the halo, for a known phase function.
 
-Both relative uncertainties were chosen on drawn captures 0 to 11 of docs/studies/radiometry.py, and are judged on others.
+Both relative uncertainties were chosen on the drawn captures 0 to 11 of docs/studies/radiometry.py, and are judged on
+others.
 """
 _WIDTH_STD = 0.01
 """Relative standard uncertainty of the sheet's radius by the neglected light that is scattered by less than a pixel."""
@@ -127,7 +129,7 @@ def fit_radiometry(
     known = resolve_calibration(calibration)
     if not isinstance(known, Calibration):
         raise CalibrationError("a calibration by polynomials has no paths of the light: give one by models")
-    earlier = None if compared_with is None else read_radiometry(compared_with)
+    earlier = None if compared_with is None else read_estimates(compared_with)
     with open_capture(capture) as scan:
         check_fits(scan.header, known, source=scan.path.name)
         if np.isfinite(scan.pose).any():
@@ -143,12 +145,8 @@ def fit_radiometry(
             free, free_variance = whole[1], covariance[1, 1]
             whole, covariance = evidence.estimate_with_covariance(attenuation_per_m=described)
             whole[1], covariance[1, 1] = free, free_variance
-        values = dict(zip(_NAMES, whole.tolist(), strict=True))
-        if repeats is None:
-            noise = measure_noise(scan, stripes, repeats=None, background_dn=values["background_dn"])
-        else:
-            with open_capture(repeats) as again:
-                noise = measure_noise(scan, stripes, repeats=again, background_dn=values["background_dn"])
+        with nullcontext() if repeats is None else open_capture(repeats) as again:
+            noise = measure_noise(scan, stripes, repeats=again)
         std = np.sqrt(np.diag(covariance))
         estimates = [
             Estimate(name, float(value), float(error), *_TEXTS[name])

@@ -13,13 +13,12 @@ import numpy as np
 from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError
 from uwlts.files.json_files import json_text, read_json
-from uwlts.files.reading import add_article
 from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Sensor, Table
 
 FORMAT, VERSION = "uwlts-radiometry", 1
-_SIGNIFICANT = 3.0
+SIGNIFICANT = 3.0
 """Changes above this multiple of their standard uncertainty are called significant: one of 370 by chance."""
 
 
@@ -53,7 +52,7 @@ class Change:
     def line(self) -> str:
         """Return the change as text."""
         text = f"{self.meaning}: {self.before:.4g} -> {self.after:.4g} {self.unit}".rstrip()
-        marked = " (significant)" if abs(self.significance) > _SIGNIFICANT else ""
+        marked = " (significant)" if abs(self.significance) > SIGNIFICANT else ""
         return f"{text}, {self.after - self.before:+.3g} ± {self.std:.2g}, {self.significance:+.1f} sigma{marked}"
 
 
@@ -228,16 +227,33 @@ class Radiometry(Brief):
             description.write_text(text, encoding="utf-8")
 
 
-def read_radiometry(path: str | Path) -> tuple[Estimate, ...]:
+def read_estimates(path: str | Path) -> tuple[Estimate, ...]:
     """Read the estimates of an earlier result; CaptureError if the file is missing, foreign or damaged."""
-    content = read_json(Path(path), called="result of uwlts radiometry")
-    if content.get("format") != FORMAT or content.get("version") != VERSION:
-        raise CaptureError(f"{path} is JSON but not {add_article('result')} of uwlts radiometry, version {VERSION}")
+    found = _read(path, "estimates")
     try:
-        found: Any = content["estimates"]
         return tuple(Estimate(**each) for each in found)
+    except TypeError as error:
+        raise CaptureError(f"{path} is damaged: its estimates are no table") from error
+
+
+def read_statistics(path: str | Path) -> StripeStatistics:
+    """Read the statistics of an earlier result; CaptureError if the file is missing, foreign or damaged."""
+    found = _read(path, "statistics")
+    try:
+        return StripeStatistics(**found | {"tail_per_px": tuple(found["tail_per_px"])})
     except (KeyError, TypeError) as error:
-        raise CaptureError(f"{path} is damaged: it has no table of estimates") from error
+        raise CaptureError(f"{path} is damaged: its statistics are no table") from error
+
+
+def _read(path: str | Path, key: str) -> Any:
+    if Path(path).suffix == ".toml":
+        raise CaptureError(f"{path} is the description; give the result beside it, {Path(path).stem}.json")
+    content = read_json(path, called="result of uwlts radiometry")
+    if content.get("format") != FORMAT or content.get("version") != VERSION:
+        raise CaptureError(f"{path} is JSON but not a result of uwlts radiometry, version {VERSION}")
+    if key not in content:
+        raise CaptureError(f"{path} is damaged: it has no {key}")
+    return content[key]
 
 
 def compare_estimates(now: Sequence[Estimate], before: Sequence[Estimate]) -> tuple[Change, ...]:

@@ -264,9 +264,7 @@ class CameraNoise:
     dark_std: float
 
 
-def measure_noise(
-    capture: Capture, stripes: CaptureStripes, *, repeats: Capture | None, background_dn: float
-) -> CameraNoise:
+def measure_noise(capture: Capture, stripes: CaptureStripes, *, repeats: Capture | None) -> CameraNoise:
     """Measure noise by photon transfer from laser images that were repeated at one place and exposure (EMVA 1288).
 
     Speckle is the same in repeated images and does not add to their differences. Without repeated images, only the
@@ -280,7 +278,8 @@ def measure_noise(
         parts.append(np.stack([images.mean(axis=0), images.var(axis=0, ddof=1)]))
     if parts:
         mean, variance = np.stack(parts, axis=1)
-        noise_dn = math.sqrt(float(np.median(variance)))
+        # Most pixels are dark.
+        noise_dn, background_dn = math.sqrt(float(np.median(variance))), float(np.median(mean))
         # The means of dark pixels differ by noise alone: they are one bin.
         dark_dn = max(6.0 * noise_dn / math.sqrt(2.0), 2.0)
         edges = background_dn + np.concatenate([[-math.inf], np.geomspace(dark_dn, 0.85 * full_dn, _BINS)])
