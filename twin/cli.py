@@ -49,6 +49,15 @@ def reproduce(call: Call) -> None:
     _run_others(call)
 
 
+@command_from(app, twin, "follow", job="Simulate")
+def follow(call: Call) -> None:
+    """Example: twin follow wall.h5 --calibration calibration.json --out runs/follow"""
+    try:
+        say(f"wrote {call()}")
+    except CommandFailed as error:
+        sys.exit(error.returncode)
+
+
 @command_from(app, twin, "demo", job="Simulate")
 def demo(call: Call) -> None:
     """Example: twin demo"""
