@@ -27,7 +27,7 @@ from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
-from uwlts.hardware.camera_interface import CameraDevice
+from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.plan import GuidedPlan
 from uwlts.hardware.guided.record import guide
@@ -40,6 +40,7 @@ from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
+from uwlts.stripe import Stripe
 
 _PREVIEW_S = 0.15
 """Pause between two live images."""
@@ -312,7 +313,7 @@ class Instrument:
         connected, self._connected, self._rig, self.light = self._connected, None, None, None
         self._end_live()
         if connected is not None:
-            self._board.position_mm = None
+            self._board.position_mm = self._board.profile = None
             try:
                 connected.closing.close()
             except Error as error:
@@ -396,15 +397,26 @@ class Instrument:
             stripe = get_stripe(frame.seen, connected.sensor)
             pixels = stripe.pixels()
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
-            if (known := self.calibration) is not None:
-                # The place of the stage while live images are shown.
-                place = Frame(frame.seen, self._board.position_mm or 0.0, True, frame.exposure_ms or 0.0, frame.time_s)
-                profile = reconstruct_frame(place, stripe, connected.plan.header("live"), known)
-                self._board.profile = None if profile is None else order_profile(profile)
+            self._show_profile(connected, frame, stripe)
         saturated = seen.saturated / max(seen.counted, 1)
         image = drawable_image(frame.seen, connected.sensor.camera)
         self._live = Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated)
         self._board.show(self._live)
+
+    def _show_profile(self, connected: _Connected, frame: GrabbedFrame, stripe: Stripe) -> None:
+        """Show the points of a live laser image; a calibration that does not fit is not used again."""
+        if self.calibration is None:
+            return
+        # Until the first movement the position may be unknown.
+        place_mm, exposure_ms = self._board.position_mm or 0.0, frame.exposure_ms or 0.0
+        placed = Frame(frame.seen, place_mm, True, exposure_ms, frame.time_s)
+        try:
+            found = reconstruct_frame(placed, stripe, connected.plan.header("live"), self.calibration)
+        except Error as error:
+            self.calibration = None
+            self._board.say(f"no profile is shown: {error}", "error")
+            return
+        self._board.profile = None if found is None else order_profile(found)
 
     def _scan(self, plan: ScanPlan, out: Path, calibration: Path | None, resume: bool, overwrite: bool) -> None:
         known: AnyCalibration | None = None if calibration is None else load_calibration(calibration)
