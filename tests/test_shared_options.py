@@ -65,6 +65,8 @@ MEANING = {
     "twin": {
         "--as-built": "sensor to render",
         "--campaign": "campaign's description",
+        "--campaigns": "Number of campaigns",
+        "--first": "Seed of the first campaign",
         "--effects": "Effects of real images to add",
         "--every": "every",
         "--ideal": "pinhole",

@@ -66,7 +66,7 @@ def main(calibration: Path, folder: Path, pictures: Path) -> None:
 
 
 def drive(page: Page, tank: Path, pictures: Path) -> None:
-    """Connect, scan, reconstruct, measure, and take the pictures."""
+    """Connect, scan, reconstruct, measure with limits, cut a section, and take the pictures."""
     press(page, "connect")
     tab(page, "Stage")
     page.locator(".log").get_by_text("connected: Grbl").wait_for()
@@ -102,8 +102,21 @@ def drive(page: Page, tank: Path, pictures: Path) -> None:
         press(page, "sphere")
         page.wait_for_timeout(5000)
     press(page, "length")
+    rows = page.locator(".measured")
+    rows.get_by_text("distance").wait_for()
+    for row in reversed(rows.filter(has_text="standard deviation").all()):
+        row.get_by_role("button", name="remove").click()
+        page.wait_for_timeout(1000)
+    for sphere in range(2):
+        for label, limit in (("lower, mm", "50.0"), ("upper, mm", "50.2")):
+            page.get_by_label(label).nth(sphere).fill(limit)
+            page.keyboard.press("Tab")
     page.wait_for_timeout(3000)
     page.screenshot(path=pictures / "desk-measure.png")
+    press(page, "section")
+    page.locator(".plot").wait_for()
+    page.wait_for_timeout(2000)
+    page.screenshot(path=pictures / "desk-section.png")
 
 
 if __name__ == "__main__":

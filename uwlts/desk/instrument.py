@@ -22,7 +22,7 @@ from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.board import Board, Picture
 from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.recording_view import RecordingView
+from uwlts.desk.recording_view import BackgroundView, RecordingView, reconstruct_frame
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
@@ -34,6 +34,7 @@ from uwlts.hardware.guided.record import guide
 from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, record_scan
+from uwlts.inspection.section import order_profile
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
@@ -42,8 +43,6 @@ from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
 
 _PREVIEW_S = 0.15
 """Pause between two live images."""
-_WAITING = 64
-"""Images in the queue for display during a scan; further ones are recorded but not shown."""
 _MOST_LOST = 2
 """Consecutive live images that may be lost before an error is reported."""
 _EARLIER = 200
@@ -86,6 +85,8 @@ class Instrument:
         self._darkened, self._lost = False, 0
         self._live: Picture | None = None
         self.exposure_ms: dict[Light, float] = {"laser": START_MS, "lamp": START_MS}
+        self.calibration: AnyCalibration | None = None
+        """Calibration for the profile of live laser images."""
         self._thread = threading.Thread(target=self._run, name="instrument", daemon=True)
         self._thread.start()
 
@@ -395,6 +396,11 @@ class Instrument:
             stripe = get_stripe(frame.seen, connected.sensor)
             pixels = stripe.pixels()
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
+            if (known := self.calibration) is not None:
+                # The place of the stage while live images are shown.
+                place = Frame(frame.seen, self._board.position_mm or 0.0, True, frame.exposure_ms or 0.0, frame.time_s)
+                profile = reconstruct_frame(place, stripe, connected.plan.header("live"), known)
+                self._board.profile = None if profile is None else order_profile(profile)
         saturated = seen.saturated / max(seen.counted, 1)
         image = drawable_image(frame.seen, connected.sensor.camera)
         self._live = Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated)
@@ -428,7 +434,7 @@ class Instrument:
         self.state, self._rig, kept_light = InstrumentState.SCANNING, None, self.light
         self._show_laser()
         try:
-            with _BackgroundView(view) as shown:
+            with BackgroundView(view.show) as shown:
                 seen = record_scan(
                     plan,
                     out,
@@ -491,35 +497,3 @@ class Instrument:
         if self._stop.is_set():
             raise Ended
         self._show_laser()
-
-
-class _BackgroundView:
-    """Display of recorded images in its own thread, so that recording never waits for it."""
-
-    def __init__(self, view: RecordingView):
-        self._view = view
-        self._waiting: queue.Queue[tuple[Frame, int] | None] = queue.Queue(_WAITING)
-        self._fault: Exception | None = None
-
-    def put(self, frame: Frame, number: int) -> None:
-        """Queue an image for display, unless too many wait."""
-        if not self._waiting.full():
-            self._waiting.put((frame, number))
-
-    def _show(self) -> None:
-        while (seen := self._waiting.get()) is not None:
-            try:
-                self._view.show(*seen)
-            except Exception as error:
-                self._fault = self._fault or error
-
-    def __enter__(self) -> "_BackgroundView":
-        self._thread = threading.Thread(target=self._show, name="view", daemon=True)
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        self._waiting.put(None)
-        self._thread.join()
-        if self._fault is not None and kind is None:
-            raise self._fault

@@ -1,24 +1,31 @@
 """Display of a recording in progress on the page: its latest image with the stripe, warnings, and the cloud so far."""
 
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
 from uwlts.desk.board import Board, Picture
 from uwlts.desk.server import DeskServer
 from uwlts.errors import CaptureError
+from uwlts.inspection.section import order_profile
 from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.calibration import Calibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, drawable_image, part_path
-from uwlts.stripe import CaptureStripes, find_stripe, warm_up
+from uwlts.storage.cloud import PointCloud
+from uwlts.stripe import CaptureStripes, Stripe, find_stripe, warm_up
 
 LOOK_S = 0.1
 """Interval between checks for new images; a check takes a few ms."""
+_WAITING = 64
+"""Images in the queue for display during a scan; further ones are recorded but not shown."""
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
 """Limits of a laser image: faint below this fraction of full scale; saturated above this fraction of saturated lines;
 too little of the stripe below this fraction of lines with a point."""
@@ -26,11 +33,10 @@ too little of the stripe below this fraction of lines with a point."""
 
 @dataclass(frozen=True, eq=False)
 class _Profile:
-    """Stripe of one laser image: pixels (N, 2), points (N, 3) in mm, their grey values, warnings."""
+    """Stripe of one laser image: pixels (N, 2), points if a calibration is known, warnings."""
 
     pixels: np.ndarray
-    points_mm: np.ndarray
-    intensity: np.ndarray
+    cloud: PointCloud | None
     lines: int
     saturated: float | None
     remarks: tuple[str, ...]
@@ -71,8 +77,9 @@ class RecordingView:
                 saturated=profile.saturated,
             )
         )
-        if len(profile.points_mm):
-            board.cloud.add(profile.points_mm, intensity=profile.intensity)
+        if (cloud := profile.cloud) is not None:
+            board.cloud.add(cloud.points_mm, intensity=cloud.intensity)
+            board.profile = order_profile(cloud)
         for remark in profile.remarks:
             # Once each, because they stay in the log.
             if remark not in self._said:
@@ -83,13 +90,7 @@ class RecordingView:
 def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | None) -> _Profile:
     along, full = header.sensor.camera.stripe_along, header.saturation_dn
     stripe = find_stripe(frame.seen, stripe_along=along, saturation=full)
-    line, points, intensity = stripe.lines, np.empty((0, 3)), np.empty(0)
-    centre = stripe.centre_px[line]
-    if calibration is not None and len(line):
-        own = np.zeros(len(line), dtype=int)
-        stripes = CaptureStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
-        cloud = reconstruct_stripes(FrameTable.from_frames(header, [frame]), stripes, calibration)
-        points, intensity = cloud.points_mm, cloud.intensity
+    cloud = None if calibration is None else reconstruct_frame(frame, stripe, header, calibration)
     saturated, remarks = None, []
     if isinstance(frame.seen, np.ndarray):
         brightest = frame.seen.max(axis=0 if along == "width" else 1)
@@ -98,9 +99,26 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
             remarks.append("saturated on many lines: shorten the exposure")
         elif np.quantile(brightest, 0.98) < _FAINT * full:
             remarks.append("faint: lengthen the exposure, or is the laser off?")
-    if len(line) < _FEW * len(stripe.status):
+    if len(stripe.lines) < _FEW * len(stripe.status):
         remarks.append("almost no stripe: is the object in the volume?")
-    return _Profile(stripe.pixels(), points, intensity, len(stripe.status), saturated, tuple(remarks))
+    return _Profile(stripe.pixels(), cloud, len(stripe.status), saturated, tuple(remarks))
+
+
+def reconstruct_frame(
+    frame: Frame, stripe: Stripe, header: CaptureHeader, calibration: AnyCalibration
+) -> PointCloud | None:
+    """Return the points of a laser image, with uncertainty if the calibration states it; None without a stripe.
+
+    The errors are those of `reconstruct_stripes`.
+    """
+    line = stripe.lines
+    if len(line) == 0:
+        return None
+    own, centre = np.zeros(len(line), dtype=int), stripe.centre_px[line]
+    stripes = CaptureStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
+    known = isinstance(calibration, Calibration) and calibration.joint is not None
+    table = FrameTable.from_frames(header, [frame])
+    return reconstruct_stripes(table, stripes, calibration, with_uncertainty=known)
 
 
 def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:
@@ -124,6 +142,41 @@ def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | Non
         if finished:
             return
         yield None
+
+
+class BackgroundView:
+    """Display of recorded images in a thread of its own, so that recording never waits for it.
+
+    ``show`` is called with images and their numbers. Its first error is raised when the ``with`` ends.
+    """
+
+    def __init__(self, show: Callable[[Frame, int], None]):
+        self._show = show
+        self._waiting: queue.Queue[tuple[Frame, int] | None] = queue.Queue(_WAITING)
+        self._fault: Exception | None = None
+
+    def put(self, frame: Frame, number: int) -> None:
+        """Queue an image for display, unless too many wait."""
+        if not self._waiting.full():
+            self._waiting.put((frame, number))
+
+    def _run(self) -> None:
+        while (seen := self._waiting.get()) is not None:
+            try:
+                self._show(*seen)
+            except Exception as error:
+                self._fault = self._fault or error
+
+    def __enter__(self) -> Self:
+        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        self._waiting.put(None)
+        self._thread.join()
+        if self._fault is not None and kind is None:
+            raise self._fault
 
 
 def watch(
