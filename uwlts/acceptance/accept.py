@@ -244,15 +244,17 @@ def accept(
         for symbol in SYMBOLS
         if stated.mpe.of(symbol) is not None or any(value.symbol == symbol for value, _ in values)
     )
+    edited = () if known is None or not known.edited else ("the earlier result was edited after it was written",)
     return Acceptance(
         plan=stated,
         positions=tuple(judged),
         characteristics=characteristics,
         scale=scale,
-        remarks=(*_remarks(stated, characteristics), *_warnings(judged)),
+        remarks=(*_remarks(stated, characteristics), *_warnings(judged), *edited),
         calibration=None if calibration is None else calibration_digest(calibration),
         software=f"uwlts {__version__}",
         date=datetime.now(UTC).isoformat(timespec="seconds"),
+        edited=bool(edited),
     )
 
 
@@ -296,7 +298,7 @@ def _judge_position(
         **state,
         state="judged",
         points=len(cloud),
-        warnings=tuple(cloud.warnings),
+        warnings=(*cloud.warnings, *_edited_parts(cloud)),
         stage_direction=direction,
         values=tuple(values),
     )
@@ -311,6 +313,11 @@ def _measure_cloud(file: Path, calibration: AnyCalibration | None) -> tuple[Poin
     with Capture(file) as capture:
         cloud = reconstruct(capture, calibration, with_uncertainty=False)
         return cloud, capture.header.stage_direction
+
+
+def _edited_parts(cloud: PointCloud) -> list[str]:
+    """Return a warning if the cloud is based on a file that was edited after it was written."""
+    return [f"the {part} was edited after it was written" for part in [cloud.metadata.get(EDITED)] if part]
 
 
 def _remarks(plan: AcceptancePlan, characteristics: Sequence[Characteristic]) -> Iterator[str]:

@@ -1,14 +1,15 @@
 """Page of an acceptance test: verdict, characteristics with decisions, pictures, shares, and traceability."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
 
-from uwlts.acceptance.accept import FORMAT, VERSION, Acceptance
+from uwlts.acceptance.accept import FORMAT, VERSION, Acceptance, JudgedPosition
 from uwlts.acceptance.characteristics import NAMES, Characteristic, MeasuredValue
 from uwlts.acceptance.directional_scale import DirectionalScale, ScaleComponent
-from uwlts.acceptance.plan import CertifiedArtefact
+from uwlts.acceptance.plan import SYMBOLS, CertifiedArtefact, Symbol
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.artefacts import SphereStandard, StepStandard
@@ -75,6 +76,9 @@ def acceptance_page(acceptance: Acceptance) -> str:
     """Return the page as text."""
     plan, scale = acceptance.plan, acceptance.scale
     x, y, z = plan.volume_mm
+    measured: list[Symbol] = [
+        symbol for symbol in SYMBOLS if any(value.symbol == symbol for value in acceptance.values)
+    ]
     facts = [
         ("sensor", plan.sensor or "not stated"),
         ("client", plan.client or "not stated"),
@@ -99,7 +103,8 @@ def acceptance_page(acceptance: Acceptance) -> str:
         scatter=_describe_scatter(scale),
         scale_remarks=() if scale is None else scale.remarks,
         remarks=acceptance.remarks,
-        positions=[_position_row(acceptance, number) for number in range(len(acceptance.positions))],
+        positions=[_position_row(number, each, measured) for number, each in enumerate(acceptance.positions, start=1)],
+        measured=measured,
         artefacts=[_artefact_row(name, each) for name, each in plan.artefacts.items()],
         temperature=plan.temperature,
         digests=[(each.file, each.sha256 or MISSING) for each in acceptance.positions],
@@ -139,15 +144,15 @@ def _characteristic_row(each: Characteristic) -> tuple[str, ...]:
     return each.symbol, each.decision, value, expanded, limit, place, measured, f"{words}; {guideline}"
 
 
-def _position_row(acceptance: Acceptance, number: int) -> tuple[str, ...]:
-    each = acceptance.positions[number]
+def _position_row(number: int, each: JudgedPosition, measured: Sequence[Symbol]) -> tuple[str, ...]:
+    """Return a position with the values of the measured characteristics."""
     state = f"{each.state}: {each.reason}" if each.reason else each.state
     values = []
-    for symbol in NAMES:
+    for symbol in measured:
         own = [value.value_mm for value in each.values if value.symbol == symbol]
-        values.append(" / ".join(format_fixed(value, 4, signed=symbol in _SIGNED) for value in own) or MISSING)
-    values = [each.replace("-", "−") if each != MISSING else each for each in values]
-    return f"{number + 1}", each.name, each.artefact, state, *values
+        shown = [format_fixed(value, 4, signed=symbol in _SIGNED).replace("-", "\N{MINUS SIGN}") for value in own]
+        values.append(" / ".join(shown) or MISSING)
+    return f"{number}", each.name, each.artefact, state, *values
 
 
 def _artefact_row(name: str, each: CertifiedArtefact) -> tuple[str, ...]:

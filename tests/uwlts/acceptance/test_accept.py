@@ -193,7 +193,7 @@ def test_wrong_plans_are_refused(tmp_path, changes, said):
         uwlts.accept(write_plan(tmp_path, **changes))
 
 
-def test_a_result_is_kept_whole_and_sealed(found, tmp_path):
+def test_a_result_is_kept_whole_and_sealed(folder, found, tmp_path):
     found.save(tmp_path / "result.json")
     assert uwlts.read(tmp_path / "result.json") == found
     content = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
@@ -201,6 +201,11 @@ def test_a_result_is_kept_whole_and_sealed(found, tmp_path):
     (tmp_path / "result.json").write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(CaptureError, match="edited"):
         uwlts.read(tmp_path / "result.json")
+    with pytest.raises(CaptureError, match="edited"):
+        uwlts.accept(folder / "plan.toml", earlier=tmp_path / "result.json")
+    continued = uwlts.accept(folder / "plan.toml", earlier=tmp_path / "result.json", trust_edited=True)
+    assert continued.edited
+    assert "the earlier result was edited after it was written" in continued.remarks
     assert uwlts.read(tmp_path / "result.json", trust_edited=True).edited
 
 
