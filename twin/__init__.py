@@ -2,9 +2,9 @@
 
 `render` renders a scene to arrays, and `simulate` to capture and truth files. `serve` provides a scene as camera and
 stage hardware. `record` renders a campaign of captures. `dataset` renders a data set with labels, and `load_dataset`
-reads it. `sweep` searches the best design of a sensor. `demo` runs the whole chain of commands, and `reproduce` the
-evaluation of the thesis. The stub file lists all names. Each name is imported at its first use, because libLLVM must be
-selected before Mitsuba is imported.
+reads it. `sweep` searches the best design of a sensor, and `predict` states the uncertainty of its measurements. `demo`
+runs the whole chain of commands, and `reproduce` the evaluation of the thesis. The stub file lists all names. Each name
+is imported at its first use, because libLLVM must be selected before Mitsuba is imported.
 """
 
 from uwlts.argument_types import attach_public

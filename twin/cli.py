@@ -63,6 +63,16 @@ def _run_others(call: Call) -> None:
         sys.exit(error.returncode)
 
 
+@command_from(app, twin, "predict", job="Design")
+def predict(call: Call) -> None:
+    """Example: twin predict thesis --campaigns 3 --out runs/predicted"""
+    try:
+        result = call()
+    except CommandFailed as error:
+        sys.exit(error.returncode)
+    show(result.lines())
+
+
 @command_from(app, twin, "sweep", job="Design")
 def sweep(call: Call) -> None:
     """Example: twin sweep baseline-angle --out runs/baseline-angle"""

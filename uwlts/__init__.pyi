@@ -1,4 +1,5 @@
 from . import report as report
+from .acceptance.accept import accept as accept
 from .alignment.align import align_trajectory as align_trajectory
 from .calibration.calibrate import calibrate as calibrate
 from .calibration.camera.photographs import calibrate_camera as calibrate_camera

@@ -1,5 +1,7 @@
 """Time of laser light after faults: ``python -m tests.bench.laser_off [tries]``, 100 tries of each fault by default.
 
+Runs with different ``--seed`` draw different times of the faults.
+
 A program of its own takes laser images by `uwlts.hardware.rig` with the twin's camera and controller. Each fault occurs
 while the laser is on and the camera's image is late, so that nothing but the protection ends the light. Light is the
 state of the simulated controller's pin. Printed is the longest uninterrupted light after the fault, over all later
@@ -127,9 +129,9 @@ def measure_light(name: str, folder: Path, *, wait_s: float) -> float:
                     os.kill(guard, signal.SIGKILL)
 
 
-def main(tries: int = 100) -> int:
+def main(tries: int = 100, *, seed: int = 0) -> int:
     """Cause each fault a number of times, at different times of the light, and print a table."""
-    chosen, measured = random.Random(0), {name: [] for name in FAULTS}
+    chosen, measured = random.Random(seed), {name: [] for name in FAULTS}
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(tries):
             for name, found in measured.items():

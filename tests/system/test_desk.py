@@ -187,12 +187,28 @@ def test_the_whole_way_of_a_first_time_operator(desk, page, served):
     press(page, "find exposure")
     says(page, "laser: exposed by")
     kept(page, "laser")
+    tab(page, "Scan")
+    page.get_by_label("calibration for the cloud").click()
+    page.get_by_role("option", name="nominal.json").click()
+    # Measured in the profile of the live images, which follows the laser.
+    tab(page, "Measure")
+    page.wait_for_timeout(2000)
+    press(page, "live profile")
+    plot = page.locator(".plot")
+    plot.wait_for()
+    around = plot.bounding_box()
+    assert around and {"Y / mm", "Z / mm"} <= set(page.locator(".plot text").all_text_contents())
+    for share in (0.4, 0.8):
+        page.mouse.click(around["x"] + share * around["width"], around["y"] + around["height"] / 2)
+        page.wait_for_timeout(300)
+    page.get_by_text(re.compile(r"profile at X [\d.]+ mm: length: distance")).wait_for()
+    press(page, "keep")
+    page.locator(".measured").get_by_text("the calibration states no uncertainty").wait_for()
+    kept(page, "profile")
     tab(page, "Stage")
     page.get_by_role("button", name="move by +10 mm").click()
     shows(page, "stage at 12.0")
     tab(page, "Scan")
-    page.get_by_label("calibration for the cloud").click()
-    page.get_by_role("option", name="nominal.json").click()
     press(page, "start")
     shows(page, f"of {COUNT}")
     kept(page, "scan")
@@ -346,8 +362,24 @@ class LaserOff:
         self._tap = page.evaluate("navigator.maxTouchPoints > 0")
 
     def works(self, state: str) -> None:
-        """Press with the light on."""
+        """Press with a steady light on, which another program has switched on."""
         light(self.controller)
+        self.press(state)
+
+    def ends_flashes(self, state: str) -> None:
+        """Press while the program itself takes laser images: no light follows."""
+        assert within(60.0, lambda: self.controller.state().laser_on), state
+        self.press(state)
+
+        def quiet() -> bool:
+            lit = len(self.controller.lights)
+            return not within(1.0, lambda: len(self.controller.lights) > lit)
+
+        assert within(5.0, quiet), state
+        assert not within(2.0, lambda: self.controller.state().laser_on), state
+
+    def press(self, state: str) -> None:
+        """Press the button at its place on the screen; the light goes off."""
         box = self.page.locator("#laser-off").bounding_box()
         assert box and box["width"] >= 44 and box["height"] >= 44
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2

@@ -1,15 +1,23 @@
 """The operator's page on a desktop, a tablet and a phone: everything in sight, keys in order."""
 
+import re
+from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
-from tests.system.test_desk import DESCRIPTIONS, TABS, desk, served, sized, tab
+from tests.system.test_desk import DESCRIPTIONS, TABS, LaserOff, desk, press, says, served, shows, sized, tab
+from tests.system.test_desk_analyses import choose
 from tests.uwlts.desk.test_analyses import step_cloud
+from tests.waiting import within
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
+
+    from twin.devices.serve import ServedTwin
 
 __all__ = ["DESCRIPTIONS", "desk", "served", "sized"]
 
@@ -80,3 +88,121 @@ def test_the_tab_key_goes_from_laser_off_through_view_and_controls_to_the_log(de
     assert all(any(name.startswith(word) for name in remaining) for word in wanted), names
     # Every stop has a name, and none comes twice in a row.
     assert all(names) and all(a != b for a, b in pairwise(names)), names
+
+
+GUIDED = """
+title = "Target"
+sensor = "sensor.toml"
+camera = "{camera}"
+[target]
+kind = "circles"
+spacing_x_mm = 12.0
+spacing_y_mm = 12.0
+diameter_mm = 7.0
+marker_diameter_mm = 3.0
+columns = 15
+rows = 13
+origin = [7, 6]
+marker_x = [1, 0]
+marker_y = [0, 1]
+[stage]
+port = "{port}"
+"""
+
+
+def write_large_step(path: Path) -> None:
+    """Write a cloud whose inspection takes a while."""
+    cloud = step_cloud()
+    shifts = [(x, y, 0.0) for x in np.arange(0, 1, 0.1) for y in np.arange(0, 1, 0.1)]
+    points = np.concatenate([cloud.points_mm + shift for shift in shifts])
+    columns = {name: np.tile(getattr(cloud, name), len(shifts)) for name in ("intensity", "frame", "line")}
+    replace(cloud, points_mm=points, **columns).save(path)
+
+
+def unlock(page: "Page", times: int) -> None:
+    """Accept the stage's position, as after Laser off."""
+    shows(page, "has to be homed")
+    tab(page, "Stage")
+    press(page, "unlock")
+    page.locator(".log").get_by_text("unlocking done").nth(times).wait_for()
+
+
+def test_laser_off_works_in_every_phase(desk, sized: "Page", served: "ServedTwin"):
+    """Judged by the controller's light; in homing, when the laser cannot be on, by the controller's state."""
+    page, folder, firmware = sized, desk.folder, served.controller._firmware
+    off = LaserOff(page, served)
+    write_large_step(folder / "plate.ply")
+    text = GUIDED.format(camera=served.camera.address, port=served.controller.port)
+    (folder / "guided.toml").write_text(text, encoding="utf-8")
+    press(page, "connect")
+    says(page, "connected: Grbl")
+    # Homing, whose movement is blocked until the controller is reset.
+    served.controller.inject("stall")
+    tab(page, "Stage")
+    press(page, "home")
+    shows(page, "homing")
+    assert within(20.0, lambda: firmware._mode == "Home")
+    off.press("homing")
+    assert within(5.0, lambda: firmware._mode == "Alarm")
+    shows(page, "has to be homed")
+    press(page, "home")
+    says(page, "homing done")
+    tab(page, "Connect")
+    press(page, "lamp")
+    page.locator(".image").get_by_text(re.compile("^live, lamp")).wait_for()
+    off.works("live-lamp")
+    unlock(page, 0)
+    tab(page, "Connect")
+    press(page, "laser")
+    off.ends_flashes("live-laser")
+    unlock(page, 1)
+    tab(page, "Connect")
+    press(page, "laser")
+    shows(page, "laser ON for images")
+    page.reload()
+    page.get_by_role("tab", name="Connect").wait_for()
+    off.ends_flashes("live-laser-reloaded")
+    unlock(page, 2)
+    tab(page, "Scan")
+    page.get_by_label("positions").fill("60")
+    page.get_by_label("step, mm").fill("0.2")
+    press(page, "start")
+    shows(page, "of 60")
+    off.ends_flashes("scanning")
+    unlock(page, 3)
+    tab(page, "Scan")
+    press(page, "continue interrupted")
+    shows(page, "of 60")
+    press(page, "pause")
+    says(page, "paused, the laser is off")
+    off.works("paused")
+    unlock(page, 4)
+    tab(page, "Inspect")
+    choose(page, "analysis", "inspect step")
+    choose(page, "cloud", "plate.ply")
+    press(page, "analyse")
+    page.get_by_text(re.compile(r"inspect step: plate.ply, \d+ s")).wait_for()
+    off.works("analysis")
+    assert page.get_by_text(re.compile(r"inspect step: plate.ply, \d+ s")).is_visible()
+    press(page, "cancel")
+    page.get_by_role("alert").get_by_text("cancelled").wait_for()
+    # A plot, and a note about an error.
+    tab(page, "Files")
+    page.get_by_role("button", name="show", exact=True).click()
+    page.locator(".cloud-view .legend").wait_for()
+    tab(page, "Measure")
+    press(page, "histogram")
+    page.locator(".plot").wait_for()
+    press(page, "length")
+    page.get_by_role("alert").get_by_text("click two points").wait_for()
+    off.works("measuring")
+    tab(page, "Calibrate")
+    page.get_by_label("plan of the calibration").click()
+    page.get_by_role("option", name="guided.toml").click()
+    press(page, "begin")
+    page.get_by_role("button", name="take", exact=True).wait_for()
+    off.works("guided")
+    # This light has not been the calibration's, which ends all the same.
+    says(page, "which ends the calibration")
+    shows(page, "not connected")
+    assert len(off.states) == 9

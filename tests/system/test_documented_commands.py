@@ -197,6 +197,11 @@ PAGES_RUN = {
     "docs/explanation/tests.md": Page(
         instead={"pytest": f"pytest --collect-only -q {ROOT / 'tests/test_public_api.py'}"}
     ),
+    "docs/how-to/accept-a-sensor.md": Page(
+        given={"calibration.json": "calibration.json", "bar-near.h5": "spheres.h5", "bar-far.h5": "today.h5"}
+        | {"plate.h5": "plane.h5", "step.h5": "step-scan.h5"},
+        tables={"acceptance.toml": 0},
+    ),
     "docs/how-to/add-a-target.md": Page(
         instead={'kind: Literal["plain circles"] = "plain circles"': 'kind: Literal["plain"] = "plain"'}
     ),
@@ -218,9 +223,18 @@ PAGES_RUN = {
         | {"part.stl": "pipe.stl"},
         again=("uwlts compare scan.cloud.h5", "uwlts compare pipe.cloud.h5"),
     ),
+    "docs/how-to/describe-your-sensor.md": Page(tables={"reef.toml": 0, "reef-close.toml": 1}),
     "docs/how-to/gauge-study.md": Page(
         texts={"diameters.csv": GAUGE, "runs/gauge/heights.csv": GAUGE},
         not_run={"python docs/studies/gauge_twin.py": "renders 18 scans"},
+    ),
+    "docs/how-to/predict-uncertainty.md": Page(
+        texts={
+            "my-sensor.toml": 'base = "thesis-small"\nname = "mine"\n',
+            "small-pipe.toml": 'base = "pipe"\ntitle = "small pipe"\n',
+        },
+        tables={"small-pipe-campaign.toml": 0},
+        instead={"--campaigns 2 --every 4": "--campaigns 1 --every 40", "--campaigns 10": "--campaigns 1"},
     ),
     "docs/how-to/inspect-a-pipe.md": Page(
         given={name: name for name in ("pipe.cloud.h5", "pipe.h5", "weld.cloud.h5", "flange.cloud.h5")}

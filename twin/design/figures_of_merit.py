@@ -605,7 +605,6 @@ _GRAVITY = 9.81
 _WATER_KG_PER_M3 = 1030.0
 """Density of sea water."""
 # As in thesis Eq. 3.2.
-_SILICA_STRENGTH_MPA = 60.0
 _CLAMPED = 0.75
 _SAFETY = 4.0
 
@@ -631,10 +630,10 @@ def laser_class(p: SensorArrays) -> np.ndarray:
 
 
 def window_needed_mm(p: SensorArrays, *, water_depth_m: float) -> np.ndarray:
-    """Return the thickness of a clamped round window of fused silica, t = A / 2 sqrt(K f P / S).
+    """Return the thickness of a clamped round window of the camera's glass, t = A / 2 sqrt(K f P / S).
 
-    Source: Harris 1999, thesis Eq. 3.2.
+    Source: Harris 1999, thesis Eq. 3.2. The strength S is that of the named glass, or of fused silica if it is unknown.
     """
     pressure_mpa = 1e-6 * _GRAVITY * _WATER_KG_PER_M3 * water_depth_m
     opening = np.where(np.isfinite(p.window_aperture_mm), p.window_aperture_mm, 0.0)
-    return 0.5 * opening * math.sqrt(_CLAMPED * _SAFETY * pressure_mpa / _SILICA_STRENGTH_MPA)
+    return 0.5 * opening * np.sqrt(_CLAMPED * _SAFETY * pressure_mpa / p.window_strength_mpa)

@@ -97,6 +97,7 @@ class SensorArrays:
     window_faces_pass: Array
     window_absorption_per_mm: Array
     window_aperture_mm: Array
+    window_strength_mpa: Array
     wavelength_mm: Array
     power_w: Array
     fan_half_rad: Array
@@ -329,6 +330,7 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
         "ambient_w_per_mm2": 1e-6 * sensor.lamp.ambient_w_per_m2,
         "speckle_coherence": speckle,
         "stage_resolution_mm": sensor.stage.resolution_mm,
+        "window_strength_mpa": window.strength_mpa(),
         "near_mm": sensor.volume.near_mm,
         "far_mm": sensor.volume.far_mm,
     }

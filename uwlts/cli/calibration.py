@@ -205,3 +205,50 @@ def verify(call: Call) -> None:
         warn(f"the verdict is not kept: {error}")
     if not verification.passed:
         sys.exit(1)
+
+
+@command_from(app, uwlts, "accept", job="Calibrate", also=[(uwlts.report, "write_acceptance")])
+def accept(
+    call: Call,
+    *,
+    out: Annotated[
+        Path | None,
+        Parameter(
+            help="Page to write, with the result as sealed JSON beside it; by default PLAN.acceptance.html, or PLAN.html "
+            "if PLAN ends with acceptance. An earlier result of the same plan there is continued and replaced."
+        ),
+    ] = None,
+    pdf=False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Exit code 0 only if conformity is proven for everything in the plan.
+
+    Example: uwlts accept acceptance.toml --pdf
+    """
+    from uwlts.acceptance.accept import Acceptance
+    from uwlts.acceptance.plan import load_plan
+    from uwlts.files.inputs import record_made
+    from uwlts.pages.toolkit import json_beside, refuse_unsuitable_page
+    from uwlts.report.acceptance_page import KIND
+
+    plan = Path(call.given["plan"])
+    page = out or plan.with_suffix(".html" if plan.stem.endswith(KIND) else f".{KIND}.html")
+    result = json_beside(page, KIND)
+    if result.is_file() and not overwrite:
+        # The command continues its own result.
+        record_made(result)
+        record_made(page)
+        known, title = uwlts.read(result, trust_edited=call.given.get("trust_edited", False)), load_plan(plan).title
+        if not isinstance(known, Acceptance) or known.plan.title != title:
+            raise OutputError(
+                f"{result} is not of the test {title!r}: give another `out`, or `overwrite` to replace it"
+            )
+        call.given.setdefault("earlier", known)
+        overwrite = True
+    refuse_unsuitable_page(page, kind=KIND, overwrite=overwrite)
+    found = call()
+    show(found.lines())
+    uwlts.report.write_acceptance(page, found, pdf=pdf, overwrite=overwrite)
+    say(f"wrote {page}, {result.name}" + (f", {page.with_suffix('.pdf').name}" if pdf else ""))
+    if found.verdict != "conformity proven":
+        sys.exit(1)

@@ -42,10 +42,17 @@ _FILES: Mapping[str, str] = MappingProxyType(
         "reference": "cloud",
         "datum": "cloud",
         "order": "description",
+        "measured": "measured values",
     }
 )
 """Kinds of the files that parameters name."""
-_LABELS = {"file": "cloud", "at_most": "at most, points", "order": "order with limits", "pdf": "also as PDF"}
+_LABELS = {
+    "file": "cloud",
+    "at_most": "at most, points",
+    "order": "order with limits",
+    "measured": "measured values",
+    "pdf": "also as PDF",
+}
 """Labels of fields whose parameters have no telling names."""
 SHAPES = ("plane", "sphere", "cylinder")
 """Ideal shapes, which a reference may be instead of a file."""
@@ -187,7 +194,7 @@ def _reconstruct(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcom
     return AnalysisOutcome((f"{len(cloud):,} points",), warnings=tuple(cloud.warnings))
 
 
-_REPORT = (uwlts.report, "write_findings", ("order", "calibration", "pdf"))
+_REPORT = (uwlts.report, "write_findings", ("order", "measured", "calibration", "pdf"))
 _CLOUD = ".cloud.h5"
 """Ending of clouds to measure, with the whole uncertainty."""
 _INSPECTED = (".html", ".findings.json", "-coloured.ply")

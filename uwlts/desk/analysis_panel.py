@@ -20,6 +20,7 @@ from uwlts.desk.analyses import (
     name_results,
 )
 from uwlts.desk.desk_files import list_files
+from uwlts.desk.number_field import NumberField
 from uwlts.errors import Error
 from uwlts.report.findings_order import load_order
 
@@ -136,10 +137,7 @@ def _make_field(each: AnalysisField, files: dict[str, list[str]]) -> Any:
         return made.props("dense use-chips" if each.several else "dense")
     if each.switch:
         return ui.checkbox(each.label)
-    made = ui.number(each.label).props("dense")
-    # Keep the number as typed; the analysis checks limits.
-    made.sanitize = lambda: None
-    return made
+    return NumberField(each.label).props("dense")
 
 
 def _files_by_kind(folder: Path) -> dict[str, list[str]]:

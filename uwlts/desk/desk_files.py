@@ -65,7 +65,9 @@ def guess_kind(name: str) -> str:
             return "capture"
         case [_, *_, "laz" | "las" | "xyz" | "e57" | "mcap"]:
             return "exported cloud"
-        case [_, *_, "findings" | "registration", "json"]:
+        case [_, *_, "measured", "json"]:
+            return "measured values"
+        case [_, *_, "findings" | "registration", "json"] | [_, *_, "measured", "csv"]:
             return "figures"
         case [_, *_, "json"]:
             return "calibration"

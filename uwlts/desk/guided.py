@@ -14,6 +14,7 @@ from uwlts.desk.board import Board, Picture, encode_png
 from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.server import DeskServer
+from uwlts.errors import HardwareError
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.operator import ANSWERS
 from uwlts.hardware.guided.plan import GuidedPlan, load_guided_plan
@@ -35,7 +36,7 @@ class BoardScreen:
         self._board, self.switch = board, switch or LaserSwitch(board, self.laser_off)
         self._given: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._stage: LaserStage | None = None
-        self._ending = False
+        self._ending = self._darkened = False
 
     def press(self, answer: str) -> None:
         """Store a button's answer."""
@@ -48,14 +49,21 @@ class BoardScreen:
     def laser_off(self) -> None:
         """Switch the laser off at any time; the recording ends and accepted images are kept."""
         if isinstance(stage := self._stage, GrblStage):
+            self._darkened = True
             darken(stage, self._board)
         else:
             self._board.say("no laser is connected to this program: switch it off by its own switch", "warning")
 
     def answer(self) -> str | None:
-        """Return the oldest answer not yet returned, or None; raises Ended after `end`."""
+        """Return the oldest answer not yet returned, or None.
+
+        Raises Ended after `end`, and HardwareError after the laser was switched off.
+        """
         if self._ending:
             raise Ended
+        if self._darkened:
+            # Images of a hand-held target do not need the stage, whose fault would end the recording later.
+            raise HardwareError("the laser was switched off by hand, which ends the calibration: continue it later")
         return None if self._given.empty() else self._given.get()
 
     def request(self, text: str) -> None:

@@ -22,7 +22,7 @@ from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.board import Board, Picture
 from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.recording_view import BackgroundView, RecordingView
+from uwlts.desk.recording_view import BackgroundView, RecordingView, reconstruct_frame
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
@@ -34,11 +34,12 @@ from uwlts.hardware.guided.record import guide
 from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, record_scan
+from uwlts.inspection.section import order_profile
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.capture import Capture, drawable_image, part_path
+from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
 
 _PREVIEW_S = 0.15
 """Pause between two live images."""
@@ -84,6 +85,8 @@ class Instrument:
         self._darkened, self._lost = False, 0
         self._live: Picture | None = None
         self.exposure_ms: dict[Light, float] = {"laser": START_MS, "lamp": START_MS}
+        self.calibration: AnyCalibration | None = None
+        """Calibration for the profile of live laser images."""
         self._thread = threading.Thread(target=self._run, name="instrument", daemon=True)
         self._thread.start()
 
@@ -393,6 +396,11 @@ class Instrument:
             stripe = get_stripe(frame.seen, connected.sensor)
             pixels = stripe.pixels()
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
+            if (known := self.calibration) is not None:
+                # The place of the stage while live images are shown.
+                place = Frame(frame.seen, self._board.position_mm or 0.0, True, frame.exposure_ms or 0.0, frame.time_s)
+                profile = reconstruct_frame(place, stripe, connected.plan.header("live"), known)
+                self._board.profile = None if profile is None else order_profile(profile)
         saturated = seen.saturated / max(seen.counted, 1)
         image = drawable_image(frame.seen, connected.sensor.camera)
         self._live = Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated)

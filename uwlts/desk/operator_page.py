@@ -4,10 +4,8 @@ import asyncio
 import threading
 from collections.abc import Awaitable, Callable
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import get_args
 from urllib.parse import quote
 
 import numpy as np
@@ -23,14 +21,16 @@ from uwlts.desk.board_page import BoardView, build_board, update_regularly
 from uwlts.desk.desk_files import find_file, guess_kind, is_interrupted, list_files, new_path
 from uwlts.desk.guided import answer_buttons
 from uwlts.desk.instrument import Instrument, InstrumentState
+from uwlts.desk.measure_panel import MeasurePanel, Measuring
+from uwlts.desk.number_field import NumberField
 from uwlts.desk.server import DeskServer
 from uwlts.desk.thinned_cloud import FIELDS, point_table
 from uwlts.errors import DescriptionError, Error
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
-from uwlts.inspection.picking import Shape, find_nearest_point, fit_shape_near, measure_length
 from uwlts.model.library import validate_description
 from uwlts.report.inventory import describe
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_region, read_thinned_cloud
 from uwlts.storage.copc_file import is_copc
@@ -42,14 +42,6 @@ _MOST_OPENED = 5_000_000
 _JOGS_MM = (-10.0, -1.0, -0.1, 0.1, 1.0, 10.0)
 _FREE = (InstrumentState.READY, InstrumentState.LOCKED)
 _RUNNING = (InstrumentState.SCANNING, InstrumentState.PAUSED)
-
-
-@dataclass
-class _Opened:
-    """The cloud that is shown and measured, and the positions picked in it."""
-
-    cloud: PointCloud | None = None
-    picked: list[np.ndarray] = field(default_factory=list)
 
 
 def serve_desk(
@@ -116,7 +108,7 @@ class _Desk:
     ):
         self.folder, self.board, self.instrument = folder, board, instrument
         self.plan_path, self.plan = plan_path, plan
-        self.opened = _Opened()
+        self.measuring = Measuring()
         self.analyses = Analyses(folder, board, self._show_result)
 
     def serve_files(self, server: DeskServer) -> None:
@@ -170,7 +162,7 @@ class _Desk:
                 found = cloud.select(inside[:: -(-len(inside) // _MOST_SHOWN) or 1])
             return point_table(found.points_mm, **_fields(found))
 
-        self.opened = _Opened(cloud)
+        self.measuring.open(cloud)
         self.board.detail = None
         self.board.cloud.clear()
         self.board.cloud_name = name
@@ -195,29 +187,10 @@ class _Desk:
         except Error as error:
             self.board.say(str(error), "error")
 
-    def cloud_to_measure(self) -> PointCloud:
-        """Return the opened cloud, or else the cloud of the running scan."""
-        if self.opened.cloud is not None:
-            return self.opened.cloud
-        points = self.board.cloud.points()
-        none = np.full(len(points), -1)
-        return PointCloud(points[:, :3], points[:, 3], none, none, metadata={})
-
 
 def _fields(cloud: PointCloud) -> dict[str, np.ndarray | None]:
     """Return fields (N,) for colouring a cloud's points."""
     return {field: cloud.field_values(field) for field in FIELDS}
-
-
-class _Number(ui.number):
-    """A field for a number that keeps what was typed.
-
-    NiceGUI's field is rewritten when it loses the focus, possibly with a number older than what was typed before the
-    page was connected.
-    """
-
-    def sanitize(self) -> None:
-        """Do nothing: limits are checked where the number is used."""
 
 
 class _OperatorPage:
@@ -225,9 +198,10 @@ class _OperatorPage:
 
     def __init__(self, desk: _Desk):
         self._desk, self._instrument, self._board = desk, desk.instrument, desk.board
-        self._view = BoardView(desk.board, picked=self._show_picked)
+        self._view = BoardView(desk.board, picked=lambda place: self._measure.show_picked(place))
         self._only: list[tuple[DisableableElement, tuple[InstrumentState, ...]]] = []
         self._analyses = AnalysisPanel(desk.folder, desk.analyses, button=self._button, mark=self._view.mark)
+        self._measure = MeasurePanel(desk.folder, desk.board, desk.measuring, button=self._button, mark=self._view.mark)
         self._refreshed = 0
         self._files: tuple[object, ...] = ()
 
@@ -262,7 +236,7 @@ class _OperatorPage:
             self._scan_part,
             self._files_part,
             self._analyses.build,
-            self._measure_part,
+            self._measure.build,
         )
 
     def _button(
@@ -288,6 +262,7 @@ class _OperatorPage:
         self._view.refresh()
         self._show_request()
         self._analyses.refresh()
+        self._measure.refresh()
         self._light.value = self._instrument.light or "none"
         if (shown := self._exposure_now()) != self._exposed:
             # Not while the operator types in it.
@@ -320,7 +295,7 @@ class _OperatorPage:
         self._only.append((self._light, _FREE))
         self._exposed = self._exposure_now()
         with ui.element("div").classes("fields"):
-            self._exposure = _Number("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
+            self._exposure = NumberField("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
             self._exposure.on("change", self._expose)
             self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
         ui.label("The laser is on only while an image is exposed.").classes("text-xs")
@@ -375,7 +350,7 @@ class _OperatorPage:
                     f'outline dense aria-label="move by {by:+g} mm"'
                 )
         with ui.row().classes("items-center"):
-            place = _Number("position, mm", value=0.0, format="%.3f")
+            place = NumberField("position, mm", value=0.0, format="%.3f")
             self._button("move", lambda: self._instrument.move(float(place.value or 0.0)), (InstrumentState.READY,))
 
     # Calibrate
@@ -411,14 +386,15 @@ class _OperatorPage:
         stage = None if plan is None else plan.stage
         start, step, count = (None, None, None) if stage is None else (stage.start_mm, stage.step_mm, stage.count)
         with ui.element("div").classes("fields"):
-            self._start = _Number("first position, mm", value=start, format="%.3f")
-            self._step = _Number("step, mm", value=step, format="%.4f")
-            self._number = _Number("positions", value=count, min=1, precision=0)
+            self._start = NumberField("first position, mm", value=start, format="%.3f")
+            self._step = NumberField("step, mm", value=step, format="%.4f")
+            self._number = NumberField("positions", value=count, min=1, precision=0)
         self._extent = ui.label().classes("text-sm")
         self._show_extent()
         for each in (self._start, self._step, self._number):
             each.on_value_change(self._show_extent)
         self._calibration = ui.select([], label="calibration for the cloud", clearable=True).classes("w-full")
+        self._calibration.on_value_change(lambda event: self._use_calibration(event.value))
         with ui.element("div").classes("fields"):
             self._out = ui.input("name of the capture", value="scan")
             self._overwrite = ui.checkbox("replace existing")
@@ -431,6 +407,13 @@ class _OperatorPage:
             self._button("pause", self._instrument.pause, (InstrumentState.SCANNING,))
             self._button("resume", self._instrument.resume, (InstrumentState.PAUSED,))
             self._button("stop", self._instrument.stop, _RUNNING).props("color=warning")
+
+    def _use_calibration(self, name: str | None) -> None:
+        """Use a calibration for the profiles of live images."""
+        try:
+            self._instrument.calibration = load_calibration(self._desk.folder / name) if name else None
+        except Error as error:
+            self._board.say(str(error), "error")
 
     def _show_extent(self) -> None:
         start, step, count = self._start.value, self._step.value, self._number.value
@@ -451,7 +434,7 @@ class _OperatorPage:
         if is_interrupted(out) and not resume and not overwrite:
             raise DescriptionError(f"{out.name} was interrupted: continue it, give another name, or tick 'replace'")
         known = self._calibration.value
-        self._desk.opened = _Opened()
+        self._desk.measuring.open(None)
         self._instrument.scan(
             plan.model_copy(update={"stage": stage}),
             out,
@@ -495,6 +478,8 @@ class _OperatorPage:
                         continue
                     if file.kind == "cloud":
                         self._button("show", partial(self._show, name)).props("flat dense")
+                    if file.kind == "measured values":
+                        self._button("list", partial(self._measure.open, name)).props("flat dense")
                     if file.kind == "capture":
                         self._button("reconstruct", partial(self._reconstruct, name)).props("flat dense")
                     self._button("about", partial(self._about, name)).props("flat dense")
@@ -518,56 +503,6 @@ class _OperatorPage:
         self._desk.analyses.start("reconstruct", {"capture": name, "calibration": known}, name="", overwrite=False)
         # Progress and result are there.
         self._tabs.set_value("Inspect")
-
-    # Measure
-
-    def _measure_part(self) -> None:
-        ui.label("Click points in the cloud: the last two give a length, the last one the middle of a shape.").classes(
-            "text-sm"
-        )
-        self._places = ui.label("no point is picked").classes("text-sm font-mono whitespace-pre-wrap")
-        with ui.row():
-            self._button("length", self._length)
-            self._button("forget points", self._forget).props("flat")
-        with ui.row().classes("items-center"):
-            self._radius = _Number("radius about the point, mm", value=15.0, min=0.01)
-            for shape in get_args(Shape):
-                self._button(shape, partial(self._shape, shape)).props("outline dense")
-        self._results = ui.column().classes("w-full gap-1 text-sm font-mono")
-
-    def _show_picked(self, place: np.ndarray) -> None:
-        picked = self._desk.opened.picked
-        if picked and np.array_equal(picked[-1], place):
-            return
-        picked.append(place)
-        del picked[:-2]
-        self._view.mark(picked)
-        self._places.set_text("\n".join(f"X {x:.3f}  Y {y:.3f}  Z {z:.3f} mm" for x, y, z in picked))
-
-    def _forget(self) -> None:
-        self._desk.opened.picked.clear()
-        self._view.mark([])
-        self._places.set_text("no point is picked")
-
-    def _length(self) -> None:
-        picked, cloud = self._desk.opened.picked, self._desk.cloud_to_measure()
-        if len(picked) < 2:
-            raise DescriptionError("click two points in the cloud first")
-        self._show_result(measure_length(cloud, *(find_nearest_point(cloud, place) for place in picked)).text())
-
-    async def _shape(self, shape: Shape) -> None:
-        picked, cloud = self._desk.opened.picked, self._desk.cloud_to_measure()
-        if not picked:
-            raise DescriptionError("click a point in the cloud first")
-        radius = float(self._radius.value or 0.0)
-        if radius <= 0:
-            raise DescriptionError("give the radius about the point, above 0 mm")
-        self._show_result((await asyncio.to_thread(fit_shape_near, cloud, picked[-1], radius, shape)).text())
-
-    def _show_result(self, text: str) -> None:
-        self._board.say(text)
-        with self._results:
-            ui.label(text).move(target_index=0)
 
 
 def _addresses(plan: ScanPlan) -> tuple[str, str]:

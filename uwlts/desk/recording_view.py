@@ -13,7 +13,9 @@ import numpy as np
 from uwlts.desk.board import Board, Picture
 from uwlts.desk.server import DeskServer
 from uwlts.errors import CaptureError
+from uwlts.inspection.section import order_profile
 from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.calibration import Calibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, drawable_image, part_path
@@ -31,11 +33,10 @@ too little of the stripe below this fraction of lines with a point."""
 
 @dataclass(frozen=True, eq=False)
 class _Profile:
-    """Stripe of one laser image: pixels (N, 2), points (N, 3) in mm, their grey values, warnings."""
+    """Stripe of one laser image: pixels (N, 2), points if a calibration is known, warnings."""
 
     pixels: np.ndarray
-    points_mm: np.ndarray
-    intensity: np.ndarray
+    cloud: PointCloud | None
     lines: int
     saturated: float | None
     remarks: tuple[str, ...]
@@ -76,8 +77,9 @@ class RecordingView:
                 saturated=profile.saturated,
             )
         )
-        if len(profile.points_mm):
-            board.cloud.add(profile.points_mm, intensity=profile.intensity)
+        if (cloud := profile.cloud) is not None:
+            board.cloud.add(cloud.points_mm, intensity=cloud.intensity)
+            board.profile = order_profile(cloud)
         for remark in profile.remarks:
             # Once each, because they stay in the log.
             if remark not in self._said:
@@ -88,10 +90,7 @@ class RecordingView:
 def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | None) -> _Profile:
     along, full = header.sensor.camera.stripe_along, header.saturation_dn
     stripe = find_stripe(frame.seen, stripe_along=along, saturation=full)
-    line, points, intensity = stripe.lines, np.empty((0, 3)), np.empty(0)
-    if calibration is not None and len(line):
-        cloud = reconstruct_frame(frame, stripe, header, calibration)
-        points, intensity = cloud.points_mm, cloud.intensity
+    cloud = None if calibration is None else reconstruct_frame(frame, stripe, header, calibration)
     saturated, remarks = None, []
     if isinstance(frame.seen, np.ndarray):
         brightest = frame.seen.max(axis=0 if along == "width" else 1)
@@ -100,20 +99,26 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
             remarks.append("saturated on many lines: shorten the exposure")
         elif np.quantile(brightest, 0.98) < _FAINT * full:
             remarks.append("faint: lengthen the exposure, or is the laser off?")
-    if len(line) < _FEW * len(stripe.status):
+    if len(stripe.lines) < _FEW * len(stripe.status):
         remarks.append("almost no stripe: is the object in the volume?")
-    return _Profile(stripe.pixels(), points, intensity, len(stripe.status), saturated, tuple(remarks))
+    return _Profile(stripe.pixels(), cloud, len(stripe.status), saturated, tuple(remarks))
 
 
 def reconstruct_frame(
-    frame: Frame, stripe: Stripe, header: CaptureHeader, calibration: AnyCalibration, *, with_uncertainty: bool = False
-) -> PointCloud:
-    """Triangulate the stripe of a single laser image of a recording; the errors are those of `reconstruct_stripes`."""
+    frame: Frame, stripe: Stripe, header: CaptureHeader, calibration: AnyCalibration
+) -> PointCloud | None:
+    """Return the points of a laser image, with uncertainty if the calibration states it; None without a stripe.
+
+    The errors are those of `reconstruct_stripes`.
+    """
     line = stripe.lines
-    own = np.zeros(len(line), dtype=int)
-    stripes = CaptureStripes(own, line, stripe.centre_px[line], stripe.amplitude[line], stripe.width_px[line], {})
+    if len(line) == 0:
+        return None
+    own, centre = np.zeros(len(line), dtype=int), stripe.centre_px[line]
+    stripes = CaptureStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
+    known = isinstance(calibration, Calibration) and calibration.joint is not None
     table = FrameTable.from_frames(header, [frame])
-    return reconstruct_stripes(table, stripes, calibration, with_uncertainty=with_uncertainty)
+    return reconstruct_stripes(table, stripes, calibration, with_uncertainty=known)
 
 
 def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:

@@ -94,22 +94,29 @@ def fit_shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, sh
     robust = fit_robustly(fit, points)
     used = near[robust.inliers]
     figures = _figures(robust.fit)
-    names = list(figures)
-    stated = {}
-    if (known := cloud.uncertainty) is not None:
-
-        def changed(moves: np.ndarray) -> list[float]:
-            moved = _figures(fit(cloud.points_mm[used] + moves))
-            return [moved[name] - figures[name] for name in names]
-
-        random, systematic = PointErrors.from_uncertainty(known[used], cloud.frame[used]).propagate(
-            changed, draws=_DRAWS
-        )
-        assert systematic is not None
-        stated = {
-            name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(names, random, systematic, strict=True)
-        }
+    stated = propagate_figures(cloud, used, lambda moved: _figures(fit(moved)))
     return PickedMeasurement(shape, figures, stated, len(used), robust.rejected)
+
+
+def propagate_figures(
+    cloud: PointCloud, used: np.ndarray, measure: Callable[[np.ndarray], dict[str, float]]
+) -> dict[str, FigureUncertainty]:
+    """Return the uncertainties of figures that ``measure`` returns for positions (K, 3) of used points (K,) of a cloud.
+
+    The result is empty for a cloud without uncertainty.
+    """
+    if (known := cloud.uncertainty) is None:
+        return {}
+    points = cloud.points_mm[used]
+    figures = measure(points)
+
+    def changed(moves: np.ndarray) -> list[float]:
+        moved = measure(points + moves)
+        return [moved[name] - value for name, value in figures.items()]
+
+    random, systematic = PointErrors.from_uncertainty(known[used], cloud.frame[used]).propagate(changed, draws=_DRAWS)
+    assert systematic is not None
+    return {name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(figures, random, systematic, strict=True)}
 
 
 def _figures(fit: SphereFit | FlatFit | CylinderFit) -> dict[str, float]:

@@ -71,17 +71,24 @@ def load_order(path: str | Path | None) -> FindingOrder:
 
 
 def judge_value(value: FeatureValue, limits: FindingLimits) -> Verdict:
-    """Return the verdict on a value by its coverage interval: both conformity and non-conformity are proven.
-
-    This is the decision rule of ISO 14253-1. An interval that contains the limit leaves the verdict undecided.
-    """
+    """Return the verdict on a value by its coverage interval (`judge_interval`); a remaining wall has a lower limit."""
     limit = limits.of(value.name)
-    if limit is None:
-        return "no limit"
-    best, worst = value.low, value.high
     if value.name == "remaining wall":
-        best, worst, limit = -value.high, -value.low, -limit
-    return "within the limit" if worst <= limit else "exceeds the limit" if best > limit else "undecided"
+        return judge_interval(value.low, value.high, lower=limit)
+    return judge_interval(value.low, value.high, upper=limit)
+
+
+def judge_interval(low: float, high: float, *, lower: float | None = None, upper: float | None = None) -> Verdict:
+    """Return the verdict on a coverage interval from ``low`` to ``high``: conformity and non-conformity are proven.
+
+    This is the decision rule of ISO 14253-1. An interval that contains a limit leaves the verdict undecided.
+    """
+    if lower is None and upper is None:
+        return "no limit"
+    least, most = -np.inf if lower is None else lower, np.inf if upper is None else upper
+    if least <= low and high <= most:
+        return "within the limit"
+    return "exceeds the limit" if high < least or low > most else "undecided"
 
 
 def judge_feature(feature: Feature, limits: FindingLimits) -> tuple[Verdict, list[str]]:

@@ -52,6 +52,7 @@ from uwlts.report.findings_order import (
     load_order,
     sort_by_severity,
 )
+from uwlts.report.measured_values import COLUMNS, MeasuredValues, read_measured
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
@@ -107,6 +108,7 @@ def write_findings(
     certificate: str | Path | None = None,
     verification: Sequence[str | Path] = (),
     order: str | Path | None = None,
+    measured: str | Path | None = None,
     unit: Unit | None = None,
     trust_edited: bool = False,
     overwrite: bool = False,
@@ -139,6 +141,8 @@ def write_findings(
         TOML file with client, object, operator, date, sensor, water, and the tables ``datum`` (name, place_mm,
         direction, twelve_o_clock) and ``limits`` (depth_mm, remaining_wall_mm, ovality_percent, undercut_mm), by which
         findings are judged.
+    measured
+        List of values measured by hand (NAME.measured.json of the desk), shown as a table.
     unit
         Unit of a cloud of another program, mm or m, if neither format nor names of columns state it; by default mm.
     trust_edited
@@ -170,17 +174,20 @@ def write_findings(
         refuse_unsuitable_pdf(page.with_suffix(".pdf"))
         refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
     stated = load_order(order)
-    measured = read_cloud(path, unit=unit)
-    sources = _sources(path, measured, captures, calibration, certificate)
-    checks = [_artefact_check(each, measured) for each in verification]
+    points = read_cloud(path, unit=unit)
+    by_hand = None if measured is None else read_measured(measured)
+    sources = _sources(path, points, captures, calibration, certificate)
+    checks = [_artefact_check(each, points) for each in verification]
     sources += [
         Source("verification", Path(each).name, hash_file(each), "by the same calibration") for each in verification
     ]
-    found = inspect_cloud(measured, kind, **options)
-    made = datetime.now(UTC).isoformat(timespec="seconds")
-    text = _page(found, measured, sources, checks, stated, title=title or f"Inspection of {path.name}", made=made)
+    if measured is not None:
+        sources.append(Source("measured values", Path(measured).name, hash_file(measured), "measured by hand"))
+    found = inspect_cloud(points, kind, **options)
+    made, title = datetime.now(UTC).isoformat(timespec="seconds"), title or f"Inspection of {path.name}"
+    text = _page(found, points, sources, checks, stated, by_hand, title=title, made=made)
     record: Table = {
-        "title": title or f"Inspection of {path.name}",
+        "title": title,
         "made": made,
         "software": f"uwlts {__version__}",
         "sources": [vars(source) for source in sources],
@@ -189,6 +196,7 @@ def write_findings(
         ],
         "order": stated.model_dump(mode="json", exclude_none=True),
         "verdicts": {each.name: judge_feature(each, stated.limits)[0] for each in found.features},
+        "measured": [] if by_hand is None else by_hand.model_dump(mode="json")["values"],
         "inspection": found.record(),
     }
     if pdf:
@@ -264,6 +272,7 @@ def _page(
     sources: list[Source],
     checks: list[tuple[str, list[_CheckedFigure]]],
     order: FindingOrder,
+    by_hand: MeasuredValues | None,
     *,
     title: str,
     made: str,
@@ -288,6 +297,7 @@ def _page(
         all_values=_rows(parts),
         whole=[(each.name, [_value_row(value) for value in each.values]) for each in whole],
         repeated=_rows(repeated),
+        by_hand=None if by_hand is None else (COLUMNS, [each.row() for each in by_hand.values]),
         map=_map(found, cloud, parts),
         pictures=[(each.name, _picture(each, found, cloud)) for each in drawn],
         left_out=len(parts) - len(drawn),

@@ -106,7 +106,7 @@ def write_cloud(
       ``.foxglove.mcap``; one for each image if the points' times are known (`uwlts.storage.mcap_clouds`).
 
     ``colours`` (N, 3) uint8, red, green and blue, are stored for other programs in PLY, LAS, LAZ and E57
-    (`COLOURED_FORMATS`); HDF5 has the deviation instead.
+    (`COLOURED_FORMATS`); HDF5 has the deviation instead. A PLY with colours names the intensity ``scalar_intensity``.
 
     Raises
     ------
@@ -129,7 +129,9 @@ def write_cloud(
         columns |= dict(zip(PLY_COLOURS, colours.T, strict=True))
     full = not is_lean(path)
     std = None if full else compute_normal_std(cloud)
-    columns |= {"intensity": cloud.intensity, "deviation": cloud.deviation_mm, "time": cloud.time_s}
+    # MeshLab shows a property named "intensity" as grey, in place of the colours.
+    brightness = "intensity" if colours is None else "scalar_intensity"
+    columns |= {brightness: cloud.intensity, "deviation": cloud.deviation_mm, "time": cloud.time_s}
     columns |= {"normal_std": cloud.normal_std_mm if std is None else std}
     for name, indices in (("frame", cloud.frame), ("line", cloud.line)):
         columns[name] = None if (indices == NO_INDEX).all() else indices

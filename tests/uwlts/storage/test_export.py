@@ -222,7 +222,11 @@ def test_colours_are_those_that_other_programs_read(tmp_path: Path):
     found = file.read_scan(0, colors=True, ignore_missing_fields=True)
     file.close()
     assert np.array_equal(np.column_stack([found[f"color{each}"] for each in ("Red", "Green", "Blue")]), colours)
-    assert np.array_equal(read_cloud(tmp_path / "a.ply").points_mm, cloud.points_mm)
+    again = read_cloud(tmp_path / "a.ply")
+    assert np.array_equal(again.points_mm, cloud.points_mm) and np.array_equal(again.intensity, cloud.intensity)
+    # MeshLab shows a property with this name as grey, in place of the colours.
+    header = (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0]
+    assert b"float scalar_intensity" in header and b"float intensity" not in header
 
 
 @pytest.mark.parametrize("name", ["a.xyz", "a.mcap", "a.copc.laz"])

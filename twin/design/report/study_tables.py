@@ -15,6 +15,8 @@ from twin.design.figures_of_merit import CLASS_NAMES, FIGURES
 from twin.design.study import Study, Variable
 from twin.design.verification import Agreement
 from twin.scene.paths import Value
+from uwlts.model.media import GLASSES
+from uwlts.model.sensor import Window
 from uwlts.pages.toolkit import Tile
 
 MISSING = "\N{EN DASH}"
@@ -229,10 +231,23 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
     found += [tile(name, note=note) for name, note in last if name not in (*objectives, *others)]
     if "window_mm" not in objectives:
         thin = " – too thin" if needed > window.thickness_mm else ""
-        note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}" if window.mounted else ""
+        note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}"
+        note = f"{note}\n{_by_material(window, needed)}" if window.mounted else ""
         text = value_text("window_mm", window.thickness_mm) if window.mounted else "none"
         found.append(Tile("camera's window", text, note))
     return found
+
+
+def _by_material(window: Window, needed_mm: float) -> str:
+    """Return the thicknesses of other materials that replace a window which needs a thickness."""
+    thicknesses = {
+        name: needed_mm * math.sqrt(window.strength_mpa() / glass.strength_mpa)
+        for name, glass in GLASSES.items()
+        if glass.strength_mpa is not None
+    }
+    unknown = ", ".join(name for name, glass in GLASSES.items() if glass.strength_mpa is None)
+    texts = (f"{value_text('window_mm', thickness)} of {name}" for name, thickness in thicknesses.items())
+    return f"by material: {', '.join(texts)}; unknown for {unknown}"
 
 
 def agreement_text(study: Study, found: Agreement) -> str:

@@ -1,0 +1,337 @@
+"""Tab of the operator's page for measurements: in the cloud, in sections and live profiles, and the list of values."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from nicegui import ui
+
+from uwlts.desk.board import Board
+from uwlts.desk.desk_files import find_file, new_path
+from uwlts.desk.number_field import NumberField
+from uwlts.desk.plot_view import Plot, PlotView
+from uwlts.errors import DescriptionError, Error
+from uwlts.files.inputs import protect_inputs
+from uwlts.inspection.picking import PickedMeasurement, Shape, find_nearest_point, fit_shape_near, measure_length
+from uwlts.inspection.section import Section, cut_section, measure_step
+from uwlts.report.measured_values import MEASURED_ENDINGS, MeasuredValue, MeasuredValues, read_measured, write_measured
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import name_cloud
+
+_BINS = 60
+_DEFAULT_RADIUS_MM, _DEFAULT_WIDTH_MM = 15.0, 2.0
+_GROWING = "points of a running scan have no uncertainty: reconstruct it"
+_WITHOUT = "the cloud has no uncertainty"
+_LIVE_WITHOUT = "the calibration states no uncertainty"
+AddButton = Callable[[str, Callable[[], object]], ui.button]
+Tool = Literal["distance", "step"]
+
+
+@dataclass
+class Measuring:
+    """State of measurements, shared by all browsers: the opened cloud, positions picked in it, and the list."""
+
+    cloud: PointCloud | None = None
+    picked: list[np.ndarray] = field(default_factory=list)
+    values: MeasuredValues = field(default_factory=MeasuredValues)
+
+    def open(self, cloud: PointCloud | None) -> None:
+        """Measure another cloud, or that of the running scan; the list is kept."""
+        self.cloud, self.picked = cloud, []
+
+
+class MeasurePanel:
+    """Tab in one browser; ``button`` adds a button whose errors are shown, ``mark`` marks places in the cloud."""
+
+    def __init__(
+        self,
+        folder: Path,
+        board: Board,
+        measuring: Measuring,
+        *,
+        button: AddButton,
+        mark: Callable[[Sequence[np.ndarray]], None],
+    ):
+        self._folder, self._board, self._measuring = folder, board, measuring
+        self._button, self._mark = button, mark
+        self._section: Section | None = None
+        self._source, self._without, self._live = "", "", False
+        self._places_mm: list[float] = []
+        self._rows: dict[int, _Row] = {}
+        self._shown: MeasuredValues | None = None
+        self._tool: Tool = "distance"
+
+    def build(self) -> None:
+        """Build the tab."""
+        ui.label("Click points in the cloud: the last two give a length, the last one the middle of a shape.").classes(
+            "text-sm"
+        )
+        self._places = ui.label("no point is picked").classes("text-sm font-mono whitespace-pre-wrap")
+        with ui.row().classes("gap-2"):
+            self._button("length", self._length)
+            self._button("section", self._cut).props("outline")
+            self._button("live profile", self._follow).props("outline")
+            self._button("forget points", self._forget).props("flat dense")
+        with ui.row().classes("items-center gap-2"):
+            self._radius = NumberField("radius about the point, mm", value=_DEFAULT_RADIUS_MM, min=0.01)
+            for shape in get_args(Shape):
+                self._button(shape, partial(self._shape, shape)).props("outline dense")
+        with ui.element("div").classes("fields"):
+            self._width = NumberField("width, mm", value=_DEFAULT_WIDTH_MM, min=0.001)
+            self._field = ui.select(["Z", "intensity", "deviation"], value="Z", label="field")
+            self._button("histogram", self._show_histogram).props("outline dense")
+        self._plot = PlotView(self._pick_along)
+        self._caption = ui.label().classes("text-sm font-mono")
+        with ui.row().classes("gap-2") as self._in_section:
+            for tool in get_args(Tool):
+                self._button(tool, partial(self._choose_tool, tool)).props("outline dense")
+            self._button("keep", self._keep).props("dense")
+        self._in_section.set_visibility(False)
+        self._list = ui.column().classes("w-full gap-1")
+        with ui.column().classes("w-full gap-1") as self._ending:
+            with ui.element("div").classes("fields"):
+                self._name = ui.input("name of the results")
+                self._replace = ui.checkbox("replace existing")
+            with ui.row().classes("gap-2"):
+                self._button("save the list", self._save)
+                self._button("undo", self._undo).props("outline")
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Show changes of the list, and the latest profile."""
+        if self._live and self._board.profile is not None and self._board.profile is not self._section:
+            self._section = self._board.profile
+            self._show_section()
+        values = self._measuring.values
+        if values is not self._shown:
+            self._shown = values
+            self._show_values(values)
+
+    # In the cloud
+
+    def show_picked(self, place: np.ndarray) -> None:
+        """Add a position that was clicked in the cloud."""
+        picked = self._measuring.picked
+        if picked and np.array_equal(picked[-1], place):
+            return
+        picked.append(place)
+        del picked[:-2]
+        self._mark(picked)
+        self._places.set_text("\n".join(f"X {x:.3f}  Y {y:.3f}  Z {z:.3f} mm" for x, y, z in picked))
+
+    def _forget(self) -> None:
+        self._measuring.picked.clear()
+        self._mark([])
+        self._places.set_text("no point is picked")
+
+    def _cloud(self) -> tuple[PointCloud, str]:
+        """Return the opened cloud, or else that of the running scan, and the reason why it has no uncertainty."""
+        if (opened := self._measuring.cloud) is not None:
+            return opened, _WITHOUT
+        points = self._board.cloud.points()
+        none = np.full(len(points), -1)
+        return PointCloud(points[:, :3], points[:, 3], none, none, metadata={}), _GROWING
+
+    def _two_picked(self) -> list[np.ndarray]:
+        if len(self._measuring.picked) < 2:
+            raise DescriptionError("click two points in the cloud first")
+        return self._measuring.picked
+
+    def _length(self) -> None:
+        (first, second), (cloud, without) = self._two_picked(), self._cloud()
+        found = measure_length(cloud, find_nearest_point(cloud, first), find_nearest_point(cloud, second))
+        self._add(found, self._board.cloud_name, without)
+
+    async def _shape(self, shape: Shape) -> None:
+        picked, (cloud, without) = self._measuring.picked, self._cloud()
+        if not picked:
+            raise DescriptionError("click a point in the cloud first")
+        radius, source = _positive(self._radius, "the radius about the point"), self._board.cloud_name
+        self._add(await asyncio.to_thread(fit_shape_near, cloud, picked[-1], radius, shape), source, without)
+
+    def _add(self, found: PickedMeasurement, source: str, without: str) -> None:
+        self._board.say(found.text())
+        self._measuring.values = self._measuring.values.add(found, source=source, without_interval=without)
+
+    # In a section or a profile
+
+    def _cut(self) -> None:
+        (first, second), (cloud, self._without) = self._two_picked(), self._cloud()
+        self._section = cut_section(cloud, first, second, width_mm=_positive(self._width, "the width"))
+        self._live, self._source = False, f"{self._board.cloud_name}, section"
+        self._places_mm = sorted([0.0, float((second - first) @ self._section.direction)])
+        self._show_section()
+
+    def _follow(self) -> None:
+        if self._board.profile is None:
+            raise DescriptionError(
+                "there is no profile yet: choose the calibration under Scan, then show live images with the laser, "
+                "or record a scan"
+            )
+        self._live, self._section, self._places_mm, self._without = True, None, [], _LIVE_WITHOUT
+        self.refresh()
+
+    def _pick_along(self, along_mm: float) -> None:
+        if self._section is None:
+            return
+        self._places_mm = [*self._places_mm, along_mm][-2:]
+        self._show_section()
+
+    def _choose_tool(self, tool: Tool) -> None:
+        self._tool = tool
+        self._show_section()
+
+    def _measure_section(self) -> PickedMeasurement:
+        if self._section is None or len(self._places_mm) < 2:
+            raise DescriptionError("click two places in the plot")
+        section, (first, second) = self._section, self._places_mm
+        if self._tool == "distance":
+            return measure_length(section.cloud, section.find_nearest(first), section.find_nearest(second))
+        return measure_step(section, first, second, width_mm=_positive(self._width, "the width"))
+
+    def _keep(self) -> None:
+        self._add(self._measure_section(), self._source, self._without)
+
+    def _show_section(self) -> None:
+        section = self._section
+        if section is None or len(section.cloud) == 0:
+            return
+        if self._live:
+            self._source = f"profile at X {section.cloud.points_mm[0, 0]:.3f} mm"
+        nearest = [section.find_nearest(place) for place in self._places_mm]
+        along, depth = section.along_mm, section.depth_mm
+        self._plot.show(
+            Plot(
+                along,
+                depth,
+                "Y / mm" if self._live else "along the section / mm",
+                "Z / mm",
+                downwards=True,
+                marks=[(float(along[index]), float(depth[index])) for index in nearest],
+            )
+        )
+        self._in_section.set_visibility(True)
+        try:
+            text = self._measure_section().text()
+        except Error as error:
+            text = str(error)
+        self._caption.set_text(f"{self._source}: {text}")
+
+    def _show_histogram(self) -> None:
+        cloud, _ = self._cloud()
+        name = str(self._field.value)
+        known = {"Z": cloud.points_mm[:, 2], "intensity": cloud.intensity, "deviation": cloud.deviation_mm}[name]
+        values = np.empty(0) if known is None else known[np.isfinite(known)].astype(float)
+        if len(values) == 0:
+            raise DescriptionError(f"the cloud has no {name}: choose another field, or open a cloud that has it")
+        counts, edges = np.histogram(values, _BINS)
+        unit = "grey values" if name == "intensity" else "mm"
+        width = float(edges[1] - edges[0])
+        self._live, self._section = False, None
+        self._in_section.set_visibility(False)
+        self._plot.show(Plot(edges[:-1] + width / 2, counts, f"{name} / {unit}", "points", bar_width=width))
+        self._caption.set_text(
+            f"{name}: mean {values.mean():.4f}, standard deviation {values.std():.4f} {unit}, {len(values):,} points"
+        )
+
+    # List
+
+    def _show_values(self, values: MeasuredValues) -> None:
+        """Update the rows; rows that remain keep the focus."""
+        known = {each.number for each in values.values}
+        for number in [number for number in self._rows if number not in known]:
+            self._rows.pop(number).delete()
+        for place, value in enumerate(values.values):
+            if value.number not in self._rows:
+                with self._list:
+                    self._rows[value.number] = _Row(value.number, self._measuring, self._button, self._board)
+            self._rows[value.number].show(value, place)
+        self._ending.set_visibility(bool(values.values) or values.before is not None)
+        self._name.props["placeholder"] = self._default_name()
+        self._name.update()
+
+    def _default_name(self) -> str:
+        return name_cloud(self._board.cloud_name or "profile")
+
+    def _undo(self) -> None:
+        self._measuring.values = self._measuring.values.undo()
+
+    async def _save(self) -> None:
+        name = (self._name.value or "").strip() or self._default_name()
+        page = new_path(self._folder, f"{name}{MEASURED_ENDINGS[0]}", suffix=MEASURED_ENDINGS[0])
+        values, overwrite = self._measuring.values, bool(self._replace.value)
+        title = f"Measured values of {name}"
+
+        def save() -> list[Path]:
+            with protect_inputs():
+                return write_measured(page, values, title=title, overwrite=overwrite)
+
+        self._board.say(f"wrote {', '.join(each.name for each in await asyncio.to_thread(save))}")
+
+    def open(self, name: str) -> None:
+        """Read a list of the folder in place of the present one, which undo restores."""
+        read = read_measured(find_file(self._folder, name))
+        self._measuring.values = self._measuring.values.replace(read.values)
+        self._board.say(f"{name}: {len(read.values)} values")
+
+
+class _Row:
+    """Row of the list in one browser."""
+
+    def __init__(self, number: int, measuring: Measuring, button: AddButton, board: Board):
+        self._number, self._measuring, self._board = number, measuring, board
+        self._list = ui.context.slot.parent
+        with ui.element("div").classes("measured") as self._element:
+            self._name = ui.input("name").props("dense").on("change", self._rename)
+            self._lower = NumberField("lower, mm").props("dense").on("change", self._limit)
+            self._upper = NumberField("upper, mm").props("dense").on("change", self._limit)
+            self._text = ui.label().classes("value font-mono text-sm")
+            self._verdict = ui.label().classes("verdict text-sm")
+            button("remove", self._remove).props("flat dense")
+
+    def show(self, value: MeasuredValue, place: int) -> None:
+        """Show a value at a place of the list."""
+        self._show_fields(value)
+        self._text.set_text(value.interval_text())
+        self._verdict.set_text(value.verdict)
+        self._verdict.props(f'data-verdict="{value.verdict}"')
+        if self._list.default_slot.children[place] is not self._element:
+            self._element.move(target_index=place)
+
+    def _show_fields(self, value: MeasuredValue) -> None:
+        self._name.value, self._lower.value, self._upper.value = value.name, value.lower_mm, value.upper_mm
+
+    def delete(self) -> None:
+        """Remove the row."""
+        self._element.delete()
+
+    def _change(self, change: Callable[[MeasuredValues], MeasuredValues]) -> None:
+        values = self._measuring.values
+        try:
+            self._measuring.values = change(values)
+        except Error as error:
+            # The list has not changed.
+            self._show_fields(values.find(self._number))
+            self._board.say(str(error), "error")
+            ui.notify(str(error), type="negative", multi_line=True)
+
+    def _rename(self) -> None:
+        self._change(lambda values: values.rename(self._number, str(self._name.value or "")))
+
+    def _limit(self) -> None:
+        lower, upper = self._lower.value, self._upper.value
+        self._change(lambda values: values.limit(self._number, lower, upper))
+
+    def _remove(self) -> None:
+        self._measuring.values = self._measuring.values.remove(self._number)
+
+
+def _positive(number: NumberField, called: str) -> float:
+    value = float(number.value or 0.0)
+    if value <= 0:
+        raise DescriptionError(f"give {called}, above 0 mm")
+    return value

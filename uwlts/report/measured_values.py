@@ -1,0 +1,226 @@
+"""List of values measured by hand: names, intervals, limits with verdicts, undo; its file, table and page."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import ConfigDict, Field, computed_field, model_validator
+
+from uwlts._version import __version__
+from uwlts.errors import DescriptionError
+from uwlts.files.json_files import read_model, write_model
+from uwlts.files.writing import refuse_unsuitable, write_atomically
+from uwlts.inspection.picking import PickedMeasurement
+from uwlts.model.library import validate_description
+from uwlts.model.sensor import Description
+from uwlts.pages.numbers import format_to_scale
+from uwlts.pages.toolkit import MISSING, render_page, write_page
+from uwlts.report.findings_order import Verdict, judge_interval
+
+FORMAT = "uwlts-measured-values"
+VERSION = 1
+MEASURED = "measured"
+"""Kind of the files, in their names."""
+MEASURED_ENDINGS = tuple(f".{MEASURED}{ending}" for ending in (".html", ".json", ".csv"))
+"""Endings of page, list and table."""
+COVERAGE_FACTOR = 2.0
+"""Coverage factor of the expanded uncertainties, that of `FigureUncertainty.expanded_mm`."""
+COLUMNS = ("name", "quantity", "value / mm", "U (k = 2) / mm", "lower limit", "upper limit", "verdict", "source")
+_SHOWN_MM = 1e-4
+"""Precision of values without uncertainty."""
+
+
+class MeasuredValue(Description):
+    """Value measured by hand.
+
+    Attributes
+    ----------
+    number : int
+        Number of the value in its list.
+    name : str
+        Name given by the user.
+    quantity : str
+        Measured quantity, such as "distance" or "diameter".
+    value_mm : float
+    expanded_mm : float or None
+        Expanded uncertainty (k = 2); None if it is unknown.
+    without_interval : str
+        Reason why the uncertainty is unknown; empty if it is known.
+    lower_mm, upper_mm : float or None
+        Limits of the value; None: not limited.
+    source : str
+        Cloud or image that was measured.
+    points : int
+        Number of measured points.
+    """
+
+    model_config = ConfigDict(extra="ignore")
+
+    number: int
+    name: Annotated[str, Field(min_length=1, max_length=100)]
+    quantity: str
+    value_mm: float
+    expanded_mm: Annotated[float, Field(ge=0)] | None
+    without_interval: str
+    lower_mm: float | None = None
+    upper_mm: float | None = None
+    source: str
+    points: int
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> Self:
+        if self.lower_mm is not None and self.upper_mm is not None and self.lower_mm > self.upper_mm:
+            raise ValueError(
+                f"the lower limit {self.lower_mm:g} mm is above the upper one, {self.upper_mm:g} mm: exchange them"
+            )
+        return self
+
+    @computed_field
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict on the whole interval (ISO 14253-1); undecided if a limit is given and the uncertainty is unknown."""
+        if self.expanded_mm is None:
+            return "no limit" if self.lower_mm is None and self.upper_mm is None else "undecided"
+        low, high = self.value_mm - self.expanded_mm, self.value_mm + self.expanded_mm
+        return judge_interval(low, high, lower=self.lower_mm, upper=self.upper_mm)
+
+    def interval_text(self) -> str:
+        """Return quantity, value and interval as text, or the reason why there is no interval."""
+        known = self.expanded_mm is not None
+        stated = f"± {self._figure(self.expanded_mm)} mm" if known else f"mm ({self.without_interval})"
+        return f"{self.quantity} {self._figure(self.value_mm)} {stated}"
+
+    def row(self) -> tuple[str, ...]:
+        """Return the texts of a table with `COLUMNS`."""
+        limits = [MISSING if each is None else f"{each:g}" for each in (self.lower_mm, self.upper_mm)]
+        stated = self.without_interval if self.expanded_mm is None else self._figure(self.expanded_mm)
+        return self.name, self.quantity, self._figure(self.value_mm), stated, *limits, self.verdict, self.source
+
+    def _figure(self, value_mm: float | None) -> str:
+        return MISSING if value_mm is None else format_to_scale(value_mm, self.expanded_mm or _SHOWN_MM, digits=2)
+
+
+class MeasuredValues(Description):
+    """List of measured values. Changes return a new list, which remembers the one before for `undo`."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    coverage_factor: float = COVERAGE_FACTOR
+    values: tuple[MeasuredValue, ...] = ()
+    before: MeasuredValues | None = Field(default=None, exclude=True, repr=False)
+
+    def add(self, measured: PickedMeasurement, *, source: str, without_interval: str) -> MeasuredValues:
+        """Add all figures of a measurement, named after it and numbered.
+
+        ``without_interval`` is the reason if a figure has no uncertainty.
+        """
+        taken, count = {each.name for each in self.values}, 1
+        while (name := f"{measured.name} {count}") in taken:
+            count += 1
+        first = max((each.number for each in self.values), default=0) + 1
+        added = []
+        for number, (quantity, value) in enumerate(measured.figures_mm.items(), start=first):
+            known = measured.uncertainty.get(quantity)
+            added.append(
+                MeasuredValue(
+                    number=number,
+                    name=name,
+                    quantity=quantity,
+                    value_mm=value,
+                    expanded_mm=None if known is None else known.expanded_mm,
+                    without_interval=without_interval if known is None else "",
+                    source=source,
+                    points=measured.points_used,
+                )
+            )
+        return self.replace((*self.values, *added))
+
+    def rename(self, number: int, name: str) -> MeasuredValues:
+        """Rename a value; DescriptionError if the name is empty or longer than 100 characters."""
+        return self._change(number, name=name.strip())
+
+    def limit(self, number: int, lower_mm: float | None, upper_mm: float | None) -> MeasuredValues:
+        """Set the limits of a value; DescriptionError if the lower one is above the upper one."""
+        return self._change(number, lower_mm=lower_mm, upper_mm=upper_mm)
+
+    def remove(self, number: int) -> MeasuredValues:
+        """Remove a value."""
+        self.find(number)
+        return self.replace([each for each in self.values if each.number != number])
+
+    def undo(self) -> MeasuredValues:
+        """Return the list before the last change; DescriptionError if there was none."""
+        if self.before is None:
+            raise DescriptionError("there is no change of the list to undo")
+        return self.before
+
+    def replace(self, values: Sequence[MeasuredValue]) -> MeasuredValues:
+        """Return a list of other values, which remembers this one."""
+        return MeasuredValues(values=tuple(values), before=self)
+
+    def find(self, number: int) -> MeasuredValue:
+        """Return the value with a number; DescriptionError if it was removed."""
+        found = next((each for each in self.values if each.number == number), None)
+        if found is None:
+            raise DescriptionError(f"value {number} was removed from the list")
+        return found
+
+    def _change(self, number: int, **changed: object) -> MeasuredValues:
+        old = self.find(number)
+        new = validate_description(MeasuredValue, old.model_dump() | changed, f"the value '{old.name}'")
+        return self if new == old else self.replace([new if each is old else each for each in self.values])
+
+    def table(self) -> str:
+        """Return the list as CSV with a line of names; intervals that are unknown are empty."""
+        names = [name for name in MeasuredValue.model_fields if name != "number"]
+        text = io.StringIO()
+        writer = csv.DictWriter(text, [*names, "verdict"], extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(each.model_dump() for each in self.values)
+        return text.getvalue()
+
+
+def write_measured(page: str | Path, measured: MeasuredValues, *, title: str, overwrite: bool = False) -> list[Path]:
+    """Write a list as a page, and beside it as JSON and CSV; return the paths.
+
+    Parameters
+    ----------
+    page
+        Page to write, NAME.measured.html; the others are NAME.measured.json and NAME.measured.csv.
+    measured
+        Values.
+    title
+        Title of the page.
+    overwrite
+        Replace existing files.
+
+    Raises
+    ------
+    DescriptionError
+        The list is empty.
+    OutputError
+        A file exists and ``overwrite`` is not set, or cannot be written.
+    """
+    if not measured.values:
+        raise DescriptionError("the list of measured values is empty: measure something first")
+    paths = [Path(page).with_suffix(Path(each).suffix) for each in MEASURED_ENDINGS]
+    for path, ending in zip(paths, MEASURED_ENDINGS, strict=True):
+        refuse_unsuitable(path, overwrite=overwrite, endings=(ending,))
+    rows = [each.row() for each in measured.values]
+    text = render_page(
+        "uwlts.report", "measured.html.j2", title=title, software=f"uwlts {__version__}", columns=COLUMNS, rows=rows
+    )
+    write_model(paths[1], measured, file_format=FORMAT, version=VERSION, overwrite=overwrite)
+    with write_atomically(paths[2], overwrite=overwrite) as aside:
+        aside.write_text(measured.table(), encoding="utf-8")
+    write_page(paths[0], text, overwrite=overwrite)
+    return paths
+
+
+def read_measured(path: str | Path) -> MeasuredValues:
+    """Read a list written by `write_measured`; CaptureError if it cannot be read."""
+    return read_model(path, MeasuredValues, file_format=FORMAT, version=VERSION, called="list of measured values")
