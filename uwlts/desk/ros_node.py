@@ -3,7 +3,6 @@
 The libraries of ROS 2 are imported when the node starts.
 """
 
-import math
 import sys
 from array import array
 from collections.abc import Callable
@@ -40,24 +39,20 @@ _WHEELS = ("ros-rclpy", "ros-rmw-fastrtps-cpp", "ros-sensor-msgs", "ros-std-srvs
 class StampedClouds:
     """Messages of clouds whose times are those since the start of a scan.
 
-    The clock's time at which a scan began is taken from its first cloud. A message has the time of its image on that
-    clock.
+    A message has the time of its image on the clock. The start of a scan on the clock follows from its first message.
     """
 
     def __init__(self, types: MessageTypes, now_ns: Callable[[], int], *, frame_id: str = FRAME_ID):
         self._types, self._now_ns, self._frame_id = types, now_ns, frame_id
-        self._began_ns, self._last_s = 0, math.inf
+        self._began_ns, self._scan = 0, -1
 
-    def message(self, cloud: PointCloud) -> Any:
-        """Return the message of a cloud of one image, which has a time."""
-        assert cloud.time_s is not None
-        since_s = float(cloud.time_s[0]) if len(cloud) else 0.0
-        if since_s < self._last_s:
-            self._began_ns = self._now_ns() - round(since_s * NANOSECONDS)
-        self._last_s = since_s
+    def message(self, cloud: PointCloud, time_s: float, scan: int) -> Any:
+        """Return the message of the cloud of an image, at its time in the scan with a number."""
+        since_ns = round(time_s * NANOSECONDS)
+        if scan != self._scan:
+            self._began_ns, self._scan = self._now_ns() - since_ns, scan
         table = pack_points(cloud, covariance_columns_m2(cloud))
-        time_ns = self._began_ns + round(since_s * NANOSECONDS)
-        return point_cloud2(table, self._types, time_ns=time_ns, frame_id=self._frame_id)
+        return point_cloud2(table, self._types, time_ns=self._began_ns + since_ns, frame_id=self._frame_id)
 
 
 def serve_ros(
@@ -125,7 +120,7 @@ def serve_ros(
         service = ScanService(
             source,
             known,
-            lambda cloud: publisher.publish(clouds.message(cloud)),
+            lambda cloud, time_s: publisher.publish(clouds.message(cloud, time_s, service.scans)),
             folder=Path(folder),
             camera=opened,
             stage=moved,

@@ -28,7 +28,7 @@ class ScanService:
     """Scans on request, one at a time, each in a thread of its own: recorded by a plan, or played from a capture.
 
     `start`, `stop` and `laser_off` return at once, with a text for the caller; they raise Error if refused. ``publish``
-    is called with the points of each laser image, whose times are those since the start of the scan.
+    is called with the points of each laser image, and the time of the image in s since the start of the scan.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class ScanService:
     calibration
         Calibration of the sensor.
     publish
-        Receives clouds, with covariance if the calibration is a joint one.
+        Receives clouds and times.
     folder
         Folder of the captures.
     camera, stage
@@ -46,13 +46,18 @@ class ScanService:
         Home the stage, or accept its position, before a scan for which it is locked.
     report
         Receives lines of text.
+
+    Attributes
+    ----------
+    scans : int
+        Number of scans begun.
     """
 
     def __init__(
         self,
         source: ScanPlan | Path,
         calibration: AnyCalibration,
-        publish: Callable[[PointCloud], None],
+        publish: Callable[[PointCloud, float], None],
         *,
         folder: Path = Path(),
         camera: CameraDevice | None = None,
@@ -64,19 +69,21 @@ class ScanService:
         self._source, self._calibration, self._publish, self._report = source, calibration, publish, report
         self._folder, self._camera, self._stage, self._home, self._unlock = folder, camera, stage, home, unlock
         self._stop, self._thread = threading.Event(), threading.Thread()
+        self.scans = 0
         warm_up()
 
     def start(self) -> str:
         """Begin a scan; HardwareError if one is running, CalibrationError if the calibration is of another sensor."""
         if self._thread.is_alive():
             raise HardwareError("a scan is running: stop it first")
-        self._stop.clear()
         if isinstance(self._source, Path):
             work, said = self._play, f"playing {self._source.name}"
         else:
             path = self._free_path(self._source.title)
             check_fits(self._source.header(path.stem), self._calibration, source=path.name)
             work, said = lambda: self._record(path), f"recording {path.name}"
+        self._stop.clear()
+        self.scans += 1
         self._thread = threading.Thread(target=self._run, args=(work,), name="scan", daemon=True)
         self._thread.start()
         return said
@@ -159,8 +166,8 @@ class ScanService:
             frame.seen, stripe_along=header.sensor.camera.stripe_along, saturation=header.saturation_dn
         )
         if (cloud := reconstruct_frame(frame, stripe, header, self._calibration)) is not None:
-            times_s = np.full(len(cloud), frame.time_s)
-            self._publish(replace(cloud, frame=np.full(len(cloud), number), time_s=times_s))
+            placed = {"frame": np.full(len(cloud), number), "time_s": np.full(len(cloud), frame.time_s)}
+            self._publish(replace(cloud, **placed), frame.time_s)
 
     def close(self) -> None:
         """End the scan, and wait for its end."""

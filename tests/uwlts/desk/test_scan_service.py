@@ -70,7 +70,7 @@ def lit(thesis: Sensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_played_capture_gives_its_cloud_image_by_image_at_its_speed(capture: Path, calibration: Calibration):
     clouds: list[PointCloud] = []
     said: list[str] = []
-    service = ScanService(capture, calibration, clouds.append, report=said.append)
+    service = ScanService(capture, calibration, lambda cloud, _: clouds.append(cloud), report=said.append)
     begun_s = time.monotonic()
     assert service.start() == "playing scan.h5"
     with pytest.raises(HardwareError, match="a scan is running"):
@@ -92,7 +92,7 @@ def test_a_played_capture_gives_its_cloud_image_by_image_at_its_speed(capture: P
 def test_playing_stops_on_request_and_switches_no_laser(capture: Path, calibration: Calibration):
     first = threading.Event()
     said: list[str] = []
-    service = ScanService(capture, calibration, lambda cloud: first.set(), report=said.append)
+    service = ScanService(capture, calibration, lambda *_: first.set(), report=said.append)
     for refused, words in ((service.stop, "no scan is running"), (service.laser_off, "no laser is connected")):
         with pytest.raises(HardwareError, match=words):
             refused()
@@ -121,9 +121,14 @@ def plan_for(folder: Path, controller: GrblController, capture: Path, *, count: 
 
 def test_recorded_scans_are_files_and_clouds(tmp_path, lit, calibration, controller):
     plan, clouds, said = plan_for(tmp_path, controller, lit), [], []
+
+    def publish(cloud: PointCloud, time_s: float) -> None:
+        clouds.append(cloud)
+        assert (cloud.time_s == time_s).all()
+
     with GrblStage(controller.port) as stage, ReplayCamera(lit, repeat=True) as camera:
         service = ScanService(
-            plan, calibration, clouds.append, folder=tmp_path, camera=camera, stage=stage, home=True, report=said.append
+            plan, calibration, publish, folder=tmp_path, camera=camera, stage=stage, home=True, report=said.append
         )
         for number in (1, 2):
             assert service.start() == f"recording test-plate-00{number}.h5"
@@ -143,7 +148,7 @@ def test_the_laser_off_service_ends_a_scan_with_the_laser_off(tmp_path, lit, cal
     with GrblStage(controller.port) as stage, ReplayCamera(lit, repeat=True) as camera:
         stage.home()
         service = ScanService(
-            plan, calibration, lambda _: begun.set(), folder=tmp_path, camera=camera, stage=stage, report=said.append
+            plan, calibration, lambda *_: begun.set(), folder=tmp_path, camera=camera, stage=stage, report=said.append
         )
         service.start()
         assert begun.wait(30), said
@@ -160,7 +165,7 @@ def test_the_laser_off_service_ends_a_scan_with_the_laser_off(tmp_path, lit, cal
 def test_a_calibration_of_another_sensor_is_refused_before_anything_moves(tmp_path, lit, calibration, controller):
     other = replace_size(calibration)
     plan = plan_for(tmp_path, controller, lit)
-    service = ScanService(plan, other, lambda cloud: None, folder=tmp_path)
+    service = ScanService(plan, other, lambda *_: None, folder=tmp_path)
     with pytest.raises(CalibrationError):
         service.start()
     assert not controller.state().laser_on and list(tmp_path.glob("*.h5*")) == []

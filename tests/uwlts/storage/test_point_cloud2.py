@@ -52,7 +52,7 @@ def rows(message) -> np.ndarray:
 
 def test_points_are_in_metres_with_time_and_covariance():
     cloud = cloud_at(0.25)
-    message = sent(StampedClouds(bag_types(STORE), lambda: 0, frame_id="tank").message(cloud))
+    message = sent(StampedClouds(bag_types(STORE), lambda: 0, frame_id="tank").message(cloud, 0.25, 1))
     assert message.header.frame_id == "tank" and message.is_dense and (message.height, message.width) == (1, COUNT)
     table = rows(message)
     # 32-bit numbers below 0.5 m have steps of 3e-8 m.
@@ -73,8 +73,9 @@ def test_points_are_in_metres_with_time_and_covariance():
 def test_stamps_are_those_of_the_images_on_the_clock_of_the_node():
     moments_ns = iter([1_700_000_000_500_000_000, 1_800_000_000_000_000_000])
     clouds = StampedClouds(bag_types(STORE), lambda: next(moments_ns))
-    # The second scan begins again with small times.
-    stamps = [sent(clouds.message(cloud_at(time_s))).header.stamp for time_s in (0.25, 0.75, 0.5)]
+    # The first message of a scan may be later than the last one of the scan before.
+    images = ((0.25, 1), (0.75, 1), (0.9, 2))
+    stamps = [sent(clouds.message(cloud_at(time_s), time_s, scan)).header.stamp for time_s, scan in images]
     assert [(stamp.sec, stamp.nanosec) for stamp in stamps] == [
         (1_700_000_000, 500_000_000),
         (1_700_000_001, 0),
@@ -84,5 +85,5 @@ def test_stamps_are_those_of_the_images_on_the_clock_of_the_node():
 
 @pytest.mark.parametrize("known", [True, False])
 def test_covariance_is_only_sent_if_known(known: bool):
-    message = sent(StampedClouds(bag_types(STORE), lambda: 0).message(cloud_at(0.0, known=known)))
+    message = sent(StampedClouds(bag_types(STORE), lambda: 0).message(cloud_at(0.0, known=known), 0.0, 1))
     assert ("cov_xx" in [field.name for field in message.fields]) == known
