@@ -22,7 +22,7 @@ _START = 1e-7
 """Variance relative to that at the end, below which it counts as zero: 0.1 mm of 0.3 m."""
 _AS_DEAD_RECKONED = 0.5
 """Least ratio of the position-heading covariance to that of dead reckoning, for positions to count as dead-reckoned."""
-_WALKS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
+_WALKS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 """Candidate fractions of a random walk in the variance at the end, if none is stated."""
 _CORRELATION = 0.3
 """Default correlation time of rates, relative to the pass: they change several times at most. Chosen on simulated loops

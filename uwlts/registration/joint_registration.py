@@ -272,6 +272,17 @@ class JointRegistration:
             parts.append((target, -found.target_errors.height_changes()))
         return parts
 
+    def largest_move(self, solution: PoseSolution, covariance: np.ndarray) -> float:
+        """Return the largest component of the poses' step in standard uncertainties, without undetermined directions.
+
+        ``covariance`` (U, U) is that of the solution.
+        """
+        units = self.units[: self.unknown_poses]
+        step, ways = solution.step[: len(units)] / units, solution.open_directions / units
+        std = np.sqrt(np.diag(covariance)[: len(units)]) / units
+        step = step - ways.T @ (ways @ step)
+        return float(np.max(np.abs(step) / np.where(std > 0, std, np.inf), initial=0.0))
+
     def move(self, step: np.ndarray) -> None:
         """Update poses and pattern amplitudes by a step (U,)."""
         middles = self.middles_mm

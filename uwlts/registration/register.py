@@ -360,7 +360,7 @@ def _settle(
         joint.require_connected(list(pairs), names)
         solution = joint.solve(list(pairs.values()))
         covariance = joint.covariance(list(pairs.values()), solution)
-        moves = _largest_move(solution.step[: joint.unknown_poses], covariance)
+        moves = joint.largest_move(solution, covariance)
         if moves < _SETTLED or (rounds == _REFITS and moves <= 1):
             return distances, pairs, solution, covariance
         if rounds == _REFITS:
@@ -370,12 +370,6 @@ def _settle(
             )
         joint.move(solution.step)
         rounds += 1
-
-
-def _largest_move(step: np.ndarray, covariance: np.ndarray) -> float:
-    """Return the largest component of a step (P,) of the poses in standard uncertainties."""
-    std = np.sqrt(np.diag(covariance)[: len(step)])
-    return float(np.max(np.abs(step) / np.where(std > 0, std, np.inf), initial=0.0))
 
 
 def _pair_fit(
