@@ -12,8 +12,8 @@ from uwlts._version import __version__
 from uwlts.acceptance.characteristics import (
     NAMES,
     Characteristic,
-    Decision,
     CharacteristicValue,
+    Decision,
     describe_missing,
     judge_characteristic,
     measure_position,
