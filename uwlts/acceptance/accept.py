@@ -12,8 +12,8 @@ from uwlts._version import __version__
 from uwlts.acceptance.characteristics import (
     NAMES,
     Characteristic,
+    CharacteristicValue,
     Decision,
-    MeasuredValue,
     describe_missing,
     judge_characteristic,
     measure_position,
@@ -67,7 +67,7 @@ class JudgedPosition(_Stored):
     points: int = 0
     warnings: tuple[str, ...] = ()
     stage_direction: Vector | None = None
-    values: tuple[MeasuredValue, ...] = ()
+    values: tuple[CharacteristicValue, ...] = ()
 
 
 class Acceptance(Brief, _Stored):
@@ -135,7 +135,7 @@ class Acceptance(Brief, _Stored):
         return tuple(each for each in self.positions if each.state != "judged")
 
     @property
-    def values(self) -> tuple[MeasuredValue, ...]:
+    def values(self) -> tuple[CharacteristicValue, ...]:
         """All measured values."""
         return tuple(value for each in self.positions for value in each.values)
 

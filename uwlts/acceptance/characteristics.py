@@ -45,7 +45,7 @@ class _Stored(BaseModel):
     model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 
 
-class MeasuredValue(_Stored):
+class CharacteristicValue(_Stored):
     """Measured value of a characteristic at one position.
 
     Attributes
@@ -85,7 +85,7 @@ class Characteristic(_Stored):
     Attributes
     ----------
     symbol : str
-    worst : MeasuredValue or None
+    worst : CharacteristicValue or None
         Value that is nearest to, or farthest beyond, the limit, including its uncertainty; None if nothing was
         measured.
     count, wanted : int
@@ -98,7 +98,7 @@ class Characteristic(_Stored):
     """
 
     symbol: Symbol
-    worst: MeasuredValue | None
+    worst: CharacteristicValue | None
     count: Annotated[int, Field(ge=0)]
     wanted: Annotated[int, Field(ge=0)]
     mpe_mm: Positive | None
@@ -107,7 +107,7 @@ class Characteristic(_Stored):
 
 def measure_position(
     cloud: PointCloud, artefact: CertifiedArtefact, position: str, temperature: Temperature | None
-) -> list[MeasuredValue]:
+) -> list[CharacteristicValue]:
     """Return all values of the characteristics at one position.
 
     EvaluationError if the cloud does not show the artefact.
@@ -122,7 +122,7 @@ def measure_position(
             place = _mean_place(cloud, found.deviation_mm)
             values: tuple[tuple[Symbol, float], ...] = ("F", found.form.range_mm), ("F95", found.form.range_95_mm)
             return [
-                MeasuredValue(
+                CharacteristicValue(
                     symbol=symbol, position=position, label="plane", value_mm=value, expanded_mm=by_form, place_mm=place
                 )
                 for symbol, value in values
@@ -132,7 +132,7 @@ def measure_position(
             calibrated = found.height_mm - found.height_error_mm
             std = _size_std_mm(artefact, artefact.standard.height_uncertainty_mm, calibrated, temperature)
             return [
-                MeasuredValue(
+                CharacteristicValue(
                     symbol="E",
                     position=position,
                     label="height",
@@ -148,7 +148,7 @@ def measure_position(
             raise EvaluationError(f"a {found.kind} has no characteristic of an acceptance test")
 
 
-def judge_characteristic(symbol: Symbol, values: list[MeasuredValue], mpe_mm: float | None) -> Characteristic:
+def judge_characteristic(symbol: Symbol, values: list[CharacteristicValue], mpe_mm: float | None) -> Characteristic:
     """Return a characteristic with its worst value and the decision."""
     own = [each for each in values if each.symbol == symbol]
     worst = max(own, key=lambda each: abs(each.value_mm) + (each.expanded_mm or 0.0), default=None)
@@ -171,7 +171,7 @@ def judge_characteristic(symbol: Symbol, values: list[MeasuredValue], mpe_mm: fl
     )
 
 
-def _decide(value: MeasuredValue, mpe_mm: float | None) -> Decision:
+def _decide(value: CharacteristicValue, mpe_mm: float | None) -> Decision:
     """Return the decision on one value by its coverage interval (ISO 14253-1)."""
     if mpe_mm is None:
         return "no MPE"
@@ -184,7 +184,7 @@ def _decide(value: MeasuredValue, mpe_mm: float | None) -> Decision:
 
 def _sphere_values(
     found: SphereEvaluation, artefact: CertifiedArtefact, position: str, temperature: Temperature | None
-) -> Iterator[MeasuredValue]:
+) -> Iterator[CharacteristicValue]:
     standard = artefact.standard
     assert isinstance(standard, SphereStandard)
     for number, sphere in enumerate(found.spheres, start=1):
@@ -197,7 +197,7 @@ def _sphere_values(
             ("PS", sphere.diameter_error_mm, by_size),
         )
         for symbol, value, expanded in measured:
-            yield MeasuredValue(
+            yield CharacteristicValue(
                 symbol=symbol,
                 position=position,
                 label=f"sphere {number}",
@@ -210,7 +210,7 @@ def _sphere_values(
         between = centres[number] - centres[number - 1]
         calibrated = spacing.spacing_mm - spacing.sse_mm
         std = _size_std_mm(artefact, standard.spacing_uncertainty_mm, calibrated, temperature)
-        yield MeasuredValue(
+        yield CharacteristicValue(
             symbol="SD",
             position=position,
             label="spacing" if len(found.spacings) == 1 else f"spacing {number}-{number + 1}",

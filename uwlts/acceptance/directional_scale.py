@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 from scipy.stats import t as t_distribution
 
-from uwlts.acceptance.characteristics import MeasuredValue
+from uwlts.acceptance.characteristics import CharacteristicValue
 from uwlts.model.sensor import Vector
 
 Component = Literal["XX", "YY", "ZZ", "YZ", "XY", "XZ"]
@@ -94,7 +94,7 @@ class DirectionalScale(BaseModel):
 
 
 def fit_directional_scale(
-    values: Sequence[MeasuredValue], artefacts: Sequence[str], stage_directions: Sequence[Vector]
+    values: Sequence[CharacteristicValue], artefacts: Sequence[str], stage_directions: Sequence[Vector]
 ) -> DirectionalScale | None:
     """Return scales and shears from measured lengths; None without lengths.
 

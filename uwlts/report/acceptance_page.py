@@ -7,7 +7,7 @@ import numpy as np
 from markupsafe import Markup
 
 from uwlts.acceptance.accept import FORMAT, VERSION, Acceptance, JudgedPosition
-from uwlts.acceptance.characteristics import NAMES, Characteristic, MeasuredValue
+from uwlts.acceptance.characteristics import NAMES, Characteristic, CharacteristicValue
 from uwlts.acceptance.directional_scale import DirectionalScale, ScaleComponent
 from uwlts.acceptance.plan import SYMBOLS, CertifiedArtefact, Symbol
 from uwlts.files.json_files import json_text
@@ -268,5 +268,5 @@ def _draw_lengths(acceptance: Acceptance) -> Markup:
     return figure_svg(figure)
 
 
-def _length_label(value: MeasuredValue) -> str:
+def _length_label(value: CharacteristicValue) -> str:
     return plain_text(f"{value.position} ({value.symbol}, {value.length_mm or 0.0:.0f} mm)")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.acceptance.characteristics import MeasuredValue
+from uwlts.acceptance.characteristics import CharacteristicValue
 from uwlts.acceptance.directional_scale import fit_directional_scale
 
 SHARES = {
@@ -20,7 +20,7 @@ LENGTH_MM = 100.0
 
 def lengths(directions, errors_mm, *, calibration_std_mm=0.0):
     return [
-        MeasuredValue(
+        CharacteristicValue(
             symbol="SD",
             position=str(number),
             label="spacing",
