@@ -27,6 +27,8 @@ use_variant(os.environ.get("TWIN_TEST_VARIANT", CPU))
 
 # Processes that tests start in other folders find the packages as this one does.
 os.environ["PYTHONPATH"] = str(ROOT)
+# Views of clouds open no window on the developer's screen: the program `true` is the browser.
+os.environ["BROWSER"] = "true"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

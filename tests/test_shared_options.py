@@ -37,7 +37,8 @@ MEANING = {
         "--out": "to write|New folder",
         "--overwrite": "Replace|replace",
         "--pixels": "Whether pixels are square",
-        "--plan": "[Pp]lan of a scan|TOML file with sensor, medium, positions",
+        "--pdf": "Also print the page",
+        "--plan": "[Pp]lan of (a scan|an acceptance test)|TOML file with sensor, medium, positions",
         "--port": "[Pp]ort of the page",
         "--pose-format": "euler-ZYX-deg",
         "--pose-unit": "Unit of the .*positions",
@@ -64,6 +65,8 @@ MEANING = {
     "twin": {
         "--as-built": "sensor to render",
         "--campaign": "campaign's description",
+        "--campaigns": "Number of campaigns",
+        "--first": "Seed of the first campaign",
         "--effects": "Effects of real images to add",
         "--every": "every",
         "--ideal": "pinhole",

@@ -15,7 +15,15 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import ArgumentError
 
 PLOTS = ["cloud", "stripe", "deviation_histogram", "along_stripe", "residuals", "window_curves"]
-SERVERS = {"uwlts.serve_desk", "uwlts.watch", "uwlts.examine", "twin.demo", "twin.reproduce", "twin.serve"}
+SERVERS = {
+    "uwlts.serve_desk",
+    "uwlts.watch",
+    "uwlts.examine",
+    "twin.demo",
+    "twin.predict",
+    "twin.reproduce",
+    "twin.serve",
+}
 """Functions that work without any file: for minutes, or until they are ended. No fitting argument is given to them."""
 WRONG = [None, 3, -2.5, True, "no such thing", Path("nothing"), np.zeros((2, 3, 3)), [1, 2], ["a"], {"a": 1}, object()]
 NO_FILE = "nothing.h5"

@@ -49,6 +49,15 @@ def reproduce(call: Call) -> None:
     _run_others(call)
 
 
+@command_from(app, twin, "follow", job="Simulate")
+def follow(call: Call) -> None:
+    """Example: twin follow wall.h5 --calibration calibration.json --out runs/follow"""
+    try:
+        say(f"wrote {call()}")
+    except CommandFailed as error:
+        sys.exit(error.returncode)
+
+
 @command_from(app, twin, "demo", job="Simulate")
 def demo(call: Call) -> None:
     """Example: twin demo"""
@@ -63,6 +72,16 @@ def _run_others(call: Call) -> None:
         sys.exit(error.returncode)
 
 
+@command_from(app, twin, "predict", job="Design")
+def predict(call: Call) -> None:
+    """Example: twin predict thesis --campaigns 3 --out runs/predicted"""
+    try:
+        result = call()
+    except CommandFailed as error:
+        sys.exit(error.returncode)
+    show(result.lines())
+
+
 @command_from(app, twin, "sweep", job="Design")
 def sweep(call: Call) -> None:
     """Example: twin sweep baseline-angle --out runs/baseline-angle"""
@@ -71,12 +90,14 @@ def sweep(call: Call) -> None:
 
 @app.command(group=JOBS["Design"])
 def scenes() -> None:
-    """List the scenes, sensors, campaigns, data sets, studies and waters that ship with the program.
+    """List scenes, sensors, campaigns, data sets, studies and their figures, waters, and window materials.
 
     Example: twin scenes
     """
+    from twin.design.figures_of_merit import FIGURES
     from twin.scene.description import load_scene
     from uwlts.model.library import list_names
+    from uwlts.model.media import GLASSES
     from uwlts.model.waters import WATERS
 
     for name in list_names():
@@ -84,6 +105,8 @@ def scenes() -> None:
         say(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
     for folder in ("sensors", "campaigns", "datasets", "studies"):
         say(f"{folder}: {', '.join(list_names(folder))}")
+    say(f"figures of studies: {', '.join(FIGURES)}")
+    say(f"window materials: {', '.join(GLASSES)}; also by common names such as acrylic or float glass")
     say(f"waters: {', '.join(WATERS)}, or a turbidity from 0 to 3")
     for name, water in WATERS.items():
         say(f"  {name}: {water.sentence}")

@@ -1,4 +1,5 @@
 from . import report as report
+from .acceptance.accept import accept as accept
 from .alignment.align import align_trajectory as align_trajectory
 from .calibration.calibrate import calibrate as calibrate
 from .calibration.camera.photographs import calibrate_camera as calibrate_camera
@@ -11,6 +12,7 @@ from .comparison.surface_mesh import mesh as mesh
 from .desk.guided import record_guided as record_guided
 from .desk.operator_page import serve_desk as serve_desk
 from .desk.recording_view import watch as watch
+from .desk.ros_node import serve_ros as serve_ros
 from .desk.scan import scan as scan
 from .doctor import examine as examine
 from .errors import Error as Error
@@ -28,11 +30,14 @@ from .model.sensor import Sensor as Sensor
 from .model.trajectory import Trajectory as Trajectory
 from .optics.design_table import design as design
 from .optics.nominal import nominal as nominal
+from .radiometry.fit import fit_radiometry as fit_radiometry
+from .radiometry.result import Radiometry as Radiometry
 from .reconstruction.reconstruct import reconstruct as reconstruct
 from .reconstruction.verify import verify as verify
 from .registration.register import register as register
 from .report import plot as plot
 from .report.any_file import read as read
+from .report.frames import to_frame as to_frame
 from .report.inventory import describe as describe
 from .storage.capture import Capture as Capture
 from .storage.cloud import PointCloud as PointCloud

@@ -49,6 +49,10 @@ class DescriptionError(Error):
     """A description of a sensor, scene or target cannot be read: unknown key, wrong type, unknown name."""
 
 
+class DescriptionWarning(UserWarning):
+    """A description keeps a value of its base that does not fit the values that it changes; commands print it."""
+
+
 class DesignError(Error):
     """A description is readable but its sensor cannot work."""
 

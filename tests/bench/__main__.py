@@ -1,19 +1,18 @@
 """Compare speed and memory with the project's limits: ``python -m tests.bench``; writes ``runs/bench.json``.
 
 With names of sections as arguments, only these are measured. Times are medians after a warm-up, without compilation.
-Limits are for two cores.
+Limits are for two cores. Most rows also state the ratio of their time to a floor: a plain computation on the same data,
+measured in the same run (`tests.bench.floors`). Ratios hold on other machines, times do not.
 """
 
 import json
 import os
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -28,45 +27,18 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from tests.bench.rows import Floor, Row, at_least, at_most, median_seconds
 from twin.options import use_variant
 
 RESULT = Path("runs/bench.json")
 CORES = 2
-
-
-@dataclass(frozen=True)
-class Row:
-    """Measured value and its limit; ``ok`` is True if the value is within the limit."""
-
-    name: str
-    value: float
-    unit: str
-    limit: float
-    ok: bool
-
-
-def at_most(name: str, value: float, unit: str, limit: float) -> Row:
-    """Return a row with a value that must not exceed the limit."""
-    return Row(name, round(float(value), 4), unit, limit, bool(value <= limit))
-
-
-def at_least(name: str, value: float, unit: str, limit: float) -> Row:
-    """Return a row with a value that must reach the limit."""
-    return Row(name, round(float(value), 4), unit, limit, bool(value >= limit))
-
-
-def median_seconds(action: Callable[[int], object], *, warm_up: int = 3, runs: int = 15) -> float:
-    """Return the median duration of ``action(k)`` after a warm-up."""
-    seconds = []
-    for k in range(warm_up + runs):
-        start = time.perf_counter()
-        action(k)
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds[warm_up:])
+STOCK_FRAME = "Mitsuba's path integrator, a frame without water"
+MAXIMA = "NumPy's maximum of every line"
 
 
 def rendering() -> list[Row]:
-    """Time of a full-size laser frame and a lamp frame of the thesis's sensor."""
+    """Time of sharp full-size laser frames of the thesis's sensor."""
+    from tests.bench.floors import stock_frame_seconds
     from twin.light.renderer import Renderer
     from twin.options import NONE
     from twin.scene.description import load_scene
@@ -83,19 +55,21 @@ def rendering() -> list[Row]:
         Renderer(sensor, sensor.media["water"], load_scene(name), effects=replace(NONE, haze=True))
         for name in ("spheres", "pipe")
     )
-    limit = 0.25
+    limit, floor = 0.25, Floor(STOCK_FRAME, stock_frame_seconds(), 0.5)
     return [
         at_most(
             "sharp laser frame 1280 x 1024, 64 samples per lit pixel, spheres in water",
             median_seconds(lambda k: spheres.irradiance("laser", pose(k), spp=64)),
             "s",
             limit,
+            floor,
         ),
         at_most(
             "sharp laser frame 1280 x 1024, 64 samples per lit pixel, pipe across the whole image in water",
             median_seconds(lambda k: pipe.irradiance("laser", pose(k), spp=64)),
             "s",
             limit,
+            floor,
         ),
     ]
 
@@ -106,16 +80,21 @@ def light() -> list[Row]:
     The time limits were set for the noise of 64 samples in an earlier version.
     """
     from tests.bench import light as bench_light
+    from tests.bench.floors import stock_frame_seconds
 
-    rows = []
+    rows, floor = [], Floor(STOCK_FRAME, stock_frame_seconds(), 1.0)
     for water, limit, most_noise in (("clear", 0.12, 0.25), ("coastal", 0.25, 0.66)):
         seconds, noise = bench_light.rendered_light(water)
         recorded = bench_light.recorded_frame(water)
         rows.append(
-            at_most(f"laser frame with all effects, speckle to disk, spheres in {water} water", recorded, "s", limit)
+            at_most(
+                f"laser frame with all effects, speckle to disk, spheres in {water} water", recorded, "s", limit, floor
+            )
         )
         rows.append(
-            at_most(f"the same: its light alone, before speckle and detector, {water} water", seconds, "s", limit)
+            at_most(
+                f"the same: its light alone, before speckle and detector, {water} water", seconds, "s", limit, floor
+            )
         )
         rows.append(at_most(f"the same: noise of its light, {water} water", 100 * noise, "% of peak", most_noise))
     advantage, how = bench_light.equal_noise_advantage()
@@ -126,28 +105,37 @@ def light() -> list[Row]:
 def campaign() -> list[Row]:
     """Speed of a campaign of the thesis: record it, calibrate jointly from it, and measure with it on one core."""
     from tests.bench.calibration import joint_calibration, measuring_rate
+    from tests.bench.floors import connected_parts_seconds, line_maxima_seconds, stock_frame_seconds
     from tests.bench.light import campaign as recorded
+    from uwlts.storage.capture import Capture
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         frames, seconds, peak, growth = recorded(folder)
         target, *steps, in_water = (folder / f"{number}.h5" for number in range(5))
-        calibration, finding, estimating = joint_calibration([target, in_water], steps)
+        calibration, images, finding, estimating = joint_calibration([target, in_water], steps)
         cv2.setNumThreads(1)
         by_stage, by_path = measuring_rate([folder / "13.h5", folder / "14.h5"], calibration)
+        with Capture(target) as capture:
+            labelled = connected_parts_seconds(capture.image(0))
+        with Capture(folder / "13.h5") as capture:
+            maxima = line_maxima_seconds(capture.image(0), capture.header.sensor.camera.stripe_along)
+    of_frames, of_lines = Floor(STOCK_FRAME, frames * stock_frame_seconds(), 1.0), Floor(MAXIMA, 1.0 / maxima, 40.0)
+    of_images = Floor("OpenCV's connected components of as many images", images * labelled, 30.0)
     return [
-        at_most(f"campaign of {frames} frames", seconds, "s", 60),
+        at_most(f"campaign of {frames} frames", seconds, "s", 60, of_frames),
         at_most("campaign, peak memory", peak, "GiB", 3),
         at_most("campaign, time of the last frames over that of earlier ones", growth, "times", 1.3),
-        at_most("joint calibration: targets and stripes found in its images", finding, "s", 3),
+        at_most(f"joint calibration: targets and stripes found in its {images} images", finding, "s", 3, of_images),
         at_most("joint calibration: the estimate", estimating, "s", 3),
-        at_least("spheres in water: stripes, points and their covariance", by_stage, "frames/s", 1000),
-        at_least("the same along a trajectory", by_path, "frames/s", 1000),
+        at_least("spheres in water: stripes, points and their covariance", by_stage, "frames/s", 1000, of_lines),
+        at_least("the same along a trajectory", by_path, "frames/s", 1000, of_lines),
     ]
 
 
 def pipeline() -> list[Row]:
     """Time of stripe extraction and reconstruction on one core: the default method, and the fastest one."""
+    from tests.bench.floors import connected_parts_seconds, line_maxima_seconds, plain_centroid_seconds
     from twin.options import Options
     from twin.recording.sensor_simulator import SensorSimulator
     from twin.scene.description import load_scene
@@ -187,19 +175,25 @@ def pipeline() -> list[Row]:
         )
         extraction = median_seconds(lambda k, extract=extract: extract(), runs=101)
         both = median_seconds(lambda k, extract=extract, then=reconstruct: then(extract().pixels()), runs=101)
-        rows.append(at_most(f"{method}, {stripe}", 1e3 * extraction, "ms/frame", limit_ms))
-        rows.append(at_least(f"{method} and reconstruction on one core, {stripe}", 1 / both, "frames/s", 1000))
+        maxima = Floor(MAXIMA, 1e3 * line_maxima_seconds(image, along), 6.0)
+        centroid = Floor("a plain compiled centroid", 1.0 / plain_centroid_seconds(image, along), 4.0)
+        rows.append(at_most(f"{method}, {stripe}", 1e3 * extraction, "ms/frame", limit_ms, maxima))
+        rows.append(
+            at_least(f"{method} and reconstruction on one core, {stripe}", 1 / both, "frames/s", 1000, centroid)
+        )
     scene = load_scene("target")
     target = parse_target(scene.target)
     lamp = next(shot for shot in scene.motion.shots() if shot.light == "lamp")
     image = SensorSimulator(load_sensor("thesis"), scene, Options()).image(lamp, 0)
     seconds = median_seconds(lambda k: target.detect(image), runs=11)
     found = len(target.detect(image).pixels)
-    return [*rows, at_most(f"the {found} circles of a target in view found, on one core", seconds, "s", 0.3)]
+    labelled = Floor("OpenCV's connected components of the image", connected_parts_seconds(image), 30.0)
+    return [*rows, at_most(f"the {found} circles of a target in view found, on one core", seconds, "s", 0.3, labelled)]
 
 
 def reproduction() -> list[Row]:
     """Time per image of the thesis's campaign, its scans thinned: 3,000 images in half an hour are 600 ms."""
+    from tests.bench.floors import stock_frame_seconds
     from twin.recording.campaigns import record_campaigns
     from twin.scene.campaign import load_campaign
 
@@ -213,7 +207,9 @@ def reproduction() -> list[Row]:
         start = time.perf_counter()
         record_campaigns(load_campaign("thesis"), Path(folder), seeds=range(1), every=30, progress=count)
         seconds = time.perf_counter() - start
-    return [at_most(f"the thesis's campaign, thinned to {images} images", 1e3 * seconds / images, "ms/image", 500)]
+    stock = Floor(STOCK_FRAME, 1e3 * stock_frame_seconds(), 1.0)
+    name = f"the thesis's campaign, thinned to {images} images"
+    return [at_most(name, 1e3 * seconds / images, "ms/image", 500, stock)]
 
 
 def studies() -> list[Row]:
@@ -234,20 +230,27 @@ def datasets() -> list[Row]:
     Two workers share memory and caches, so their limit is a tenth below twice the rate of one.
     """
     from tests.bench.dataset import rate_hz
+    from tests.bench.floors import stock_frame_seconds
 
     one, two = (rate_hz(workers=workers) for workers in (1, 2))
+    # A frame of 640 x 512 pixels has a quarter of the sensor's.
+    stock = Floor(f"{STOCK_FRAME}, of 640 x 512", 4.0 / stock_frame_seconds(), 1.0)
     return [
-        at_least("data set stripe-clean, two workers", two, "frames/s", 10),
+        at_least("data set stripe-clean, two workers", two, "frames/s", 10, stock),
         at_least("the same: two workers by one", two / one, "times", 1.8),
     ]
 
 
 def hardware() -> list[Row]:
     """Frames per second from a camera to the disk, alone and with stripe and points found meanwhile."""
-    from tests.bench.recording import RATE_HZ, SERVED, TAKEN, following_rate, gige_recording, recording
+    from tests.bench.floors import plain_centroid_seconds, stored_image_seconds
+    from tests.bench.recording import RATE_HZ, SERVED, TAKEN, example_image, following_rate, gige_recording, recording
 
     alone, live, gige = recording(), recording(live=True), gige_recording()
+    image = example_image()
+    centroid = Floor("a plain compiled centroid", 1.0 / plain_centroid_seconds(image, "width"), 6.0)
     return [
+        at_most("camera to disk: HDF5 alone stores a frame", 1e3 * stored_image_seconds(image), "ms", 1e3 / RATE_HZ),
         at_least(f"camera to disk, {TAKEN} frames at {RATE_HZ:g}/s", alone.rate_hz, "frames/s", 0.99 * RATE_HZ),
         at_most("the same: lost", alone.lost, "frames", 0),
         at_least("the same while another process follows the file", live.rate_hz, "frames/s", 0.99 * RATE_HZ),
@@ -255,7 +258,7 @@ def hardware() -> list[Row]:
         at_least("the follower, with stripe and points", live.followed_hz, "frames/s", 0.99 * RATE_HZ),
         at_least("the follower: frames", live.followed, "frames", TAKEN),
         at_most("the follower: behind at the end", live.behind_s, "s", 0.25),
-        at_least("the follower's work on frames from memory", following_rate(), "frames/s", 300),
+        at_least("the follower's work on frames from memory", following_rate(), "frames/s", 300, centroid),
         at_least(f"GigE Vision on loopback to disk, {SERVED} frames", gige.rate_hz, "frames/s", 0.998 * RATE_HZ),
         at_most("the same: lost", gige.lost, "frames", 0),
     ]
@@ -280,9 +283,11 @@ def commands() -> list[Row]:
     def seconds(*arguments: str) -> float:
         return median_seconds(lambda k: subprocess.run([sys.executable, *arguments], check=True, capture_output=True))
 
+    started = seconds("-c", "")
+    python, numpy = Floor("an empty Python", started, 20.0), Floor("import numpy", seconds("-c", "import numpy"), 1.0)
     return [
-        at_most("uwlts --help", seconds("-m", "uwlts", "--help"), "s", 0.3),
-        at_most("import uwlts", seconds("-c", "import uwlts") - seconds("-c", ""), "s", 0.2),
+        at_most("uwlts --help", seconds("-m", "uwlts", "--help"), "s", 0.3, python),
+        at_most("import uwlts, beyond an empty Python", seconds("-c", "import uwlts") - started, "s", 0.2, numpy),
     ]
 
 
@@ -301,16 +306,27 @@ def main(*sections: str) -> int:
         print(f"{count} cores found, measuring on {CORES}")
     # Before the renderer is imported.
     use_variant()
-    console, rows = Console(width=130), []
+    console, rows = Console(width=170), []
     for number, name in enumerate(chosen, 1):
         summary = (SECTIONS[name].__doc__ or "").partition(":")[0].rstrip(".\n")
         console.print(f"[{number}/{len(chosen)}] {name}: {summary}", markup=False)
         start = time.perf_counter()
         measured = SECTIONS[name]()
         rows += measured
-        table = Table("what", "value", "limit", "unit", "", title=f"{name}, {time.perf_counter() - start:.0f} s")
+        table = Table(
+            "what",
+            "value",
+            "limit",
+            "unit",
+            "times floor",
+            "limit",
+            "",
+            title=f"{name}, {time.perf_counter() - start:.0f} s",
+        )
         for row in measured:
-            table.add_row(row.name, f"{row.value:.3f}", f"{row.limit:.4g}", row.unit, "ok" if row.ok else "MISSED")
+            ratio = ("", "") if row.floor is None else (f"{row.ratio:.2f}", f"{row.floor.most:g}: {row.floor.name}")
+            verdict = "ok" if row.ok else "MISSED"
+            table.add_row(row.name, f"{row.value:.3f}", f"{row.limit:.4g}", row.unit, *ratio, verdict)
         console.print(table)
     RESULT.parent.mkdir(parents=True, exist_ok=True)
     RESULT.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8")

@@ -42,8 +42,8 @@ class _InMemory:
         return len(self._images)
 
 
-def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibration, float, float]:
-    """Return the calibration, the seconds to find targets and stripes in all images, and those of the estimate."""
+def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibration, int, float, float]:
+    """Return the calibration, its number of images, and the seconds to find targets and stripes and of the estimate."""
     options = CalibrationOptions()
     with ExitStack() as stack:
         opened = [[stack.enter_context(Capture(path)) for path in paths] for paths in (targets, steps)]
@@ -51,7 +51,8 @@ def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibrati
         gathered = gather_jointly(*opened, options=options)
         found = time.perf_counter()
         calibration = solve_jointly(gathered, options=options).calibration
-        return calibration, found - start, time.perf_counter() - found
+        images = sum(len(capture) for captures in opened for capture in captures)
+        return calibration, images, found - start, time.perf_counter() - found
 
 
 def measuring_rate(scans: list[Path], calibration: Calibration) -> tuple[float, float]:

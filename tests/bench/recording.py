@@ -83,6 +83,11 @@ def gige_recording() -> Recorded:
         return _record(camera, sensor, Path(folder) / "out.h5", SERVED)
 
 
+def example_image() -> np.ndarray:
+    """Return one of the recorded images (H, W)."""
+    return _images(load_sensor("thesis"))[0]
+
+
 def _images(sensor: Sensor) -> list[np.ndarray]:
     rng = np.random.default_rng(0)
     height, width = sensor.camera.height_px, sensor.camera.width_px

@@ -116,6 +116,7 @@ FOLDERS = {
     "twin record --out",
     "twin dataset --out",
     "twin reproduce --out",
+    "twin predict --out",
     "twin demo --out",
     "twin sweep --out",
 }

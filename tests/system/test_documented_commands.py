@@ -48,6 +48,7 @@ MAKE = {"make ": "`make test-full` runs this test, and demo, bench, docs and che
 INSTALL = {"pip install": "make does it", "twin demo": "takes a minute; tests/system/test_campaign.py runs it"}
 HARDWARE = "needs hardware: docs/how-to/scan.md and desk.md run it with the twin"
 ALIGNED_ELSEWHERE = "a pass that can be aligned takes minutes to render: tests/uwlts/alignment/test_align.py runs it"
+NEEDS_ROS = "needs ROS 2: tests/ros_node.py runs it"
 NEEDS_LEARN = "needs the extra learn, with some 1 GB of libraries, and minutes of training"
 THREE_VIEWS = {"top.cloud.h5": "pipe.cloud.h5", "left.cloud.h5": "pipe.cloud.h5", "right.cloud.h5": "pipe.cloud.h5"}
 NO_MOVEMENT = "1,0,0,0,0,1,0,0,0,0,1,0\n" * 3
@@ -196,6 +197,11 @@ PAGES_RUN = {
     "docs/explanation/tests.md": Page(
         instead={"pytest": f"pytest --collect-only -q {ROOT / 'tests/test_public_api.py'}"}
     ),
+    "docs/how-to/accept-a-sensor.md": Page(
+        given={"calibration.json": "calibration.json", "bar-near.h5": "spheres.h5", "bar-far.h5": "today.h5"}
+        | {"plate.h5": "plane.h5", "step.h5": "step-scan.h5"},
+        tables={"acceptance.toml": 0},
+    ),
     "docs/how-to/add-a-target.md": Page(
         instead={'kind: Literal["plain circles"] = "plain circles"': 'kind: Literal["plain"] = "plain"'}
     ),
@@ -217,9 +223,18 @@ PAGES_RUN = {
         | {"part.stl": "pipe.stl"},
         again=("uwlts compare scan.cloud.h5", "uwlts compare pipe.cloud.h5"),
     ),
+    "docs/how-to/describe-your-sensor.md": Page(tables={"reef.toml": 0, "reef-close.toml": 1}),
     "docs/how-to/gauge-study.md": Page(
         texts={"diameters.csv": GAUGE, "runs/gauge/heights.csv": GAUGE},
         not_run={"python docs/studies/gauge_twin.py": "renders 18 scans"},
+    ),
+    "docs/how-to/predict-uncertainty.md": Page(
+        texts={
+            "my-sensor.toml": 'base = "thesis-small"\nname = "mine"\n',
+            "small-pipe.toml": 'base = "pipe"\ntitle = "small pipe"\n',
+        },
+        tables={"small-pipe-campaign.toml": 0},
+        instead={"--campaigns 2 --every 4": "--campaigns 1 --every 40", "--campaigns 10": "--campaigns 1"},
     ),
     "docs/how-to/inspect-a-pipe.md": Page(
         given={name: name for name in ("pipe.cloud.h5", "pipe.h5", "weld.cloud.h5", "flange.cloud.h5")}
@@ -240,9 +255,13 @@ PAGES_RUN = {
     ),
     "docs/how-to/make-a-mesh.md": Page(given=THREE_VIEWS | {"merged.cloud.h5": "pipe.cloud.h5"}),
     "docs/how-to/register-scans.md": Page(given=THREE_VIEWS, texts={"start.csv": NO_MOVEMENT}),
+    "docs/how-to/ros.md": Page(not_run={"pip install": NEEDS_ROS, "uwlts ros": NEEDS_ROS}),
     "docs/how-to/scan-from-a-vehicle.md": Page(
         prepare={"uwlts reconstruct pass.h5 --calibration calibration.json --mount mount.json --traj": correct_nothing},
         not_run={"uwlts align pass.cloud.h5": ALIGNED_ELSEWHERE},
+    ),
+    "docs/reference/digital-certificate.md": Page(
+        given={"calibration.json": "calibration.json"}, tables={"administration.toml": 0}
     ),
     "docs/reference/api.md": Page(given={name: name for name in ("target-air.h5", "target-water.h5", "spheres.h5")}),
     "docs/tutorials/calibrate-a-sensor.md": Page(small_python=True),

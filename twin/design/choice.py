@@ -23,7 +23,14 @@ from twin.design.designs import (
     make_sensor,
     select_design,
 )
-from twin.design.figures_of_merit import DEPTHS, PLACES, Field, evaluate_field, find_depths_in_view
+from twin.design.figures_of_merit import (
+    DEPTHS,
+    PLACES,
+    RENDERED_SCATTERING_DEPTH,
+    Field,
+    evaluate_field,
+    find_depths_in_view,
+)
 from twin.design.geometry import Array, standoff_mm
 from twin.design.parameters import (
     PARAMETER_OF,
@@ -207,12 +214,24 @@ def choose(study: Study, columns: Columns) -> DesignChoice:
                 "refined along the gradient", build_sensor(study, end), select_design(evaluate_designs(study, [end]), 0)
             )
         )
+    notes += [note] if (note := describe_turbidity(marked[-1])) else []
     front = np.flatnonzero(found.front(meets))
     front = front[np.argsort(found.cost()[front])]
     spread = front[np.unique(np.linspace(0, len(front) - 1, study.verify + 1).round().astype(int))]
     others = [int(place) for place in spread if place != best][: max(study.verify - 1, 0)]
     further = [found.highlight(place, "on the Pareto front") for place in others]
     return DesignChoice(tuple(marked), tuple(further), tuple(notes))
+
+
+def describe_turbidity(one: HighlightedDesign) -> str:
+    """Return a note on a design in water that is more turbid than that of the rendered designs, else an empty text."""
+    depth = one.design.number_of("scattering_depth")
+    if not depth > RENDERED_SCATTERING_DEPTH:
+        return ""
+    return (
+        f"{one.label}: the optical depth of scattering is {depth:.1f}, but formulas and rendering were compared only "
+        f"up to {RENDERED_SCATTERING_DEPTH:g}: do not rely on its sigmas unless it is rendered (verify) and agrees."
+    )
 
 
 # --- refinement -------------------------------------------------------------------------------------------------------

@@ -53,6 +53,8 @@ _BRIGHT_LINES = 2.05
 """Level of automatic exposure in standard deviations of speckle above the mean: 2 % of the lines are brighter."""
 _UNMODELLED = 0.02
 """Deviation of a stripe from the fitted Gaussian, relative to its height; it limits the weight of the flanks."""
+RENDERED_SCATTERING_DEPTH = 5.0
+"""Largest optical depth of scattering at which formulas and rendering agreed, see docs/results/designs.md."""
 _FLANK = 4.0
 """Limit of the sum over the stripe's profile in standard deviations; less than 1e-4 of the light is outside."""
 _NODES = 16
@@ -70,13 +72,14 @@ class StripeModel:
 
     ``sigma_px`` is the standard deviation of the stripe's image across the stripe, and ``blur_px`` the contribution of
     the lens. ``rate_e_per_ms`` is the rate of photo-electrons of the brightest pixel, and ``background_e_per_ms`` the
-    rate because of other light.
+    rate because of other light. ``way_mm`` is the length of the light's path in the medium, from laser to camera.
     """
 
     sigma_px: Array
     blur_px: Array
     rate_e_per_ms: Array
     background_e_per_ms: Array
+    way_mm: Array
 
 
 def model_stripe(
@@ -142,7 +145,8 @@ def model_stripe(
     lit = _relative_power(xp, p, angle)
     per_mm = p.power_w * lit / (2 * p.fan_half_rad) / ((1 + fan.slope * fan.slope) * fan.growth_mm)
     back = length_outside_mm(xp, window, view.path)
-    passed = xp.exp(-p.extinction_per_mm * (length_outside_mm(xp, laser_window, fan) + back))
+    way = length_outside_mm(xp, laser_window, fan) + back
+    passed = xp.exp(-p.extinction_per_mm * way)
     on_surface = per_mm / (math.sqrt(2 * math.pi) * sheet) * p.laser_window_passes(xp) * passed
     a, b = view.slopes
     cosine_squared = 1 / (1 + a * a + b * b)
@@ -153,7 +157,7 @@ def model_stripe(
     rate = on_surface * reflectance / math.pi * per_radiance * electrons * thick / sigma
     ambient = p.ambient_w_per_mm2 * reflectance / math.pi * per_radiance * electrons
     ambient = ambient * xp.exp(-p.extinction_per_mm * back)
-    return StripeModel(sigma, blur, rate, ambient)
+    return StripeModel(sigma, blur, rate, ambient, way)
 
 
 def centre_noise_px(xp: ModuleType, p: SensorArrays, stripe: StripeModel, exposure_ms: Array) -> Array:
@@ -230,6 +234,7 @@ class Field:
     blur_px: Array
     signal_e: Array
     occlusion_rad: Array
+    scattering_depth: Array
     lit: Array
     in_view: Array
     exposure_ms: Array
@@ -336,6 +341,7 @@ def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Arr
         blur_px=stripe.blur_px,
         signal_e=stripe.rate_e_per_ms * used,
         occlusion_rad=2 * xp.asin(xp.minimum(0.5 * xp.sqrt(dot(chord, chord) + 1e-24), 1.0)),
+        scattering_depth=p.scattering_per_mm * stripe.way_mm,
         lit=lit,
         in_view=inside,
         exposure_ms=used,
@@ -381,6 +387,8 @@ class Figures:
     section_cm2: np.ndarray = _figure("area of the sheet in the volume", "cm²")  # that the camera sees
     # Largest angle between laser's and camera's rays: steeper walls hide one from the other.
     occlusion_deg: np.ndarray = _figure("occlusion angle, largest", "°")
+    # Scattering coefficient times the path from laser to camera: mean number of scatterings of the light.
+    scattering_depth: np.ndarray = _figure("optical depth of scattering, largest", "")
     signal_e: np.ndarray = _figure("faintest signal", "e⁻")
     exposure_ms: np.ndarray = _figure("exposure", "ms")  # as used
     required_ms: np.ndarray = _figure("exposure required", "ms")  # that the wanted brightness takes
@@ -542,6 +550,7 @@ def _reduce_fields(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray,
         line_far_mm=line[:, -1],
         section_cm2=0.01 * np.trapezoid(line, f["z_mm"][:, :, 0], axis=1),
         occlusion_deg=np.degrees(worst("occlusion_rad")),
+        scattering_depth=worst("scattering_depth"),
         signal_e=np.where(inside, f["signal_e"], np.inf).min(axis=(1, 2)),
         speckle_limit_mm=one(speckle_px) * f["depth_per_px_mm"][at],
         laser_class=one(laser_class(p)),
@@ -605,7 +614,6 @@ _GRAVITY = 9.81
 _WATER_KG_PER_M3 = 1030.0
 """Density of sea water."""
 # As in thesis Eq. 3.2.
-_SILICA_STRENGTH_MPA = 60.0
 _CLAMPED = 0.75
 _SAFETY = 4.0
 
@@ -631,10 +639,10 @@ def laser_class(p: SensorArrays) -> np.ndarray:
 
 
 def window_needed_mm(p: SensorArrays, *, water_depth_m: float) -> np.ndarray:
-    """Return the thickness of a clamped round window of fused silica, t = A / 2 sqrt(K f P / S).
+    """Return the thickness of a clamped round window of the camera's glass, t = A / 2 sqrt(K f P / S).
 
-    Source: Harris 1999, thesis Eq. 3.2.
+    Source: Harris 1999, thesis Eq. 3.2. The strength S is that of the named glass, or of fused silica if it is unknown.
     """
     pressure_mpa = 1e-6 * _GRAVITY * _WATER_KG_PER_M3 * water_depth_m
     opening = np.where(np.isfinite(p.window_aperture_mm), p.window_aperture_mm, 0.0)
-    return 0.5 * opening * math.sqrt(_CLAMPED * _SAFETY * pressure_mpa / _SILICA_STRENGTH_MPA)
+    return 0.5 * opening * np.sqrt(_CLAMPED * _SAFETY * pressure_mpa / p.window_strength_mpa)

@@ -97,6 +97,7 @@ class SensorArrays:
     window_faces_pass: Array
     window_absorption_per_mm: Array
     window_aperture_mm: Array
+    window_strength_mpa: Array
     wavelength_mm: Array
     power_w: Array
     fan_half_rad: Array
@@ -117,6 +118,7 @@ class SensorArrays:
     laser_window_aperture_mm: Array
     medium_index: Array
     extinction_per_mm: Array
+    scattering_per_mm: Array
     quantum_efficiency: Array
     full_well_e: Array
     read_noise_e: Array
@@ -316,6 +318,7 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
         "beam_quality": laser.beam_quality_m2,
         "medium_index": index,
         "extinction_per_mm": medium.extinction_per_mm(wavelength),
+        "scattering_per_mm": medium.scattering_per_mm(wavelength),
         "quantum_efficiency": detector.quantum_efficiency,
         "full_well_e": detector.full_well_e,
         "read_noise_e": detector.read_noise_e,
@@ -329,6 +332,7 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
         "ambient_w_per_mm2": 1e-6 * sensor.lamp.ambient_w_per_m2,
         "speckle_coherence": speckle,
         "stage_resolution_mm": sensor.stage.resolution_mm,
+        "window_strength_mpa": window.strength_mpa(),
         "near_mm": sensor.volume.near_mm,
         "far_mm": sensor.volume.far_mm,
     }

@@ -15,9 +15,10 @@ import numpy as np
 import tomli_w
 from pydantic import TypeAdapter
 
-from twin.design.choice import choose
+from twin.design.choice import StudyResults, choose
 from twin.design.designs import Columns, HighlightedDesign
 from twin.design.report.study_page import page_text
+from twin.design.report.study_tables import failure_counts
 from twin.design.screening import JOURNAL, PARTS, evaluate_study, read_parts, write_csv
 from twin.design.study import Study, load_study
 from twin.design.verification import Agreement, verify_candidates
@@ -35,6 +36,8 @@ PAGE = "report.html"
 TABLE = "designs.csv"
 WINNER = "winner.toml"
 SUMMARY = "summary.json"
+_REASONS = 3
+"""Most frequent reasons of failure in the lines of a result; the page lists all."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -77,6 +80,8 @@ class SweepResult(Brief):
     def lines(self) -> list[str]:
         """Return the result as lines of text."""
         lines = ["{} designs, {} work, {} meet all constraints".format(*self.counts()), *self.notes]
+        reasons = failure_counts(StudyResults(self.study, self.columns))[:_REASONS]
+        lines += [f"{count} cannot work: {' '.join(reason.split())}" for reason, count in reasons]
         names = [*self.study.free(), *self.study.figures()]
         for one in self.marked:
             table = one.design.table().items()

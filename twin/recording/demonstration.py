@@ -1,19 +1,13 @@
 """Demonstration of all commands: record a virtual campaign, calibrate, reconstruct, evaluate, report."""
 
-import io
 import json
-import runpy
 import shlex
-import sys
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import redirect_stderr, redirect_stdout
 from itertools import groupby
 from pathlib import Path
 
-from uwlts.errors import CommandFailed, SetupError
-from uwlts.runtime.console import INTERRUPTED
-from uwlts.runtime.workers import Lost, open_workers
+from twin.recording.command_lines import run_lines
+from uwlts.runtime.workers import open_workers
 
 STAGES = ("render", "calibrate", "reconstruct", "evaluate", "report")
 AT_ONCE = 2
@@ -82,51 +76,9 @@ def demo(out: str | Path = "runs/demo") -> Path:
                 (folder / "seconds.json").write_text(json.dumps(seconds, indent=2) + "\n", encoding="utf-8")
             start = time.perf_counter()
             # Commands of one stage are independent.
-            for line, ended in workers.map_unordered(_run, _announce([line for _, line in rows])):
-                if isinstance(ended, Lost):
-                    raise SetupError(f"{line}: {ended.reason}")
-                code, output = ended
-                print(output, end="", flush=True)
-                if code:
-                    raise CommandFailed(line, code)
+            run_lines(workers, [line for _, line in rows])
             seconds[stage] = round(time.perf_counter() - start, 2)
     total = ", ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items())
     report = folder / "report.html"
     print(f"done in {time.perf_counter() - begun:.1f} s ({total}); open {report}")
     return report
-
-
-def _announce(lines: Iterable[str]) -> Iterator[str]:
-    """Yield the commands; print each one when it starts."""
-    for line in lines:
-        print(f"$ {line}", flush=True)
-        yield line
-
-
-class _PlainErrors(io.TextIOBase):
-    """Standard error of a command that runs beside others: it is no terminal, so that it gets lines and no bars."""
-
-    def write(self, text: str, /) -> int:
-        assert sys.__stderr__ is not None
-        sys.__stderr__.write(text)
-        sys.__stderr__.flush()
-        return len(text)
-
-
-def _run(line: str) -> tuple[int, str]:
-    """Run a command as ``python -m`` does, and return its exit code and output; errors and progress appear at once.
-
-    It runs in this process: importing the shared modules takes most commands longer than their work.
-    """
-    program, *arguments = shlex.split(line)
-    output = io.StringIO()
-    sys.argv = [program, *arguments]
-    code = 0
-    with redirect_stdout(output), redirect_stderr(_PlainErrors()):
-        try:
-            runpy.run_module(program, run_name="__main__", alter_sys=True)
-        except SystemExit as end:
-            code = int(end.code or 0)
-    if code == INTERRUPTED:
-        raise KeyboardInterrupt
-    return code, output.getvalue()

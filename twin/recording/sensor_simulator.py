@@ -65,7 +65,8 @@ def true_pose(scene: Scene, shot: Shot) -> np.ndarray:
 def check_scene(renderer: Renderer, scene: Scene) -> None:
     """Check that a scan reaches the objects.
 
-    DesignError if the objects are outside the depth range of the measuring volume, or the sheet never meets them.
+    DesignError if the scene's stand-off or the objects are outside the depth range of the measuring volume, or the
+    sheet never meets the objects. The scene's stand-off is the origin of its placement; a platform has none.
     """
     volume, axis = renderer.sensor.volume, camera_from_object(renderer.sensor)[:3, 2]
     # The sheet's centre line is along Z; outside the window, its camera depth is standoff + Z axis_z.
@@ -75,6 +76,16 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
     inverse = np.linalg.inv([true_pose(scene, shot) for shot in scene.motion.shots()])
     seen = np.einsum("sij,cj->sci", inverse[:, :3, :3], corners) + inverse[:, None, :3, 3]
     low, high = seen.min(axis=1), seen.max(axis=1)
+    origin = (inverse @ scene.placements[scene.placement].matrix()[:, 3])[:, 2]
+    if not isinstance(scene.motion, Platform) and not ((origin >= nearest) & (origin <= farthest)).any():
+        low_mm, high_mm = (renderer.design.standoff_mm + axis[2] * z for z in (origin.min(), origin.max()))
+        depth = f"{low_mm:.1f}" + (f" to {high_mm:.1f}" if high_mm - low_mm > 0.05 else "")
+        raise DesignError(
+            f"the stand-off of the scene '{scene.title}' (placement '{scene.placement}') is {depth} mm from the "
+            f"camera's window, outside the measuring volume of the sensor '{renderer.sensor.name}' from "
+            f"{volume.near_mm:g} to {volume.far_mm:g} mm: choose another placement, or set volume.near_mm and "
+            "volume.far_mm about it"
+        )
     if not ((low[:, 2] <= farthest) & (high[:, 2] >= nearest)).any():
         raise DesignError(
             f"the objects are at Z = {low[:, 2].min():.1f} to {high[:, 2].max():.1f} mm from the stand-off, outside "

@@ -170,7 +170,7 @@ def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: 
         relative = used.distance_mm / used.std_mm
         spread = noise_factor(relative)
         # Each direction has half the weight, and overlapping patches share points.
-        shared = 2 * estimate.pieces[source].patches.shared
+        shared = 2 * estimate.pieces[source].patches.overlap
         ways.append((source, target, used, biweight(relative / spread) / (used.std_mm * spread) ** 2 / shared))
     if not ways:
         return

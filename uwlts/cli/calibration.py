@@ -178,8 +178,10 @@ def certificate(
 
     calibration = call.given["calibration"]
     if check is not None:
-        if call.given.keys() & {"out", "before"}:
-            raise DescriptionError("`check` verifies and writes nothing: give it without `out` and `before`")
+        if call.given.keys() & {"out", "before", "administration"}:
+            raise DescriptionError(
+                "`check` verifies and writes nothing: give it without `out`, `before` and `administration`"
+            )
         against = uwlts.report.check_certificate(check, calibration)
         say("\n".join(against) or f"{check} is unchanged, and belongs to {calibration}")
         if against:
@@ -188,6 +190,8 @@ def certificate(
     page, content = call()
     show(certificate_lines(content))
     wrote_page(page)
+    if "administration" in call.given:
+        say(f"wrote {page.with_suffix('.xml')}")
 
 
 @command_from(app, uwlts, "verify", job="Calibrate")
@@ -204,4 +208,51 @@ def verify(call: Call) -> None:
     except OutputError as error:
         warn(f"the verdict is not kept: {error}")
     if not verification.passed:
+        sys.exit(1)
+
+
+@command_from(app, uwlts, "accept", job="Calibrate", also=[(uwlts.report, "write_acceptance")])
+def accept(
+    call: Call,
+    *,
+    out: Annotated[
+        Path | None,
+        Parameter(
+            help="Page to write, with the result as sealed JSON beside it; by default PLAN.acceptance.html, or "
+            "PLAN.html if PLAN ends with acceptance. An earlier result of the same plan is continued and replaced."
+        ),
+    ] = None,
+    pdf=False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Exit code 0 only if conformity is proven for everything in the plan.
+
+    Example: uwlts accept acceptance.toml --pdf
+    """
+    from uwlts.acceptance.accept import Acceptance
+    from uwlts.acceptance.plan import load_plan
+    from uwlts.files.inputs import record_made
+    from uwlts.pages.toolkit import json_beside, refuse_unsuitable_page
+    from uwlts.report.acceptance_page import KIND
+
+    plan = Path(call.given["plan"])
+    page = out or plan.with_suffix(".html" if plan.stem.endswith(KIND) else f".{KIND}.html")
+    result = json_beside(page, KIND)
+    if result.is_file() and not overwrite:
+        # The command continues its own result.
+        record_made(result)
+        record_made(page)
+        known, title = uwlts.read(result, trust_edited=call.given.get("trust_edited", False)), load_plan(plan).title
+        if not isinstance(known, Acceptance) or known.plan.title != title:
+            raise OutputError(
+                f"{result} is not of the test {title!r}: give another `out`, or `overwrite` to replace it"
+            )
+        call.given.setdefault("earlier", known)
+        overwrite = True
+    refuse_unsuitable_page(page, kind=KIND, overwrite=overwrite)
+    found = call()
+    show(found.lines())
+    uwlts.report.write_acceptance(page, found, pdf=pdf, overwrite=overwrite)
+    say(f"wrote {page}, {result.name}" + (f", {page.with_suffix('.pdf').name}" if pdf else ""))
+    if found.verdict != "conformity proven":
         sys.exit(1)

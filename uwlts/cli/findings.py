@@ -33,8 +33,8 @@ def evaluate(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts evaluate spheres.cloud.h5 --truth spheres.truth.h5 --out spheres.evaluation.json"""
+    from uwlts.pages.cloud_figure import colour_limit_mm
     from uwlts.report.inventory import evaluation_lines
-    from uwlts.report.plot import colour_limit_mm
 
     evaluation = call()
     evaluation.save(out, overwrite=overwrite)

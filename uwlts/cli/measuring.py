@@ -135,3 +135,35 @@ def mesh(
     surface = call()
     surface.save(out, overwrite=overwrite)
     wrote(surface.lines(), [], out)
+
+
+@command_from(app, uwlts, "fit_radiometry", job="Scan")
+def radiometry(
+    call: Call,
+    *,
+    out: Annotated[
+        Path,
+        a_file(".toml", beside=".json"),
+        Parameter(help="Description of the sensor to write (TOML), with all estimates as JSON beside it."),
+    ],
+    page: Annotated[
+        Path | None,
+        a_file(".html"),
+        Parameter(help="Page to write that shows both captures; needs --compared-with and --earlier-capture."),
+    ] = None,
+    earlier_capture: Annotated[Path | None, Parameter(help="Capture of the earlier result, for the page.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Example: uwlts radiometry wall.h5 --calibration calibration.json --out followed.toml"""
+    from uwlts.errors import DescriptionError
+
+    earlier = call.given.get("compared_with")
+    if page and not (earlier and earlier_capture):
+        raise DescriptionError("`page` compares two captures: give `compared_with` and `earlier_capture`, too")
+    found = call()
+    found.save(out, overwrite=overwrite)
+    if page and earlier and earlier_capture:
+        given = {"earlier": earlier, "earlier_capture": earlier_capture, "overwrite": overwrite}
+        uwlts.report.write_radiometry(page, found, call.given["capture"], **given)
+    show(found.lines())
+    say(f"wrote {out} and {out.with_suffix('.json').name}" + (f", {page}" if page else ""))

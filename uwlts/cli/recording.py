@@ -1,4 +1,4 @@
-"""Commands at the sensor: scan, watch, the operator's desk, and the examination of the machine."""
+"""Commands at the sensor: scan, watch, the operator's desk, the node of ROS 2, and the examination of the machine."""
 
 import sys
 
@@ -26,6 +26,12 @@ def watch(call: Call) -> None:
 @command_from(app, uwlts, "serve_desk", job="Scan")
 def desk(call: Call) -> None:
     """Example: uwlts desk tank --plan plan.toml"""
+    call()
+
+
+@command_from(app, uwlts, "serve_ros", job="Scan")
+def ros(call: Call) -> None:
+    """Example: uwlts ros plan.toml --calibration calibration.json --home"""
     call()
 
 

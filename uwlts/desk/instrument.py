@@ -22,7 +22,7 @@ from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.board import Board, Picture
 from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.recording_view import RecordingView, reconstruct_profile
+from uwlts.desk.recording_view import BackgroundView, RecordingView, reconstruct_frame
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
@@ -44,8 +44,6 @@ from uwlts.stripe import Stripe
 
 _PREVIEW_S = 0.15
 """Pause between two live images."""
-_WAITING = 64
-"""Images in the queue for display during a scan; further ones are recorded but not shown."""
 _MOST_LOST = 2
 """Consecutive live images that may be lost before an error is reported."""
 _EARLIER = 200
@@ -413,7 +411,7 @@ class Instrument:
         place_mm, exposure_ms = self._board.position_mm or 0.0, frame.exposure_ms or 0.0
         placed = Frame(frame.seen, place_mm, True, exposure_ms, frame.time_s)
         try:
-            found = reconstruct_profile(placed, stripe, connected.plan.header("live"), self.calibration)
+            found = reconstruct_frame(placed, stripe, connected.plan.header("live"), self.calibration)
         except Error as error:
             self.calibration = None
             self._board.say(f"no profile is shown: {error}", "error")
@@ -448,7 +446,7 @@ class Instrument:
         self.state, self._rig, kept_light = InstrumentState.SCANNING, None, self.light
         self._show_laser()
         try:
-            with _BackgroundView(view) as shown:
+            with BackgroundView(view.show) as shown:
                 seen = record_scan(
                     plan,
                     out,
@@ -511,35 +509,3 @@ class Instrument:
         if self._stop.is_set():
             raise Ended
         self._show_laser()
-
-
-class _BackgroundView:
-    """Display of recorded images in its own thread, so that recording never waits for it."""
-
-    def __init__(self, view: RecordingView):
-        self._view = view
-        self._waiting: queue.Queue[tuple[Frame, int] | None] = queue.Queue(_WAITING)
-        self._fault: Exception | None = None
-
-    def put(self, frame: Frame, number: int) -> None:
-        """Queue an image for display, unless too many wait."""
-        if not self._waiting.full():
-            self._waiting.put((frame, number))
-
-    def _show(self) -> None:
-        while (seen := self._waiting.get()) is not None:
-            try:
-                self._view.show(*seen)
-            except Exception as error:
-                self._fault = self._fault or error
-
-    def __enter__(self) -> "_BackgroundView":
-        self._thread = threading.Thread(target=self._show, name="view", daemon=True)
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        self._waiting.put(None)
-        self._thread.join()
-        if self._fault is not None and kind is None:
-            raise self._fault

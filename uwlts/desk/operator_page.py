@@ -24,7 +24,7 @@ from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.measure_panel import MeasurePanel, Measuring
 from uwlts.desk.number_field import NumberField
 from uwlts.desk.server import DeskServer
-from uwlts.desk.thinned_cloud import point_table
+from uwlts.desk.thinned_cloud import FIELDS, point_table
 from uwlts.errors import DescriptionError, Error
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
@@ -190,9 +190,7 @@ class _Desk:
 
 def _fields(cloud: PointCloud) -> dict[str, np.ndarray | None]:
     """Return fields (N,) for colouring a cloud's points."""
-    known = cloud.uncertainty
-    std = None if known is None else np.linalg.norm(known.std_mm(), axis=1)
-    return {"intensity": cloud.intensity, "deviation": cloud.deviation_mm, "uncertainty": std}
+    return {field: cloud.field_values(field) for field in FIELDS}
 
 
 class _OperatorPage:

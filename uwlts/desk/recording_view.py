@@ -1,10 +1,12 @@
 """Display of a recording in progress on the page: its latest image with the stripe, warnings, and the cloud so far."""
 
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -22,6 +24,8 @@ from uwlts.stripe import CaptureStripes, Stripe, find_stripe, warm_up
 
 LOOK_S = 0.1
 """Interval between checks for new images; a check takes a few ms."""
+_WAITING = 64
+"""Images in the queue for display during a scan; further ones are recorded but not shown."""
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
 """Limits of a laser image: faint below this fraction of full scale; saturated above this fraction of saturated lines;
 too little of the stripe below this fraction of lines with a point."""
@@ -86,7 +90,7 @@ class RecordingView:
 def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | None) -> _Profile:
     along, full = header.sensor.camera.stripe_along, header.saturation_dn
     stripe = find_stripe(frame.seen, stripe_along=along, saturation=full)
-    cloud = None if calibration is None else reconstruct_profile(frame, stripe, header, calibration)
+    cloud = None if calibration is None else reconstruct_frame(frame, stripe, header, calibration)
     saturated, remarks = None, []
     if isinstance(frame.seen, np.ndarray):
         brightest = frame.seen.max(axis=0 if along == "width" else 1)
@@ -100,10 +104,13 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
     return _Profile(stripe.pixels(), cloud, len(stripe.status), saturated, tuple(remarks))
 
 
-def reconstruct_profile(
+def reconstruct_frame(
     frame: Frame, stripe: Stripe, header: CaptureHeader, calibration: AnyCalibration
 ) -> PointCloud | None:
-    """Return the points of a laser image, with uncertainty if the calibration states it; None without a stripe."""
+    """Return the points of a laser image, with uncertainty if the calibration states it; None without a stripe.
+
+    The errors are those of `reconstruct_stripes`.
+    """
     line = stripe.lines
     if len(line) == 0:
         return None
@@ -135,6 +142,41 @@ def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | Non
         if finished:
             return
         yield None
+
+
+class BackgroundView:
+    """Display of recorded images in a thread of its own, so that recording never waits for it.
+
+    ``show`` is called with images and their numbers. Its first error is raised when the ``with`` ends.
+    """
+
+    def __init__(self, show: Callable[[Frame, int], None]):
+        self._show = show
+        self._waiting: queue.Queue[tuple[Frame, int] | None] = queue.Queue(_WAITING)
+        self._fault: Exception | None = None
+
+    def put(self, frame: Frame, number: int) -> None:
+        """Queue an image for display, unless too many wait."""
+        if not self._waiting.full():
+            self._waiting.put((frame, number))
+
+    def _run(self) -> None:
+        while (seen := self._waiting.get()) is not None:
+            try:
+                self._show(*seen)
+            except Exception as error:
+                self._fault = self._fault or error
+
+    def __enter__(self) -> Self:
+        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        self._waiting.put(None)
+        self._thread.join()
+        if self._fault is not None and kind is None:
+            raise self._fault
 
 
 def watch(

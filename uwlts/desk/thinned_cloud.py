@@ -4,7 +4,9 @@ import threading
 
 import numpy as np
 
-FIELDS = ("intensity", "deviation", "uncertainty")
+from uwlts.pages.cloud_figure import CloudField
+
+FIELDS: tuple[CloudField, ...] = ("intensity", "deviation", "uncertainty")
 """Fields for colouring points besides depth: in grey values, mm and mm."""
 _COLUMNS = 3 + len(FIELDS)
 

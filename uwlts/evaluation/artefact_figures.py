@@ -8,7 +8,15 @@ from typing import Any, ClassVar, assert_never
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
+from uwlts.evaluation.figures import (
+    TOWARDS_SENSOR,
+    ArtefactEvaluation,
+    FigureId,
+    FormErrors,
+    Quantity,
+    measure_form,
+    spread_mm,
+)
 from uwlts.evaluation.spheres import evaluate_spheres
 from uwlts.evaluation.step_faces import StepFace, label_step_faces, step_height
 from uwlts.fitting.least_squares import RobustFit, fit_robustly
@@ -52,13 +60,14 @@ def evaluate_cloud(cloud: PointCloud, artefact: Artefact) -> ArtefactEvaluation:
 class PlaneEvaluation(ArtefactEvaluation):
     """Evaluation of a plane; `re_mm` is the range of the residuals (range error), `std_mm` their standard deviation.
 
-    `normal` points to the sensor; deviations are positive on that side.
+    `form` has the form errors by all points. `normal` points to the sensor; deviations are positive on that side.
     """
 
     kind: ClassVar[str] = "plane"
 
     re_mm: float
     std_mm: float
+    form: FormErrors
     point_mm: tuple[float, float, float]
     normal: tuple[float, float, float]
 
@@ -105,6 +114,7 @@ def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluati
         **counts,
         re_mm=spread_mm(robust.fit.residuals_mm),
         std_mm=robust.fit.std_mm,
+        form=measure_form(_fit_facing_plane, points, robust.distances_mm),
         point_mm=tuple(robust.fit.point_mm.tolist()),
         normal=tuple(robust.fit.normal.tolist()),
     )
@@ -185,6 +195,8 @@ class StepEvaluation(ArtefactEvaluation):
         Standard deviation of each face about its own plane.
     parallelism_deg : float
         Angle between both planes.
+    normal, point_mm : (float, float, float)
+        Unit normal of the reference face towards the sensor, and the mean of the points of both faces.
     """
 
     kind: ClassVar[str] = "step"
@@ -199,6 +211,8 @@ class StepEvaluation(ArtefactEvaluation):
     lower_std_mm: float
     upper_std_mm: float
     parallelism_deg: float
+    normal: tuple[float, float, float]
+    point_mm: tuple[float, float, float]
     labels: np.ndarray
 
     def values_mm(self) -> dict[FigureId, float | None]:
@@ -260,5 +274,7 @@ def measure_step(
         lower_std_mm=lower.std_mm,
         upper_std_mm=upper.std_mm,
         parallelism_deg=float(np.degrees(np.arccos(min(1.0, abs(lower.normal @ upper.normal))))),
+        normal=tuple(planes[base].normal.tolist()),
+        point_mm=tuple(points[labels != StepFace.NEITHER].mean(axis=0).tolist()),
         labels=labels,
     )

@@ -7,16 +7,18 @@ gives the noise of distances and slopes.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.storage.cloud import PointUncertainty, project_variance
+from uwlts.fitting.patch_errors import PatchErrors
+from uwlts.storage.cloud import PointUncertainty, project_image_errors, project_variance
 
 _CELLS_PER_RADIUS = 3.0
 """Averaging cubes per disc radius: a disc contains 28 averages for 6 coefficients."""
@@ -27,6 +29,8 @@ _ROUND = 0.3
 """Least squared ratio of a disc's narrow to its wide extent; distant profiles give strips instead of discs."""
 _LARGEST_PATCH = 0.1
 """Largest disc radius relative to the cloud's size; a larger disc is not local."""
+_LEAST_NOISE_MM = 1e-6
+"""Lower bound of a point's noise, mm, so that weights stay finite."""
 _ROUGH = 5.0
 """Largest ratio of a patch's scatter to the median scatter; patches on edges exceed it."""
 _MOST = 15_000
@@ -42,6 +46,19 @@ LEAST_INFORMATION = 5.0
 """Least information on a determined motion, relative to the information that noise of the normals alone produces."""
 _ROUNDING = 1e-9
 """Least information above rounding noise, relative to the information on the best determined motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class Averages:
+    """Averages of points in cubes: positions (C, 3) and systematic patterns (M, C, 3), mm, and point counts (C,)."""
+
+    places_mm: np.ndarray
+    counts: np.ndarray
+    patterns_mm: np.ndarray
+
+    @cached_property
+    def tree(self) -> KDTree:
+        return KDTree(self.places_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,14 +81,23 @@ class Patches:
         Number of a point near the centre of the patch.
     radius_mm : float
         Radius of the discs.
-    shared : float
-        Mean number of patches that contain a point; overlapping patches are correlated.
+    averages : Averages
+        Averages of points to which the patches are fitted.
+    errors : PatchErrors
+        Effect of the independent errors of the cloud on the heights of the patches.
+    image_variance_mm2 : (P,) float64
+        Variance of the heights by errors of images, which ``covariance`` does not contain.
     one_sided : bool
         True if all normals point to the sensor (-Z); otherwise their signs have no meaning.
-    by_images : float
-        Fraction of the median patch variance due to image errors, which are common to all patches along an image.
+    noise_stated : bool
+        True if the cloud states the noise of its points; otherwise it is that of their scatter, with the misfit of
+        second-order surfaces.
+    shared : float
+        Variance of the sum of all heights by noise, relative to the sum of their variances.
+    overlap : float
+        Mean number of patches that contain a point.
     strips : float
-        Number of strips, as wide as a patch, into which the images are divided.
+        Number of independent groups of patches with regard to errors of images.
     """
 
     places_mm: np.ndarray
@@ -81,15 +107,28 @@ class Patches:
     patterns_mm: np.ndarray
     numbers: np.ndarray
     radius_mm: float
-    shared: float
+    averages: Averages
+    errors: PatchErrors
+    image_variance_mm2: np.ndarray
     one_sided: bool
-    by_images: float = 0.0
-    strips: float = 1.0
+    noise_stated: bool
+    shared: float
+    overlap: float
+    strips: float
 
     def correlated_count(self, count: int) -> float:
         """Return the number of patches that carry the information of one independent patch, among ``count`` patches."""
-        along = max(count / self.strips, self.shared)
-        return (1 - self.by_images) * self.shared + self.by_images * along
+        of_images, of_noise = np.median(self.image_variance_mm2), np.median(self.covariance[:, 0, 0])
+        share = float(of_images / (of_images + of_noise))
+        return (1 - share) * self.shared + share * max(count / self.strips, self.shared)
+
+    def corrected(self, amounts: np.ndarray) -> Patches:
+        """Return the patches moved by amounts (M,) of the systematic patterns."""
+        moved = replace(
+            self.averages, places_mm=self.averages.places_mm + np.tensordot(amounts, self.averages.patterns_mm, axes=1)
+        )
+        places = self.places_mm + np.tensordot(amounts, self.patterns_mm, axes=1)
+        return replace(self, places_mm=places, averages=moved)
 
     def __len__(self) -> int:
         return len(self.places_mm)
@@ -113,9 +152,13 @@ class Patches:
             self.patterns_mm[:, selection],
             self.numbers[selection],
             self.radius_mm,
-            self.shared,
+            self.averages,
+            self.errors[selection],
+            self.image_variance_mm2[selection],
             self.one_sided,
-            self.by_images,
+            self.noise_stated,
+            self.shared,
+            self.overlap,
             self.strips,
         )
 
@@ -129,8 +172,8 @@ def surface_patches(
 ) -> Patches:
     """Fit patches to the surface of a cloud.
 
-    Pose errors of images (`PointUncertainty.poses_mm`) average only over the images of a disc, and are common to all
-    patches along an image.
+    Errors of an image's position and pose average only over the images of a disc, and are common to all patches along
+    the image.
 
     Parameters
     ----------
@@ -150,44 +193,28 @@ def surface_patches(
         raise EvaluationError(f"the cloud has {len(points_mm)} points; at least {10 * _FEWEST} are needed")
     radius = radius_mm or find_disc_radius(points_mm)
     owner, means, counts = _average_in_cubes(points_mm, radius / _CELLS_PER_RADIUS)
+    averages = Averages(means, counts, _average_patterns(uncertainty, owner, counts))
     middle = _select_central(means, radius)
-    away, near = _nearest_within(KDTree(means), means[middle], radius)
-    held = np.isfinite(away)
-    enough = held.sum(axis=1) >= _FEWEST
-    middle, near, held = middle[enough], near[enough], held[enough]
+    discs = _gather_discs(averages, means[middle], radius)
+    enough = discs.held.sum(axis=1) >= _FEWEST
+    middle, discs = middle[enough], discs[enough]
     if not len(middle):
         raise EvaluationError(f"no disc of {radius:.3g} mm radius contains enough points: the cloud is too sparse")
-    near = np.where(held, near, 0)
-    about = means[near] - means[middle][:, None]
-    weight = np.where(held, counts[near], 0.0)
-    axes = _principal_frames(about, weight)
-    u, v, w = np.einsum("pij,pkj->ipk", axes, about) / radius
-    columns = _columns(u, v)
-    normal = np.einsum("pka,pk,pkb->pab", columns, weight, columns)
-    # Points on a line leave second-order terms undetermined. A ridge of 1e-6 of the total weight sets these to zero.
-    ridge = 1e-6 * weight.sum(axis=1)[:, None, None] * np.eye(6)
-    inverse = np.linalg.inv(normal + ridge)
-    shape = np.einsum("pab,pkb,pk,pk->pa", inverse, columns, weight, w)
-    left = np.where(held, w - np.einsum("pka,pa->pk", columns, shape), 0.0)
-    freedom = np.maximum(held.sum(axis=1) - 6, 1)
-    # Variance of one point: the variance of an average of n points is 1/n of it.
-    variance = np.einsum("pk,pk,pk->p", weight, left, left) / freedom
-    typical = np.median(variance)
-    kept = variance <= _ROUGH**2 * max(typical, 1e-30)
+    axes = _principal_frames(discs.about_mm, discs.weight)
+    fit = _fit_discs(discs, axes, radius)
+    variance = fit.point_variance
+    kept = variance <= _ROUGH**2 * max(np.median(variance), 1e-30)
+    first, grouped = _first_points(owner), frame is not None and bool(np.any(frame >= 0))
+    variance = noise = np.maximum(variance, np.median(variance))
     if uncertainty is not None:
-        variance = np.maximum(variance, _stated_variance(uncertainty, points_mm, owner, middle, axes[:, 2]) / radius**2)
-    variance = np.maximum(variance, typical)
-    covariance = variance[:, None, None] * inverse
-    shared, share, strips = max(float(weight.sum() / counts.sum()), 1.0), 0.0, 1.0
-    if uncertainty is not None and uncertainty.poses_mm is not None and frame is not None:
-        first = _first_points(owner)
-        by_image, images = _pose_variance(uncertainty.poses_mm, frame, first[middle], first[near], held, axes[:, 2])
-        own, moved = covariance[:, 0, 0], by_image / radius**2 / images
-        share = float(np.median(moved) / (np.median(moved) + np.median(own)))
-        strips = max(len(np.unique(frame)) / float(np.median(images)), 1.0)
-        covariance[:, 0, 0] = own + moved
+        known = uncertainty[first[middle]]
+        noise = project_variance(known.random_mm2, axes[:, 2]) / radius**2
+        of_images = np.sum(project_image_errors(known, axes[:, 2]) ** 2, axis=0) / radius**2
+        noise = np.maximum(noise if grouped else noise + of_images, _LEAST_NOISE_MM**2 / radius**2)
+        variance = np.maximum(variance, noise)
     units = radius ** np.array([1.0, 0, 0, -1, -1, -1])
-    places, axes, shape = _level(means[middle], axes, shape * units)
+    covariance = variance[:, None, None] * fit.inverse
+    places, axes, shape = _level(means[middle], axes, fit.shape * units)
     flipped = axes[:, 2, 2] > 0
     one_sided = bool(np.mean(np.abs(axes[:, 2, 2]) > _FACING) > 0.98)
     sign = np.where(flipped, -1.0, 1.0)
@@ -196,11 +223,82 @@ def surface_patches(
     signs = sign[:, None] ** np.array([1, 1, 2, 1, 2, 1])
     shape = shape * signs
     covariance = covariance * np.outer(units, units) * signs[:, :, None] * signs[:, None]
-    patterns = _patch_patterns(uncertainty, owner, middle, len(counts))
-    parts = (places, axes, shape, covariance, patterns, _first_points(owner)[middle])
-    patches = Patches(*parts, radius, shared, one_sided, share, strips)
+    images = _image_errors(uncertainty if grouped else None, frame, owner, first)
+    errors = PatchErrors(discs.near, fit.heights, radius * np.sqrt(noise), axes[:, 2], counts, *images)
     chosen = np.flatnonzero(kept)
-    return patches[chosen[:: max(1, -(-len(chosen) // _MOST))]]
+    chosen = chosen[:: max(1, -(-len(chosen) // _MOST))]
+    errors = errors[chosen]
+    return Patches(
+        places[chosen],
+        axes[chosen],
+        shape[chosen],
+        covariance[chosen],
+        averages.patterns_mm[:, middle[chosen]],
+        first[middle][chosen],
+        radius,
+        averages,
+        errors,
+        errors.image_variance(),
+        one_sided,
+        uncertainty is not None,
+        errors.correlation(by_images=False),
+        max(float(discs.weight.sum() / counts.sum()), 1.0),
+        len(chosen) / errors.correlation(by_images=True),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Discs:
+    """Averages ``near`` (P, K) in discs, where ``held`` (P, K), their positions from the middles, and their weights."""
+
+    near: np.ndarray
+    held: np.ndarray
+    about_mm: np.ndarray
+    weight: np.ndarray
+
+    def __getitem__(self, selection: Any) -> _Discs:
+        return _Discs(*(values[selection] for values in vars(self).values()))
+
+
+def _gather_discs(averages: Averages, middles_mm: np.ndarray, radius: float) -> _Discs:
+    """Find the averages in discs about middles (P, 3)."""
+    away, near = _nearest_within(averages.tree, middles_mm, radius)
+    held = np.isfinite(away)
+    near = np.where(held, near, 0)
+    about = averages.places_mm[near] - middles_mm[:, None]
+    return _Discs(near, held, about, np.where(held, averages.counts[near], 0.0))
+
+
+class _DiscFit(NamedTuple):
+    """Second-order fits to discs; lengths are in radii, except for ``heights``.
+
+    ``shape`` (P, 6) are coefficients, ``inverse`` (P, 6, 6) is their covariance for a unit variance of one point, and
+    ``point_variance`` (P,) is that variance by the scatter. ``heights`` (P, K) are derivatives of the height in the
+    middle by the heights of the averages.
+    """
+
+    shape: np.ndarray
+    inverse: np.ndarray
+    point_variance: np.ndarray
+    heights: np.ndarray
+
+
+def _fit_discs(discs: _Discs, axes: np.ndarray, radius: float) -> _DiscFit:
+    """Fit second-order surfaces to the averages in discs, over the tangents of ``axes`` (P, 3, 3)."""
+    weight = discs.weight
+    u, v, w = np.einsum("pij,pkj->ipk", axes, discs.about_mm) / radius
+    columns = _columns(u, v)
+    normal = np.einsum("pka,pk,pkb->pab", columns, weight, columns)
+    # Points on a line leave second-order terms undetermined. A ridge of 1e-6 of the total weight sets these to zero.
+    ridge = 1e-6 * weight.sum(axis=1)[:, None, None] * np.eye(6)
+    inverse = np.linalg.inv(normal + ridge)
+    shape = np.einsum("pab,pkb,pk,pk->pa", inverse, columns, weight, w)
+    left = np.where(discs.held, w - np.einsum("pka,pa->pk", columns, shape), 0.0)
+    freedom = np.maximum(discs.held.sum(axis=1) - 6, 1)
+    # Variance of one point: the variance of an average of n points is 1/n of it.
+    variance = np.einsum("pk,pk,pk->p", weight, left, left) / freedom
+    heights = np.einsum("pb,pkb,pk->pk", inverse[:, 0], columns, weight)
+    return _DiscFit(shape, inverse, variance, heights.astype(np.float32))
 
 
 def find_disc_radius(points_mm: np.ndarray) -> float:
@@ -242,6 +340,10 @@ class PatchDistances:
         Distance along the normal, positive on its side, and its standard deviation by noise of both patches.
     slope_variance : (Q,) float64
         Variance of the normal's slope in each tangential direction.
+    target_errors : PatchErrors or None
+        Effect of the target's errors on its heights, if its surface was fitted again.
+    target_patterns_mm : (Q, M, 3) float64 or None
+        Systematic patterns of the target at the foot of each distance, if its surface was fitted again.
     """
 
     source: np.ndarray
@@ -251,10 +353,12 @@ class PatchDistances:
     distance_mm: np.ndarray
     std_mm: np.ndarray
     slope_variance: np.ndarray
+    target_errors: PatchErrors | None = None
+    target_patterns_mm: np.ndarray | None = None
 
     def __getitem__(self, selection: np.ndarray) -> PatchDistances:
         """Select distances by indices or a mask."""
-        return PatchDistances(*(values[selection] for values in vars(self).values()))
+        return replace(self, **{name: value[selection] for name, value in vars(self).items() if value is not None})
 
 
 def distances_between(
@@ -298,6 +402,7 @@ def distances_between(
     rows, nearest, columns = rows[good], nearest[good], columns[good]
     covariance = target.covariance[nearest]
     variance = source.covariance[rows, 0, 0] + np.einsum("qa,qab,qb->q", columns, covariance, columns)
+    variance += source.image_variance_mm2[rows] + target.image_variance_mm2[nearest]
     return PatchDistances(
         rows,
         nearest,
@@ -307,6 +412,46 @@ def distances_between(
         np.sqrt(np.maximum(variance, 1e-12)),
         (covariance[:, 1, 1] + covariance[:, 2, 2]) / 2,
     )
+
+
+def refit_distances(found: PatchDistances, source: Patches, target: Patches, target_pose: np.ndarray) -> PatchDistances:
+    """Measure distances again, from second-order fits to the target's points about the foot of each distance.
+
+    Both surfaces are then smoothed in the same way, and errors of their second-order approximation cancel. Feet whose
+    height is less certain than a single point are omitted.
+    """
+    rotation, radius = target_pose[:3, :3], target.radius_mm
+
+    def gather(found: PatchDistances) -> tuple[np.ndarray, np.ndarray, _Discs]:
+        places = (found.places_mm - target_pose[:3, 3]) @ rotation
+        feet = places - found.distance_mm[:, None] * (found.normals @ rotation)
+        return places, feet, _gather_discs(target.averages, feet, radius)
+
+    found = found[gather(found)[2].held.sum(axis=1) >= _FEWEST]
+    places, feet, discs = gather(found)
+    axes = target.axes[found.target]
+    fit = _fit_discs(discs, axes, radius)
+    slopes = fit.shape[:, 1:3]
+    normals = np.column_stack([-slopes, np.ones(len(slopes))]) / np.sqrt(1 + np.sum(slopes**2, axis=1))[:, None]
+    normals = np.einsum("qi,qij->qj", normals, axes)
+    feet = feet + radius * fit.shape[:, :1] * axes[:, 2]
+    noise = target.errors.noise_mm[found.target]
+    errors = replace(target.errors, near=discs.near, rows=fit.heights, noise_mm=noise, normals=normals)
+    variance = source.errors[found.source].noise_variance() + errors.noise_variance()
+    variance += source.image_variance_mm2[found.source] + target.image_variance_mm2[found.target]
+    patterns = np.zeros((len(feet), len(target.patterns_mm), 3))
+    for number, pattern in enumerate(target.averages.patterns_mm):
+        patterns[:, number] = np.einsum("qk,qki->qi", fit.heights, pattern[discs.near])
+    again = replace(
+        found,
+        normals=normals @ rotation.T,
+        distance_mm=np.einsum("qi,qi->q", places - feet, normals),
+        std_mm=np.sqrt(np.maximum(variance, 1e-12)),
+        slope_variance=(noise / radius) ** 2 * (fit.inverse[:, 1, 1] + fit.inverse[:, 2, 2]) / 2,
+        target_errors=errors,
+        target_patterns_mm=patterns,
+    )
+    return again[fit.inverse[:, 0, 0] < 1]
 
 
 def rigid_derivatives(places_mm: np.ndarray, directions: np.ndarray, middle_mm: np.ndarray) -> np.ndarray:
@@ -417,15 +562,6 @@ def _level(places: np.ndarray, axes: np.ndarray, shape: np.ndarray) -> tuple[np.
     return moved, np.stack([first, np.cross(normal, first), normal], axis=1), level
 
 
-def _stated_variance(
-    known: PointUncertainty, points: np.ndarray, owner: np.ndarray, middle: np.ndarray, normals: np.ndarray
-) -> np.ndarray:
-    """Return the stated variance (P,) of a point along the normals of patches, by noise and image position."""
-    at = _first_points(owner)[middle]
-    of_image = np.einsum("pi,pi->p", known.position_mm[at], normals)
-    return of_image**2 + project_variance(known.random_mm2[at], normals)
-
-
 def _first_points(owner: np.ndarray) -> np.ndarray:
     """Return the number of the first point in each cube, from the cubes (N,) of the points."""
     first = np.zeros(int(owner.max()) + 1, np.int64)
@@ -433,23 +569,24 @@ def _first_points(owner: np.ndarray) -> np.ndarray:
     return first
 
 
-def _pose_variance(
-    poses_mm: np.ndarray, frame: np.ndarray, at: np.ndarray, near: np.ndarray, held: np.ndarray, normals: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the variance (P,) along normals by pose errors of one image, and the number of images (P,) in a patch."""
-    variance = np.sum(np.einsum("kpi,pi->kp", poses_mm[:, at], normals) ** 2, axis=0)
-    images = np.sort(np.where(held, frame[near], frame[at][:, None]), axis=1)
-    return variance, 1 + np.count_nonzero(np.diff(images, axis=1), axis=1)
+def _image_errors(
+    known: PointUncertainty | None, frame: np.ndarray | None, owner: np.ndarray, first: np.ndarray
+) -> tuple[csr_array, np.ndarray]:
+    """Return the fraction (C, I) of points of each average by image, and shifts (J, C, 3) by errors of the image."""
+    if known is None or frame is None:
+        return csr_array((len(first), 0)), np.zeros((0, len(first), 3))
+    shifts = known[first].image_errors_mm()
+    numbers = np.unique(frame, return_inverse=True)[1].ravel()
+    shares = csr_array((1 / np.bincount(owner)[owner], (owner, numbers)))
+    return shares, shifts[shifts.any(axis=(1, 2))].astype(np.float64)
 
 
-def _patch_patterns(known: PointUncertainty | None, owner: np.ndarray, middle: np.ndarray, cells: int) -> np.ndarray:
-    """Return the patterns (M, P, 3) of patches, averaged over the points of the central cube."""
+def _average_patterns(known: PointUncertainty | None, owner: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the systematic patterns (M, C, 3) of averages."""
     if known is None:
-        return np.zeros((0, len(middle), 3))
-    counts = np.bincount(owner, minlength=cells)[middle]
-    return np.array(
-        [
-            np.stack([np.bincount(owner, column, cells)[middle] for column in pattern.T], 1) / counts[:, None]
-            for pattern in known.patterns_mm
-        ]
-    ).reshape(-1, len(middle), 3)
+        return np.zeros((0, len(counts), 3))
+    patterns = np.zeros((len(known.patterns_mm), len(counts), 3))
+    for number, pattern in enumerate(known.patterns_mm):
+        for axis, column in enumerate(pattern.T):
+            patterns[number, :, axis] = np.bincount(owner, column) / counts
+    return patterns

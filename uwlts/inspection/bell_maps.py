@@ -151,7 +151,7 @@ def limit_deviations(surface: UnrolledSurface, tree: KDTree) -> tuple[UnrolledSu
         for start in range(0, len(nearest), SEARCH_RULE.points_at_a_time)
     ]
     for part in parts:
-        found: Any = tree.query(surface.places[part], k=SEARCH_RULE.neighbours + 1)
+        found: Any = tree.query(surface.places[part], k=SEARCH_RULE.neighbours + 1, workers=-1)
         nearest[part] = found[1][:, 1:]
         beside = surface.heights[nearest[part]]
         middle[part] = np.median(beside, axis=1)

@@ -228,12 +228,13 @@ def _choose_peaks(maps: Sequence[BellMap], threshold: float) -> list[_Peak]:
     for each in maps:
         size = np.nan_to_num(np.abs(each.height) * np.sqrt(np.maximum(each.information, 0)))
         top = (size == ndimage.maximum_filter(size, 2 * SEARCH_RULE.cells_per_radius + 1)) & (size > 0)
-        for i, j in np.argwhere(top):
-            place = each.origin + (np.array([i, j]) + 0.5) * each.cell
-            noise = float(maps[0].noise_at(place[None])[0])
-            if size[i, j] > 0.5 * threshold * noise:
-                height, z = float(each.height[i, j]), float(np.nan_to_num(np.abs(each.z[i, j])))
-                peaks.append(_Peak(place, each.radius, height, z, float(size[i, j]) / noise))
+        cells = np.argwhere(top)
+        places = each.origin + (cells + 0.5) * each.cell
+        noise, tops = maps[0].noise_at(places), size[top]
+        for k in np.flatnonzero(tops > 0.5 * threshold * noise):
+            i, j = cells[k]
+            height, z = float(each.height[i, j]), float(np.nan_to_num(np.abs(each.z[i, j])))
+            peaks.append(_Peak(places[k], each.radius, height, z, float(tops[k] / noise[k])))
     significant = [peak for peak in peaks if peak.z > threshold]
     if not significant:
         return []

@@ -5,14 +5,17 @@ description can name a ``base`` of its own kind and contain only the differences
 """
 
 import re
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from uwlts.errors import DescriptionError, Error, list_problems
+from uwlts.errors import DescriptionError, DescriptionWarning, Error, list_problems
 from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parse_toml, read_text, shorten
+from uwlts.model.inheritance import Level, find_misfits
 from uwlts.model.sensor import Description, Sensor, Table
 
 AnyDescription = TypeVar("AnyDescription", bound=Description)
@@ -50,8 +53,13 @@ def find_description(name_or_path: str | Path, folder: str = "") -> Path:
     return shipped
 
 
-def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> Table:
+def read_table(path: Path, folder: str = "") -> Table:
     """Read a TOML file and merge it with its ``base``: tables are merged, all other values replaced."""
+    return read_levels(path, folder)[-1].merged
+
+
+def read_levels(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> tuple[Level, ...]:
+    """Read a TOML file and its chain of bases, each merged with those before it; the first base is first."""
     text = read_text(path, most_bytes=MOST_TOML_BYTES, error=DescriptionError, called="description", foreign=_NO_TOML)
     if path.resolve() in seen:
         raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
@@ -63,7 +71,7 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
         raise DescriptionError(f"{path} {_NO_TOML}: {error}") from error
     base = table.pop("base", None)
     if base is None:
-        return table
+        return (Level(path.stem, table, table),)
     if not isinstance(base, str):
         raise DescriptionError(f"{path}: base is {base!r}; expected the name or path of another description")
     beside = path.parent / f"{base.removesuffix('.toml')}.toml"
@@ -71,7 +79,8 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
     base_path = (
         beside if is_regular_file(beside) and beside.resolve() != path.resolve() else find_description(base, folder)
     )
-    return merge_tables(read_table(base_path, folder, seen=(*seen, path.resolve())), table)
+    levels = read_levels(base_path, folder, seen=(*seen, path.resolve()))
+    return *levels, Level(path.stem, table, merge_tables(levels[-1].merged, table))
 
 
 _EITHER_OR = (({"baseline_mm", "triangulation_angle_deg"}, {"origin_mm", "axis"}), ({"water"}, {"turbidity"}))
@@ -143,10 +152,23 @@ def load_sensor(name_or_path: str | Path) -> Sensor:
     DescriptionError
         The name is unknown, or the file is missing, not TOML, or has an unknown key or an invalid value.
 
+    Warns
+    -----
+    DescriptionWarning
+        A value of the base does not fit what the description changes, such as the focus after another stand-off.
+
     Examples
     --------
     >>> sensor = uwlts.load_sensor("thesis")
     >>> sensor.medium("water").refractive_index(sensor.laser.wavelength_nm)
     """
     path = find_description(name_or_path, "sensors")
-    return validate_description(Sensor, read_table(path, "sensors"), path)
+    return validate_sensor(read_levels(path, "sensors"), path)
+
+
+def validate_sensor(levels: Sequence[Level], source: str | Path) -> Sensor:
+    """Validate a chain of descriptions as a sensor; DescriptionWarning for inherited values that no longer fit."""
+    sensor = validate_description(Sensor, levels[-1].merged, source)
+    for text in find_misfits(levels, sensor):
+        warnings.warn(text, DescriptionWarning, stacklevel=3)
+    return sensor

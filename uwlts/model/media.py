@@ -53,13 +53,19 @@ def water_index(*, wavelength_nm: float, temperature_c: float, salinity_g_kg: fl
 
 @dataclass(frozen=True)
 class Glass:
-    """Window material: index relative to air as a function of wavelength in um, valid range, absorption at 635 nm."""
+    """Window material: index relative to air as a function of wavelength in um, valid range, absorption at 635 nm.
+
+    ``strength_mpa`` is the fracture strength for the thickness of a window under pressure with a safety factor of 4,
+    and ``strength_source`` its source. It is None if no value with a source is known.
+    """
 
     index: Callable[[float], float]
     lowest_um: float
     highest_um: float
     absorption_per_m: float
     source: str
+    strength_mpa: float | None = None
+    strength_source: str = ""
 
 
 def _sellmeier(strengths: tuple[float, ...], poles_um2: tuple[float, ...]) -> Callable[[float], float]:
@@ -75,12 +81,19 @@ def _soda_lime(um: float) -> float:
 _BK7 = _sellmeier((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653))
 _SILICA = _sellmeier((0.6961663, 0.4079426, 0.8974794), (0.0684043**2, 0.1162414**2, 9.896161**2))
 
+FUSED_SILICA_MPA = 60.0
+"""Fracture strength that is used for windows of unknown strength, as in the thesis (Figure 34, after Harris 1999)."""
+_FLOAT_GLASS = 45.0, "EN 572-1, annealed float glass"
+"""Characteristic bending strength: at most 5 % of panes break below it."""
+_CAST_ACRYLIC = 41.4, "4 times the 1500 psi of continuous load, Altuglas, Plexiglas G"
+"""Acrylic breaks at 70 MPa, but crazes under a continuous tension above 1500 psi (10.3 MPa)."""
+
 GLASSES = {
     "N-BK7": Glass(_BK7, 0.3, 2.5, 0.24, "Schott data sheet"),
-    "fused-silica": Glass(_SILICA, 0.21, 3.71, 0.0, "Malitson 1965, JOSA 55:1205"),
-    "soda-lime": Glass(_soda_lime, 0.31, 4.6, 14.5, "Rubin 1985, clear"),
-    "soda-lime-low-iron": Glass(_soda_lime, 0.31, 4.6, 3.25, "Rubin 1985, low iron"),
-    "PMMA": Glass(_sellmeier((1.1819,), (0.011313,)), 0.4368, 1.052, 0.0, "Sultanova 2009"),
+    "fused-silica": Glass(_SILICA, 0.21, 3.71, 0.0, "Malitson 1965, JOSA 55:1205", FUSED_SILICA_MPA, "Harris 1999"),
+    "soda-lime": Glass(_soda_lime, 0.31, 4.6, 14.5, "Rubin 1985, clear", *_FLOAT_GLASS),
+    "soda-lime-low-iron": Glass(_soda_lime, 0.31, 4.6, 3.25, "Rubin 1985, low iron", *_FLOAT_GLASS),
+    "PMMA": Glass(_sellmeier((1.1819,), (0.011313,)), 0.4368, 1.052, 0.0, "Sultanova 2009", *_CAST_ACRYLIC),
 }
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from uwlts.model.library import load_sensor
+from uwlts.model.media import GLASSES
 from uwlts.model.sensor import Sensor
 from uwlts.optics.design import (
     depth_mm,
@@ -81,9 +82,6 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
         f_number=camera.f_number,
         distance_mm=apparent,
     )
-    glass = window_thickness_mm(
-        pressure_mpa=1.0, unsupported_diameter_mm=camera.window.aperture_diameter_mm, strength_mpa=60.0
-    )
     needed = line_needed_mm(pipe_diameter_mm=300.0, passes=5)
     snell = "with Snell's law"
     return [
@@ -103,11 +101,29 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
         DesignRow("image plane to lens axis, sheet in focus", math.degrees(tilt), "deg", "Eq. 2.12, Scheimpflug"),
         DesignRow("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994, contrast 0.71"),
         DesignRow("speckle limit along the laser's axis", speckle * leaning / tangent, "um", "over sin theta_t"),
-        DesignRow("fused silica window for 1 MPa, clamped", glass, "mm", "Eq. 3.2, safety factor 4, 60 MPa"),
+        *_window_rows(camera.window.aperture_diameter_mm),
+    ]
+
+
+def _window_rows(aperture_mm: float) -> list[DesignRow]:
+    """Return the thickness of a window of each material with a known strength, for the pressure at 100 m."""
+    return [
+        DesignRow(
+            f"{name} window for 1 MPa, clamped",
+            window_thickness_mm(pressure_mpa=1.0, unsupported_diameter_mm=aperture_mm, strength_mpa=glass.strength_mpa),
+            "mm",
+            f"Eq. 3.2, safety factor 4, {glass.strength_mpa:g} MPa ({glass.strength_source})",
+        )
+        for name, glass in GLASSES.items()
+        if glass.strength_mpa is not None
     ]
 
 
 def format_table(rows: list[DesignRow]) -> list[str]:
-    """Format the table as lines of text."""
+    """Format the table as lines of text; the last line names the window materials of unknown strength."""
     width = max(len(row.name) for row in rows)
-    return [f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows]
+    unknown = ", ".join(name for name, glass in GLASSES.items() if glass.strength_mpa is None)
+    return [
+        *(f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows),
+        f"without a thickness: {unknown}, because no strength with a source is known; ask its maker",
+    ]

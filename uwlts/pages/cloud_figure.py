@@ -1,4 +1,7 @@
-"""Interactive point cloud of a page: the desk's view (`VIEW`), its libraries and points, compressed within the page."""
+"""Interactive point cloud of a page: the desk's view (`VIEW`), its libraries and points, compressed within the page.
+
+The colour scale of deviations and the viewing direction are those of static plots, too.
+"""
 
 import base64
 import gzip
@@ -6,8 +9,12 @@ import json
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+
+CloudField = Literal["deviation", "depth", "intensity", "uncertainty"]
+"""Quantities of points that colours show: Z for "depth"."""
 
 VIEW = Path(__file__).with_name("cloud_view.js")
 """Component of Vue that draws a cloud; the desk uses it, too."""
@@ -23,32 +30,60 @@ _LARGEST = 2**13 - 1
 _UNKNOWN = -(2**15)
 
 
+STOPS = (
+    (0.0, (33, 82, 172)),
+    (0.25, (99, 161, 214)),
+    (0.5, (205, 205, 200)),
+    (0.75, (236, 139, 96)),
+    (1.0, (170, 21, 40)),
+)
+"""Colour scale of deviations: position between -1 and +1 limit (0 to 1), and red, green, blue."""
+
+LIMIT_STD = 2.0
+"""Range of the deviation colours in standard deviations, as in the thesis."""
+
+AZIMUTH_DEG = 28.0
+"""Viewing direction of clouds: angle from +X towards +Y, deg."""
+ELEVATION_DEG = 38.0
+"""Viewing direction of clouds: angle downwards (towards +Z), deg."""
+
+
+def view_direction() -> np.ndarray:
+    """Return the viewing direction of clouds, a unit vector (3,) in the OCS."""
+    azimuth, elevation = np.radians((AZIMUTH_DEG, ELEVATION_DEG))
+    across = np.cos(elevation)
+    return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
+
+
+def colour_limit_mm(deviation_mm: np.ndarray) -> float:
+    """Return the limit of the deviation colours: `LIMIT_STD` standard deviations, above zero."""
+    finite = deviation_mm[np.isfinite(deviation_mm)].astype(np.float64)
+    return max(LIMIT_STD * float(finite.std()), 1e-9) if len(finite) else 1e-9
+
+
 @dataclass(frozen=True, eq=False)
 class CloudPoints:
-    """Points for a view of a page.
+    """Points for a view of a page, seen along `view_direction`.
 
     Attributes
     ----------
     points_mm : (N, 3) float64
         Positions, mm.
+    field : str
+        Quantity that is shown by colour.
     values : (N,) float64 or None
-        Field that is shown by colour, NaN where unknown; None: Z.
-    limit : float
-        Value at the end of the colour scale, which is symmetric about zero.
+        The quantity, NaN where unknown; None for "depth", which is Z.
     unit : str
-        Unit of the field.
-    stops : tuple
-        Colours: place from 0 to 1, and red, green, blue from 0 to 255.
-    eye : tuple
-        Direction from the middle of the points to the viewer.
+        Unit of the quantity.
+    limit : float or None
+        Value at the end of the scale `STOPS`, which is symmetric about zero; None for the range of the values.
     """
 
     points_mm: np.ndarray
+    field: CloudField
     values: np.ndarray | None
-    limit: float
     unit: str
-    stops: tuple[tuple[float, tuple[int, int, int]], ...]
-    eye: tuple[float, float, float]
+    limit: float | None
 
     def to_json(self) -> str:
         """Return the text that the page's script reads; steps are 1/16382 of the range of each column."""
@@ -60,10 +95,13 @@ class CloudPoints:
                 "offset": [offset for offset, _, _ in packed],
                 "step": [step for _, step, _ in packed],
                 "data": encode_script(b"".join(data for _, _, data in packed)),
-                "limits": None if self.values is None else [-self.limit, self.limit],
+                "field": self.field,
                 "unit": self.unit,
-                "stops": [[place, [each / 255 for each in colour]] for place, colour in self.stops],
-                "eye": self.eye,
+                "limits": None if self.limit is None else [-self.limit, self.limit],
+                "stops": None
+                if self.limit is None
+                else [[place, [each / 255 for each in colour]] for place, colour in STOPS],
+                "eye": (-view_direction()).tolist(),
             }
         )
 

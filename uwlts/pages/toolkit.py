@@ -169,7 +169,7 @@ class InteractiveFigure:
 
 @dataclass(frozen=True)
 class InteractiveCloud:
-    """Position of an interactive cloud in a page; ``still`` is the address of a picture that replaces it in print."""
+    """Position of an interactive cloud in a page; ``still`` is the address of a picture for print, if any."""
 
     number: int
     caption: str

@@ -8,21 +8,23 @@ share a calibration of the sensor or mount share its errors. The prior correlate
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, pairwise, permutations
 
 import numpy as np
+from scipy.sparse import csr_array, diags_array
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import biweight, noise_factor, rms_distance
+from uwlts.fitting.least_squares import biweight, rms_distance, robust_std
 from uwlts.fitting.patches import (
     LEAST_INFORMATION,
     PatchDistances,
     Patches,
     decompose_motions,
     distances_between,
+    refit_distances,
     rigid_derivatives,
     slope_information,
 )
@@ -38,6 +40,8 @@ _PAIR_REACH = 4.0
 """Matching distance in the first round of a pair fit (unit: patch radius); a search is accurate to about one radius."""
 _PAIR_ROUNDS = 12
 """Rounds of a pair fit; after seven the matching distance is one patch radius."""
+_LEAST_SPREAD = 0.05
+"""Lower bound of the scatter relative to noise that is not stated: exact surfaces agree better than their patches."""
 _SPHERE_REACH = 0.25
 """Largest distance between the centres of one sphere in two scans, relative to its diameter."""
 
@@ -53,9 +57,11 @@ class PairEvidence:
     residuals, weights, std : (Q,) float64
         Residuals, their weights and their stated standard deviations.
     spread : float
-        Ratio of the robust scatter of the distances to their stated noise, at least 1.
+        Ratio of the robust scatter of the distances to their noise; at least 1 if both scans state their noise.
     spurious : (P, P) float64
         Information on the poses that noise of the normals alone would produce.
+    ways : tuple of (int, int, PatchDistances)
+        Source, target and distances in both directions, in the order of the rows.
     places_mm : (patches, 3) float64
         Positions of the surface distances.
     patches, spheres : int
@@ -68,6 +74,7 @@ class PairEvidence:
     std: np.ndarray
     spread: float
     spurious: np.ndarray
+    ways: tuple[tuple[int, int, PatchDistances], ...]
     places_mm: np.ndarray
     patches: int
     spheres: int
@@ -88,10 +95,22 @@ class PairEvidence:
 
 @dataclass(frozen=True, eq=False)
 class PoseSolution:
-    """Step (U,) in the determined directions, joint covariance (U, U), and undetermined directions (K, P) of poses."""
+    """Step of all unknowns in the determined directions.
+
+    Attributes
+    ----------
+    step : (U,) float64
+    response : (U, U) float64
+        Derivatives of the step by the negative gradient.
+    by_prior : (U, U) float64
+        Covariance of the step by errors of the initial poses and by the true pattern amplitudes.
+    open_directions : (K, P) float64
+        Undetermined directions of the poses.
+    """
 
     step: np.ndarray
-    covariance: np.ndarray
+    response: np.ndarray
+    by_prior: np.ndarray
     open_directions: np.ndarray
 
 
@@ -133,13 +152,21 @@ class JointRegistration:
         """Centroids (N, 3) of the scans in the common frame."""
         return np.einsum("nij,nj->ni", self.poses[:, :3, :3], self.local_middles) + self.poses[:, :3, 3]
 
-    def measure_distances(self, reach_mm: float) -> dict[tuple[int, int], PatchDistances]:
-        """Measure the patch distances of each ordered pair of scans that overlap within ``reach_mm``."""
-        moved = [self._corrected_patches(number) for number in range(len(self.patches))]
+    def measure_distances(self, reach_mm: float, *, refit: bool = False) -> dict[tuple[int, int], PatchDistances]:
+        """Measure the patch distances of each ordered pair of scans that overlap within ``reach_mm``.
+
+        With ``refit``, the target's surface is fitted again at each distance (`refit_distances`).
+        """
+        moved = [patches.corrected(amounts) for patches, amounts in zip(self.patches, self.patterns, strict=True)]
         found = {
             (a, b): distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
             for a, b in permutations(range(len(moved)), 2)
         }
+        if refit:
+            found = {
+                (a, b): refit_distances(distances, moved[a], moved[b], self.poses[b])
+                for (a, b), distances in found.items()
+            }
         return {pair: distances for pair, distances in found.items() if len(distances.source)}
 
     def collect_evidence(self, found: dict[tuple[int, int], PatchDistances]) -> dict[tuple[int, int], PairEvidence]:
@@ -193,29 +220,57 @@ class JointRegistration:
         values, vectors, metric = decompose_motions(reduced, spurious)
         known = values > LEAST_INFORMATION
         ways, strengths = vectors[:, known], values[known]
-        down = gradient[:count] - within.T @ gradient[count:]
         open_ways = np.linalg.qr(vectors[:, np.logical_not(known)])[0]
         off = self._offset_from_start()
         if self.start_std is None:
             ways = ways - open_ways @ (open_ways.T @ ways)
-            covariance = (ways / strengths) @ ways.T
+            inverse, by, beforehand = (ways / strengths) @ ways.T, np.eye(count), np.zeros(count)
         else:
             beforehand = np.tile(np.repeat(1 / np.square(self.start_std), 3), count // 6) * self.units[:count] ** 2
             by = metric @ ways
-            covariance = np.linalg.inv((by * strengths) @ by.T + np.diag(beforehand))
-            down = by @ (ways.T @ down) + beforehand * off / self.units[:count]
-        step = -covariance @ down
+            inverse = np.linalg.inv((by * strengths) @ by.T + np.diag(beforehand))
+            by = by @ ways.T
+        poses = np.vstack([inverse, -within @ inverse])
+        response = poses @ by @ np.hstack([np.eye(count), -within.T])
+        response[count:, count:] += np.linalg.inv(beside)
+        step = -response @ gradient - poses @ (beforehand * off / self.units[:count])
         if self.start_std is None:
             # Undetermined directions return to the initial pose: far from the solution they may appear determined.
-            step = step - open_ways @ (open_ways.T @ (off / self.units[:count]))
-        rest = -np.linalg.solve(beside, gradient[count:]) - within @ step
-        whole = np.block(
-            [
-                [covariance, -covariance @ within.T],
-                [-within @ covariance, np.linalg.inv(beside) + within @ covariance @ within.T],
-            ]
-        )
-        return PoseSolution(self.units * np.append(step, rest), whole * scale, open_ways.T * self.units[:count])
+            back = open_ways @ (open_ways.T @ (off / self.units[:count]))
+            step -= np.append(back, -within @ back)
+        by_prior = response[:, count:] @ self.prior_information @ response[:, count:].T
+        by_prior += (poses * beforehand) @ poses.T
+        return PoseSolution(self.units * step, response * scale, by_prior * scale, open_ways.T * self.units[:count])
+
+    def covariance(self, pairs: Sequence[PairEvidence], solution: PoseSolution) -> np.ndarray:
+        """Return the joint covariance (U, U) of a step by all independent errors of the scans and by the prior.
+
+        The distances of the pairs must be refitted (`measure_distances`).
+        """
+        information = np.zeros((len(self.units),) * 2)
+        changes: dict[int, np.ndarray] = {}
+        for pair in pairs:
+            weighted = pair.weights[:, None] * pair.derivatives
+            information += weighted[pair.patches :].T @ pair.derivatives[pair.patches :]
+            first = 0
+            for source, target, found in pair.ways:
+                rows = pair.spread * weighted[first : first + len(found.source)]
+                first += len(found.source)
+                for number, by_errors in self._height_changes(source, target, found):
+                    changes[number] = changes.get(number, 0.0) + by_errors.T @ rows
+        for each in changes.values():
+            information += each.T @ each
+        return solution.response @ information @ solution.response.T + solution.by_prior
+
+    def _height_changes(self, source: int, target: int, found: PatchDistances) -> list[tuple[int, csr_array]]:
+        """Return the changes (Q, E) of distances by the independent errors of both scans, with the scans' numbers."""
+        own = self.patches[source].errors[found.source]
+        # Without a known side, the normals of both surfaces may have opposite signs.
+        sign = np.sign(np.einsum("qi,qi->q", found.normals @ self.poses[source, :3, :3], own.normals))
+        parts = [(source, csr_array(diags_array(sign) @ own.height_changes()))]
+        if found.target_errors is not None:
+            parts.append((target, -found.target_errors.height_changes()))
+        return parts
 
     def move(self, step: np.ndarray) -> None:
         """Update poses and pattern amplitudes by a step (U,)."""
@@ -240,10 +295,6 @@ class JointRegistration:
                 f"{', '.join(lost)}: not connected with {names[0]} by overlaps. Give better initial poses, a larger "
                 "reach or spheres, or search for the initial poses (search)"
             )
-
-    def _corrected_patches(self, number: int) -> Patches:
-        patches, amounts = self.patches[number], self.patterns[number]
-        return replace(patches, places_mm=patches.places_mm + np.tensordot(amounts, patches.patterns_mm, axes=1))
 
     def _common_centres(self, number: int) -> list[MarkerSphere]:
         """Transform the spheres of a scan into the common frame."""
@@ -270,7 +321,8 @@ class JointRegistration:
     ) -> PairEvidence:
         unknown, middles = len(self.units), self.middles_mm
         relative = np.concatenate([each.distance_mm / each.std_mm for *_, each in ways]) if ways else np.empty(0)
-        spread = noise_factor(relative)
+        stated = self.patches[a].noise_stated and self.patches[b].noise_stated
+        spread = max(robust_std(relative) if ways else 1.0, 1.0 if stated else _LEAST_SPREAD)
         blocks, residuals, weights, deviations = [], [], [], []
         spurious = np.zeros((self.unknown_poses, self.unknown_poses))
         for source, target, found in ways:
@@ -282,14 +334,20 @@ class JointRegistration:
             by_poses = partial(self._derivatives_by_poses, source, target, found.places_mm)
             block = np.zeros((len(weight), unknown))
             block[:, : self.unknown_poses] = by_poses(found.normals)
-            for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):
-                turned = self.patches[number].patterns_mm[:, rows] @ self.poses[number, :3, :3].T
-                block[:, self.pattern_columns[number]] = sign * np.einsum("mqi,qi->qm", turned, found.normals)
+            own, other = (
+                self.patches[n].patterns_mm[:, rows].transpose(1, 0, 2)
+                for n, rows in ((source, found.source), (target, found.target))
+            )
+            if found.target_patterns_mm is not None:
+                other = found.target_patterns_mm
+            for number, shifts, sign in ((source, own, 1.0), (target, other, -1.0)):
+                turned = shifts @ self.poses[number, :3, :3].T
+                block[:, self.pattern_columns[number]] = sign * np.einsum("qmi,qi->qm", turned, found.normals)
             blocks.append(block)
             residuals.append(found.distance_mm)
             weights.append(weight)
             deviations.append(found.std_mm)
-            spurious += slope_information(found.normals, weight * found.slope_variance, by_poses)
+            spurious += slope_information(found.normals, weight * spread**2 * found.slope_variance, by_poses)
         for first, second, views in spheres:
             covariance = first.covariance + second.covariance
             root = np.linalg.cholesky(np.linalg.inv(covariance)).T
@@ -302,7 +360,7 @@ class JointRegistration:
             blocks.append(block)
             residuals.append(off)
             # Spheres are scaled by the same spread as surfaces, since they would otherwise dominate a poor fit.
-            weights.append(np.full(3, 2 / views / spread**2))
+            weights.append(np.full(3, 2 / views / max(spread, 1.0) ** 2))
             deviations.append(np.ones(3))
         return PairEvidence(
             np.vstack(blocks),
@@ -311,6 +369,7 @@ class JointRegistration:
             np.concatenate(deviations),
             spread,
             spurious,
+            tuple(ways),
             np.vstack([found.places_mm for *_, found in ways]) if ways else np.empty((0, 3)),
             len(relative),
             len(spheres),

@@ -17,7 +17,7 @@ import numpy as np
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError
-from uwlts.fitting.patches import surface_patches
+from uwlts.fitting.patches import PatchDistances, surface_patches
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Table
@@ -38,6 +38,10 @@ from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import PoseFormat, read_poses, write_poses
 
 _ROUNDS = 60
+_REFITS = 12
+"""Largest number of further rounds, with surfaces fitted again at each distance."""
+_SETTLED = 0.1
+"""Step, in standard uncertainties, below which a pose is settled: it would add 0.5 % to the standard uncertainty."""
 _STILL_MM = 1e-5
 """Rms shift of the points, mm, that ends the iteration: far below any measurable change."""
 _SMALLEST = 1e-6
@@ -324,13 +328,10 @@ def register(
             break
         reach = max(NARROWER * reach, least)
     progress(steps, steps)
-    distances = joint.measure_distances(reach)
-    pairs = joint.collect_evidence(distances)
-    solution = joint.solve(list(pairs.values()))
-    _require_settled(solution, joint.unknown_poses)
+    distances, pairs, solution, known = _settle(joint, reach, names)
     amounts = np.concatenate(joint.patterns)
     covariance = np.zeros((6 * len(scans),) * 2)
-    covariance[6:, 6:] = solution.covariance[: joint.unknown_poses, : joint.unknown_poses]
+    covariance[6:, 6:] = known[: joint.unknown_poses, : joint.unknown_poses]
     return RegisteredScans(
         names=names,
         poses=joint.poses,
@@ -341,19 +342,40 @@ def register(
         overlaps=tuple(_overlap(pair) for pair in pairs.values()),
         narrow_overlaps=joint.find_narrow_overlaps(distances),
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
-        cloud=merge_clouds(scans, names, joint, solution.covariance),
+        cloud=merge_clouds(scans, names, joint, known),
     )
 
 
-def _require_settled(solution: PoseSolution, unknown: int) -> None:
-    """Raise EvaluationError if a further step would move the poses by more than their uncertainty."""
-    std = np.sqrt(np.diag(solution.covariance)[:unknown])
-    moves = float(np.max(np.abs(solution.step[:unknown]) / np.where(std > 0, std, np.inf), initial=0.0))
-    if moves > 1:
-        raise EvaluationError(
-            f"the registration does not converge: after {_ROUNDS} rounds the next one would move a scan by "
-            f"{moves:.2g} standard uncertainties. Give more accurate initial poses, or scans with more overlap"
-        )
+def _settle(
+    joint: JointRegistration, reach: float, names: Sequence[str]
+) -> tuple[dict[tuple[int, int], PatchDistances], dict[tuple[int, int], PairEvidence], PoseSolution, np.ndarray]:
+    """Move the poses until they are settled; return distances, evidence, the last solution, and its covariance (U, U).
+
+    Raises EvaluationError if a further step would move a pose by more than its standard uncertainty.
+    """
+    rounds = 0
+    while True:
+        distances = joint.measure_distances(reach, refit=True)
+        pairs = joint.collect_evidence(distances)
+        joint.require_connected(list(pairs), names)
+        solution = joint.solve(list(pairs.values()))
+        covariance = joint.covariance(list(pairs.values()), solution)
+        moves = _largest_move(solution.step[: joint.unknown_poses], covariance)
+        if moves < _SETTLED or (rounds == _REFITS and moves <= 1):
+            return distances, pairs, solution, covariance
+        if rounds == _REFITS:
+            raise EvaluationError(
+                f"the registration does not converge: the next round would move a scan by {moves:.2g} standard "
+                "uncertainties. Give more accurate initial poses, or scans with more overlap"
+            )
+        joint.move(solution.step)
+        rounds += 1
+
+
+def _largest_move(step: np.ndarray, covariance: np.ndarray) -> float:
+    """Return the largest component of a step (P,) of the poses in standard uncertainties."""
+    std = np.sqrt(np.diag(covariance)[: len(step)])
+    return float(np.max(np.abs(step) / np.where(std > 0, std, np.inf), initial=0.0))
 
 
 def _pair_fit(

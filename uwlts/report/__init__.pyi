@@ -1,4 +1,5 @@
 from . import plot as plot
+from .acceptance_page import write_acceptance as write_acceptance
 from .camera_page import write_camera as write_camera
 from .campaign_page import write_campaign as write_campaign
 from .certificate import check_certificate as check_certificate
@@ -6,4 +7,5 @@ from .certificate_page import write_certificate as write_certificate
 from .change_page import write_change as write_change
 from .findings_page import write_findings as write_findings
 from .model_comparison import write_models as write_models
+from .radiometry_page import write_radiometry as write_radiometry
 from .registration_page import write_registration as write_registration

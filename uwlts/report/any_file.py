@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from uwlts.acceptance.accept import FORMAT as ACCEPTANCE, Acceptance, read_acceptance
 from uwlts.errors import CaptureError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION, EvaluationRecord, read_evaluation
 from uwlts.files.json_files import read_json, trusting
@@ -22,7 +23,7 @@ from uwlts.storage.truth import FORMAT as TRUTH, Truth, read_truth
 
 _READABLE = (
     f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
-    "calibrations, mounts and evaluations (.json), trajectories (.csv, .tum, ROS bags)"
+    "calibrations, mounts, evaluations and acceptance tests (.json), trajectories (.csv, .tum, ROS bags)"
 )
 
 
@@ -34,13 +35,13 @@ def read(
     pose_unit: Unit | None = None,
     unit: Unit | None = None,
     trust_edited: bool = False,
-) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Trajectory:
+) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Acceptance | Trajectory:
     """Read a file of the program, whose content determines the type of the result.
 
     The result is an opened capture, a cloud, a mesh, ground truth, a calibration, a mount, the record of an evaluation,
-    or a trajectory. A PLY file with faces is a mesh. The metadata of a capture's frames are read at once, and images on
-    demand: ``capture[12]`` is a `Frame`. A recording in progress can be opened by its name ``NAME.part``. Close a
-    capture, or use it as a context manager.
+    an acceptance test, or a trajectory. A PLY file with faces is a mesh. The metadata of a capture's frames are read at
+    once, and images on demand: ``capture[12]`` is a `Frame`. A recording in progress can be opened by its name
+    ``NAME.part``. Close a capture, or use it as a context manager.
 
     Parameters
     ----------
@@ -53,11 +54,12 @@ def read(
     unit : {"mm", "m"}, optional
         As for `export`.
     trust_edited : bool
-        Accept calibrations, mounts and evaluations that were edited after they were written; results record it.
+        Accept calibrations, mounts, evaluations and acceptance tests that were edited after they were written; results
+        record it.
 
     Returns
     -------
-    Capture, PointCloud, SurfaceMesh, Truth, Calibration, PolynomialCalibration, Mount, EvaluationRecord or Trajectory
+    Capture, PointCloud, SurfaceMesh, Truth, Mount, EvaluationRecord, Acceptance, Trajectory or a calibration
         An opened capture must be closed, or used in a ``with`` statement.
 
     Raises
@@ -86,6 +88,8 @@ def read(
             return read_mount(path)
         if found == EVALUATION:
             return read_evaluation(path)
+        if found == ACCEPTANCE:
+            return read_acceptance(path)
         raise CaptureError(f"{path} is JSON of the format {found!r}; this reads {_READABLE}")
     if ending == ".csv":
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)

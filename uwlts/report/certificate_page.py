@@ -15,6 +15,7 @@ from uwlts.calibration.joint.observability import list_regions
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.json_files import trusting
+from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
@@ -38,6 +39,7 @@ from uwlts.report.certificate_volume import (
     require_same_sensor,
     uncertainty_maps,
 )
+from uwlts.report.digital_certificate import digital_certificate, load_administration
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import read_calibration
 
@@ -51,6 +53,7 @@ def write_certificate(
     *,
     out: str | Path | None = None,
     before: str | Path | None = None,
+    administration: str | Path | None = None,
     trust_edited: bool = False,
     overwrite: bool = False,
 ) -> tuple[Path, AnyCertificate]:
@@ -64,6 +67,9 @@ def write_certificate(
         Page to write (default: CALIBRATION.certificate.html). The JSON is written beside it.
     before : str or Path, optional
         Another calibration of the same sensor to compare with.
+    administration : str or Path, optional
+        TOML file with laboratory, customer, item and persons. With it, the certificate is also written as digital
+        calibration certificate (DCC, XML) beside the page.
     trust_edited : bool
         Accept files that were edited after they were written; results record it.
     overwrite : bool
@@ -82,15 +88,25 @@ def write_certificate(
         A calibration cannot be read.
     CalibrationError
         The joint estimate is damaged, or the other calibration is of another sensor.
+    DescriptionError
+        The administrative data are not valid.
     """
     source = Path(calibration)
     page = Path(out or source.with_name(f"{source.stem}.certificate.html"))
+    digital = page.with_suffix(".xml")
     refuse_unsuitable_page(page, overwrite=overwrite)
+    stated = None if administration is None else load_administration(administration)
+    if stated is not None:
+        refuse_unsuitable(digital, overwrite=overwrite)
     known = read_calibration(source)
     content = make_certificate(known, source, issued=datetime.now(UTC).isoformat(timespec="seconds"))
     earlier = None if before is None else (Path(before).name, read_calibration(before))
     text = certificate_page(content, known, before=earlier)
     sealed = json.dumps(content.in_file(), indent=2, ensure_ascii=False) + "\n"
+    if stated is not None:
+        xml = digital_certificate(content, stated)
+        with write_atomically(digital, overwrite=overwrite) as aside:
+            aside.write_text(xml, encoding="utf-8")
     write_page(page, text, beside=sealed, overwrite=overwrite)
     return page, content
 

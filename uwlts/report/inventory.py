@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import JsonValue
 from scipy.spatial.transform import Rotation
 
+from uwlts.acceptance.accept import FORMAT as ACCEPTANCE_FORMAT, read_acceptance
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT, EvaluationRecord, TruthComparisons, read_evaluation
 from uwlts.files.json_files import read_json, trusting
@@ -82,11 +83,13 @@ def _json_lines(path: Path) -> list[str]:
             return polynomial_lines(read_polynomials(path))
         if found == EVALUATION_FORMAT:
             return evaluation_lines(read_evaluation(path))
+        if found == ACCEPTANCE_FORMAT:
+            return read_acceptance(path).lines()
         if found == MOUNT_FORMAT:
             return mount_lines(read_mount(path))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CaptureError(f"{path} is damaged: a value is missing or not a number ({error})") from error
-    raise CaptureError(f"{path} is neither a calibration, a mount nor an evaluation: format is {found!r}")
+    raise CaptureError(f"{path} is no calibration, mount, evaluation or acceptance test: format is {found!r}")
 
 
 def capture_lines(capture: Capture) -> list[str]:

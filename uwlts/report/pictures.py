@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from uwlts.files.writing import write_atomically
+from uwlts.pages.cloud_display import choose_points
 from uwlts.pages.cloud_figure import CloudPoints
-from uwlts.pages.numbers import unit_for
 from uwlts.pages.toolkit import figure_png, figure_svg, new_figure
 from uwlts.report import plot
 from uwlts.report.gather import GatheredCampaign, GatheredMeasurement
@@ -113,25 +113,10 @@ def _draw_measurement(measurement: GatheredMeasurement, send: Send) -> Measureme
 
 def cloud_points(cloud: PointCloud) -> tuple[CloudPoints, str]:
     """Return points for an interactive view, seen from the sensor, and its caption."""
-    chosen = np.arange(len(cloud))
-    shown = f"All {len(cloud):,} points."
-    if len(cloud) > MOST_POINTS:
-        chosen = np.sort(np.random.default_rng(0).choice(len(cloud), MOST_POINTS, replace=False))
-        shown = f"{MOST_POINTS:,} of {len(cloud):,} points, drawn at random."
-    values, limit, unit = None, 1.0, "mm"
-    if cloud.deviation_mm is None:
-        shown += " The file holds no deviations; let the evaluation write a coloured cloud to see them here."
-    else:
-        limit = plot.colour_limit_mm(cloud.deviation_mm)
-        unit, factor = unit_for(limit)
-        limit *= factor
-        values = factor * cloud.deviation_mm[chosen].astype(np.float64)
-        shown += f" The colours end at {plot.LIMIT_STD:g} standard deviations, ±{limit:.3g} {unit}."
-        if np.isnan(values).any():
-            shown += " Dark points were not evaluated: outliers, near an edge, or beside the artefact."
-    x, y, z = (-plot.view_direction()).tolist()
-    points = CloudPoints(cloud.points_mm[chosen], values, limit, unit, plot.STOPS, (x, y, z))
-    return points, f"{shown} X: direction of the scan; Y: along the stripe; Z: away from the sensor."
+    if cloud.deviation_mm is not None:
+        return choose_points(cloud.points_mm, "deviation", cloud.field_values("deviation"), most=MOST_POINTS)
+    shown, caption = choose_points(cloud.points_mm, "depth", None, most=MOST_POINTS)
+    return shown, f"{caption} The file holds no deviations; let the evaluation write a coloured cloud to see them here."
 
 
 def svg_if_any(draw: Callable[..., Axes], shown: object, **options: Any) -> Markup | None:

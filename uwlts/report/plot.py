@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle, product
-from typing import Any, Literal, assert_never
+from typing import Any, assert_never
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,22 +20,12 @@ from mpl_toolkits.mplot3d import Axes3D, proj3d
 from uwlts.argument_types import check_arguments
 from uwlts.errors import ImageError
 from uwlts.model.calibration import Calibration
+from uwlts.pages.cloud_figure import AZIMUTH_DEG, ELEVATION_DEG, STOPS, CloudField, colour_limit_mm, view_direction
 from uwlts.pages.numbers import entries_of, format_to_scale, number_list, split_name, unit_for, unit_of
 from uwlts.pages.toolkit import BLUE, COLOURS, INK, RED, make_figure, new_figure, plain_text, typeset_number
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
-
-Colour = Literal["deviation", "depth", "intensity", "uncertainty"]
-
-STOPS = (
-    (0.0, (33, 82, 172)),
-    (0.25, (99, 161, 214)),
-    (0.5, (205, 205, 200)),
-    (0.75, (236, 139, 96)),
-    (1.0, (170, 21, 40)),
-)
-"""Colour scale of deviations: position between -1 and +1 limit (0 to 1), and red, green, blue."""
 
 DEVIATIONS = LinearSegmentedColormap.from_list(
     "deviations", [(place, (red / 255, green / 255, blue / 255)) for place, (red, green, blue) in STOPS]
@@ -50,14 +40,6 @@ ORANGE = "#ff7800"
 """Colour of stripe centres."""
 PALE = "#9dbad6"
 """Colour of bars."""
-
-LIMIT_STD = 2.0
-"""Range of the deviation colours in standard deviations, as in the thesis."""
-
-AZIMUTH_DEG = 28.0
-"""Viewing direction of clouds: angle from +X towards +Y, deg."""
-ELEVATION_DEG = 38.0
-"""Viewing direction of clouds: angle downwards (towards +Z), deg."""
 
 SHORT_LIST = 3
 """Lists of residuals up to this length are written into tables; longer ones are drawn."""
@@ -87,7 +69,7 @@ class NothingToDrawError(ValueError):
 
 
 @check_arguments
-def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviation") -> Axes3D:
+def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: CloudField = "deviation") -> Axes3D:
     """Draw all points of a cloud, seen obliquely from the sensor's side, with equal scales and without perspective.
 
     Parameters
@@ -148,26 +130,26 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
     return ax
 
 
-def _select_values(cloud: PointCloud, colour: Colour) -> tuple[np.ndarray | None, str, dict[str, Any]]:
+def _select_values(cloud: PointCloud, colour: CloudField) -> tuple[np.ndarray | None, str, dict[str, Any]]:
     """Return values (N,) with label and style; None if the cloud does not have them."""
+    values = cloud.field_values(colour)
+    if values is None:
+        return None, "", {}
     match colour:
         case "deviation":
-            if cloud.deviation_mm is None or not np.isfinite(cloud.deviation_mm).any():
+            if not np.isfinite(values).any():
                 return None, "", {}
-            limit = colour_limit_mm(cloud.deviation_mm)
+            limit = colour_limit_mm(values)
             unit, factor = unit_for(limit)
             style = {"cmap": DEVIATIONS, "vmin": -factor * limit, "vmax": factor * limit}
-            return factor * cloud.deviation_mm.astype(np.float64), f"deviation / {unit}", style
+            return factor * values, f"deviation / {unit}", style
         case "depth":
-            return cloud.points_mm[:, 2], "Z / mm", {"cmap": "viridis"}
+            return values, "Z / mm", {"cmap": "viridis"}
         case "intensity":
-            return cloud.intensity.astype(np.float64), "brightness / grey levels", {"cmap": "cividis"}
+            return values, "brightness / grey levels", {"cmap": "cividis"}
         case "uncertainty":
-            if cloud.uncertainty is None:
-                return None, "", {}
-            std = np.linalg.norm(cloud.uncertainty.std_mm().astype(np.float64), axis=1)
-            unit, factor = unit_for(float(np.median(std)))
-            return factor * std, f"standard uncertainty / {unit}", {"cmap": "viridis"}
+            unit, factor = unit_for(float(np.median(values)))
+            return factor * values, f"standard uncertainty / {unit}", {"cmap": "viridis"}
         case _:
             assert_never(colour)
 
@@ -178,24 +160,11 @@ def deviation_colours(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
     return shown(np.ma.masked_invalid((deviation_mm / limit_mm + 1) / 2), bytes=True)[:, :3]
 
 
-def view_direction() -> np.ndarray:
-    """Return the viewing direction of clouds, a unit vector (3,) in the OCS."""
-    azimuth, elevation = np.radians((AZIMUTH_DEG, ELEVATION_DEG))
-    across = np.cos(elevation)
-    return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
-
-
 def cloud_limits(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return lower and upper limits (3,) of axes that contain the points, each of non-zero length."""
     low, high = (points_mm.min(axis=0), points_mm.max(axis=0)) if len(points_mm) else (np.zeros(3), np.ones(3))
     half = np.maximum(0.52 * (high - low), 0.02 * max(1e-6, float((high - low).max())))
     return (low + high) / 2 - half, (low + high) / 2 + half
-
-
-def colour_limit_mm(deviation_mm: np.ndarray) -> float:
-    """Return the limit of the deviation colours: `LIMIT_STD` standard deviations, above zero."""
-    finite = deviation_mm[np.isfinite(deviation_mm)].astype(np.float64)
-    return max(LIMIT_STD * float(finite.std()), 1e-9) if len(finite) else 1e-9
 
 
 def surface_limit_mm(distance_mm: np.ndarray) -> float:

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout
 
@@ -14,7 +15,7 @@ from cyclopts import App, CycloptsError, CycloptsPanel, MissingArgumentError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from uwlts.errors import Error, make_printable
+from uwlts.errors import DescriptionWarning, Error, make_printable
 from uwlts.files.inputs import protect_inputs, refuse_named_inputs
 from uwlts.runtime.interrupts import preserve_interrupts
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -28,6 +29,7 @@ SWITCHES = {
 _LINE_EVERY_S = 10.0
 """Interval between lines of progress without a terminal: a log of an hour stays readable."""
 _quiet = False
+_python_show_warning = warnings.showwarning
 
 
 @contextmanager
@@ -75,6 +77,14 @@ def _progress_lines(title: str) -> ProgressListener:
     return listen
 
 
+def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
+    """Print a warning on standard error as the commands do; without the line of code for those about descriptions."""
+    if issubclass(category, DescriptionWarning):
+        print(make_printable(f"warning: {message}"), file=sys.stderr, flush=True)
+    else:
+        _python_show_warning(message, category, *place, **more)  # pyright: ignore[reportArgumentType]
+
+
 def run(app: App) -> int:
     """Run a command line and return its exit code: 2 with a message for the user's errors, 130 for Ctrl-C.
 
@@ -92,7 +102,8 @@ def run(app: App) -> int:
     _quiet, words = on["quiet"], [word for word in words if word not in switches]
     command: object = None
     try:
-        with preserve_interrupts(), ExitStack() as output:
+        with preserve_interrupts(), warnings.catch_warnings(), ExitStack() as output:
+            warnings.showwarning = _show_warning
             command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
             if _quiet:
                 output.enter_context(redirect_stdout(output.enter_context(open(os.devnull, "w", encoding="utf-8"))))

@@ -16,6 +16,7 @@ PROJECT = "uwlts"
 EXTRAS = {
     "clouds": "clouds as LAZ, LAS, E57 and COPC",
     "cluster": "sweeps on several machines",
+    "frames": "results as tables of pandas",
     "genicam": "cameras with a GenTL producer, XIMEA's among them",
     "learn": "learned stripes",
     "registration": "the search for initial poses by shape",

@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, assert_never
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from uwlts.errors import CaptureError
 from uwlts.files.reading import require_plain
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.pages.cloud_figure import CloudField
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Stored elements of the symmetric 3x3 covariance matrix: xx, xy, xz, yy, yz, zz."""
@@ -243,6 +244,44 @@ class PointCloud(Brief):
             metadata=self.metadata,
             warnings=self.warnings,
         )
+
+    @check_arguments
+    def show(self, colour: CloudField = "depth") -> None:
+        """Show the points in 3D, in the output of a notebook's cell, or from a script in the browser.
+
+        The view contains everything that it needs, at most 200,000 points: `select` the part of a large cloud. A script
+        writes it to a temporary file, whose path is printed. OutputError if that cannot be written.
+
+        Parameters
+        ----------
+        colour
+            Quantity shown by colour: "depth" Z; "intensity", the brightness of the stripe; "uncertainty", the standard
+            uncertainty of the position; or "deviation" from the fitted or true surface, limited to two standard
+            deviations.
+        """
+        # Templates are only needed here.
+        from uwlts.pages.cloud_display import display_points, show
+
+        show(display_points(self.points_mm, colour, self.field_values(colour)))
+
+    def field_values(self, field: CloudField) -> np.ndarray | None:
+        """Return a quantity (N,) that colours can show, NaN where unknown, in mm or grey values; None if unknown.
+
+        For "uncertainty" it is the norm of the coordinates' standard uncertainties, or else `normal_std_mm`.
+        """
+        match field:
+            case "depth":
+                return self.points_mm[:, 2]
+            case "intensity":
+                return self.intensity.astype(np.float64)
+            case "deviation":
+                return None if self.deviation_mm is None else self.deviation_mm.astype(np.float64)
+            case "uncertainty" if self.uncertainty is not None:
+                return np.linalg.norm(self.uncertainty.std_mm().astype(np.float64), axis=1)
+            case "uncertainty":
+                return None if self.normal_std_mm is None else self.normal_std_mm.astype(np.float64)
+            case _:
+                assert_never(field)
 
     @property
     def covariance_mm2(self) -> np.ndarray | None:

@@ -12,9 +12,10 @@ from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
-from uwlts.storage.mcap_clouds import covariance_columns, mcap_content
+from uwlts.storage.mcap_clouds import mcap_content
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit, read_number_table
 from uwlts.storage.pcd_file import read_pcd
+from uwlts.storage.point_cloud2 import covariance_columns
 
 TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
 """Columns x, y, z by name, or the first three, in mm or the unit of their names; and optionally intensity."""

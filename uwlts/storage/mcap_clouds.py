@@ -11,20 +11,19 @@ import numpy as np
 
 from uwlts.errors import OutputError
 from uwlts.runtime.optional_library import optional_library
-from uwlts.storage.cloud import PAIRS, PointCloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.point_cloud2 import (
+    FRAME_ID,
+    NANOSECONDS,
+    MessageTypes,
+    covariance_columns,
+    pack_points,
+    packed_layout,
+    point_cloud2,
+)
 
-TOPIC, FRAME_ID = "/points", "base"
+TOPIC = "/points"
 _POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
-_NANOSECONDS = 10**9
-
-
-def covariance_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
-    """Return the columns (N,) float32 ``cov_xx_mm2`` to ``cov_zz_mm2`` of each point's covariance; empty if unknown."""
-    covariance = cloud.covariance_mm2
-    if covariance is None:
-        return {}
-    names = [f"cov_{'xyz'[i]}{'xyz'[j]}_mm2" for i, j in PAIRS]
-    return {name: covariance[:, i, j].astype(np.float32) for name, (i, j) in zip(names, PAIRS, strict=True)}
 
 
 def mcap_content(cloud: PointCloud, *, foxglove: bool) -> bytes:
@@ -45,19 +44,6 @@ def mcap_content(cloud: PointCloud, *, foxglove: bool) -> bytes:
     return _foxglove(cloud) if foxglove else _ros2(cloud)
 
 
-def _table(cloud: PointCloud) -> np.ndarray:
-    """Return the points as packed rows, little-endian."""
-    columns: dict[str, np.ndarray] = dict(zip("xyz", (1e-3 * cloud.points_mm).astype(np.float32).T, strict=True))
-    columns |= {"intensity": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
-    if cloud.time_s is not None:
-        columns["time"] = cloud.time_s
-    columns |= covariance_columns(cloud)
-    table = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
-    for name, values in columns.items():
-        table[name] = values
-    return table
-
-
 def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
     """Iterate over the times in ns, and the indices of the points of each."""
     if cloud.time_s is None:
@@ -66,20 +52,14 @@ def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
     order = np.argsort(cloud.time_s, kind="stable")
     _, first = np.unique(cloud.time_s[order], return_index=True)
     for rows in np.split(order, first[1:]):
-        yield round(float(cloud.time_s[rows[0]]) * _NANOSECONDS), rows
+        yield round(float(cloud.time_s[rows[0]]) * NANOSECONDS), rows
 
 
 def _ros2(cloud: PointCloud) -> bytes:
     mcap, typesys = _library("mcap.writer"), _library("rosbags.typesys")
     store: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    point_cloud2, field = store.types[_POINT_CLOUD2], store.types["sensor_msgs/msg/PointField"]
-    header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
-    kinds = {"<f4": field.FLOAT32, "<f8": field.FLOAT64, "<i4": field.INT32}
-    table = _table(cloud)
-    fields = [
-        field(name=name, offset=int(offset), datatype=kinds[kind.str], count=1)
-        for name, (kind, offset) in _layout(table).items()
-    ]
+    types = bag_types(store)
+    table = pack_points(cloud, covariance_columns(cloud))
     content = BytesIO()
     writer = mcap.Writer(content)
     writer.start(profile="ros2", library="uwlts")
@@ -87,17 +67,7 @@ def _ros2(cloud: PointCloud) -> bytes:
     schema = writer.register_schema(name=_POINT_CLOUD2, encoding="ros2msg", data=text.encode())
     channel = writer.register_channel(topic=TOPIC, message_encoding="cdr", schema_id=schema)
     for number, (time, rows) in enumerate(_moments(cloud)):
-        message = point_cloud2(
-            header=header(stamp=stamp(sec=time // _NANOSECONDS, nanosec=time % _NANOSECONDS), frame_id=FRAME_ID),
-            height=1,
-            width=len(rows),
-            fields=fields,
-            is_bigendian=False,
-            point_step=table.itemsize,
-            row_step=table.itemsize * len(rows),
-            data=np.frombuffer(table[rows].tobytes(), np.uint8),
-            is_dense=True,
-        )
+        message = point_cloud2(table[rows], types, time_ns=time, frame_id=FRAME_ID)
         data = bytes(store.serialize_cdr(message, _POINT_CLOUD2))
         writer.add_message(channel_id=channel, log_time=time, publish_time=time, sequence=number, data=data)
     writer.finish()
@@ -108,10 +78,10 @@ def _foxglove(cloud: PointCloud) -> bytes:
     foxglove, channels, messages = (_library(f"foxglove{part}") for part in ("", ".channels", ".messages"))
     kind_of = messages.PackedElementFieldNumericType
     kinds = {"<f4": kind_of.Float32, "<f8": kind_of.Float64, "<i4": kind_of.Int32}
-    table = _table(cloud)
+    table = pack_points(cloud, covariance_columns(cloud))
     fields = [
         messages.PackedElementField(name=name, offset=int(offset), type=kinds[kind.str])
-        for name, (kind, offset) in _layout(table).items()
+        for name, (kind, offset) in packed_layout(table).items()
     ]
     pose = messages.Pose(
         position=messages.Vector3(x=0.0, y=0.0, z=0.0), orientation=messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
@@ -121,7 +91,7 @@ def _foxglove(cloud: PointCloud) -> bytes:
         channel = channels.PointCloudChannel(TOPIC, context=context)
         for time, rows in _moments(cloud):
             message = messages.PointCloud(
-                timestamp=messages.Timestamp(time // _NANOSECONDS, time % _NANOSECONDS),
+                timestamp=messages.Timestamp(time // NANOSECONDS, time % NANOSECONDS),
                 frame_id=FRAME_ID,
                 pose=pose,
                 point_stride=table.itemsize,
@@ -132,9 +102,10 @@ def _foxglove(cloud: PointCloud) -> bytes:
     return content.getvalue()
 
 
-def _layout(table: np.ndarray) -> dict[str, tuple[np.dtype, int]]:
-    """Return type and offset of each field of a packed table."""
-    return {name: (entry[0], entry[1]) for name, entry in (table.dtype.fields or {}).items()}
+def bag_types(store: Any) -> MessageTypes:
+    """Return the types of messages of a type store of the library rosbags."""
+    names = (_POINT_CLOUD2, "sensor_msgs/msg/PointField", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    return MessageTypes(*(store.types[name] for name in names), pack=lambda data: np.frombuffer(data, np.uint8))
 
 
 def _library(module: str) -> ModuleType:

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from twin.design.choice import StudyResults, describe_turbidity
 from twin.design.designs import (
     Design,
+    HighlightedDesign,
     build_sensor,
     count_designs,
     evaluate_designs,
@@ -16,7 +18,8 @@ from twin.design.designs import (
     sample_designs,
     select_design,
 )
-from twin.design.figures_of_merit import FIGURES
+from twin.design.figures_of_merit import FIGURES, RENDERED_SCATTERING_DEPTH
+from twin.design.report.study_tables import format_design_value
 from twin.design.screening import encode_part, read_parts, write_csv, write_part
 from twin.design.study import Study, load_study
 from uwlts.errors import CaptureError, DescriptionError, DesignError
@@ -186,6 +189,25 @@ def test_a_design_as_built_is_judged_as_in_the_sweep(study):
     swept, alone = select_design(evaluate_designs(study, [design]), 0), evaluate_sensor(study, "built", sensor)
     for name in FIGURES:
         assert swept.figures[name] == pytest.approx(alone.figures[name], rel=1e-12, nan_ok=True)
+
+
+@pytest.mark.parametrize(("share", "marked"), [(0.99, False), (1.01, True)])
+def test_a_design_in_more_turbid_water_than_the_rendered_ones_is_marked(study, share, marked):
+    thesis = load_sensor("thesis")
+
+    def evaluated(per_m: float) -> HighlightedDesign:
+        water = thesis.media["water"].model_copy(update={"scattering_per_m": per_m, "phase": "petzold"})
+        sensor = thesis.model_copy(update={"media": thesis.media | {"water": water}})
+        return HighlightedDesign("mine", sensor, evaluate_sensor(study, "built", sensor))
+
+    per_metre = evaluated(1.0).design.number_of("scattering_depth")
+    one = evaluated(share * RENDERED_SCATTERING_DEPTH / per_metre)
+    depth = one.design.number_of("scattering_depth")
+    assert depth == pytest.approx(share * RENDERED_SCATTERING_DEPTH)
+    assert ("compared only up to" in describe_turbidity(one)) == marked
+    columns = evaluate_designs(study, sample_designs(study, 0, 1)) | {"scattering_depth": np.array([depth])}
+    judged = StudyResults(study, columns)
+    assert ("not verified" in format_design_value(judged, "scattering_depth", 0)) == marked
 
 
 def test_designs_that_fail_are_reported_with_their_reason(study):

@@ -208,12 +208,26 @@ def test_laser_classes(thesis, power_mw, fan_deg, expected):
     assert CLASS_NAMES[int(found.laser_class.item())] == expected
 
 
+def test_the_optical_depth_of_scattering_is_the_coefficient_times_the_longest_path(thesis):
+    def depth(per_m: float) -> float:
+        return judged(altered(thesis, {"media": {"water": {"scattering_per_m": per_m}}})).scattering_depth.item()
+
+    assert depth(3.0) == pytest.approx(3 * depth(1.0), rel=1e-9)
+    # On the axes at the far end, 420 mm from the camera's window: the laser's path behind its window, 35.93 mm from its
+    # origin, and the camera's path, aslant by less than tan 35 deg. The ends of the line are farther by up to a tenth.
+    laser = 265 / math.sin(math.radians(35)) + (420 - 309.73) / math.cos(math.radians(35)) - 35.93
+    assert 1e-3 * (laser + 420) < depth(1.0) < 1.1e-3 * (laser + 420 / math.cos(math.radians(11)))
+
+
 def test_the_window_for_the_pressure_is_that_of_equation_3_2(thesis):
     from uwlts.optics.design import window_thickness_mm
 
     pressure = 1e-6 * 1030.0 * 9.81 * 100.0
     expected = window_thickness_mm(pressure_mpa=pressure, unsupported_diameter_mm=63.0, strength_mpa=60.0)
     assert judged(thesis).window_mm.item() == pytest.approx(expected, rel=1e-12)
+    # Acrylic, also by a common name, is weaker than the fused silica that replaces an unknown material.
+    acrylic = altered(thesis, {"camera": {"window": {"glass": "acrylic"}}})
+    assert judged(acrylic).window_mm.item() == pytest.approx(expected * math.sqrt(60 / 41.4), rel=1e-12)
 
 
 # --- designs that cannot work -----------------------------------------------------------------------------------------

@@ -139,6 +139,18 @@ def test_objects_outside_the_measuring_volume_are_refused(thesis, water):
         check_scene(Renderer(thesis, water, scene), scene)
 
 
+def test_a_stand_off_of_a_scene_outside_the_measuring_volume_is_refused(thesis, water):
+    # The plate is wide enough to reach into the volume although the scene's stand-off, at 145.5 mm, does not.
+    near = altered(thesis, {"laser": {"baseline_mm": 150.0}})
+    scene = scene_of(plate(200.0), plate(0.0))
+    with pytest.raises(
+        DesignError, match=r"stand-off .*placement 'standoff'.* is 145\.5 mm .*200 to 420 mm.*volume\.near_mm"
+    ):
+        check_scene(Renderer(near, water, scene), scene)
+    follows = altered(near, {"volume": {"near_mm": 100.0, "far_mm": 400.0}})
+    check_scene(Renderer(follows, water, scene), scene)
+
+
 def test_a_scan_that_never_meets_the_sheet_is_refused(thesis, water):
     ball = {"kind": "sphere", "diameter_mm": 20.0, "position_mm": (50.0, 0.0, 0.0)}
     short = scene_of(ball, motion={"start_mm": 0.0, "step_mm": 1.0, "count": 40})

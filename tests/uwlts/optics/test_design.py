@@ -319,7 +319,11 @@ def test_the_table_of_the_thesis_sensor(thesis):
         "depth per pixel by the thesis's factor n": (0.1722, "mm/px"),
         "depth in view along the laser's axis": (237.4, "mm"),
         "line needed for a 300 mm pipe in 5 passes": (176.3, "mm"),
-        "fused silica window for 1 MPa, clamped": (7.044, "mm"),
+        # 63 sqrt(3 / S) / 2 with the strengths of 60, 45 and 41.4 MPa.
+        "fused-silica window for 1 MPa, clamped": (7.044, "mm"),
+        "soda-lime window for 1 MPa, clamped": (8.133, "mm"),
+        "soda-lime-low-iron window for 1 MPa, clamped": (8.133, "mm"),
+        "PMMA window for 1 MPa, clamped": (8.480, "mm"),
         # tan 35 deg * 1.3312 over 12.5 / 299.37.
         "image plane to lens axis, sheet in focus": (87.44, "deg"),
         # 0.635 / (2 pi) over 12.5 / 8 / 299.37, times sqrt(1/2), and over sin 35 deg.
@@ -330,6 +334,9 @@ def test_the_table_of_the_thesis_sensor(thesis):
         assert table[name].value == pytest.approx(value, rel=5e-4), name
         assert table[name].unit == unit
     assert all(row.source for row in table.values())
+    # A material of unknown strength has no row, and is named.
+    assert not any("N-BK7" in name for name in table)
+    assert "without a thickness: N-BK7" in format_table([*table.values()])[-1]
 
 
 PLACED = {"baseline_mm": None, "triangulation_angle_deg": None}

@@ -20,7 +20,7 @@ from matplotlib.tri import Triangulation
 
 from twin.design.choice import StudyResults, find_pareto_front
 from twin.design.designs import HighlightedDesign
-from twin.design.figures_of_merit import CLASS_NAMES
+from twin.design.figures_of_merit import CLASS_NAMES, RENDERED_SCATTERING_DEPTH
 from twin.design.report import study_tables as tables
 from twin.design.study import Variable
 from twin.design.verification import Agreement
@@ -38,8 +38,8 @@ _LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
 """Colours of the contour lines at the constraints' bounds."""
 _SYMBOLS = (("diamond", "D"), ("circle", "o"), ("star", "*"), ("square", "s"), ("cross", "P"))
 """Symbols of highlighted designs, in plotly and in matplotlib."""
-_TEXT_PLACES = ("top right", "bottom right", "top left", "bottom left")
-"""Positions of labels of highlighted designs, in turn."""
+_TEXT_HEIGHTS = ("top", "bottom", "middle")
+"""Heights of labels of highlighted designs, in turn; labels point to the middle of the chart."""
 _SHOWN = (
     "sigma_z_rms_mm",
     "sigma_z_mm",
@@ -376,7 +376,8 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
             )
             figure.add_trace(trace)
     order = np.flatnonzero(front)[np.argsort(values[front, 0])]
-    names = list(dict.fromkeys([*judged.study.free(), x, y]))
+    names = list(dict.fromkeys([*judged.study.free(), x, y, "scattering_depth"]))
+    names = [name for name in names if name in judged.columns]
     figure.add_scatter(
         **select_points(order),
         name=f"Pareto front ({len(order):,} of the designs)",
@@ -416,6 +417,9 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
         separators=". ",
         plot_bgcolor="white",
     )
+    across = judged.figure(x)[known]
+    least, most = float(across.min()), float(across.max())
+    middle = math.sqrt(least * most) if axes[0].get("type") == "log" else 0.5 * (least + most)
     for number, one in enumerate(marked):
         place, colour = [one.design.number_of(name) for name in (x, y)], RED if one is marked[-1] else INK
         if all(map(math.isfinite, place)):
@@ -426,7 +430,7 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
                 showlegend=False,
                 cliponaxis=False,
                 text=[f"<b>{_escaped(one.label)}</b>"],
-                textposition=_TEXT_PLACES[number % len(_TEXT_PLACES)],
+                textposition=f"{_TEXT_HEIGHTS[number % len(_TEXT_HEIGHTS)]} {'left' if place[0] > middle else 'right'}",
                 textfont={"color": colour, "size": 12.5},
                 marker={"symbol": _SYMBOLS[number % len(_SYMBOLS)][0], "size": 13, "color": colour},
                 hovertemplate=f"%{{text}}<br>{labels[0]}: %{{x}}<br>{labels[1]}: %{{y}}<extra></extra>",
@@ -438,8 +442,18 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
     none = (
         "" if judged.feasible.any() else " No design meets all constraints: the front is that of all working designs."
     )
+    turbid = int((judged.figure("scattering_depth")[known] > RENDERED_SCATTERING_DEPTH).sum())
+    deep = (
+        f" {turbid:,} of the designs are beyond the optical depth of scattering, {RENDERED_SCATTERING_DEPTH:g}, up to "
+        "which formulas and rendering were compared."
+        if turbid
+        else ""
+    )
     more = " Further objectives are not shown." if len(judged.study.objectives) > 2 else ""
-    return figure, f"Better is {better}. No design is better in both than a design on the green line.{more}{none}{thin}"
+    return (
+        figure,
+        f"Better is {better}. No design is better in both than a design on the green line.{more}{none}{thin}{deep}",
+    )
 
 
 def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:

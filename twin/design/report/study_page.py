@@ -128,7 +128,7 @@ def _over_what_is_free(
 def _best(judged: StudyResults) -> tuple[list[str], list[list[str]]]:
     """Return the head and rows of the table of the best designs."""
     study = judged.study
-    more = ("sigma_z_rms_mm", "line_mm", "depth_mm", "standoff_mm", "required_ms", "laser_class")
+    more = ("sigma_z_rms_mm", "line_mm", "depth_mm", "standoff_mm", "required_ms", "laser_class", "scattering_depth")
     figures = dict.fromkeys([*study.figures(), *more])
     names = list(dict.fromkeys([*study.free(), *(name for name in figures if name in judged.columns)]))
     missed = not judged.feasible.any()

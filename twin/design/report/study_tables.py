@@ -9,12 +9,14 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from twin.design.choice import StudyResults
+from twin.design.choice import StudyResults, describe_turbidity
 from twin.design.designs import HighlightedDesign
-from twin.design.figures_of_merit import CLASS_NAMES, FIGURES
+from twin.design.figures_of_merit import CLASS_NAMES, FIGURES, RENDERED_SCATTERING_DEPTH
 from twin.design.study import Study, Variable
 from twin.design.verification import Agreement
 from twin.scene.paths import Value
+from uwlts.model.media import GLASSES
+from uwlts.model.sensor import Window
 from uwlts.pages.toolkit import Tile
 
 MISSING = "\N{EN DASH}"
@@ -96,7 +98,8 @@ def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
         return CLASS_NAMES.get(round(value), MISSING)
     if name == "coverage" and math.isfinite(value):
         return f"{100 * value:.0f} %"
-    text, of = number_text(value), words_and_unit(name)[1]
+    # Three digits of values below 0.01 are as wide as four of others, so that they fit in a tile.
+    text, of = number_text(value, 3 if abs(value) < 0.01 else 4), words_and_unit(name)[1]
     if not unit or not of or text == MISSING:
         return text
     return text + (of if of == "°" else "\N{NO-BREAK SPACE}" + of)
@@ -119,8 +122,10 @@ def without_numbers(text: str) -> str:
 
 
 def format_design_value(judged: StudyResults, name: str, place: int, *, unit: bool = True) -> str:
-    """Format a design's value with its unit."""
-    return value_text(name, judged.columns[name][place : place + 1].tolist()[0], unit=unit)
+    """Format a design's value with its unit; values beyond those of the rendered designs are marked."""
+    value = judged.columns[name][place : place + 1].tolist()[0]
+    mark = " (not verified)" if name == "scattering_depth" and value > RENDERED_SCATTERING_DEPTH else ""
+    return value_text(name, value, unit=unit) + mark
 
 
 def failure_counts(judged: StudyResults) -> list[tuple[str, str]]:
@@ -195,7 +200,10 @@ def _range_text(name: str, variable: Variable) -> str:
     return f"{words_of(name)} from {value_text(name, variable.least)} to {value_text(name, variable.most)}{scale}"
 
 
-_ALWAYS_SHOWN = ("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm", "line_mm", "depth_mm", "standoff_mm")
+_ALWAYS_SHOWN = (
+    *("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm"),
+    *("line_mm", "depth_mm", "standoff_mm", "scattering_depth"),
+)
 
 
 def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign | None) -> list[Tile]:
@@ -212,6 +220,7 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
         notes = (
             note,
             f"misses its bound: {missed[name][1]}" if name in missed else "",
+            "beyond the rendered designs" if describe_turbidity(chosen) and name == "scattering_depth" else "",
             "not reached by camera or laser" if name.startswith("sigma_z_") and text == MISSING else "",
             f"{label}: {beside}" if beside not in (MISSING, label, "base") else "",
         )
@@ -229,10 +238,23 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
     found += [tile(name, note=note) for name, note in last if name not in (*objectives, *others)]
     if "window_mm" not in objectives:
         thin = " – too thin" if needed > window.thickness_mm else ""
-        note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}" if window.mounted else ""
+        note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}"
+        note = f"{note}\n{_by_material(window, needed)}" if window.mounted else ""
         text = value_text("window_mm", window.thickness_mm) if window.mounted else "none"
         found.append(Tile("camera's window", text, note))
     return found
+
+
+def _by_material(window: Window, needed_mm: float) -> str:
+    """Return the thicknesses of other materials that replace a window which needs a thickness."""
+    thicknesses = {
+        name: needed_mm * math.sqrt(window.strength_mpa() / glass.strength_mpa)
+        for name, glass in GLASSES.items()
+        if glass.strength_mpa is not None
+    }
+    unknown = ", ".join(name for name, glass in GLASSES.items() if glass.strength_mpa is None)
+    texts = (f"{value_text('window_mm', thickness)} of {name}" for name, thickness in thicknesses.items())
+    return f"by material: {', '.join(texts)}; unknown for {unknown}"
 
 
 def agreement_text(study: Study, found: Agreement) -> str:

@@ -8,7 +8,16 @@ from pydantic import Field, model_validator
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parse_json, read_text
 from uwlts.model.artefacts import parse_artefact
-from uwlts.model.library import find_description, load_sensor, merge_tables, read_table, validate_description
+from uwlts.model.inheritance import Level
+from uwlts.model.library import (
+    find_description,
+    load_sensor,
+    merge_tables,
+    read_levels,
+    read_table,
+    validate_description,
+    validate_sensor,
+)
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
 from uwlts.storage.capture import NO_STAGE, CaptureHeader
 from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
@@ -188,10 +197,10 @@ def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:
     if isinstance(given.sensor, dict):
         table = {key: value for key, value in given.sensor.items() if key != "base"}
         if (base := given.sensor.get("base")) is not None:
-            table = merge_tables(
-                read_table(find_description(_resolve_beside(beside, base), "sensors"), "sensors"), table
-            )
-        sensor = validate_description(Sensor, table, "sensor")
+            bases = read_levels(find_description(_resolve_beside(beside, base), "sensors"), "sensors")
+            sensor = validate_sensor((*bases, Level("sensor", table, merge_tables(bases[-1].merged, table))), "sensor")
+        else:
+            sensor = validate_description(Sensor, table, "sensor")
     else:
         sensor = load_sensor(_resolve_beside(beside, given.sensor))
     if given.intrinsics is None:

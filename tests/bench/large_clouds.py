@@ -1,0 +1,123 @@
+"""Time and memory of commands on large clouds: ``python -m tests.bench.large_clouds``, by default 10^7 points.
+
+The clouds are two scans of a pipe with pits, made with NumPy only, in files of 24 bytes per point. Each command runs
+alone in a process of its own.
+"""
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from cyclopts import App
+
+from tests.oracles.pipes import Bump, scan_pipe
+from uwlts.runtime.command_line import show
+
+_RADIUS_MM, _ARC, _NOISE_MM = 57.15, 1.2, 0.02
+_POINTS_AT_ONCE = 1_000_000
+"""Points of a section of the pipe: the oracle makes several arrays of this size."""
+_POINTS_PER_MM2 = 40.0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a command, and the most memory that it may take."""
+
+    command: str
+    seconds: float
+    processor_s: float
+    peak_gb: float
+    limit_gb: float
+
+
+def main(points: int = 10_000_000) -> int:
+    """Print the cost of each command.
+
+    Parameters
+    ----------
+    points
+        Points of each cloud.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for seed, cloud in enumerate(("before.ply", "after.ply")):
+            _write_pipe(folder / cloud, points, seed=seed)
+        commands = (
+            ("uwlts export after.ply --out after.copc.laz", 4.0),
+            ("uwlts inspect after.ply --wall-mm 9.5 --out after.json", 4.0),
+            ("uwlts compare after.ply before.ply --out change.html", 8.0),
+            ("uwlts register before.ply after.ply --out both.h5", 8.0),
+            ("uwlts mesh after.ply --out after-mesh.ply", 8.0),
+        )
+        missed = 0
+        for line, limit_gb in commands:
+            cost = _run(line, folder, limit_gb)
+            kept = cost.peak_gb <= cost.limit_gb
+            missed += not kept
+            show(
+                [
+                    f"{line}: {cost.seconds:.0f} s ({cost.processor_s:.0f} s of processor time), "
+                    f"{cost.peak_gb:.2f} GB{'' if kept else f', limit {cost.limit_gb:g} GB missed'}"
+                ]
+            )
+    return 1 if missed else 0
+
+
+def _write_pipe(path: Path, points: int, *, seed: int) -> None:
+    """Write a part of a pipe with a pit every 50 mm as PLY; all points are within a window of the angle."""
+    rng = np.random.default_rng(seed)
+    spacing = 1.0 / np.sqrt(_POINTS_PER_MM2)
+    length = points / (_POINTS_PER_MM2 * _ARC * _RADIUS_MM)
+    sections = max(1, round(points / _POINTS_AT_ONCE))
+    parts = []
+    for number in range(sections):
+        section = scan_pipe(
+            rng,
+            axis=(1.0, 0.0, 0.0),
+            radius_mm=_RADIUS_MM,
+            length_mm=length / sections,
+            arc=_ARC,
+            spacing_mm=spacing,
+            noise_mm=_NOISE_MM,
+            bumps=[Bump(along_mm=0.0, angle=0.5 * _ARC, diameter_mm=10.0, height_mm=-1.0)],
+            lost=0.0,
+        )
+        along, angle = section.own_places(section.points_mm)
+        size = np.linalg.norm(((section.points_mm - section.shift_mm) @ section.turn)[:, :2], axis=1)
+        x = along + (number - 0.5 * (sections - 1)) * length / sections
+        parts.append(
+            np.stack([x, size * np.sin(angle - 0.5 * _ARC), 400.0 - size * np.cos(angle - 0.5 * _ARC)], axis=1)
+        )
+    rows = np.concatenate(parts)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+    path.write_bytes(head.encode() + rows.astype("<f8").tobytes())
+
+
+def _run(line: str, folder: Path, limit_gb: float) -> Cost:
+    """Run a command and return its cost; ends with its exit code if it fails."""
+    program, *arguments = line.split()
+    command: Sequence[str] = [sys.executable, "-m", program, *arguments, "--quiet"]
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd()), "OPENBLAS_NUM_THREADS": "1"}
+    start, own = time.perf_counter(), Path.cwd()
+    os.chdir(folder)
+    try:
+        child = os.posix_spawn(sys.executable, command, environment)
+    finally:
+        os.chdir(own)
+    _, status, usage = os.wait4(child, 0)
+    if code := os.waitstatus_to_exitcode(status):
+        sys.exit(code)
+    # ru_maxrss is in KiB.
+    return Cost(
+        line, time.perf_counter() - start, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e9, limit_gb
+    )
+
+
+if __name__ == "__main__":
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -1,0 +1,56 @@
+"""Rows of the measurements: a value, its limit, and its ratio to a floor measured in the same run."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Speed of a plain computation on the same data, in the unit of its row, and the largest ratio to it.
+
+    A ratio is always a ratio of times: 3 means that the measured work takes three times as long.
+    """
+
+    name: str
+    value: float
+    most: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """Measured value with its limit, and the same as a ratio to a floor; ``ok`` is True if both limits are kept."""
+
+    name: str
+    value: float
+    unit: str
+    limit: float
+    ok: bool
+    floor: Floor | None = None
+    ratio: float | None = None
+
+
+def at_most(name: str, value: float, unit: str, limit: float, floor: Floor | None = None) -> Row:
+    """Return a row with a value, such as a time, that must not exceed the limit."""
+    return _row(name, value, unit, limit, value <= limit, floor, None if floor is None else value / floor.value)
+
+
+def at_least(name: str, value: float, unit: str, limit: float, floor: Floor | None = None) -> Row:
+    """Return a row with a value, such as a rate, that must reach the limit."""
+    return _row(name, value, unit, limit, value >= limit, floor, None if floor is None else floor.value / value)
+
+
+def _row(name: str, value: float, unit: str, limit: float, kept: bool, floor: Floor | None, ratio: float | None) -> Row:
+    ok = bool(kept and (floor is None or ratio is None or ratio <= floor.most))
+    return Row(name, round(float(value), 4), unit, limit, ok, floor, None if ratio is None else round(float(ratio), 2))
+
+
+def median_seconds(action: Callable[[int], object], *, warm_up: int = 3, runs: int = 15) -> float:
+    """Return the median duration of ``action(k)`` after a warm-up."""
+    seconds = []
+    for k in range(warm_up + runs):
+        start = time.perf_counter()
+        action(k)
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds[warm_up:])

@@ -1,0 +1,91 @@
+"""Predicted uncertainties: figures and errors, refused campaigns, and a prediction by rendering."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+import twin
+from twin.recording.predict import PredictedFigure, PredictedUncertainty
+from uwlts.errors import CommandFailed, DescriptionError
+
+FIGURE = PredictedFigure(scan="spheres", name="SSE", expanded_mm=(0.03, 0.04), errors_mm=(-0.035, 0.005))
+CAMPAIGN = """
+title = "small"
+sensor = "thesis-small"
+as_built = "thesis-small-as-built"
+
+[imperfections]
+stage_position_std_mm = 0.003
+
+"""
+TARGET = """
+[[recordings]]
+name = "target"
+scene = "target-through-window"
+motion = { step_mm = 40.0, count = 4 }
+"""
+SPHERES = """
+[[recordings]]
+name = "spheres"
+scene = "spheres"
+placements = ["standoff"]
+"""
+
+
+def test_figures_compare_uncertainty_and_errors():
+    assert FIGURE.predicted_mm == pytest.approx(math.sqrt((0.03**2 + 0.04**2) / 2))
+    assert FIGURE.found_mm == pytest.approx(2 * math.sqrt((0.035**2 + 0.005**2) / 2))
+    assert FIGURE.covered == 1
+    result = PredictedUncertainty(campaign="c", sensor="s", as_built="b", seeds=(0, 1), figures=(FIGURE, FIGURE))
+    assert result.covered_share() == 0.5
+    assert any(line.split() == ["spheres", "SSE", "0.0354", "0.0500", "1", "of", "2"] for line in result.lines())
+
+
+@pytest.mark.parametrize(
+    ("recordings", "options", "says"),
+    [
+        (SPHERES, {}, "'small' has no recording of a target for the calibration"),
+        (TARGET, {}, "'small' has no scan of an artefact"),
+        (TARGET + SPHERES, {"campaigns": 0}, "campaigns is 0; it must be at least 1"),
+        (TARGET + SPHERES, {"first": -1}, "first is -1; it must be at least 0"),
+    ],
+)
+def test_campaigns_that_predict_nothing_are_refused_before_rendering(recordings, options, says, tmp_path: Path):
+    described = tmp_path / "small.toml"
+    described.write_text(CAMPAIGN + recordings, encoding="utf-8")
+    with pytest.raises(DescriptionError, match=says):
+        twin.predict(campaign=described, out=tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_failed_calibration_is_reported_with_its_reason(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """Four images of a target in air determine neither water nor sheet."""
+    described = tmp_path / "small.toml"
+    described.write_text(CAMPAIGN + TARGET + SPHERES, encoding="utf-8")
+    with pytest.raises(CommandFailed):
+        twin.predict(campaign=described, out=tmp_path / "out", campaigns=1, every=9, spp=2)
+    assert "error: " in capfd.readouterr().out
+    assert not (tmp_path / "out" / "prediction.json").exists()
+
+
+@pytest.mark.slow
+def test_errors_of_a_rendered_campaign_are_within_the_prediction(tmp_path: Path):
+    out = tmp_path / "out"
+    result = twin.predict("thesis-small", out=out, campaigns=1, every=6, spp=8)
+    assert {each.scan for each in result.figures} == {
+        *("spheres-near", "spheres-standoff", "spheres-far", "step-scan", "pipe")
+    }
+    # Twice the expanded uncertainty is exceeded once in 15,000 figures.
+    for each in result.figures:
+        assert abs(each.errors_mm[0]) < 2 * each.expanded_mm[0], each
+        assert 0.001 < each.predicted_mm < 1.0, each
+    written = json.loads((out / "prediction.json").read_text(encoding="utf-8"))
+    assert written["format"] == "twin-prediction"
+    assert len(written["figures"]) == len(result.figures)
+    # A second call renders nothing again.
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.truth.h5")}
+    assert twin.predict("thesis-small", out=out, campaigns=1, every=6, spp=8).figures == result.figures
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*.truth.h5")} == before

@@ -1,0 +1,171 @@
+"""Scans on request: played from a capture, and recorded with a replayed camera and the twin's controller."""
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import uwlts
+from tests.uwlts.calibration_views import built_sensor
+from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
+from tests.waiting import within
+from twin.devices.grbl_controller import GrblController
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.desk.scan_service import ScanService
+from uwlts.errors import CalibrationError, HardwareError
+from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.replay import ReplayCamera
+from uwlts.hardware.scan_plan import ScanPlan, load_plan
+from uwlts.model.calibration import Calibration
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
+from uwlts.storage.cloud import PointCloud
+
+EVERY_S = 0.15
+LASER_ON = (True, True, False, True)
+
+
+def joint_calibration(sensor: Sensor) -> Calibration:
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
+    series = target_series(built_sensor(), medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise)
+    options = CalibrationOptions(poses="stage", correct_circles=False)
+    return solve_jointly(gathered(sensor, [series]), options=options).calibration
+
+
+@pytest.fixture(scope="module")
+def calibration(thesis: Sensor) -> Calibration:
+    return joint_calibration(thesis)
+
+
+def write_images(path: Path, sensor: Sensor, laser_on: tuple[bool, ...]) -> Path:
+    """Write a capture whose laser images show a stripe at different rows."""
+    header = CaptureHeader(
+        name="scan", sensor=sensor, medium_name="water", medium=MEDIUM, stage_direction=(1, 0, 0), saturation_dn=255
+    )
+    camera, rng = sensor.camera, np.random.default_rng(0)
+    with CaptureWriter(path, header, dtype=np.uint8) as writer:
+        for number, on in enumerate(laser_on):
+            rows = np.arange(camera.height_px)[:, None] - (420.3 + 20 * number)
+            image = rng.normal(5, 1, (camera.height_px, camera.width_px)) + 150 * on * np.exp(-0.2 * rows**2)
+            writer.append(Frame(image.astype(np.uint8), 2.0 * number, on, 1.0, EVERY_S * number))
+    return path
+
+
+@pytest.fixture(scope="module")
+def capture(thesis: Sensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_images(tmp_path_factory.mktemp("captures") / "scan.h5", thesis, LASER_ON)
+
+
+@pytest.fixture(scope="module")
+def lit(thesis: Sensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images that are replayed as those of the camera."""
+    return write_images(tmp_path_factory.mktemp("captures") / "lit.h5", thesis, (True, True))
+
+
+def test_a_played_capture_gives_its_cloud_image_by_image_at_its_speed(capture: Path, calibration: Calibration):
+    clouds: list[PointCloud] = []
+    said: list[str] = []
+    service = ScanService(capture, calibration, clouds.append, report=said.append)
+    begun_s = time.monotonic()
+    assert service.start() == "playing scan.h5"
+    with pytest.raises(HardwareError, match="a scan is running"):
+        service.start()
+    service.wait()
+    assert said == [f"played {capture}"] and time.monotonic() - begun_s > EVERY_S * (len(LASER_ON) - 1)
+    whole = uwlts.reconstruct(capture, calibration)
+    assert len(clouds) == sum(LASER_ON) and len(whole) > 1000
+    for number, cloud in zip(np.flatnonzero(LASER_ON), clouds, strict=True):
+        same = whole.select(whole.frame == number)
+        assert (cloud.frame == number).all() and np.array_equal(cloud.line, same.line)
+        np.testing.assert_allclose(cloud.points_mm, same.points_mm, atol=1e-9)
+        np.testing.assert_array_equal(cloud.time_s, EVERY_S * number)
+        # The noise of the stripe is estimated from one image instead of from all.
+        ratio = np.trace(cloud.covariance_mm2, axis1=1, axis2=2) / np.trace(same.covariance_mm2, axis1=1, axis2=2)
+        assert 0.5 < np.median(ratio) < 2
+
+
+def test_playing_stops_on_request_and_switches_no_laser(capture: Path, calibration: Calibration):
+    first = threading.Event()
+    said: list[str] = []
+    service = ScanService(capture, calibration, lambda cloud: first.set(), report=said.append)
+    for refused, words in ((service.stop, "no scan is running"), (service.laser_off, "no laser is connected")):
+        with pytest.raises(HardwareError, match=words):
+            refused()
+    service.start()
+    assert first.wait(20)
+    assert service.stop() == "the scan ends after the present image"
+    service.wait()
+    assert said == ["stopped"]
+
+
+@pytest.fixture
+def controller() -> Iterator[GrblController]:
+    with GrblController(speed_up=100.0, boot_s=0.2, position_mm=30.0) as running:
+        yield running
+
+
+def plan_for(folder: Path, controller: GrblController, capture: Path, *, count: int = 3) -> ScanPlan:
+    (folder / "plan.toml").write_text(
+        f'title = "Test plate"\nsensor = "thesis"\nmedium = "water"\ncamera = "replay:{capture}"\nlaser_ms = 1.0\n'
+        f'[stage]\nport = "{controller.port}"\nstart_mm = 20.0\nstep_mm = 1.0\ncount = {count}\nsettle_s = 0.0\n'
+        "feed_mm_per_min = 600.0\n",
+        encoding="utf-8",
+    )
+    return load_plan(folder / "plan.toml")
+
+
+def test_recorded_scans_are_files_and_clouds(tmp_path, lit, calibration, controller):
+    plan, clouds, said = plan_for(tmp_path, controller, lit), [], []
+    with GrblStage(controller.port) as stage, ReplayCamera(lit, repeat=True) as camera:
+        service = ScanService(
+            plan, calibration, clouds.append, folder=tmp_path, camera=camera, stage=stage, home=True, report=said.append
+        )
+        for number in (1, 2):
+            assert service.start() == f"recording test-plate-00{number}.h5"
+            service.wait()
+            assert said[-1].startswith(f"wrote {tmp_path / f'test-plate-00{number}.h5'}"), said
+        service.close()
+    assert len(uwlts.read(tmp_path / "test-plate-002.h5")) == 3
+    assert [cloud.frame[0] for cloud in clouds] == [0, 1, 2] * 2 and min(map(len, clouds)) > 1000
+    times_s = [cloud.time_s[0] for cloud in clouds]
+    assert times_s[0] < times_s[1] < times_s[2]
+
+
+def test_the_laser_off_service_ends_a_scan_with_the_laser_off(tmp_path, lit, calibration, controller):
+    said: list[str] = []
+    begun = threading.Event()
+    plan = plan_for(tmp_path, controller, lit, count=90)
+    with GrblStage(controller.port) as stage, ReplayCamera(lit, repeat=True) as camera:
+        stage.home()
+        service = ScanService(
+            plan, calibration, lambda _: begun.set(), folder=tmp_path, camera=camera, stage=stage, report=said.append
+        )
+        service.start()
+        assert begun.wait(30), said
+        assert service.laser_off().startswith("laser switched off")
+        assert within(1.0, lambda: not controller.state().laser_on)
+        service.wait()
+        # Without `home` the next scan is refused.
+        service.start()
+        service.wait()
+        assert said[-1].startswith("error: ") and "home" in said[-1]
+        stage.unlock()
+
+
+def test_a_calibration_of_another_sensor_is_refused_before_anything_moves(tmp_path, lit, calibration, controller):
+    other = replace_size(calibration)
+    plan = plan_for(tmp_path, controller, lit)
+    service = ScanService(plan, other, lambda cloud: None, folder=tmp_path)
+    with pytest.raises(CalibrationError):
+        service.start()
+    assert not controller.state().laser_on and list(tmp_path.glob("*.h5*")) == []
+
+
+def replace_size(calibration: Calibration) -> Calibration:
+    camera = calibration.camera.model_copy(update={"width_px": calibration.camera.width_px // 2})
+    return calibration.model_copy(update={"camera": camera})

@@ -1,0 +1,236 @@
+"""Digital calibration certificate: order of elements as in the schema, values, and refused administrative data.
+
+``ORDER`` lists the elements of dcc.xsd 3.2.0 and SI_Format.xsd 2.1.0 that are used, in the order of the schemas. They
+themselves (LGPL-3) are not copied into the project.
+"""
+
+import re
+import xml.etree.ElementTree as ET
+
+import pytest
+
+import uwlts
+from tests.system.in_process import run_program
+from uwlts.cli import app
+from uwlts.errors import DescriptionError, EvaluationError
+from uwlts.model.sensor import Medium
+from uwlts.report.certificate import CertifiedFile, JointCertificate, ParameterRow, Validity
+from uwlts.report.certificate_volume import LengthUncertainty
+from uwlts.report.digital_certificate import DCC, SI, UNITS, digital_certificate, load_administration
+
+ADMINISTRATION = """
+identifier = "UW-7"
+begin = 2026-03-02
+end = 2026-03-03
+
+[laboratory]
+name = "Laboratory <A & B>"
+country = "BR"
+city = "Florianopolis"
+street = "Rua 1"
+
+[customer]
+name = "Operator"
+country = "NO"
+city = "Stavanger"
+e_mail = "a@example.org"
+
+[item]
+serial_number = "7"
+manufacturer = "Maker"
+
+[[persons]]
+name = "A. Silva"
+role = "head"
+main_signer = true
+"""
+ORDER = {
+    "digitalCalibrationCertificate": "administrativeData! measurementResults!",
+    "administrativeData": "dccSoftware! coreData! items! calibrationLaboratory! respPersons! customer! statements",
+    "dccSoftware": "software!",
+    "software": "name! release!",
+    "coreData": "countryCodeISO3166_1! usedLangCodeISO639_1! mandatoryLangCodeISO639_1! uniqueIdentifier! "
+    "beginPerformanceDate! endPerformanceDate! performanceLocation! issueDate",
+    "items": "item!",
+    "item": "name! manufacturer! model identifications!",
+    "manufacturer": "name!",
+    "identifications": "identification!",
+    "identification": "issuer! value! name",
+    "calibrationLaboratory": "contact!",
+    "contact": "name! eMail location!",
+    "customer": "name! eMail location!",
+    "location": "city countryCode postCode street",
+    "respPersons": "respPerson!",
+    "respPerson": "person! role mainSigner",
+    "person": "name!",
+    "statements": "statement!",
+    "statement": "declaration",
+    "declaration": "content!",
+    "measurementResults": "measurementResult!",
+    "measurementResult": "name! usedMethods influenceConditions results!",
+    "usedMethods": "usedMethod!",
+    "usedMethod": "name! norm",
+    "influenceConditions": "influenceCondition!",
+    "influenceCondition": "name! data!",
+    "results": "result!",
+    "result": "name! data!",
+    "data": "quantity!",
+    "quantity": "name real!",
+    "real": "value! unit! expandedUnc",
+    "expandedUnc": "uncertainty! coverageFactor! coverageProbability! distribution",
+    "name": "content!",
+}
+"""Children of each element in their order; those with ! are required, and all may be repeated."""
+DECIMAL = r"[-+]?((\d*\.\d+)|(\d+\.\d*)|(\d+\.?))([Ee][-+]?\d+)?"
+
+
+@pytest.fixture
+def administration(tmp_path):
+    (tmp_path / "administration.toml").write_text(ADMINISTRATION, encoding="utf-8")
+    return tmp_path / "administration.toml"
+
+
+def certificate(**changes):
+    """A small certificate with all kinds of entries."""
+    units = [
+        ("f", "px", 2440.0132856416235, 0.18),
+        ("stage_scale", "µm/m", -3.0, 50.0),
+        ("glass_index", "", 1.52, None),
+    ]
+    rows = [ParameterRow(name=name, words=name, unit=u, value=v, std=s, std_before=None) for name, u, v, s in units]
+    file = CertifiedFile(file="c.json", sha256="ab" * 32, digest="cd" * 8, date=None, software=None)
+    medium = Medium(kind="fresh", temperature_c=25.0)
+    ends = {"camera_depth_mm": (320.0, 480.0), "y_mm": (-97.0, 95.0), "z_mm": (-67.0, 131.0)}
+    volume = Validity(
+        name="water",
+        medium=medium,
+        through_window=True,
+        index=1.3312,
+        index_std=1e-5,
+        outline_mm=(),
+        stripe_points=9,
+        **ends,
+    )
+    content = {"format": "uwlts-certificate", "version": 1, "sensor": "thesis", "issued": "2026-03-04T05:06:07+00:00"}
+    content |= {
+        "software": "uwlts 1.2",
+        "calibration": file,
+        "wavelength_nm": 635.0,
+        "made_from": {},
+        "parameters": rows,
+    }
+    content |= {
+        "uncertainty_known": True,
+        "validity": (volume,),
+        "scatter_px": {},
+        "shared_variance": {},
+        "residuals": 1,
+    }
+    content |= {"strays": 0, "images": (), "lengths": (LengthUncertainty("Y", 150.0, 0.0118, 0.0306),)}
+    content |= {"cannot_tell": ("f is weakly known",), "sha256": "ef" * 32}
+    return JointCertificate.model_validate(content | changes)
+
+
+def check_order(element):
+    """Check an element and all below it against the schema's order and required elements; return their number."""
+    name = element.tag.partition("}")[2]
+    if name not in ORDER:
+        assert len(element) == 0, name
+        assert element.text.strip() == element.text != "", name
+        return 1
+    listed = ORDER[name].split()
+    names = [each.rstrip("!") for each in listed]
+    found = [child.tag.partition("}")[2] for child in element]
+    assert set(found) <= set(names), name
+    assert [*map(names.index, found)] == sorted(map(names.index, found)), name
+    assert {each.rstrip("!") for each in listed if each.endswith("!")} <= set(found), name
+    return 1 + sum(map(check_order, element))
+
+
+def quantities(root):
+    """Value, unit and expanded uncertainty of each quantity by its name."""
+    found = {}
+    for each in root.iter(f"{{{DCC}}}quantity"):
+        real = each.find(f"{{{SI}}}real")
+        texts = [real.findtext(f"{{{SI}}}{name}") for name in ("value", "unit")]
+        uncertainty = real.find(f"{{{SI}}}expandedUnc")
+        expanded = None if uncertainty is None else uncertainty.findtext(f"{{{SI}}}uncertainty")
+        for number in (texts[0], expanded):
+            assert number is None or re.fullmatch(DECIMAL, number)
+        if uncertainty is not None:
+            assert uncertainty.findtext(f"{{{SI}}}coverageFactor") == "2"
+            assert uncertainty.findtext(f"{{{SI}}}coverageProbability") == "0.95"
+        found.setdefault(each.findtext(f"{{{DCC}}}name/{{{DCC}}}content"), []).append(
+            (float(texts[0]), texts[1], expanded and float(expanded))
+        )
+    return found
+
+
+def test_elements_have_the_order_of_the_schema(administration):
+    root = ET.fromstring(digital_certificate(certificate(), load_administration(administration)).encode())
+    assert root.tag == f"{{{DCC}}}digitalCalibrationCertificate"
+    assert root.get("schemaVersion") == "3.2.0"
+    assert check_order(root) > 200
+    texts = [each.text for each in root.iter()]
+    for text in ("UW-7", "Laboratory <A & B>", "2026-03-02", "2026-03-04", "ef" * 32, "ab" * 32, "f is weakly known"):
+        assert text in texts, text
+
+
+def test_values_are_those_of_the_certificate(administration):
+    root = ET.fromstring(digital_certificate(certificate(), load_administration(administration)).encode())
+    found = quantities(root)
+    assert found["f (f) in pixels"] == [(2440.0132856416235, r"\one", 0.36)]
+    assert found["stage_scale (stage_scale)"] == [(-3.0, r"\micro\metre\metre\tothe{-1}", 100.0)]
+    assert found["glass_index (glass_index)"] == [(1.52, r"\one", None)]
+    lengths = [(150.0, r"\milli\metre", each) for each in (0.0118, 0.0306)]
+    assert found["length of 150 mm along Y"] == lengths
+    assert found["refractive index relative to air"] == [(1.3312, r"\one", 2e-5)]
+    assert found["temperature"] == [(25.0, r"\degreecelsius", None)]
+    assert found["largest Z in water"] == [(131.0, r"\milli\metre", None)]
+
+
+def test_all_units_of_parameters_are_known():
+    from uwlts.model import parameter_keys
+
+    units = {
+        each.quantity.unit
+        for group in vars(parameter_keys).values()
+        if isinstance(group, type) and hasattr(group, "__members__")
+        for each in group
+    }
+    assert len(units) > 3
+    assert units <= UNITS.keys()
+
+
+def test_an_unknown_unit_is_refused(administration):
+    row = ParameterRow(name="a", words="a", unit="furlong", value=1.0, std=None, std_before=None)
+    with pytest.raises(EvaluationError, match="the unit 'furlong' of a"):
+        digital_certificate(certificate(parameters=(row,)), load_administration(administration))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('country = "BR"', 'country = "Brazil"', "laboratory.country"),
+        ('identifier = "UW-7"', 'identifier = ""', "identifier"),
+        ("end = 2026-03-03", "end = 2026-03-01", "before it begins"),
+        ("[[persons]]", "[[people]]", "persons: missing"),
+    ],
+)
+def test_wrong_administrative_data_are_refused(administration, old, new, said):
+    administration.write_text(ADMINISTRATION.replace(old, new), encoding="utf-8")
+    with pytest.raises(DescriptionError, match=said):
+        load_administration(administration)
+
+
+def test_the_command_writes_it_beside_the_page(administration, tmp_path):
+    """Also of a calibration without uncertainties, which states so."""
+    uwlts.nominal("thesis", medium="water").save(tmp_path / "water.json")
+    words = ["certificate", tmp_path / "water.json", "--out", tmp_path / "c.html", "--administration", administration]
+    done = run_program(app, "uwlts", *words)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith(f"wrote {tmp_path / 'c.xml'}\n")
+    root = ET.fromstring((tmp_path / "c.xml").read_bytes())
+    check_order(root)
+    assert {each for values in quantities(root).values() for *_, each in values} == {None}
+    assert run_program(app, "uwlts", *words).returncode == 2

@@ -1,0 +1,87 @@
+"""Command lines of the sensor's software and of the twin, run two at a time, as a user would type them."""
+
+import io
+import runpy
+import shlex
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
+
+from uwlts.errors import CommandFailed, SetupError
+from uwlts.runtime.console import INTERRUPTED
+from uwlts.runtime.workers import Lost, Workers
+
+
+def run_lines(workers: Workers, lines: Iterable[str], *, quiet: bool = False) -> None:
+    """Run independent command lines in parallel, and print each one and its output.
+
+    Parameters
+    ----------
+    workers
+        Processes that run the commands.
+    lines
+        Command lines that begin with ``uwlts`` or ``twin``.
+    quiet
+        Print only the output of a command that fails.
+
+    Raises
+    ------
+    CommandFailed
+        A command failed; its output, which has been printed, gives the reason.
+    SetupError
+        A worker process ended unexpectedly.
+    """
+    for line, ended in workers.map_unordered(_run_quietly if quiet else _run, lines if quiet else _announce(lines)):
+        if isinstance(ended, Lost):
+            raise SetupError(f"{line}: {ended.reason}")
+        code, output = ended
+        if code or not quiet:
+            print(output, end="", flush=True)
+        if code:
+            raise CommandFailed(line, code)
+
+
+def _announce(lines: Iterable[str]) -> Iterator[str]:
+    """Yield the commands; print each one when it starts."""
+    for line in lines:
+        print(f"$ {line}", flush=True)
+        yield line
+
+
+class _PlainErrors(io.TextIOBase):
+    """Standard error of a command that runs beside others: it is no terminal, so that it gets lines and no bars."""
+
+    def write(self, text: str, /) -> int:
+        assert sys.__stderr__ is not None
+        sys.__stderr__.write(text)
+        sys.__stderr__.flush()
+        return len(text)
+
+
+def _run(line: str) -> tuple[int, str]:
+    """Run a command and return its exit code and output; errors and progress appear at once."""
+    return _run_module(line, _PlainErrors())
+
+
+def _run_quietly(line: str) -> tuple[int, str]:
+    """Run a command and return its exit code, and its output with errors and progress."""
+    return _run_module(line, None)
+
+
+def _run_module(line: str, errors: io.TextIOBase | None) -> tuple[int, str]:
+    """Run a command as ``python -m`` does; without a stream for errors, they are a part of the output.
+
+    It runs in this process: importing the shared modules takes most commands longer than their work.
+    """
+    program, *arguments = shlex.split(line)
+    output = io.StringIO()
+    sys.argv = [program, *arguments]
+    code = 0
+    with redirect_stdout(output), redirect_stderr(errors or output):
+        try:
+            runpy.run_module(program, run_name="__main__", alter_sys=True)
+        except SystemExit as end:
+            code = int(end.code or 0)
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt
+    return code, output.getvalue()

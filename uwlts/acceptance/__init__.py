@@ -1,0 +1,1 @@
+"""Acceptance test of a sensor: plan, measured characteristics, decisions, and the shares of stage and sensor."""

@@ -1,0 +1,463 @@
+"""Fit of laser power, water, sheet and noise to the images of a scan, with uncertainties by the jackknife."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize_scalar
+from scipy.special import erf
+
+from uwlts.errors import CalibrationError, CaptureError, DescriptionError
+from uwlts.files.json_files import trusting
+from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.calibration import Calibration
+from uwlts.model.phase_functions import PetzoldAverage, PhaseFunction
+from uwlts.model.sensor import CaptureHeader, Sensor
+from uwlts.optics.fitness import check_fits
+from uwlts.radiometry.followed_sensor import follow_sensor
+from uwlts.radiometry.result import Estimate, Radiometry, StripeStatistics, compare_estimates, read_estimates
+from uwlts.radiometry.scattering import STEP_PX, HaloKernel
+from uwlts.radiometry.stripe_images import (
+    BLOCKS,
+    TAIL_FIRST_PX,
+    TAIL_PX,
+    StripeImages,
+    fill_gaps,
+    measure_noise,
+    measure_stripes,
+)
+from uwlts.radiometry.stripe_light import StripeLight, stripe_light
+from uwlts.radiometry.water_outlook import outlook
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.storage.calibration_file import resolve_calibration
+from uwlts.storage.capture import Capture, describe_source, open_capture
+from uwlts.stripe import StripeSettings, find_stripes
+
+_MOST_SCATTERING_PER_M = 6.0
+"""Limit of the scattering coefficient, far beyond water in which a stripe is found at 0.5 m."""
+_SCATTERING_NODES = 25
+_INSEPARABLE = 0.9
+"""Absolute correlation of two estimates from which they are listed as not separable."""
+_KNOWN_ATTENUATION = 0.3
+"""Standard uncertainty of the attenuation in 1/m from which the described water is kept: over 0.7 m of path, the laser
+power then changes by a fifth."""
+_ROUNDS = 3
+_SCATTERING_STD = 0.04
+"""Relative standard uncertainty of the scattering coefficient by the model of the halo, for a known phase function.
+
+Both relative uncertainties were chosen on the drawn captures 0 to 11 of docs/studies/radiometry.py, and are judged on
+others.
+"""
+_WIDTH_STD = 0.01
+"""Relative standard uncertainty of the sheet's radius by the neglected light that is scattered by less than a pixel."""
+_LEAST_SIGMA_PX = 0.5
+"""Least standard deviation of the sheet in the image for which its radius is separable from pixel and blur."""
+_AS_DESCRIBED = np.zeros(2)
+_FAN_STD = 0.1
+"""Standard uncertainty of the described power along the fan, relative, at its edges: line lasers are specified so."""
+
+
+@trusting
+def fit_radiometry(
+    capture: Capture | str | Path,
+    calibration: Calibration | str | Path,
+    *,
+    reflectance: float = 0.8,
+    repeats: Capture | str | Path | None = None,
+    compared_with: str | Path | None = None,
+    stripe: StripeSettings = None,
+    trust_edited: bool = False,
+    progress: ProgressListener = ignore_progress,
+) -> Radiometry:
+    """Fit light, water and noise to what the images of a scan show, and describe the sensor with these values.
+
+    The calibration gives each stripe centre's point, its paths in the water and the slope of the surface. The fall of
+    the stripe's brightness with the path gives the attenuation, its halo the scattering, its width the thickness of the
+    sheet. The surface is assumed matt (Lambert) with one reflectance. Standard uncertainties are by the jackknife over
+    blocks of the scan.
+
+    Parameters
+    ----------
+    capture : Capture or path
+        Scan by a stage of a smooth, matt surface; one that extends over depth, such as an inclined plate, separates
+        attenuation and laser power.
+    calibration : Calibration or path
+        Calibration of the sensor (uwlts calibrate).
+    reflectance : float
+        Diffuse reflectance of the surface. Images show only its product with the laser's power.
+    repeats : Capture or path, optional
+        Laser images that were repeated at one position and exposure, for the camera's gain; by default those in the
+        scan, if there are any.
+    compared_with : path, optional
+        Earlier result (JSON). The changes are listed with their significance.
+    stripe : StripeOptions or dict, optional
+        As for `reconstruct`.
+    trust_edited : bool
+        As for `read`.
+    progress : callable, optional
+        Called after each image with the number of images done and the total number.
+
+    Returns
+    -------
+    Radiometry
+        Estimates with standard uncertainties and correlations, quantities that the images do not separate, the outlook
+        for the operator, and the description of the sensor.
+
+    Raises
+    ------
+    CaptureError, CalibrationError
+        A file cannot be read; calibration and capture do not fit; the capture has free poses, centre lines instead of
+        images, images at too few positions, or too few stripe centres.
+    DescriptionError
+        The reflectance is not above 0 and up to 1.
+
+    Examples
+    --------
+    >>> found = uwlts.fit_radiometry("wall.h5", "calibration.json")
+    >>> found.save("today.json")
+    """
+    if not 0 < reflectance <= 1:
+        raise DescriptionError(f"reflectance is {reflectance:g}; expected a number above 0 and up to 1")
+    known = resolve_calibration(calibration)
+    if not isinstance(known, Calibration):
+        raise CalibrationError("a calibration by polynomials has no paths of the light: give one by models")
+    earlier = None if compared_with is None else read_estimates(compared_with)
+    with open_capture(capture) as scan:
+        check_fits(scan.header, known, source=scan.path.name)
+        if np.isfinite(scan.pose).any():
+            raise CaptureError(f"{scan.path.name} has poses of a platform: give a scan by a stage")
+        stripes, gaps = fill_gaps(find_stripes(scan, options=stripe, progress=progress))
+        light = stripe_light(scan.header, known, stripes, scan.stage_mm)
+        images = measure_stripes(scan, stripes, light.usable, progress)
+        evidence = _Evidence.gather(scan.header, known, light, images)
+        whole, covariance = evidence.estimate_with_covariance()
+        determined = math.sqrt(covariance[1, 1]) < _KNOWN_ATTENUATION
+        described = 1e3 * scan.header.medium.extinction_per_mm(scan.header.sensor.laser.wavelength_nm)
+        if not determined:
+            free, free_variance = whole[1], covariance[1, 1]
+            whole, covariance = evidence.estimate_with_covariance(attenuation_per_m=described)
+            whole[1], covariance[1, 1] = free, free_variance
+        with nullcontext() if repeats is None else open_capture(repeats) as again:
+            noise = measure_noise(scan, stripes, repeats=again)
+        std = np.sqrt(np.diag(covariance))
+        estimates = [
+            Estimate(name, float(value), float(error), *_TEXTS[name])
+            for name, value, error in zip(_NAMES, whole, std, strict=True)
+        ]
+        estimates.append(Estimate("dark_noise_dn", noise.dark_dn, noise.dark_std, *_TEXTS["dark_noise_dn"]))
+        if noise.gain is not None and noise.gain_std is not None:
+            estimates.append(Estimate("gain_dn_per_e", noise.gain, noise.gain_std, *_TEXTS["gain_dn_per_e"]))
+        scale = np.where(std > 0, std, 1.0)
+        correlation = covariance / np.outer(scale, scale)
+        kept = tuple(estimate for estimate in estimates if math.isfinite(estimate.value))
+        statistics = StripeStatistics.from_estimates(kept, gaps=gaps, tail=evidence.tail_shares())
+        by_name = {estimate.name: estimate for estimate in kept}
+        sensor = follow_sensor(
+            scan.header,
+            known,
+            by_name,
+            reflectance=reflectance,
+            sheet_distance_mm=evidence.distance_mm,
+            attenuation_per_m=by_name["attenuation_per_m"].value if determined else described,
+            dark_e=evidence.dark_e,
+            exposure_ms=float(np.median(images.exposure_ms)),
+        )
+        return Radiometry(
+            date=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+            sensor=sensor,
+            medium_name=scan.header.medium_name,
+            reflectance=reflectance,
+            estimates=kept,
+            correlation=correlation,
+            statistics=statistics,
+            not_separable=_not_separable(correlation, by_name, determined, described),
+            outlook=outlook(scan.header, known, by_name, images, determined=determined),
+            changes=() if earlier is None else compare_estimates(kept, earlier),
+            sources={
+                "capture": describe_source(scan).model_dump(mode="json"),
+                "calibration": calibration_digest(known),
+                "compared_with": None if compared_with is None else Path(compared_with).name,
+            },
+            path_mm=(float(evidence.paths.min()), float(evidence.paths.max())),
+        )
+
+
+_TEXTS = {
+    "power_reflectance_mw": ("mW", "laser power times exposure scale times reflectance"),
+    "attenuation_per_m": ("1/m", "beam attenuation of the water"),
+    "scattering_per_m": ("1/m", "scattering by the water, for the described phase function"),
+    "sheet_radius_mm": ("mm", "1/e² radius of the sheet at the surface"),
+    "background_dn": ("DN", "grey value without the stripe"),
+    "stripe_sigma_px": ("px", "standard deviation of the stripe across, with blur"),
+    "grain_contrast": ("", "contrast of the stripe's light along it"),
+    "grain_length_lines": ("lines", "correlation length of this light along the stripe"),
+    "fan_slope": ("", "relative change of the fan's power from its middle to its edge, odd part"),
+    "fan_curvature": ("", "the same, even part"),
+    "dark_noise_dn": ("DN", "noise of a pixel in the dark: read-out and dark current"),
+    "gain_dn_per_e": ("DN/e", "gain of the camera"),
+}
+_NAMES = tuple(_TEXTS)[:10]
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """Measured light of all groups and blocks, and the tables of halos for each block."""
+
+    images: StripeImages
+    sheet_per_px: np.ndarray
+    blur_var: np.ndarray
+    model: np.ndarray
+    fan: np.ndarray
+    paths: np.ndarray
+    distance_mm: float
+    path_mm: float
+    dark_e: float
+    nodes: np.ndarray
+    tails: CubicSpline
+    within: CubicSpline
+
+    @classmethod
+    def gather(
+        cls, header: CaptureHeader, calibration: Calibration, light: StripeLight, images: StripeImages
+    ) -> _Evidence:
+        """Average the geometry over groups, and tabulate the halo of every block over the scattering coefficient."""
+        held = images.of_group >= 0
+        group, count = images.of_group[held], len(images.light)
+        number = np.bincount(group, minlength=count)
+
+        def mean(values: np.ndarray) -> np.ndarray:
+            return np.bincount(group, values[held], count) / number
+
+        block, size = images.block, np.bincount(images.block)
+
+        def mean_of_block(values: np.ndarray) -> np.ndarray:
+            return np.bincount(block, values) / size
+
+        sheet, ray = mean(light.sheet_per_px), mean(light.ray_per_px)
+        to_laser, to_camera = mean(light.laser_path_mm), mean(light.camera_path_mm)
+        index = calibration.medium_index(header.medium)
+        blur = _defocus_variance(header.sensor, calibration, mean(light.depth_mm), medium_index=index)
+        sheet_of_block = mean_of_block(sheet)
+        nodes = np.concatenate([[0.0], np.geomspace(1e-2, _MOST_SCATTERING_PER_M, _SCATTERING_NODES - 1)])
+        per_sr, core = _phase(header), images.width // 2
+        sigma = np.full(BLOCKS, 1.0)
+        tails, within = [], []
+        for j, (own, seen, first, second) in enumerate(
+            zip(sheet_of_block, *map(mean_of_block, (ray, to_laser, to_camera)), strict=True)
+        ):
+            kernel = HaloKernel(per_sr, ((first, own), (second, seen)))
+            middle = int(np.argmin(np.abs(kernel.place_px)))
+            step = round(1 / STEP_PX)
+            rows = [kernel.profile(1e-3 * b, sigma_px=sigma[j]) for b in nodes]
+            tails.append([row[middle + step :: step][:TAIL_PX] for row in rows])
+            reach = round((core + 0.5) / STEP_PX)
+            within.append([STEP_PX * row[middle - reach : middle + reach + 1].sum() for row in rows])
+        detector = header.sensor.detector
+        return cls(
+            images=images,
+            sheet_per_px=sheet_of_block,
+            blur_var=mean_of_block(blur),
+            model=images.exposure_ms * mean(light.grey_per_mw),
+            fan=mean(light.fan_angle),
+            paths=to_laser + to_camera,
+            distance_mm=float(np.mean(mean(light.distance_mm))),
+            path_mm=float(np.mean(to_laser + to_camera)),
+            dark_e=1e-3
+            * float(np.median(images.exposure_ms))
+            * detector.dark_current_e_per_s
+            * detector.dark_current_growth(),
+            nodes=nodes,
+            tails=CubicSpline(nodes, np.array(tails), axis=1),
+            within=CubicSpline(nodes, np.array(within), axis=1),
+        )
+
+    def estimate_with_covariance(self, attenuation_per_m: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the estimates in the order of `_NAMES`, and their covariance; with a given attenuation, if any.
+
+        The covariance of the jackknife over the blocks is added to those of the described profile of the fan and of the
+        model of the halo. The latter is the change of the estimates if the tail begins at twice the distance; for the
+        scattering it is a fraction.
+        """
+        every = np.ones(BLOCKS, bool)
+        whole = self.estimate(every, attenuation_per_m)
+        left = np.array([self.estimate(np.arange(BLOCKS) != j, attenuation_per_m) for j in range(BLOCKS)])
+        away = left - left.mean(axis=0)
+        covariance = (BLOCKS - 1) / BLOCKS * away.T @ away
+        for fan in np.eye(2):
+            moved = self.estimate(every, attenuation_per_m, fan=_FAN_STD * fan) - whole
+            covariance += np.outer(moved, moved)
+        moved = self.estimate(every, attenuation_per_m, first_px=2 * TAIL_FIRST_PX) - whole
+        scattering = _NAMES.index("scattering_per_m")
+        moved[scattering] = math.copysign(_SCATTERING_STD * whole[scattering], moved[scattering])
+        covariance += np.outer(moved, moved)
+        radius = _NAMES.index("sheet_radius_mm")
+        covariance[radius, radius] += (_WIDTH_STD * whole[radius]) ** 2
+        return whole, covariance
+
+    def estimate(
+        self,
+        kept: np.ndarray,
+        attenuation_per_m: float | None = None,
+        fan: np.ndarray = _AS_DESCRIBED,
+        first_px: int = TAIL_FIRST_PX,
+    ) -> np.ndarray:
+        """Return the estimates from some of the blocks (BLOCKS,).
+
+        ``fan`` is the expected deviation of the fan's power from its description, odd and even part; ``first_px`` is
+        the least distance of the tail.
+        """
+        images, some = self.images, kept[self.images.block]
+        background, scattering = float(np.min(images.tail[kept])), 0.0
+        for _ in range(_ROUNDS):
+            light = images.light - images.width * background
+            of_block = np.bincount(images.block, light) / np.bincount(images.block)
+            scattering, background = self._fit_tail(kept, of_block, first_px)
+        share = self.within(scattering)[images.block]
+        bright = np.maximum(images.light - images.width * background, 1e-3) / (self.model * share)
+        path_m = 1e-3 * (self.paths - self.path_mm)
+        design = np.column_stack([np.ones_like(path_m), -path_m, self.fan, self.fan**2 - 1 / 3])
+        weight = _huber_weights(design[some], np.log(bright[some]))
+        root = np.sqrt(weight)
+        # Rows for what is known: the fan's described power, and the attenuation if it is given.
+        known = np.array([[0, 0, 1, 0], [0, 0, 0, 1]]) / _FAN_STD
+        scale = max(_scatter(design[some], np.log(bright[some]), weight), 1e-6)
+        rows = [design[some] * root[:, None] / scale, known]
+        sides = [np.log(bright[some]) * root / scale, fan / _FAN_STD]
+        if attenuation_per_m is not None:
+            rows.append(np.array([[0, 1e6, 0, 0]]))
+            sides.append(np.array([1e6 * attenuation_per_m]))
+        level, attenuation, slope, curve = np.linalg.lstsq(np.vstack(rows), np.concatenate(sides), rcond=None)[0]
+        power = math.exp(level + attenuation * 1e-3 * self.path_mm)
+        sigma = np.array([_fit_sigma(images.fine_px, profile) for profile in images.fine[kept]])
+        radius = 2 * self.sheet_per_px[kept] * np.sqrt(np.maximum(sigma**2 - self.blur_var[kept], 0.0))
+        grain = images.grain[kept].mean(axis=0)
+        rho = grain / grain[0]
+        ends = np.flatnonzero(rho <= 0)
+        length = 1 + 2 * float(rho[1 : ends[0] if len(ends) else None].sum())
+        return np.array([
+            power, attenuation, scattering, float(np.mean(radius)), background,
+            float(np.mean(sigma)), math.sqrt(max(grain[0], 0.0)), length, slope, curve,
+        ])  # fmt: skip
+
+    def _fit_tail(self, kept: np.ndarray, light: np.ndarray, first_px: int) -> tuple[float, float]:
+        """Return the scattering coefficient in 1/m, and the grey value of the background, from the tails."""
+        first = max(self.images.width // 2, first_px)
+        tail, count = self.images.tail[kept, first:], self.images.tail_count[kept, first:]
+
+        def background_and_misfit(b: float) -> tuple[float, float]:
+            shape = self.tails(b)[kept, first:] / self.within(b)[kept, None]
+            rest = tail - light[kept, None] * shape
+            level = float(np.sum(count * rest) / np.sum(count))
+            return level, float(np.sum(count * (rest - level) ** 2))
+
+        found: Any = minimize_scalar(
+            lambda b: background_and_misfit(b)[1], bounds=(0.0, _MOST_SCATTERING_PER_M), method="bounded",
+            options={"xatol": 1e-5},
+        )  # fmt: skip
+        return float(found.x), background_and_misfit(float(found.x))[0]
+
+    def tail_shares(self) -> tuple[float, ...]:
+        """Return the light per px at 8, 16 and 32 px beside the stripe, divided by that of the stripe."""
+        images, every = self.images, np.ones(BLOCKS, bool)
+        background = self.estimate(every)[_NAMES.index("background_dn")]
+        light = float(np.mean(images.light)) - images.width * background
+        return tuple(float(np.mean(images.tail[:, at - 1]) - background) / light for at in (8, 16, 32))
+
+
+def _phase(header: CaptureHeader) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the phase function of the medium's particles; Petzold's average particle if none are described."""
+    scatterers = header.medium.scatterers(header.sensor.laser.wavelength_nm)
+    particles: PhaseFunction = PetzoldAverage()
+    for part in scatterers:
+        if part.phase.name != "molecular":
+            particles = part.phase
+    return particles.per_sr
+
+
+def _defocus_variance(
+    sensor: Sensor, calibration: Calibration, depth_mm: np.ndarray, *, medium_index: float
+) -> np.ndarray:
+    """Return the variance in px² of the described lens's blur across the stripe, for depths (N,) of the surface.
+
+    A disc of radius r has the variance r² / 4. Behind the window, depths appear divided by their index.
+    """
+    camera, window = sensor.camera, calibration.window
+    magnified = camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
+    pupil = 0.5 * camera.focal_length_mm / (camera.f_number * (1 + magnified))
+    apparent = depth_mm
+    if window is not None and camera.window.mounted:
+        outer = window.distance_mm + window.thickness_mm
+        apparent = window.distance_mm + window.thickness_mm / window.glass_index + (depth_mm - outer) / medium_index
+    radius = pupil * camera.focal_length_px() * np.abs(1 / apparent - 1 / camera.focus_distance_mm)
+    return radius**2 / 4
+
+
+def _fit_sigma(place_px: np.ndarray, profile: np.ndarray) -> float:
+    """Return the standard deviation in px of a Gaussian, integrated over pixels, that fits a mean profile best."""
+    held = np.isfinite(profile)
+    x, y = place_px[held], profile[held]
+
+    def misfit(log_sigma: float) -> float:
+        sigma = math.sqrt(2) * math.exp(log_sigma)
+        shape = 0.5 * (erf((x + 0.5) / sigma) - erf((x - 0.5) / sigma))
+        design = np.column_stack([shape, np.ones_like(x)])
+        return float(np.sum((y - design @ np.linalg.lstsq(design, y, rcond=None)[0]) ** 2))
+
+    limits = math.log(0.1), math.log(float(x[-1]))
+    found: Any = minimize_scalar(misfit, bounds=limits, method="bounded")
+    return math.exp(float(found.x))
+
+
+def _huber_weights(design: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return Huber's weights: groups on edges, prints or scratches count less."""
+    weight = np.ones(len(values))
+    for _ in range(5):
+        root = np.sqrt(weight)
+        rest = values - design @ np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
+        scale = 1.4826 * float(np.median(np.abs(rest))) + 1e-12
+        weight = np.minimum(1.0, 1.5 * scale / np.maximum(np.abs(rest), 1e-12))
+    return weight
+
+
+def _scatter(design: np.ndarray, values: np.ndarray, weight: np.ndarray) -> float:
+    """Return the weighted standard deviation of the residuals of a linear fit."""
+    root = np.sqrt(weight)
+    rest = values - design @ np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
+    return float(np.sqrt(np.average(rest**2, weights=weight)))
+
+
+def _not_separable(
+    correlation: np.ndarray, by_name: dict[str, Estimate], determined: bool, described: float
+) -> tuple[str, ...]:
+    """Return the quantities that the images do not separate, as text."""
+    found = ["laser power, exposure scale, transmission of lens and windows, and reflectance: only their product"]
+    attenuation = by_name["attenuation_per_m"]
+    if not determined:
+        found.append(
+            f"attenuation and laser power: the paths differ too little (attenuation ±{attenuation.std:.2g}/m); the "
+            f"description keeps {described:.3g}/m, with the power that gives the observed brightness; scan a surface "
+            "that extends over more depth"
+        )
+    for i, j in zip(*np.triu_indices(len(_NAMES), 1), strict=True):
+        if abs(correlation[i, j]) > _INSEPARABLE:
+            a, b = (_TEXTS[_NAMES[k]][1] for k in (i, j))
+            found.append(f"{a}, and {b}: correlated by {correlation[i, j]:.2f}")
+    scattering = by_name["scattering_per_m"]
+    if scattering.value < 2 * scattering.std:
+        most = scattering.value + 2 * scattering.std
+        found.append(f"scattering and none: below {most:.2g}/m no halo is seen beside the stripe")
+    if "gain_dn_per_e" not in by_name:
+        found.append("gain and speckle: repeat laser images at one position and exposure to measure the gain")
+    if by_name["stripe_sigma_px"].value < _LEAST_SIGMA_PX:
+        found.append("radius of the sheet and pixel: the stripe is narrower than a pixel, and the radius is its limit")
+    found.append("waist and focus of the sheet: only its radius at the surface; the described focus is kept")
+    found.append("background by dark current, black level and daylight: only their sum at this exposure")
+    return tuple(found)

@@ -1,0 +1,286 @@
+"""Result of `uwlts.fit_radiometry`: estimates, their files, and the comparison of two results."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwlts.argument_types import check_arguments
+from uwlts.errors import CaptureError
+from uwlts.files.json_files import json_text, read_json
+from uwlts.files.writing import require_ending, write_atomically
+from uwlts.model.brief import Brief
+from uwlts.model.sensor import Sensor, Table
+
+FORMAT, VERSION = "uwlts-radiometry", 1
+SIGNIFICANT = 3.0
+"""Changes above this multiple of their standard uncertainty are called significant: one of 370 by chance."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimate with its standard uncertainty, unit and meaning."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+    meaning: str
+
+    def line(self) -> str:
+        """Return the estimate as text."""
+        return f"{self.meaning}: {format_value(self.value, self.std)} {self.unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Change:
+    """Change of an estimate since an earlier result; ``significance`` is in combined standard uncertainties."""
+
+    name: str
+    meaning: str
+    unit: str
+    before: float
+    after: float
+    std: float
+    significance: float
+
+    def line(self) -> str:
+        """Return the change as text."""
+        text = f"{self.meaning}: {self.before:.4g} -> {self.after:.4g} {self.unit}".rstrip()
+        marked = " (significant)" if abs(self.significance) > SIGNIFICANT else ""
+        return f"{text}, {self.after - self.before:+.3g} ± {self.std:.2g}, {self.significance:+.1f} sigma{marked}"
+
+
+@dataclass(frozen=True)
+class StripeStatistics:
+    """Statistics of the stripe for comparisons with rendered images.
+
+    Attributes
+    ----------
+    fwhm_px : float
+        Full width at half maximum of the mean stripe.
+    grain_contrast, grain_length_lines : float
+        Contrast of the stripe's light along it, and the correlation length of this light.
+    tail_per_px : tuple of float
+        Light per px at 8, 16 and 32 px beside the stripe, divided by all of its light.
+    background_dn : float
+        Grey value without the stripe.
+    gaps : float
+        Fraction of the lines between the ends of the stripe that have no stripe centre.
+    """
+
+    fwhm_px: float
+    grain_contrast: float
+    grain_length_lines: float
+    tail_per_px: tuple[float, ...]
+    background_dn: float
+    gaps: float
+
+    @classmethod
+    def from_estimates(cls, estimates: Sequence[Estimate], *, gaps: float, tail: tuple[float, ...]) -> StripeStatistics:
+        """Return the statistics from estimates, the fraction of gaps and the tail."""
+        value = {each.name: each.value for each in estimates}
+        width = 2 * math.sqrt(2 * math.log(2)) * value["stripe_sigma_px"]
+        grain = value["grain_contrast"], value["grain_length_lines"]
+        return cls(width, *grain, tail, value["background_dn"], gaps)
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """Water at a glance for the operator.
+
+    ``attenuation_per_m`` is None if the scan does not determine it. ``reach_mm`` is the depth outside the window to
+    which the stripe is found at the exposure ``exposure_ms``, ``view_mm`` the depth at which the sheet leaves the view.
+    ``advised_exposure_ms`` brings the brightest stripe to the sensor's ``exposure.auto_level``.
+    """
+
+    attenuation_per_m: float | None
+    scattering_per_m: float
+    reach_mm: float
+    view_mm: float
+    exposure_ms: float
+    advised_exposure_ms: float
+
+    def lines(self) -> list[str]:
+        """Return the outlook as text."""
+        water = "attenuation not determined by this scan"
+        if self.attenuation_per_m is not None:
+            water = f"attenuation {self.attenuation_per_m:.2f}/m"
+            if self.attenuation_per_m > 0:
+                water += f" (light falls to a tenth in {math.log(10) / self.attenuation_per_m:.1f} m)"
+        whole = self.reach_mm >= self.view_mm - 1.0
+        reach = f"the whole view, {self.view_mm:.0f} mm" if whole else f"{self.reach_mm:.0f} of {self.view_mm:.0f} mm"
+        found = f"at {self.exposure_ms:.3g} ms the stripe is found to a depth of {reach}"
+        return [
+            f"water: {water}, scattering {self.scattering_per_m:.2f}/m",
+            f"{found}; use {self.advised_exposure_ms:.3g} ms",
+        ]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Radiometry(Brief):
+    """Light, water and noise fitted to the images of a scan.
+
+    Attributes
+    ----------
+    date : str
+        Date and time of the fit, UTC.
+    sensor : Sensor
+        Description with the calibrated geometry and the fitted values.
+    medium_name : str
+        Medium of the scan in the description.
+    reflectance : float
+        Reflectance by which the fitted product of power and reflectance was divided.
+    estimates : tuple of Estimate
+    correlation : (P, P) float64
+        Correlation of the first P estimates, those of the stripe.
+    statistics : StripeStatistics
+    not_separable : tuple of str
+        Quantities that the images do not separate.
+    outlook : Outlook
+    changes : tuple of Change
+        Changes since an earlier result, if one was given.
+    sources : dict
+        Digests of capture and calibration.
+    path_mm : (float, float)
+        Shortest and longest path of the light in the water.
+    """
+
+    date: str
+    sensor: Sensor
+    medium_name: str
+    reflectance: float
+    estimates: tuple[Estimate, ...]
+    correlation: np.ndarray
+    statistics: StripeStatistics
+    not_separable: tuple[str, ...]
+    outlook: Outlook
+    changes: tuple[Change, ...]
+    sources: Table
+    path_mm: tuple[float, float]
+
+    def __getitem__(self, name: str) -> Estimate:
+        """Return an estimate by name."""
+        return next(each for each in self.estimates if each.name == name)
+
+    def lines(self) -> list[str]:
+        """Return the result as text."""
+        low, high = self.path_mm
+        return [
+            *self.outlook.lines(),
+            f"from paths of {low:.0f} to {high:.0f} mm in the water:",
+            *(f"  {each.line()}" for each in self.estimates),
+            "not separable in these images:",
+            *(f"  {text}" for text in self.not_separable),
+            *([f"changes since {self.sources.get('compared_with')}:"] if self.changes else []),
+            *(f"  {each.line()}" for each in self.changes),
+        ]
+
+    def record(self) -> Table:
+        """Return everything but the sensor as JSON."""
+        content: Any = {
+            "format": FORMAT,
+            "version": VERSION,
+            "date": self.date,
+            "sources": self.sources,
+            "medium": self.medium_name,
+            "reflectance": self.reflectance,
+            "estimates": [asdict(each) for each in self.estimates],
+            "correlation": self.correlation.tolist(),
+            "statistics": asdict(self.statistics) | {"tail_per_px": list(self.statistics.tail_per_px)},
+            "not_separable": list(self.not_separable),
+            "outlook": asdict(self.outlook),
+            "changes": [asdict(each) for each in self.changes],
+            "path_mm": list(self.path_mm),
+        }
+        return content
+
+    @check_arguments
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the description of the sensor as TOML, and everything else as JSON beside it.
+
+        Both are written completely or not at all; OutputError if that fails.
+        """
+        import tomli_w
+
+        require_ending(Path(path), (".toml",))
+        source: Any = self.sources["capture"]
+        head = [
+            f"{self.sensor.name}: fitted to images by uwlts radiometry, {self.date}",
+            f"capture {source['file']}, SHA-256 {source['sha256']}",
+            f"calibration {self.sources['calibration']}; reflectance of the surface taken as {self.reflectance:g}",
+            *(each.line() for each in self.estimates),
+            *(f"not separable: {text}" for text in self.not_separable),
+        ]
+        table = _without_none(self.sensor.model_dump(mode="json"))
+        text = "".join(f"# {line}\n" for line in head) + "\n" + tomli_w.dumps(table)
+        with (
+            write_atomically(Path(path).with_suffix(".json"), overwrite=overwrite) as record,
+            write_atomically(path, overwrite=overwrite) as description,
+        ):
+            record.write_text(json_text(self.record(), indent=1), encoding="utf-8")
+            description.write_text(text, encoding="utf-8")
+
+
+def read_estimates(path: str | Path) -> tuple[Estimate, ...]:
+    """Read the estimates of an earlier result; CaptureError if the file is missing, foreign or damaged."""
+    found = _read(path, "estimates")
+    try:
+        return tuple(Estimate(**each) for each in found)
+    except TypeError as error:
+        raise CaptureError(f"{path} is damaged: its estimates are no table") from error
+
+
+def read_statistics(path: str | Path) -> StripeStatistics:
+    """Read the statistics of an earlier result; CaptureError if the file is missing, foreign or damaged."""
+    found = _read(path, "statistics")
+    try:
+        return StripeStatistics(**found | {"tail_per_px": tuple(found["tail_per_px"])})
+    except (KeyError, TypeError) as error:
+        raise CaptureError(f"{path} is damaged: its statistics are no table") from error
+
+
+def _read(path: str | Path, key: str) -> Any:
+    if Path(path).suffix == ".toml":
+        raise CaptureError(f"{path} is the description; give the result beside it, {Path(path).stem}.json")
+    content = read_json(path, called="result of uwlts radiometry")
+    if content.get("format") != FORMAT or content.get("version") != VERSION:
+        raise CaptureError(f"{path} is JSON but not a result of uwlts radiometry, version {VERSION}")
+    if key not in content:
+        raise CaptureError(f"{path} is damaged: it has no {key}")
+    return content[key]
+
+
+def compare_estimates(now: Sequence[Estimate], before: Sequence[Estimate]) -> tuple[Change, ...]:
+    """Return the changes of all estimates that both results have, in combined standard uncertainties."""
+    earlier: Mapping[str, Estimate] = {each.name: each for each in before}
+    changes = []
+    for each in now:
+        old = earlier.get(each.name)
+        if old is None:
+            continue
+        std = math.hypot(each.std, old.std)
+        moved = each.value - old.value
+        significance = moved / std if std > 0 else math.copysign(math.inf, moved) if moved else 0.0
+        changes.append(Change(each.name, each.meaning, each.unit, old.value, each.value, std, significance))
+    return tuple(changes)
+
+
+def format_value(value: float, std: float) -> str:
+    """Return a value with its standard uncertainty to two digits, as in 0.832 ± 0.014."""
+    if not (math.isfinite(std) and std > 0):
+        return f"{value:.4g}"
+    digits = max(0, 1 - math.floor(math.log10(std)))
+    return f"{value:.{digits}f} ± {std:.{digits}f}"
+
+
+def _without_none(content: Any) -> Any:
+    """Return a table without its empty entries, which TOML cannot express."""
+    if isinstance(content, dict):
+        return {key: _without_none(value) for key, value in content.items() if value is not None}
+    return [_without_none(value) for value in content] if isinstance(content, list) else content

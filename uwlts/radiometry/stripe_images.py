@@ -1,0 +1,354 @@
+"""Light across a stripe and beside it, grain along it, and noise of the camera, measured in images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from uwlts.errors import CaptureError
+from uwlts.model.stripe import CaptureStripes
+from uwlts.runtime.progress import ProgressListener
+from uwlts.storage.capture import Capture
+from uwlts.stripe.peak_window import FWHM_PER_SIGMA
+
+TAIL_PX = 90
+"""Largest distance from the stripe of the tail, where halo and background are separated."""
+TAIL_FIRST_PX = 12
+"""Least distance of the tail. Closer to the stripe, flare of the lens and blur add to the halo, and rendered halos are
+smoothed over cells of 8 px."""
+SMOOTH_LINES = 25
+"""Lines over which a surface and its brightness are smooth; grains are finer."""
+_LAGS = 8
+"""Lags along the stripe for the correlation of grains, lines."""
+_FINE_PX = 0.25
+"""Cells of the mean profile across the stripe."""
+GROUP_LINES = 16
+"""Lines whose light is added: many grains, so that the logarithm of the sum has no bias to speak of."""
+BLOCKS = 20
+"""Blocks of consecutive groups for the jackknife: a standard uncertainty is then known to a sixth."""
+_CLIPPED = 0.98
+"""Fraction of full scale above which a pixel may be clipped."""
+_MOST_CLIPPED = 0.02
+"""Largest fraction of lines with clipped pixels in a run; their light is too low by about a tenth."""
+_LONGEST_GAP = 8
+"""Longest gap along the stripe, lines, in which centres are interpolated."""
+_ROUNDS = 5
+_BINS = 24
+"""Bins of the photon transfer."""
+
+
+@dataclass(frozen=True, eq=False)
+class StripeImages:
+    """Light of M groups of neighbouring stripe centres, in J blocks of consecutive groups.
+
+    Attributes
+    ----------
+    light : (M,)
+        Grey values across the stripe, added over ``width`` pixels, with the background; mean of the group.
+    of_group : (N,) int
+        Group of each stripe centre, -1 for unused ones.
+    block : (M,) int
+        Block of each group.
+    exposure_ms : (M,)
+        Exposure of each group.
+    width : int
+        Number of pixels across the stripe that are added.
+    fine_px, fine : (K,), (J, K)
+        Distances from the centre, and mean grey value there of each block.
+    tail : (J, TAIL_PX)
+        Mean grey value at 1, 2, ... pixels from the centre, on both sides.
+    tail_count : (J, TAIL_PX)
+        Number of pixels of ``tail``.
+    grain : (J, _LAGS + 1)
+        Mean product of the relative deviations of ``light`` from smooth at lags along the stripe, lines.
+    peak_dn : float
+        Grey value that one of two hundred stripe centres exceeds.
+    """
+
+    light: np.ndarray
+    of_group: np.ndarray
+    block: np.ndarray
+    exposure_ms: np.ndarray
+    width: int
+    fine_px: np.ndarray
+    fine: np.ndarray
+    tail: np.ndarray
+    tail_count: np.ndarray
+    grain: np.ndarray
+    peak_dn: float
+
+
+def fill_gaps(stripes: CaptureStripes) -> tuple[CaptureStripes, float]:
+    """Interpolate centres in short gaps, and return the fraction of lines in gaps of any length.
+
+    Lines without a centre are dim by chance; without them, a faint stripe would seem brighter than it is.
+    """
+    same = np.diff(stripes.frame) == 0
+    missing = np.where(same, np.diff(stripes.line) - 1, 0)
+    short = (missing > 0) & (missing <= _LONGEST_GAP)
+    before = np.repeat(np.flatnonzero(short), missing[short])
+    step = np.concatenate([np.arange(1, count + 1) for count in missing[short].tolist()] or [np.empty(0, int)])
+    share = step / (missing[before] + 1)
+    place = np.concatenate([np.arange(len(stripes.line)), before + share])
+    order, source = np.argsort(place, kind="stable"), np.concatenate([np.arange(len(stripes.line)), before])
+    filled = stripes[source[order]]
+    line = np.concatenate([stripes.line, stripes.line[before] + step])[order]
+    centre = np.interp(place[order], np.arange(len(stripes.line)), stripes.centre_px)
+    whole = replace(filled, line=line, centre_px=centre)
+    return whole, float(missing.sum() / (missing.sum() + len(stripes.line)))
+
+
+def measure_stripes(
+    capture: Capture, stripes: CaptureStripes, usable: np.ndarray, progress: ProgressListener
+) -> StripeImages:
+    """Measure the light across the stripe at its usable centres (N,) and beside it.
+
+    Runs of lines with more than a few clipped pixels are left out as a whole: to leave out single bright lines would
+    make the stripe seem darker.
+
+    Raises
+    ------
+    CaptureError
+        Fewer than `BLOCKS` groups of centres can be used, or the capture has centre lines instead of images.
+    """
+    along, full_dn = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
+    core = math.ceil(3 * float(np.nanmedian(stripes.width_px)) / FWHM_PER_SIGMA) + 3
+    of_group, light, exposure = np.full(len(stripes.line), -1), [], []
+    parts: list[_Part] = []
+    frames = np.unique(stripes.frame).tolist()
+    peaks = []
+    for number, frame in enumerate(frames):
+        own = np.flatnonzero(stripes.frame == frame)
+        line = stripes.line[own]
+        image = capture.image(frame)
+        profiles = (image if along == "height" else image.T).astype(np.float32)
+        for run in _runs(line, usable[own]):
+            chosen = own[run]
+            part = _measure_run(profiles, stripes.line[chosen], stripes.centre_px[chosen], core, _CLIPPED * full_dn)
+            peaks.append(part.values[:, part.middle])
+            if np.mean(part.clipped) > _MOST_CLIPPED:
+                continue
+            for some in np.array_split(np.arange(len(chosen)), max(1, len(chosen) // GROUP_LINES)):
+                kept = some[np.isfinite(part.light[some])]
+                if len(kept) < GROUP_LINES / 2:
+                    continue
+                of_group[chosen[kept]] = len(light)
+                light.append(float(part.light[kept].mean()))
+                exposure.append(float(capture.exposure_ms[frame]))
+                parts.append(part.select(kept))
+        progress(number + 1, len(frames), "brightness of the stripe")
+    if len(light) < BLOCKS:
+        raise CaptureError(
+            f"{capture.path.name} has {len(light)} groups of {GROUP_LINES} neighbouring stripe centres on a smooth "
+            f"surface that are not saturated; {BLOCKS} are needed: record more images, or with a shorter exposure"
+        )
+    block = np.arange(len(light)) * BLOCKS // len(light)
+    of_block = [_Part.join([part for part, at in zip(parts, block, strict=True) if at == j]) for j in range(BLOCKS)]
+    edges = np.arange(-core - _FINE_PX / 2, core + _FINE_PX, _FINE_PX)
+    tails = [part.tail() for part in of_block]
+    return StripeImages(
+        np.array(light),
+        of_group,
+        block,
+        np.array(exposure),
+        2 * core + 1,
+        0.5 * (edges[1:] + edges[:-1]),
+        np.array([part.mean_profile(edges) for part in of_block]),
+        np.array([mean for mean, _ in tails]),
+        np.array([count for _, count in tails]),
+        np.array([part.grain() for part in of_block]),
+        float(np.quantile(np.concatenate(peaks), 0.995)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Pixels about N neighbouring centres.
+
+    Attributes
+    ----------
+    values : (N, 2 TAIL_PX + 1)
+        Grey values, NaN outside the image.
+    offset : (N,)
+        Distance of the middle pixel from the centre.
+    light, deviation : (N,)
+        Light added across the stripe, and its relative deviation from smooth.
+    clipped : (N,) bool
+    middle : int
+        Number of the middle pixel.
+    """
+
+    values: np.ndarray
+    offset: np.ndarray
+    light: np.ndarray
+    deviation: np.ndarray
+    clipped: np.ndarray
+    middle: int = TAIL_PX
+
+    def select(self, kept: np.ndarray) -> _Part:
+        """Return the pixels of some centres."""
+        columns = self.values, self.offset, self.light, self.deviation, self.clipped
+        values, offset, light, deviation, clipped = (column[kept] for column in columns)
+        return _Part(values, offset, light, deviation, clipped)
+
+    @classmethod
+    def join(cls, parts: list[_Part]) -> _Part:
+        """Join the pixels of several runs."""
+        names = "values", "offset", "light", "deviation", "clipped"
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return cls(**columns)
+
+    def mean_profile(self, edges: np.ndarray) -> np.ndarray:
+        """Return the mean grey value (K,) in cells of the distance from the centre; NaN in empty cells."""
+        place = self.offset[:, None] + np.arange(-TAIL_PX, TAIL_PX + 1)
+        cell = np.digitize(place.ravel(), edges) - 1
+        held = (cell >= 0) & (cell < len(edges) - 1) & np.isfinite(self.values.ravel())
+        count = np.bincount(cell[held], minlength=len(edges) - 1)
+        total = np.bincount(cell[held], self.values.ravel()[held], minlength=len(edges) - 1)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    def tail(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean grey value (TAIL_PX,) at whole distances from the centre, and the number of pixels."""
+        finite = np.isfinite(self.values)
+        total, count = np.where(finite, self.values, 0.0).sum(axis=0), finite.sum(axis=0)
+        sums = [each[TAIL_PX + 1 :] + each[TAIL_PX - 1 :: -1] for each in (total, count)]
+        return sums[0] / np.maximum(sums[1], 1), sums[1]
+
+    def grain(self) -> np.ndarray:
+        """Return the mean products (_LAGS + 1,) of the relative deviations at lags."""
+        d = self.deviation
+        return np.array([np.mean(d[: len(d) - lag] * d[lag:]) for lag in range(_LAGS + 1)])
+
+
+def _runs(line: np.ndarray, usable: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the places of consecutive usable lines, at least `SMOOTH_LINES` long."""
+    breaks = np.flatnonzero((np.diff(line) != 1) | (usable[1:] != usable[:-1])) + 1
+    for run in np.split(np.arange(len(line)), breaks):
+        if len(run) >= SMOOTH_LINES and usable[run[0]]:
+            yield run
+
+
+def _measure_run(profiles: np.ndarray, line: np.ndarray, centre_px: np.ndarray, core: int, most: float) -> _Part:
+    """Measure a run of neighbouring lines. Their centres are smoothed: grains move a centre, not the stripe."""
+    smooth = np.asarray(savgol_filter(centre_px, SMOOTH_LINES, 2))
+    middle = np.rint(smooth).astype(int)
+    places = middle[:, None] + np.arange(-TAIL_PX, TAIL_PX + 1)
+    inside = (places >= 0) & (places < profiles.shape[1])
+    values = np.where(inside, profiles[line[:, None], np.clip(places, 0, profiles.shape[1] - 1)], np.nan)
+    centre = values[:, TAIL_PX - core : TAIL_PX + core + 1]
+    light = centre.sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        clipped = centre.max(axis=1) >= most
+    known = np.where(np.isfinite(light), light, np.nanmean(light))
+    # The deviation refers to the light above the surroundings.
+    above = known - centre.shape[1] * np.nanmedian(np.where(inside, values, np.nan))
+    deviation = above / np.maximum(np.asarray(savgol_filter(above, SMOOTH_LINES, 2)), 1e-3) - 1.0
+    return _Part(values, middle - smooth, light, deviation, clipped)
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """Noise of the camera: grey values per electron and standard deviation in the dark, with standard uncertainties.
+
+    ``gain`` and its uncertainty are None without repeated images.
+    """
+
+    gain: float | None
+    gain_std: float | None
+    dark_dn: float
+    dark_std: float
+
+
+def measure_noise(capture: Capture, stripes: CaptureStripes, *, repeats: Capture | None) -> CameraNoise:
+    """Measure noise by photon transfer from laser images that were repeated at one place and exposure (EMVA 1288).
+
+    Speckle is the same in repeated images and does not add to their differences. Without repeated images, only the
+    noise of pixels far from the stripe is measured, from differences of successive images.
+    """
+    source = capture if repeats is None else repeats
+    full_dn = source.header.saturation_dn
+    parts = []
+    for numbers in _repeated(source):
+        images = np.stack([source.image(number) for number in numbers.tolist()]).astype(np.float32)
+        parts.append(np.stack([images.mean(axis=0), images.var(axis=0, ddof=1)]))
+    if parts:
+        mean, variance = np.stack(parts, axis=1)
+        # Most pixels are dark.
+        noise_dn, background_dn = math.sqrt(float(np.median(variance))), float(np.median(mean))
+        # The means of dark pixels differ by noise alone: they are one bin.
+        dark_dn = max(6.0 * noise_dn / math.sqrt(2.0), 2.0)
+        edges = background_dn + np.concatenate([[-math.inf], np.geomspace(dark_dn, 0.85 * full_dn, _BINS)])
+        # Each part of the jackknife has a piece of the stripe: all images of some of its lines.
+        across = 1 if source.header.sensor.camera.stripe_along == "height" else 2
+        pieces = zip(*(np.array_split(each, BLOCKS, axis=across) for each in (mean, variance)), strict=True)
+        counted = np.array([_bin_variance(m.ravel(), v.ravel(), edges) for m, v in pieces])
+        whole = _fit_transfer(counted.sum(axis=0), background_dn)
+        if whole is not None:
+            left = np.array([_fit_transfer(counted.sum(axis=0) - part, background_dn) or whole for part in counted])
+            std = np.sqrt((BLOCKS - 1) / BLOCKS * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
+            dark = math.sqrt(max(whole[1], 0.0))
+            return CameraNoise(whole[0], float(std[0]), dark, float(std[1]) / max(2 * dark, 1e-3))
+    return _dark_noise(capture, stripes)
+
+
+def _repeated(capture: Capture) -> list[np.ndarray]:
+    """Return the numbers of successive laser images at the same place and exposure, two or more each."""
+    lit = np.flatnonzero(capture.laser_on & capture.has_image)
+    moved = (np.diff(capture.stage_mm[lit]) != 0) | (np.diff(capture.exposure_ms[lit]) != 0)
+    return [numbers for numbers in np.split(lit, np.flatnonzero(moved) + 1) if len(numbers) > 1]
+
+
+def _bin_variance(mean: np.ndarray, variance: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the number, and the sums of means and of variances, (3, B) of pixels in bins of their mean."""
+    cell = np.digitize(mean, edges) - 1
+    held = (cell >= 0) & (cell < len(edges) - 1)
+    sums = [np.bincount(cell[held], weight, len(edges) - 1) for weight in (None, mean[held], variance[held])]
+    return np.array(sums, dtype=float)
+
+
+def _fit_transfer(counted: np.ndarray, background_dn: float) -> tuple[float, float] | None:
+    """Return gain and variance in the dark, without rounding, by weighted least squares; None if undetermined."""
+    count, means, variances = counted
+    held = count > 50
+    if np.count_nonzero(held) < 4:
+        return None
+    mean, variance = means[held] / count[held] - background_dn, variances[held] / count[held]
+    design, expected = np.column_stack([mean, np.ones_like(mean)]), np.full_like(mean, float(np.mean(variance)))
+    gain = dark = 0.0
+    for _ in range(_ROUNDS):
+        # The standard deviation of a variance is proportional to its expectation.
+        root = np.sqrt(count[held]) / np.maximum(expected, 1e-3)
+        gain, dark = np.linalg.lstsq(design * root[:, None], variance * root, rcond=None)[0]
+        expected = gain * mean + dark
+    return float(gain), float(dark) - 1.0 / 12.0
+
+
+def _dark_noise(capture: Capture, stripes: CaptureStripes) -> CameraNoise:
+    along = capture.header.sensor.camera.stripe_along
+    lit = np.flatnonzero(capture.laser_on & capture.has_image)
+    found = []
+    before: np.ndarray | None = None
+    for frame in lit.tolist():
+        image = capture.image(frame).astype(np.float32)
+        profiles = image if along == "height" else image.T
+        own = stripes.frame == frame
+        values = np.full_like(profiles, np.nan)
+        near = np.abs(np.arange(profiles.shape[1]) - stripes.centre_px[own][:, None]) <= TAIL_PX
+        line = stripes.line[own]
+        values[line] = np.where(near, np.nan, profiles[line])
+        if before is not None:
+            difference = (values - before)[np.isfinite(values) & np.isfinite(before)]
+            if difference.size > 100:
+                limit = 5 * max(float(np.quantile(np.abs(difference), 0.683)), 1.0)
+                found.append(0.5 * float(np.var(difference[np.abs(difference) < limit])))
+        before = values
+    if not found:
+        return CameraNoise(None, None, math.nan, math.nan)
+    dark = math.sqrt(max(float(np.mean(found)) - 1.0 / 12.0, 0.0))
+    spread = float(np.std(found)) / math.sqrt(len(found)) if len(found) > 1 else float(found[0])
+    return CameraNoise(None, None, dark, spread / max(2 * dark, 1e-3))

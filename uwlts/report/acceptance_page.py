@@ -1,0 +1,267 @@
+"""Page of an acceptance test: verdict, characteristics with decisions, pictures, shares, and traceability."""
+
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+
+from uwlts.acceptance.accept import FORMAT, VERSION, Acceptance
+from uwlts.acceptance.characteristics import NAMES, Characteristic, MeasuredValue
+from uwlts.acceptance.directional_scale import DirectionalScale, ScaleComponent
+from uwlts.acceptance.plan import CertifiedArtefact
+from uwlts.files.json_files import json_text
+from uwlts.files.writing import refuse_unsuitable
+from uwlts.model.artefacts import SphereStandard, StepStandard
+from uwlts.pages.numbers import format_fixed
+from uwlts.pages.pdf import print_pdf, refuse_unsuitable_pdf
+from uwlts.pages.toolkit import (
+    BLUE,
+    COLOURS,
+    INK,
+    MISSING,
+    RED,
+    SOFT,
+    figure_svg,
+    legend_below,
+    new_figure,
+    plain_text,
+    refuse_unsuitable_page,
+    render_page,
+    write_page,
+)
+
+KIND = "acceptance"
+"""Kind of the page, in the name of its JSON file."""
+_DECISIONS = {"conformity proven": "#2e8b57", "nonconformity proven": RED}
+"""Colours of decisions; all others are open."""
+_OPEN = "#d9822b"
+_SIGNED = ("PS", "SD", "E")
+
+
+def write_acceptance(path: str | Path, acceptance: Acceptance, *, pdf: bool = False, overwrite: bool = False) -> None:
+    """Write the page of an acceptance test, its result as sealed JSON beside it, and optionally a PDF.
+
+    Parameters
+    ----------
+    path : str or Path
+        Page to write; the JSON is written beside it, for test.html to test.acceptance.json.
+    acceptance : Acceptance
+        Result of `uwlts.accept`.
+    pdf : bool
+        Also print the page to a PDF beside it, with an installed Chromium or Chrome.
+    overwrite : bool
+        Replace existing files.
+
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not given, or cannot be written.
+    SetupError
+        A PDF is requested, but no browser is installed.
+    """
+    page = Path(path)
+    refuse_unsuitable_page(page, kind=KIND, overwrite=overwrite)
+    if pdf:
+        refuse_unsuitable_pdf(page.with_suffix(".pdf"))
+        refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
+    text = acceptance_page(acceptance)
+    content = {"format": FORMAT, "version": VERSION} | acceptance.model_dump(mode="json")
+    if pdf:
+        print_pdf(text, page.with_suffix(".pdf"), overwrite=overwrite)
+    write_page(page, text, beside=json_text(content, indent=2), kind=KIND, overwrite=overwrite)
+
+
+def acceptance_page(acceptance: Acceptance) -> str:
+    """Return the page as text."""
+    plan, scale = acceptance.plan, acceptance.scale
+    x, y, z = plan.volume_mm
+    facts = [
+        ("sensor", plan.sensor or "not stated"),
+        ("client", plan.client or "not stated"),
+        ("operator", plan.operator or "not stated"),
+        ("measuring volume", f"{x:g} x {y:g} x {z:g} mm (X, Y, Z), diagonal {plan.diagonal_mm():.0f} mm"),
+        ("calibration", f"{plan.calibration or 'clouds only'}, identifier {acceptance.calibration or MISSING}"),
+        ("judged", f"{acceptance.date.replace('T', ' ')}, by {acceptance.software}"),
+    ]
+    return render_page(
+        "uwlts.report",
+        "acceptance.html.j2",
+        title=plan.title,
+        verdict=acceptance.verdict,
+        conclusion=_conclusion(acceptance),
+        colour={"conformity proven": "good", "nonconformity proven": "bad"}.get(acceptance.verdict, "open"),
+        facts=facts,
+        characteristics=[_characteristic_row(each) for each in acceptance.characteristics],
+        limits=_draw_limits(acceptance) if acceptance.values else None,
+        places=_draw_places(acceptance) if acceptance.values else None,
+        lengths=_draw_lengths(acceptance) if scale is not None else None,
+        scale=[_scale_row(each) for each in _shown_components(scale)],
+        scatter=_describe_scatter(scale),
+        scale_remarks=() if scale is None else scale.remarks,
+        remarks=acceptance.remarks,
+        positions=[_position_row(acceptance, number) for number in range(len(acceptance.positions))],
+        artefacts=[_artefact_row(name, each) for name, each in plan.artefacts.items()],
+        temperature=plan.temperature,
+        digests=[(each.file, each.sha256 or MISSING) for each in acceptance.positions],
+    )
+
+
+def _conclusion(acceptance: Acceptance) -> str:
+    left = len(acceptance.outstanding)
+    match acceptance.verdict:
+        case "conformity proven":
+            return (
+                "Conformity proven: every characteristic with its uncertainty is within its maximum permissible error."
+            )
+        case "nonconformity proven":
+            failed = [each.symbol for each in acceptance.characteristics if each.decision == "nonconformity proven"]
+            return f"Nonconformity proven: {', '.join(failed)} beyond the maximum permissible error, with uncertainty."
+        case "conformity not proven":
+            failed = [
+                each.symbol
+                for each in acceptance.characteristics
+                if each.mpe_mm is not None and each.decision != "conformity proven"
+            ]
+            return f"Conformity not proven: no decision, or the limit is within the interval, for {', '.join(failed)}."
+        case "incomplete":
+            return f"Incomplete: {left} of {len(acceptance.positions)} positions are still to be measured."
+    return acceptance.verdict
+
+
+def _characteristic_row(each: Characteristic) -> tuple[str, ...]:
+    words, guideline = NAMES[each.symbol]
+    worst = each.worst
+    value = MISSING if worst is None else format_fixed(worst.value_mm, 4, signed=each.symbol in _SIGNED)
+    expanded = MISSING if worst is None or worst.expanded_mm is None else format_fixed(worst.expanded_mm, 4)
+    place = MISSING if worst is None else f"{worst.position}, {worst.label}"
+    limit = MISSING if each.mpe_mm is None else f"{each.mpe_mm:g}"
+    measured = f"{each.count} ({each.wanted})"
+    return each.symbol, each.decision, value, expanded, limit, place, measured, f"{words}; {guideline}"
+
+
+def _position_row(acceptance: Acceptance, number: int) -> tuple[str, ...]:
+    each = acceptance.positions[number]
+    state = f"{each.state}: {each.reason}" if each.reason else each.state
+    values = []
+    for symbol in NAMES:
+        own = [value.value_mm for value in each.values if value.symbol == symbol]
+        values.append(" / ".join(format_fixed(value, 4, signed=symbol in _SIGNED) for value in own) or MISSING)
+    values = [each.replace("-", "−") if each != MISSING else each for each in values]
+    return f"{number + 1}", each.name, each.artefact, state, *values
+
+
+def _artefact_row(name: str, each: CertifiedArtefact) -> tuple[str, ...]:
+    standard = each.standard
+    sizes = MISSING
+    if isinstance(standard, SphereStandard):
+        diameters = ", ".join(f"{diameter:g}" for diameter in standard.diameters_mm)
+        sizes = f"diameters {diameters} ± {_stated(standard.diameter_uncertainty_mm)}"
+        if standard.spacings_mm:
+            spacings = ", ".join(f"{s:g}" for s in standard.spacings_mm)
+            sizes += f"; spacings {spacings} ± {_stated(standard.spacing_uncertainty_mm)}"
+    elif isinstance(standard, StepStandard):
+        sizes = f"height {standard.height_mm:g} ± {_stated(standard.height_uncertainty_mm)}"
+    form = MISSING if each.stated_form_mm() is None else f"{each.stated_form_mm():g} ± {each.form_uncertainty_mm:g}"
+    expansion = "not stated"
+    if each.expansion_per_k is not None:
+        expansion = f"{1e6 * each.expansion_per_k:g} ± {1e6 * each.expansion_uncertainty_per_k:g}"
+    return name, each.certificate or "not stated", sizes, form, f"{each.alignment_uncertainty_mm:g}", expansion
+
+
+def _stated(value: float | None) -> str:
+    return "not stated" if value is None else f"{value:g}"
+
+
+def _shown_components(scale: DirectionalScale | None) -> list[ScaleComponent]:
+    if scale is None:
+        return []
+    return [*scale.components, *([] if scale.anisotropy is None else [scale.anisotropy])]
+
+
+def _scale_row(each: ScaleComponent) -> tuple[str, ...]:
+    if each.value is None:
+        return each.words, each.share, "not determined", MISSING, MISSING
+    std = MISSING if each.std is None else format_fixed(1e6 * each.std, 0)
+    half = MISSING if each.half_interval is None else format_fixed(1e6 * each.half_interval, 0)
+    words = "significant" if each.significant else "not significant"
+    said = each.share if each.half_interval is None else f"{each.share}, {words}"
+    return each.words, said, format_fixed(1e6 * each.value, 0, signed=True), std, half
+
+
+def _describe_scatter(scale: DirectionalScale | None) -> str | None:
+    if scale is None or scale.scatter_mm is None:
+        return None
+    return (
+        f"{scale.lengths} lengths leave a scatter of {1e3 * scale.scatter_mm:.1f} µm (standard deviation, "
+        f"{scale.degrees} degrees of freedom)."
+    )
+
+
+def _colour_of(decision: str) -> str:
+    return _DECISIONS.get(decision, _OPEN)
+
+
+def _draw_limits(acceptance: Acceptance) -> Markup:
+    """Draw the values of each characteristic relative to its limit, the worst one with its interval."""
+    limited = [each for each in acceptance.characteristics if each.mpe_mm is not None]
+    figure, (axes,) = new_figure(9.0, 0.8 + 0.42 * max(len(limited), 1))
+    for row, each in enumerate(reversed(limited)):
+        assert each.mpe_mm is not None
+        own = [value for value in acceptance.values if value.symbol == each.symbol]
+        shares = [abs(value.value_mm) / each.mpe_mm for value in own]
+        axes.plot(shares, [row] * len(shares), "o", markersize=3, color=SOFT, alpha=0.6)
+        if each.worst is not None:
+            colour = _colour_of(each.decision)
+            half = (each.worst.expanded_mm or 0.0) / each.mpe_mm
+            middle = abs(each.worst.value_mm) / each.mpe_mm
+            axes.errorbar(middle, row, xerr=half, fmt="o", color=colour, markersize=7, capsize=4, linewidth=2)
+    axes.axvline(1.0, color=RED, linewidth=1.5)
+    axes.set_yticks(range(len(limited)), [each.symbol for each in reversed(limited)])
+    axes.set(xlabel="absolute value / maximum permissible error", ylim=(-0.6, len(limited) - 0.4))
+    axes.set_xlim(left=0, right=max(1.15, axes.get_xlim()[1]))
+    return figure_svg(figure)
+
+
+def _draw_places(acceptance: Acceptance) -> Markup:
+    """Draw where the artefacts were measured, seen along Y and along X; lengths are lines."""
+    figure, panels = new_figure(9.0, 3.8, columns=2)
+    names = list(acceptance.plan.artefacts)
+    artefact_of = {each.name: each.artefact for each in acceptance.positions}
+    for axes, across, label in ((panels[0], 0, "X / mm, along the stage"), (panels[1], 1, "Y / mm, along the stripe")):
+        for value in acceptance.values:
+            colour = COLOURS[names.index(artefact_of[value.position]) % len(COLOURS)]
+            place = np.array(value.place_mm)
+            if value.length_mm is not None and value.direction is not None:
+                half = value.length_mm / 2 * np.array(value.direction)
+                ends = np.array([place - half, place + half])
+                name = plain_text(f"{artefact_of[value.position]} (length)")
+                axes.plot(ends[:, across], ends[:, 2], "-", color=colour, linewidth=1.6, label=name)
+            elif value.symbol in ("PF", "F"):
+                name = plain_text(artefact_of[value.position])
+                axes.plot(place[across], place[2], "os"[value.symbol == "F"], color=colour, markersize=6, label=name)
+        axes.set(xlabel=label, ylabel="Z / mm, away from the sensor", aspect="equal")
+        axes.invert_yaxis()
+    legend_below(figure)
+    return figure_svg(figure)
+
+
+def _draw_lengths(acceptance: Acceptance) -> Markup:
+    """Draw the error of each length with its test value uncertainty and limit."""
+    lengths = [value for value in acceptance.values if value.length_mm is not None]
+    figure, (axes,) = new_figure(9.0, 3.6)
+    limits = {each.symbol: each.mpe_mm for each in acceptance.characteristics}
+    for place, value in enumerate(lengths):
+        axes.errorbar(
+            place, 1e3 * value.value_mm, yerr=1e3 * (value.expanded_mm or 0.0), fmt="o", color=BLUE, capsize=4
+        )
+        if (limit := limits.get(value.symbol)) is not None:
+            for sign in (-1, 1):
+                axes.plot([place - 0.35, place + 0.35], [sign * 1e3 * limit] * 2, color=RED, linewidth=1.5)
+    axes.axhline(0, color=INK, linewidth=0.8)
+    axes.set_xticks(range(len(lengths)), [_length_label(each) for each in lengths], fontsize=8, rotation=30, ha="right")
+    axes.set_ylabel("error / µm")
+    return figure_svg(figure)
+
+
+def _length_label(value: MeasuredValue) -> str:
+    return plain_text(f"{value.position} ({value.symbol}, {value.length_mm or 0.0:.0f} mm)")

@@ -1,0 +1,293 @@
+"""Digital calibration certificate (DCC) of the PTB: a certificate as XML with values in the D-SI format.
+
+The structure is that of the schemas dcc.xsd 3.2.0 and SI_Format.xsd 2.1.0 (https://www.ptb.de/dcc). They require
+statements on laboratory, customer, item and responsible persons, which an `Administration` contains.
+"""
+
+import datetime
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from uwlts.errors import EvaluationError
+from uwlts.model.library import read_table, validate_description
+from uwlts.model.sensor import Description
+from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow
+
+DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
+SCHEMA_VERSION = "3.2.0"
+_SCHEMA = f"https://ptb.de/dcc/v{SCHEMA_VERSION}/dcc.xsd"
+_XSI = "http://www.w3.org/2001/XMLSchema-instance"
+_LANGUAGE = "en"
+_COVERAGE = ("2", "0.95")
+"""Coverage factor and coverage probability of expanded uncertainties (GUM, normal distribution, rounded)."""
+
+UNITS = {
+    "": r"\one",
+    "px": r"\one",
+    "mm": r"\milli\metre",
+    "µm": r"\micro\metre",
+    "µm/m": r"\micro\metre\metre\tothe{-1}",
+    "°": r"\degree",
+}
+"""Units in the D-SI format; pixels are counted."""
+
+
+def _check_text(text: str) -> str:
+    """Check that a text is not empty, and has no spaces at its ends, as the schema demands."""
+    if not text or text != text.strip():
+        raise ValueError("expected a text without spaces at its ends")
+    return text
+
+
+Text = Annotated[str, AfterValidator(_check_text)]
+Country = Annotated[str, Field(pattern="^[A-Z]{2}$")]
+
+
+class Contact(Description):
+    """Name and address of a laboratory, customer or manufacturer; ``country`` is the code of ISO 3166-1."""
+
+    name: Text
+    country: Country
+    city: Text
+    post_code: Text | None = None
+    street: Text | None = None
+    e_mail: Text | None = None
+
+
+class ResponsiblePerson(Description):
+    """Person who is responsible for the certificate; the main signer signs it."""
+
+    name: Text
+    role: Text | None = None
+    main_signer: bool = False
+
+
+class CalibratedItem(Description):
+    """The calibrated sensor: its serial number, manufacturer and model."""
+
+    serial_number: Text
+    manufacturer: Text
+    model: Text | None = None
+
+
+class Administration(Description):
+    """Administrative data of a digital calibration certificate, read from TOML.
+
+    Attributes
+    ----------
+    identifier : str
+        Unique identifier of the certificate.
+    begin, end : date
+        First and last day of the calibration.
+    location : str
+        Place of the calibration: laboratory, customer, laboratoryBranch, customerBranch or other.
+    laboratory, customer : Contact
+    item : CalibratedItem
+    persons : tuple of ResponsiblePerson
+    """
+
+    identifier: Text
+    begin: datetime.date
+    end: datetime.date
+    location: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = "laboratory"
+    laboratory: Contact
+    customer: Contact
+    item: CalibratedItem
+    persons: tuple[ResponsiblePerson, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _ends_after_its_begin(self) -> "Administration":
+        if self.end < self.begin:
+            raise ValueError(f"the calibration ends on {self.end}, before it begins on {self.begin}")
+        return self
+
+
+def load_administration(path: str | Path) -> Administration:
+    """Read administrative data; DescriptionError if the file is missing or not valid."""
+    return validate_description(Administration, read_table(Path(path)), path)
+
+
+def digital_certificate(content: AnyCertificate, administration: Administration) -> str:
+    """Return a certificate as the text of a digital calibration certificate (XML).
+
+    EvaluationError if the certificate has a unit that D-SI does not have.
+    """
+    for prefix, uri in (("dcc", DCC), ("si", SI), ("xsi", _XSI)):
+        ET.register_namespace(prefix, uri)
+    root = ET.Element(f"{{{DCC}}}digitalCalibrationCertificate", {"schemaVersion": SCHEMA_VERSION})
+    root.set(f"{{{_XSI}}}schemaLocation", f"{DCC} {_SCHEMA}")
+    _add_administration(_child(root, "administrativeData"), content, administration)
+    _add_results(_child(_child(root, "measurementResults"), "measurementResult"), content)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=False).join(
+        ('<?xml version="1.0" encoding="UTF-8"?>\n', "\n")
+    )
+
+
+def _add_administration(parent: ET.Element, content: AnyCertificate, stated: Administration) -> None:
+    software = _child(_child(parent, "dccSoftware"), "software")
+    program, _, release = content.software.partition(" ")
+    _text(software, "name", program)
+    _child(software, "release", release or "unknown")
+    core = _child(parent, "coreData")
+    _child(core, "countryCodeISO3166_1", stated.laboratory.country)
+    _child(core, "usedLangCodeISO639_1", _LANGUAGE)
+    _child(core, "mandatoryLangCodeISO639_1", _LANGUAGE)
+    _child(core, "uniqueIdentifier", stated.identifier)
+    _child(core, "beginPerformanceDate", stated.begin.isoformat())
+    _child(core, "endPerformanceDate", stated.end.isoformat())
+    _child(core, "performanceLocation", stated.location)
+    _child(core, "issueDate", content.issued[:10])
+    item = _child(_child(parent, "items"), "item")
+    _text(item, "name", content.sensor)
+    _text(_child(item, "manufacturer"), "name", stated.item.manufacturer)
+    if stated.item.model is not None:
+        _child(item, "model", stated.item.model)
+    identifications = _child(item, "identifications")
+    _identify(identifications, "manufacturer", stated.item.serial_number, "serial number")
+    _identify(identifications, "other", content.calibration.sha256, "SHA-256 of the calibration file")
+    _identify(identifications, "other", content.calibration.digest, "identifier of the calibration in clouds")
+    if content.sha256:
+        _identify(identifications, "other", content.sha256, "SHA-256 of the sealed certificate (JSON)")
+    _add_contact(_child(_child(parent, "calibrationLaboratory"), "contact"), stated.laboratory)
+    persons = _child(parent, "respPersons")
+    for each in stated.persons:
+        person = _child(persons, "respPerson")
+        _text(_child(person, "person"), "name", each.name)
+        if each.role is not None:
+            _child(person, "role", each.role)
+        _child(person, "mainSigner", str(each.main_signer).lower())
+    _add_contact(_child(parent, "customer"), stated.customer)
+    statements = _child(parent, "statements")
+    for text in _statements(content):
+        _text(_child(statements, "statement"), "declaration", text)
+
+
+def _statements(content: AnyCertificate) -> Iterator[str]:
+    yield (
+        "Uncertainties are expanded uncertainties with the coverage factor k = 2, for a coverage probability of about "
+        "95 % with a normal distribution (GUM, JCGM 100:2008)."
+    )
+    if content.remark is not None:
+        yield content.remark
+    if isinstance(content, JointCertificate):
+        yield "Lengths are valid in the volume that the evidence of the calibration covers, which is stated."
+        yield from content.cannot_tell
+
+
+def _add_results(parent: ET.Element, content: AnyCertificate) -> None:
+    _text(parent, "name", f"Calibration of {content.sensor}")
+    method = _child(_child(parent, "usedMethods"), "usedMethod")
+    joint = isinstance(content, JointCertificate)
+    _text(method, "name", "joint calibration of camera, window and laser sheet" if joint else "sequential calibration")
+    _child(method, "norm", "JCGM 100:2008")
+    if joint and content.validity:
+        _add_medium(_child(parent, "influenceConditions"), content)
+    results = _child(parent, "results")
+    parameters = _result(results, "Parameters")
+    for row in content.parameters:
+        words = f"{row.words} ({row.name}){' in pixels' if row.unit == 'px' else ''}"
+        _quantity(parameters, words, row.value, _unit_of(row), None if row.std is None else 2 * row.std)
+    if isinstance(content, JointCertificate) and content.lengths:
+        lengths = _result(results, "Lengths measured on surfaces of many points")
+        points = _result(results, "Lengths between two single points")
+        for each in content.lengths:
+            words = f"length of {each.length_mm:g} mm along {each.axis}"
+            _quantity(lengths, words, each.length_mm, UNITS["mm"], each.calibration_mm)
+            _quantity(points, words, each.length_mm, UNITS["mm"], each.point_mm)
+    if isinstance(content, JointCertificate) and content.validity:
+        volume = _result(results, "Volume")
+        for region in content.validity:
+            ends = {"distance from the pupil": region.camera_depth_mm, "Y": region.y_mm, "Z": region.z_mm}
+            for words, pair in ends.items():
+                for end, value in zip(("smallest", "largest"), pair, strict=True):
+                    _quantity(volume, f"{end} {words} in {region.name}", value, UNITS["mm"], None)
+
+
+def _add_medium(parent: ET.Element, content: JointCertificate) -> None:
+    for region in content.validity:
+        condition = _child(parent, "influenceCondition")
+        _text(condition, "name", f"medium {region.name}: {region.medium.kind}")
+        data = _child(condition, "data")
+        expanded = None if region.index_std is None else 2 * region.index_std
+        _quantity(data, "refractive index relative to air", region.index, UNITS[""], expanded)
+        if region.medium.kind in ("fresh", "sea"):
+            _quantity(data, "temperature", region.medium.temperature_c, r"\degreecelsius", None)
+
+
+def _result(parent: ET.Element, words: str) -> ET.Element:
+    result = _child(parent, "result")
+    _text(result, "name", words)
+    return _child(result, "data")
+
+
+def _quantity(parent: ET.Element, words: str, value: float, unit: str, expanded: float | None) -> None:
+    """Add a real quantity with its expanded uncertainty, if known."""
+    quantity = _child(parent, "quantity")
+    _text(quantity, "name", words)
+    real = ET.SubElement(quantity, f"{{{SI}}}real")
+    ET.SubElement(real, f"{{{SI}}}value").text = _decimal(value)
+    ET.SubElement(real, f"{{{SI}}}unit").text = unit
+    if expanded is not None:
+        uncertainty = ET.SubElement(real, f"{{{SI}}}expandedUnc")
+        factor, probability = _COVERAGE
+        ET.SubElement(uncertainty, f"{{{SI}}}uncertainty").text = _decimal(expanded)
+        ET.SubElement(uncertainty, f"{{{SI}}}coverageFactor").text = factor
+        ET.SubElement(uncertainty, f"{{{SI}}}coverageProbability").text = probability
+        ET.SubElement(uncertainty, f"{{{SI}}}distribution").text = "normal"
+
+
+def _unit_of(row: ParameterRow) -> str:
+    if row.unit not in UNITS:
+        raise EvaluationError(f"the unit {row.unit!r} of {row.name} is none of {', '.join(map(repr, UNITS))}")
+    return UNITS[row.unit]
+
+
+def _decimal(value: float) -> str:
+    """Return a number that is read back exactly, in the form of D-SI."""
+    return repr(float(value))
+
+
+def _add_contact(parent: ET.Element, contact: Contact) -> None:
+    _text(parent, "name", contact.name)
+    if contact.e_mail is not None:
+        _child(parent, "eMail", contact.e_mail)
+    location = _child(parent, "location")
+    given = {
+        "city": contact.city,
+        "countryCode": contact.country,
+        "postCode": contact.post_code,
+        "street": contact.street,
+    }
+    for name, text in given.items():
+        if text is not None:
+            _child(location, name, text)
+
+
+def _identify(parent: ET.Element, issuer: str, value: str, words: str) -> None:
+    identification = _child(parent, "identification")
+    _child(identification, "issuer", issuer)
+    _child(identification, "value", value)
+    _text(identification, "name", words)
+
+
+def _child(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:
+    child = ET.SubElement(parent, f"{{{DCC}}}{name}")
+    child.text = None if text is None else _printable(text)
+    return child
+
+
+def _text(parent: ET.Element, name: str, text: str) -> None:
+    """Add an element with a text in the language of the certificate."""
+    content = _child(_child(parent, name), "content", text)
+    content.set("lang", _LANGUAGE)
+
+
+def _printable(text: str) -> str:
+    """Replace characters that XML 1.0 cannot contain."""
+    return re.sub(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)

@@ -1,0 +1,182 @@
+"""Results as tables of pandas. Columns are named after the attributes of the rows, whose names contain the units."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from enum import Enum
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+import numpy as np
+from pydantic import BaseModel
+
+from uwlts.argument_types import union_members
+from uwlts.errors import ArgumentError
+from uwlts.evaluation.evaluate import Evaluation
+from uwlts.inspection.features import Inspection
+from uwlts.model.brief import Brief
+from uwlts.model.calibration import Calibration
+from uwlts.model.parameter_keys import LensParameter, WindowParameter
+from uwlts.runtime.optional_library import optional_library
+from uwlts.storage.cloud import NO_INDEX, PointCloud
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+_KEY = "key"
+"""Field that identifies a record; its own fields are columns without prefix."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationParameter:
+    """Parameter of a calibration, in ``unit``: its value, and standard uncertainties after and before; None if unknown.
+
+    The direction of the sheet's normal has no single value.
+    """
+
+    name: str
+    meaning: str
+    value: float | None
+    std: float | None
+    std_before: float | None
+    unit: str
+
+
+def to_frame(result: object) -> DataFrame:
+    """Return a result as a table of pandas, an optional library.
+
+    Rows are the figures of an `Evaluation`, the features' values of an `Inspection`, the parameters of a `Calibration`,
+    the points of a `PointCloud`, and the designs of `twin.sweep`. A list of records has a row for each: a row of
+    `design`, or an entry of ``Verification.verdicts`` or ``SurfaceChange.regions()``. Parameters have their standard
+    uncertainties, those of a joint estimate in the units of pages. Points have the standard uncertainty of each
+    coordinate, or that along the normal.
+
+    Columns have the names of the attributes. A record within a record contributes its columns after its own name, and a
+    vector three: ``centre_mm`` gives ``centre_x_mm`` to ``centre_z_mm``. Arrays of other sizes are left out.
+
+    Parameters
+    ----------
+    result : Evaluation, Inspection, Calibration, PointCloud, SweepResult, list of records, or dict of columns
+        The result.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The table. Missing numbers are NaN, missing texts None.
+
+    Raises
+    ------
+    ArgumentError
+        The result has no table.
+    SetupError
+        Pandas is not installed.
+    """
+    table: Any
+    match result:
+        case PointCloud():
+            table = _point_columns(result)
+        case Evaluation():
+            table = [_row(each) for each in result.figures]
+        case Inspection():
+            table = [
+                {f"feature_{name}": value for name, value in _row(feature).items()} | _row(each)
+                for feature in result.features
+                for each in feature.values
+            ]
+        case Calibration():
+            table = [_row(each) for each in _parameters(result)]
+        case Brief(columns=Mapping() as columns):
+            table = columns
+        case Mapping():
+            table = result
+        case Sequence() if all(map(_is_record, result)):
+            table = [_row(each) for each in result]
+        case _:
+            raise ArgumentError(
+                f"`result` is of the type {type(result).__name__}, which has no table; expected Evaluation, "
+                "Inspection, Calibration, PointCloud, the result of a sweep, columns by name, or a list of records"
+            )
+    return optional_library("pandas", needed_by="a table of results", extra="frames").DataFrame(table)
+
+
+def _point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
+    """Return the known columns (N,) of a cloud."""
+    columns = dict(zip(("x_mm", "y_mm", "z_mm"), cloud.points_mm.T, strict=True)) | {"intensity": cloud.intensity}
+    for name in ("frame", "line"):
+        if not ((known := getattr(cloud, name)) == NO_INDEX).all():
+            columns[name] = known
+    columns |= {name: getattr(cloud, name) for name in ("time_s", "deviation_mm", "normal_std_mm")}
+    if cloud.uncertainty is not None:
+        columns |= dict(zip(_axis_names("std_mm"), cloud.uncertainty.std_mm().T, strict=True))
+    return {name: values for name, values in columns.items() if values is not None}
+
+
+def _parameters(calibration: Calibration) -> Iterator[CalibrationParameter]:
+    """Iterate over the parameters of a joint estimate, or else over those of camera and window."""
+    if (joint := calibration.joint) is not None:
+        for key, value, std, before in zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True):
+            shown, factor = key.quantity, key.quantity.factor
+            prior = None if before is None else factor * before
+            yield CalibrationParameter(key.text, shown.words, factor * value, factor * std, prior, shown.unit)
+        return
+    std, values = calibration.std(), calibration.camera.parameters()
+    stated = {name: getattr(std, f"{name}_px") for name in ("fx", "fy", "cx", "cy")} | std.distortion
+    window: list[tuple[WindowParameter, float, float | None]] = []
+    if calibration.window is not None:
+        window = [(WindowParameter.DISTANCE, calibration.window.distance_mm, std.window_distance_mm)]
+    lens = [(key, values[key.text], stated.get(key.text)) for key in LensParameter if key is not LensParameter.F]
+    for key, value, known in (*lens, *window):
+        yield CalibrationParameter(key.text, key.quantity.words, value, known, None, key.quantity.unit)
+    yield CalibrationParameter("sheet_normal", "direction of the sheet's normal", None, std.sheet_normal_deg, None, "°")
+
+
+def _is_record(value: object) -> bool:
+    return isinstance(value, BaseModel) or hasattr(value, "_fields") or dataclasses.is_dataclass(value)
+
+
+def _row(record: object) -> dict[str, Any]:
+    """Return the columns of a record: its fields, then its properties that are plain values."""
+    row = _flatten(record, type(record))
+    for name, member in vars(type(record)).items():
+        if isinstance(member, property) and member.fget and _is_plain(value := getattr(record, name)):
+            row[name] = _mark_missing(value, get_type_hints(member.fget)["return"])
+    return row
+
+
+def _flatten(record: object | None, kind: type) -> dict[str, Any]:
+    """Return the plain fields of a record, None for those of a missing one."""
+    row: dict[str, Any] = {}
+    hints = get_type_hints(kind)
+    for name in _field_names(kind):
+        value = getattr(record, name, None)
+        inner = next((each for each in union_members(hints[name]) if dataclasses.is_dataclass(each)), None)
+        if isinstance(inner, type):
+            prefix = "" if name == _KEY else f"{name}_"
+            row |= {f"{prefix}{within}": each for within, each in _flatten(value, inner).items()}
+        elif name.endswith("_mm") and value is not None and np.shape(value) == (3,):
+            row |= dict(zip(_axis_names(name), np.asarray(value).tolist(), strict=True))
+        elif isinstance(value, Enum):
+            row[name] = str(value)
+        elif _is_plain(value) or (isinstance(value, tuple) and all(map(_is_plain, value))):
+            row[name] = _mark_missing(value, hints[name])
+    return row
+
+
+def _field_names(kind: Any) -> Sequence[str]:
+    if dataclasses.is_dataclass(kind):
+        return [field.name for field in dataclasses.fields(kind)]
+    return list(kind.model_fields) if issubclass(kind, BaseModel) else kind._fields
+
+
+def _mark_missing(value: object, hint: object) -> object:
+    """Return NaN for None in the place of a number, so that the column holds numbers."""
+    return np.nan if value is None and float in union_members(hint) else value
+
+
+def _axis_names(name: str) -> list[str]:
+    """Return the names of a vector's columns, such as ``std_x_mm`` for ``std_mm``."""
+    return [f"{name.removesuffix('_mm')}_{axis}_mm" for axis in "xyz"]
+
+
+def _is_plain(value: object) -> bool:
+    return value is None or isinstance(value, bool | int | float | str)
