@@ -83,7 +83,7 @@ def test_a_path_without_covariance_needs_the_size_of_its_drift():
 
 
 def test_the_most_likely_walk_states_the_errors_of_a_random_walk() -> None:
-    """Paths of which three relative displacements are known, with the most likely of the candidate drifts.
+    """Three relative displacements of a path are known; the most likely of the candidate drifts is used.
 
     With candidates of at most 0.3, 77 % of the coordinates are within twice the stated uncertainty. With all of them,
     12 other seeds have 92 to 96 %, with a standard deviation of 1.3 %: the limit is four of them below the mean.
