@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.alignment.drift_model import choose_drift_model
+from uwlts.alignment.drift_model import DriftModel, choose_drift_model
 from uwlts.errors import EvaluationError
 from uwlts.model.trajectory import Trajectory
 
@@ -80,3 +80,31 @@ def test_a_path_without_covariance_needs_the_size_of_its_drift():
         choose_drift_model(Trajectory(path.times_s, path.poses), None, None)
     with pytest.raises(EvaluationError, match="give both"):
         choose_drift_model(path, 300.0, None)
+
+
+def test_the_most_likely_walk_states_the_errors_of_a_random_walk() -> None:
+    """Three relative displacements of a path are known; the most likely of the candidate drifts is used.
+
+    With candidates of at most 0.3, 77 % of the coordinates are within twice the stated uncertainty. With all of them,
+    12 other seeds have 92 to 96 %, with a standard deviation of 1.3 %: the limit is four of them below the mean.
+    """
+    times = np.linspace(0.02, 1, 50)
+    seen = np.zeros((3, 50))
+    for row, (first, second) in zip(seen, [(2, 24), (5, 30), (17, 34)], strict=True):
+        row[[first, second]] = -1, 1
+    true = np.minimum(times[:, None], times)
+    models = [each.covariance(times[:, None], times, 1.0)[0] for each in DriftModel.of_size(1.0, 1.0).with_walks()]
+    rng, inside = np.random.default_rng(5), []
+    for _ in range(80):
+        drift = np.linalg.cholesky(true + 1e-9 * np.eye(50)) @ rng.standard_normal((50, 6))
+        fits = []
+        for model in models:
+            of_seen = seen @ model @ seen.T + 1e-6 * np.eye(3)
+            likelihood = (
+                -np.sum((seen @ drift) * np.linalg.solve(of_seen, seen @ drift)) - 6 * np.linalg.slogdet(of_seen)[1]
+            )
+            gain = np.linalg.solve(of_seen, seen @ model).T
+            fits.append((likelihood, gain, np.diag(model) - np.einsum("tq,qt->t", gain, seen @ model)))
+        _, gain, variance = max(fits, key=lambda fit: fit[0])
+        inside.append(np.abs(gain @ (seen @ drift) - drift) < 2 * np.sqrt(variance)[:, None])
+    assert np.mean(inside) > 0.88
