@@ -8,6 +8,7 @@ from docs.studies.radiometry import DESCRIBED, SCENE, SENSOR
 from uwlts.cli import app
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.radiometry.result import read_estimates
+from uwlts.runtime.console import run
 
 WATER = "absorption_per_m = 0.6\nscattering_per_m = 0.5\nphase = 'petzold'"
 BUILT = DESCRIBED | {"power": 9.0, "waist": 0.9, "black": 80.0, "water": WATER}
@@ -68,12 +69,13 @@ def test_flat_surface_does_not_separate_attenuation_and_power(folder, tmp_path):
     assert found.outlook.reach_mm > 0
 
 
-def test_wrong_input_is_refused(folder, tmp_path):
+def test_wrong_input_is_refused(folder, tmp_path, capsys):
     calibration = folder / "calibration.json"
     with pytest.raises(DescriptionError, match="reflectance is 0"):
         uwlts.fit_radiometry(folder / "scan.h5", calibration, reflectance=0.0)
     with pytest.raises(CaptureError, match="give the result beside it"):
         uwlts.fit_radiometry(folder / "scan.h5", calibration, compared_with=tmp_path / "old.toml")
     words = ["radiometry", folder / "scan.h5", "--calibration", calibration, "--out", tmp_path / "a.toml"]
-    with pytest.raises(DescriptionError, match="earlier_capture"):
-        app([*map(str, words), "--page", str(tmp_path / "a.html")], result_action="return_value")
+    code = run(app, [*map(str, words), "--page", str(tmp_path / "a.html")])
+    assert code == 2 and "--earlier-capture" in capsys.readouterr().err
+    assert not (tmp_path / "a.toml").exists()

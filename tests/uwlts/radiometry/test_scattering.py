@@ -36,8 +36,8 @@ def test_kernel_without_scattering_is_the_gaussian_stripe():
 def test_kernel_keeps_the_light_of_both_paths():
     """All orders of b D add up to exp(b D) times the unscattered light.
 
-    The trapezoidal rule on nodes a factor of 1.6 apart adds some percent to a convex kernel. The kernel lacks light that
-    is scattered beyond its 1,000 px (0.5 m), and backwards: also some percent.
+    The trapezoidal rule on nodes a factor of 1.6 apart adds some percent to a convex kernel. The kernel lacks light
+    that is scattered beyond its 1,000 px (0.5 m), and backwards: also some percent.
     """
     kernel = HaloKernel(HenyeyGreenstein(0.95).per_sr, ((300.0, 0.5), (300.0, 0.5)))
     b = 0.5e-3
