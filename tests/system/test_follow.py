@@ -69,13 +69,13 @@ def test_flat_surface_does_not_separate_attenuation_and_power(folder, tmp_path):
     assert found.outlook.reach_mm > 0
 
 
-def test_wrong_input_is_refused(folder, tmp_path, capsys):
+def test_wrong_input_is_refused(folder, tmp_path, capsys, monkeypatch):
     calibration = folder / "calibration.json"
     with pytest.raises(DescriptionError, match="reflectance is 0"):
         uwlts.fit_radiometry(folder / "scan.h5", calibration, reflectance=0.0)
     with pytest.raises(CaptureError, match="give the result beside it"):
         uwlts.fit_radiometry(folder / "scan.h5", calibration, compared_with=tmp_path / "old.toml")
     words = ["radiometry", folder / "scan.h5", "--calibration", calibration, "--out", tmp_path / "a.toml"]
-    code = run(app, [*map(str, words), "--page", str(tmp_path / "a.html")])
-    assert code == 2 and "--earlier-capture" in capsys.readouterr().err
+    monkeypatch.setattr("sys.argv", ["uwlts", *map(str, words), "--page", str(tmp_path / "a.html")])
+    assert run(app) == 2 and "--earlier-capture" in capsys.readouterr().err
     assert not (tmp_path / "a.toml").exists()

@@ -5,11 +5,11 @@ import math
 import pytest
 
 from uwlts.errors import CaptureError
-from uwlts.radiometry.result import Estimate, compare_estimates, format_value, read_estimates
+from uwlts.radiometry.result import ImageEstimate, compare_estimates, format_value, read_estimates
 
 
-def estimate(name: str, value: float, std: float) -> Estimate:
-    return Estimate(name, value, std, "1/m", f"the {name}")
+def estimate(name: str, value: float, std: float) -> ImageEstimate:
+    return ImageEstimate(name, value, std, "1/m", f"the {name}")
 
 
 def test_changes_are_in_combined_standard_uncertainties():
