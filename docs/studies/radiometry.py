@@ -92,9 +92,15 @@ def record(folder: Path, seed: int, drawn: dict[str, float]) -> tuple[Path, Path
         moved = dict(zip(("start", "step", "count"), motion, strict=True))
         scene.write_text(SCENE.format(**moved, reflectance=drawn["reflectance"], turn=drawn["turn"]))
         if not out.exists():
-            sensors = {"sensor": folder / "described.toml", "as_built": folder / "built.toml"}
             without = ("multiple-scattering",) if name == "repeats" else ()
-            twin.simulate(scene, **sensors, seed=seed, without=without, out=out)
+            twin.simulate(
+                scene,
+                sensor=folder / "described.toml",
+                as_built=folder / "built.toml",
+                seed=seed,
+                without=without,
+                out=out,
+            )
         paths.append(out)
     return paths[0], paths[1]
 
@@ -115,17 +121,13 @@ def compare(seed: int, folder: Path) -> dict[str, tuple[float, float, float]]:
         "power_reflectance_mw": drawn["power"] * drawn["reflectance"] * DESCRIBED["full_well"] / drawn["full_well"],
         "attenuation_per_m": drawn["absorption"] + drawn["scattering"],
         "scattering_per_m": drawn["scattering"],
-        "sheet_radius_mm": _radius_mm(drawn["waist"]),
+        # Within 65 mm of the focus, the sheet's radius is that of its waist to 1 %.
+        "sheet_radius_mm": drawn["waist"],
         "background_dn": drawn["black"] + gain * dark_e["scan"],
         "gain_dn_per_e": gain,
         "dark_noise_dn": gain * math.sqrt(drawn["read_noise"] ** 2 + dark_e["repeats"]),
     }
     return {name: (truth[name], found[name].value, found[name].std) for name in NAMES}
-
-
-def _radius_mm(waist: float) -> float:
-    """Return the radius of the sheet: within 65 mm of the focus it is that of the waist to 1 %."""
-    return waist
 
 
 def main(captures: int = 12, *, first_seed: int = 100, folder: Path | None = None, write: bool = False) -> None:

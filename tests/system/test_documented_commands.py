@@ -224,6 +224,7 @@ PAGES_RUN = {
         again=("uwlts compare scan.cloud.h5", "uwlts compare pipe.cloud.h5"),
     ),
     "docs/how-to/describe-your-sensor.md": Page(tables={"reef.toml": 0, "reef-close.toml": 1}),
+    "docs/how-to/follow-a-sensor.md": Page(tables={"wall.toml": 0}, again=("uwlts radiometry wall.h5",)),
     "docs/how-to/gauge-study.md": Page(
         texts={"diameters.csv": GAUGE, "runs/gauge/heights.csv": GAUGE},
         not_run={"python docs/studies/gauge_twin.py": "renders 18 scans"},

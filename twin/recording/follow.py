@@ -28,7 +28,7 @@ def follow(
     compared_with: str | Path | None = None,
     out: str | Path = "runs/follow",
     spp: int = 16,
-    seed: int = 0,
+    seed: int = 1,
     overwrite: bool = False,
     variant: Variant = CPU,
     progress: ProgressListener = ignore_progress,
@@ -122,8 +122,13 @@ def _motion_of(scan: Capture) -> Table:
         raise CaptureError(
             f"{scan.path.name} has laser images at {found}; expected even steps of a stage, without poses"
         )
-    direction = list(scan.header.stage_direction)
-    return {"start_mm": float(places[0]), "step_mm": float(steps.mean()), "count": len(places), "direction": direction}
+    motion: Table = {
+        "start_mm": float(places[0]),
+        "step_mm": float(steps.mean()),
+        "count": len(places),
+        "direction": list(scan.header.stage_direction),
+    }
+    return motion
 
 
 def _reconstructed_scene(header: CaptureHeader, mesh: str, reflectance: float) -> Table:

@@ -1,8 +1,8 @@
 """Phase functions of scatterers in water: names, parameters, limits and formulas.
 
 A new phase function is a class in this module that is listed in `KINDS`. A medium's description refers to it by name or
-by a table with its parameters, such as ``phase = {kind = "two-term", asymmetry_forward = 0.95}``. Only the twin
-evaluates phase functions; the sensor software does not. All arrays are float64.
+by a table with its parameters, such as ``phase = {kind = "two-term", asymmetry_forward = 0.95}``. The twin
+evaluates phase functions, and the sensor software where it fits the halo of a stripe. All arrays are float64.
 """
 
 import math

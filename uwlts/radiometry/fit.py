@@ -23,7 +23,7 @@ from uwlts.model.phase_functions import PetzoldAverage, PhaseFunction
 from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.optics.fitness import check_fits
 from uwlts.radiometry.followed_sensor import follow_sensor
-from uwlts.radiometry.result import Estimate, Radiometry, StripeStatistics, compare_estimates, read_estimates
+from uwlts.radiometry.result import ImageEstimate, Radiometry, StripeStatistics, compare_estimates, read_estimates
 from uwlts.radiometry.scattering import STEP_PX, HaloKernel
 from uwlts.radiometry.stripe_images import (
     BLOCKS,
@@ -149,12 +149,12 @@ def fit_radiometry(
             noise = measure_noise(scan, stripes, repeats=again)
         std = np.sqrt(np.diag(covariance))
         estimates = [
-            Estimate(name, float(value), float(error), *_TEXTS[name])
+            ImageEstimate(name, float(value), float(error), *_TEXTS[name])
             for name, value, error in zip(_NAMES, whole, std, strict=True)
         ]
-        estimates.append(Estimate("dark_noise_dn", noise.dark_dn, noise.dark_std, *_TEXTS["dark_noise_dn"]))
+        estimates.append(ImageEstimate("dark_noise_dn", noise.dark_dn, noise.dark_std, *_TEXTS["dark_noise_dn"]))
         if noise.gain is not None and noise.gain_std is not None:
-            estimates.append(Estimate("gain_dn_per_e", noise.gain, noise.gain_std, *_TEXTS["gain_dn_per_e"]))
+            estimates.append(ImageEstimate("gain_dn_per_e", noise.gain, noise.gain_std, *_TEXTS["gain_dn_per_e"]))
         scale = np.where(std > 0, std, 1.0)
         correlation = covariance / np.outer(scale, scale)
         kept = tuple(estimate for estimate in estimates if math.isfinite(estimate.value))
@@ -435,7 +435,7 @@ def _scatter(design: np.ndarray, values: np.ndarray, weight: np.ndarray) -> floa
 
 
 def _not_separable(
-    correlation: np.ndarray, by_name: dict[str, Estimate], determined: bool, described: float
+    correlation: np.ndarray, by_name: dict[str, ImageEstimate], determined: bool, described: float
 ) -> tuple[str, ...]:
     """Return the quantities that the images do not separate, as text."""
     found = ["laser power, exposure scale, transmission of lens and windows, and reflectance: only their product"]

@@ -10,7 +10,7 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.placement import LaserPose, laser_pose
 from uwlts.model.sensor import CaptureHeader, Laser, Medium, Sensor
 from uwlts.optics.brightness import sheet_sigma_mm
-from uwlts.radiometry.result import Estimate
+from uwlts.radiometry.result import ImageEstimate
 
 PARTICLES = "petzold"
 """Phase function of water whose description states none. The named waters have the same."""
@@ -19,7 +19,7 @@ PARTICLES = "petzold"
 def follow_sensor(
     header: CaptureHeader,
     calibration: Calibration,
-    found: Mapping[str, Estimate],
+    found: Mapping[str, ImageEstimate],
     *,
     reflectance: float,
     sheet_distance_mm: float,

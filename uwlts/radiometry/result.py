@@ -23,7 +23,7 @@ SIGNIFICANT = 3.0
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ImageEstimate:
     """Estimate with its standard uncertainty, unit and meaning."""
 
     name: str
@@ -38,7 +38,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Change:
+class EstimateChange:
     """Change of an estimate since an earlier result; ``significance`` is in combined standard uncertainties."""
 
     name: str
@@ -82,7 +82,9 @@ class StripeStatistics:
     gaps: float
 
     @classmethod
-    def from_estimates(cls, estimates: Sequence[Estimate], *, gaps: float, tail: tuple[float, ...]) -> StripeStatistics:
+    def from_estimates(
+        cls, estimates: Sequence[ImageEstimate], *, gaps: float, tail: tuple[float, ...]
+    ) -> StripeStatistics:
         """Return the statistics from estimates, the fraction of gaps and the tail."""
         value = {each.name: each.value for each in estimates}
         width = 2 * math.sqrt(2 * math.log(2)) * value["stripe_sigma_px"]
@@ -136,14 +138,14 @@ class Radiometry(Brief):
         Medium of the scan in the description.
     reflectance : float
         Reflectance by which the fitted product of power and reflectance was divided.
-    estimates : tuple of Estimate
+    estimates : tuple of ImageEstimate
     correlation : (P, P) float64
         Correlation of the first P estimates, those of the stripe.
     statistics : StripeStatistics
     not_separable : tuple of str
         Quantities that the images do not separate.
     outlook : Outlook
-    changes : tuple of Change
+    changes : tuple of EstimateChange
         Changes since an earlier result, if one was given.
     sources : dict
         Digests of capture and calibration.
@@ -155,16 +157,16 @@ class Radiometry(Brief):
     sensor: Sensor
     medium_name: str
     reflectance: float
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[ImageEstimate, ...]
     correlation: np.ndarray
     statistics: StripeStatistics
     not_separable: tuple[str, ...]
     outlook: Outlook
-    changes: tuple[Change, ...]
+    changes: tuple[EstimateChange, ...]
     sources: Table
     path_mm: tuple[float, float]
 
-    def __getitem__(self, name: str) -> Estimate:
+    def __getitem__(self, name: str) -> ImageEstimate:
         """Return an estimate by name."""
         return next(each for each in self.estimates if each.name == name)
 
@@ -227,11 +229,11 @@ class Radiometry(Brief):
             description.write_text(text, encoding="utf-8")
 
 
-def read_estimates(path: str | Path) -> tuple[Estimate, ...]:
+def read_estimates(path: str | Path) -> tuple[ImageEstimate, ...]:
     """Read the estimates of an earlier result; CaptureError if the file is missing, foreign or damaged."""
     found = _read(path, "estimates")
     try:
-        return tuple(Estimate(**each) for each in found)
+        return tuple(ImageEstimate(**each) for each in found)
     except TypeError as error:
         raise CaptureError(f"{path} is damaged: its estimates are no table") from error
 
@@ -256,9 +258,9 @@ def _read(path: str | Path, key: str) -> Any:
     return content[key]
 
 
-def compare_estimates(now: Sequence[Estimate], before: Sequence[Estimate]) -> tuple[Change, ...]:
+def compare_estimates(now: Sequence[ImageEstimate], before: Sequence[ImageEstimate]) -> tuple[EstimateChange, ...]:
     """Return the changes of all estimates that both results have, in combined standard uncertainties."""
-    earlier: Mapping[str, Estimate] = {each.name: each for each in before}
+    earlier: Mapping[str, ImageEstimate] = {each.name: each for each in before}
     changes = []
     for each in now:
         old = earlier.get(each.name)
@@ -267,7 +269,7 @@ def compare_estimates(now: Sequence[Estimate], before: Sequence[Estimate]) -> tu
         std = math.hypot(each.std, old.std)
         moved = each.value - old.value
         significance = moved / std if std > 0 else math.copysign(math.inf, moved) if moved else 0.0
-        changes.append(Change(each.name, each.meaning, each.unit, old.value, each.value, std, significance))
+        changes.append(EstimateChange(each.name, each.meaning, each.unit, old.value, each.value, std, significance))
     return tuple(changes)
 
 

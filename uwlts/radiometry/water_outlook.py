@@ -10,7 +10,7 @@ import numpy as np
 from uwlts.model.calibration import Calibration
 from uwlts.model.sensor import CaptureHeader
 from uwlts.optics.triangulation import points_on_sheet
-from uwlts.radiometry.result import Estimate, Outlook
+from uwlts.radiometry.result import ImageEstimate, Outlook
 from uwlts.radiometry.stripe_images import StripeImages
 from uwlts.radiometry.stripe_light import light_at
 from uwlts.stripe import StripeOptions
@@ -19,7 +19,7 @@ from uwlts.stripe import StripeOptions
 def outlook(
     header: CaptureHeader,
     calibration: Calibration,
-    found: Mapping[str, Estimate],
+    found: Mapping[str, ImageEstimate],
     images: StripeImages,
     *,
     determined: bool,
