@@ -35,6 +35,7 @@ MEANING = {
         "--kind": "Kind of the object",
         "--medium": "One of the sensor's media",
         "--out": "to write|New folder",
+        "--page": "Page to write",
         "--overwrite": "Replace|replace",
         "--pixels": "Whether pixels are square",
         "--plan": "[Pp]lan of a scan|TOML file with sensor, medium, positions",
