@@ -36,6 +36,7 @@ MEANING = {
         "--kind": "Kind of the object",
         "--medium": "One of the sensor's media",
         "--out": "to write|New folder",
+        "--page": "Page to write",
         "--overwrite": "Replace|replace",
         "--page": "Page to write",
         "--pixels": "Whether pixels are square",

@@ -118,6 +118,7 @@ FOLDERS = {
     "twin reproduce --out",
     "twin predict --out",
     "twin demo --out",
+    "twin follow --out",
     "twin sweep --out",
 }
 """Outputs that are folders, whose names need no ending."""
@@ -132,7 +133,14 @@ def _outputs() -> Iterator[Any]:
 
 
 OUTPUT_OPTIONS = list(_outputs())
-ENDINGS = {"align": "x.csv", "compare": "x.html", "evaluate": "x.json", "inspect": "x.json", "register": "x.ply"}
+ENDINGS = {
+    "align": "x.csv",
+    "compare": "x.html",
+    "evaluate": "x.json",
+    "inspect": "x.json",
+    "register": "x.ply",
+    "radiometry": "x.toml",
+}
 """Names of OUT for the commands that write more than one file."""
 
 

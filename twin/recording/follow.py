@@ -50,7 +50,7 @@ def follow(
         Name or path of the scene that was scanned; its motion is replaced by that of the scan. By default, the surface
         is reconstructed from the scan.
     placement
-        Placement of the scene.
+        Named position of the objects, of those of the scene.
     reflectance
         Diffuse reflectance of the surface; of a given scene, that of its objects.
     repeats

@@ -151,7 +151,7 @@ def _estimates(radiometry: Radiometry, names: Sequence[str]) -> ComparisonTable:
         )
         for each in radiometry.changes
     ]
-    return ComparisonTable((*names, "std of the difference", "difference / std"), tuple(rows))
+    return ComparisonTable((*names, "std", "in std"), tuple(rows))
 
 
 def _statistics(both: Sequence[StripeStatistics], names: Sequence[str]) -> ComparisonTable:
