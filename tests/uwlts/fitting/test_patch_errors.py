@@ -1,46 +1,49 @@
 """Propagation of the errors of points to patches, against patches of surfaces whose errors are drawn again."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from docs.studies.registration_coverage import as_cloud
-from tests.oracles.views import View, draw_views
+from tests.oracles.views import draw_views
 from uwlts.fitting.patches import Patches, distances_between, refit_distances, surface_patches
+from uwlts.storage.cloud import PointCloud, PointUncertainty
 
 DRAWS = 30
 
 
-def exact_view(seed: int) -> View:
-    """Return a view without errors, which states noise of 0.02 mm and offsets of profiles of 0.02 mm."""
-    view = draw_views(seed, "free form", "none")[0]
-    return replace(view, own_mm=0.02, profile_mm=np.full((1, len(view.points_mm)), 0.02))
+def exact_cloud() -> PointCloud:
+    """Return a second-order surface in profiles 0.5 mm apart, with stated noise and offsets of profiles of 0.02 mm."""
+    rng = np.random.default_rng(4)
+    frame, line = (each.ravel() for each in np.indices((60, 60)))
+    x, y = 0.5 * frame + rng.uniform(0, 0.1, frame.shape), 0.5 * line + rng.uniform(0, 0.4, line.shape)
+    points = np.column_stack([x, y, 300 + 0.1 * x + 0.002 * x**2 - 0.003 * x * y])
+    along = np.tile([0.0, 0.0, 0.02], (len(points), 1))
+    random = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.02**2], (len(points), 1))
+    known = PointUncertainty(random, along, np.zeros((0, len(points), 3)))
+    return PointCloud(points, np.ones(len(points)), frame, line, uncertainty=known)
 
 
-def patches_of(view: View, shift_mm: np.ndarray) -> Patches:
-    cloud = as_cloud(view)
-    moved = cloud.points_mm + shift_mm[:, None] * view.towards
-    return surface_patches(moved, cloud.uncertainty, frame=cloud.frame, radius_mm=4.5)
+def patches_of(cloud: PointCloud, shift_mm: np.ndarray) -> Patches:
+    points = cloud.points_mm + shift_mm[:, None] * [0.0, 0.0, 1.0]
+    return surface_patches(points, cloud.uncertainty, frame=cloud.frame, radius_mm=3.0)
 
 
 @pytest.mark.parametrize("by_images", [False, True], ids=["noise", "profiles"])
 def test_sums_of_heights_vary_as_propagated(by_images: bool) -> None:
     """Sums of heights with smooth weights, over 30 draws; limits are exceeded 1 time in 10,000.
 
-    A factor of 1.15 allows for averages that lie askew to normals, and for points of few images in a cube.
+    A factor of 1.15 allows for averages that change their cube with the noise.
     """
-    rng, view = np.random.default_rng(4), exact_view(3)
-    still = patches_of(view, np.zeros(len(view.points_mm)))
+    rng, cloud = np.random.default_rng(5), exact_cloud()
+    still = patches_of(cloud, np.zeros(len(cloud)))
     places = still.places_mm - still.places_mm.mean(axis=0)
     weights = np.stack([np.ones(len(still)), places[:, 0], places[:, 1], places[:, 0] * places[:, 1]])
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
     sums = []
     for _ in range(DRAWS):
-        frame = view.frame if by_images else np.arange(len(view.frame))
+        frame = cloud.frame if by_images else np.arange(len(cloud))
         error = rng.standard_normal(frame.max() + 1)[frame]
-        moved = patches_of(view, 0.02 * error)
+        moved = patches_of(cloud, 0.02 * error)
         found = distances_between(moved, np.eye(4), still, np.eye(4), reach_mm=1.0)
         # Patches stand on the same averages, so that each has its own counterpart.
         assert len(found.source) > 0.9 * len(still)
