@@ -22,7 +22,7 @@ HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "op
 LISTENS = {"progress", "report", "warn"}
 """Parameters for callbacks that report progress; commands print the reports instead."""
 APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
-MOST_NAMES = 49
+MOST_NAMES = 51
 """Largest number of public names of `uwlts`: functions of its commands, their savable results, and their arguments."""
 
 

@@ -56,7 +56,7 @@ class StampedClouds:
 
 
 def serve_ros(
-    source: str | Path | ScanPlan,
+    scans: str | Path | ScanPlan,
     *,
     calibration: AnyCalibration | str | Path,
     folder: str | Path = ".",
@@ -73,7 +73,7 @@ def serve_ros(
 
     Parameters
     ----------
-    source : ScanPlan or path
+    scans : ScanPlan or path
         Plan (TOML) of scans to record, or capture to play, which another program may still be recording.
     calibration : Calibration, PolynomialCalibration or path
         Calibration of the sensor.
@@ -99,12 +99,12 @@ def serve_ros(
     """
     rclpy, executors, sensor, std, builtin, services = _import_ros()
     known = resolve_calibration(calibration)
-    played = not isinstance(source, ScanPlan) and Path(source).suffix in CAPTURES
-    scans = source if isinstance(source, ScanPlan) else Path(source) if played else load_plan(Path(source))
+    played = not isinstance(scans, ScanPlan) and Path(scans).suffix in CAPTURES
+    source = scans if isinstance(scans, ScanPlan) else Path(scans) if played else load_plan(Path(scans))
     with ExitStack() as stack:
         opened, moved = None, None
-        if isinstance(scans, ScanPlan):
-            address, port = camera or scans.camera, stage or scans.stage.port
+        if isinstance(source, ScanPlan):
+            address, port = camera or source.camera, stage or source.stage.port
             if address is None or port is None:
                 what = "camera" if address is None else "stage"
                 raise DescriptionError(f"the plan names no {what}: give `{what}`")
@@ -118,7 +118,7 @@ def serve_ros(
         clouds = StampedClouds(types, lambda: node.get_clock().now().nanoseconds, frame_id=frame_id)
         publisher = node.create_publisher(sensor.PointCloud2, "points", _QUEUED)
         service = ScanService(
-            scans,
+            source,
             known,
             lambda cloud, time_s: publisher.publish(clouds.message(cloud, time_s, service.scans)),
             folder=Path(folder),

@@ -96,7 +96,11 @@ def to_frame(result: object) -> DataFrame:
                 f"`result` is of the type {type(result).__name__}, which has no table; expected Evaluation, "
                 "Inspection, Calibration, PointCloud, the result of a sweep, columns by name, or a list of records"
             )
-    return optional_library("pandas", needed_by="a table of results", extra="frames").DataFrame(table)
+    frame = optional_library("pandas", needed_by="a table of results", extra="frames").DataFrame
+    try:
+        return frame(table)
+    except ValueError as error:
+        raise ArgumentError(f"`result` has columns that make no table: {error}") from error
 
 
 def _point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
