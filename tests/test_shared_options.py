@@ -38,7 +38,6 @@ MEANING = {
         "--out": "to write|New folder",
         "--page": "Page to write",
         "--overwrite": "Replace|replace",
-        "--page": "Page to write",
         "--pixels": "Whether pixels are square",
         "--pdf": "Also print the page",
         "--plan": "[Pp]lan of (a scan|an acceptance test)|TOML file with sensor, medium, positions",
