@@ -100,7 +100,7 @@ def to_frame(result: object) -> DataFrame:
     try:
         return frame(table)
     except ValueError as error:
-        raise ArgumentError(f"`result` has columns that make no table: {error}") from error
+        raise ArgumentError(f"`result` is no set of columns of equal length: {error}") from error
 
 
 def _point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
