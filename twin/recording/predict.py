@@ -13,13 +13,16 @@ from twin.options import CPU, Variant
 from twin.recording.campaigns import record_campaigns
 from twin.recording.command_lines import run_lines
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign, replace_values
+from uwlts._version import __version__
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.files.json_files import read_json, write_model
 from uwlts.model.brief import Brief
+from uwlts.pages.toolkit import BLUE, figure_svg, new_figure, render_page, write_page
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import open_workers
 
 RESULT = "prediction.json"
+PAGE = "prediction.html"
 _AT_ONCE = 2
 _STEP_IMAGES = 5
 """Fewer images of a step standard belong to a calibration; a scan has at least this many profiles."""
@@ -91,6 +94,10 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
         """Return the fraction of all errors within their expanded uncertainty."""
         return sum(each.covered for each in self.figures) / (len(self.figures) * len(self.seeds))
 
+    def verdict(self) -> str:
+        """Return the main result as a sentence."""
+        return f"{100 * self.covered_share():.0f} % of all errors are within U"
+
     def lines(self) -> list[str]:
         """Return the result as lines of text."""
         count = len(self.seeds)
@@ -107,7 +114,7 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
             f"sensor {self.sensor}, built as {self.as_built}; campaigns {self.campaign}: {count}",
             head,
             *rows,
-            f"{100 * self.covered_share():.0f} % of all errors are within U",
+            self.verdict(),
             "U: expanded uncertainty (k = 2) by propagation; found: twice the rms error of the campaigns",
             "valid for this sensor, for these objects and places, and for imperfections as in the campaign",
         ]
@@ -131,7 +138,7 @@ def predict(
 
     Every campaign has its own imperfections and noise. The sensor's software calibrates jointly, measures and
     states an uncertainty, which is compared with the errors. An interrupted run is resumed, and campaigns are added if
-    the number is increased. OUT/prediction.json is written.
+    the number is increased. OUT/prediction.html and prediction.json are written.
 
     Parameters
     ----------
@@ -212,6 +219,7 @@ def predict(
         figures=figures,
     )
     write_model(folder / RESULT, result, file_format="twin-prediction", version=1, overwrite=True)
+    write_page(folder / PAGE, _page(result), overwrite=True)
     return result
 
 
@@ -278,3 +286,34 @@ def _read_figures(scan: str, folders: list[Path]) -> Iterator[PredictedFigure]:
         except (KeyError, TypeError) as error:
             raise CaptureError(f"an evaluation of {scan} has no uncertainty of {name!r}") from error
         yield PredictedFigure(scan=scan, name=name, expanded_mm=tuple(expanded), errors_mm=tuple(errors))
+
+
+def _page(result: PredictedUncertainty) -> str:
+    """Return a page with the uncertainties and errors as a figure and a table."""
+    figure, (axes,) = new_figure(8.0, 1.2 + 0.3 * len(result.figures))
+    for row, each in enumerate(result.figures):
+        axes.barh(row, 2 * each.predicted_mm, left=-each.predicted_mm, height=0.6, color=BLUE, alpha=0.25)
+        axes.plot(each.errors_mm, [row] * len(each.errors_mm), "o", color=BLUE, markersize=4)
+    axes.axvline(0.0, color="black", linewidth=0.5)
+    axes.set_yticks(range(len(result.figures)), [f"{each.scan}, {each.name}" for each in result.figures])
+    axes.invert_yaxis()
+    axes.set_xlabel("measured minus true value, mm")
+    count = len(result.seeds)
+    return render_page(
+        "twin.recording",
+        "prediction.html.j2",
+        sensor=Path(result.sensor).stem,
+        verdict=f"{result.verdict()}, in {count} rendered campaign{'s' if count > 1 else ''}.",
+        introduction=[
+            ("sensor", result.sensor),
+            ("built as", result.as_built),
+            ("campaign", result.campaign),
+            ("seeds", f"{result.seeds[0]} to {result.seeds[-1]}"),
+        ],
+        figure=figure_svg(figure),
+        rows=[
+            (each.scan, each.name, f"{each.predicted_mm:.4f}", f"{each.found_mm:.4f}", f"{each.covered} of {count}")
+            for each in result.figures
+        ],
+        version=__version__,
+    )

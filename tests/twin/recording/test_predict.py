@@ -85,6 +85,7 @@ def test_errors_of_a_rendered_campaign_are_within_the_prediction(tmp_path: Path)
     written = json.loads((out / "prediction.json").read_text(encoding="utf-8"))
     assert written["format"] == "twin-prediction"
     assert len(written["figures"]) == len(result.figures)
+    assert "pipe, diameter error" in (out / "prediction.html").read_text(encoding="utf-8")
     # A second call renders nothing again.
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.truth.h5")}
     assert twin.predict("thesis-small", out=out, campaigns=1, every=6, spp=8).figures == result.figures
