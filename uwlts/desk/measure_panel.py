@@ -285,6 +285,7 @@ class _Row:
     def __init__(self, number: int, measuring: Measuring, button: AddButton, board: Board):
         self._number, self._measuring, self._board = number, measuring, board
         self._list = ui.context.slot.parent
+        self._shown: MeasuredValue | None = None
         with ui.element("div").classes("measured") as self._element:
             self._name = ui.input("name").props("dense").on("change", self._rename)
             self._lower = NumberField("lower, mm").props("dense").on("change", self._limit)
@@ -302,8 +303,15 @@ class _Row:
         if self._list.default_slot.children[place] is not self._element:
             self._element.move(target_index=place)
 
-    def _show_fields(self, value: MeasuredValue) -> None:
-        self._name.value, self._lower.value, self._upper.value = value.name, value.lower_mm, value.upper_mm
+    def _show_fields(self, value: MeasuredValue, *, restore: bool = False) -> None:
+        """Show name and limits; without ``restore`` only changed ones, because the user may be typing in the others."""
+        before, self._shown = self._shown, value
+        if restore or before is None or value.name != before.name:
+            self._name.value = value.name
+        if restore or before is None or value.lower_mm != before.lower_mm:
+            self._lower.value = value.lower_mm
+        if restore or before is None or value.upper_mm != before.upper_mm:
+            self._upper.value = value.upper_mm
 
     def delete(self) -> None:
         """Remove the row."""
@@ -315,7 +323,7 @@ class _Row:
             self._measuring.values = change(values)
         except Error as error:
             # The list has not changed.
-            self._show_fields(values.find(self._number))
+            self._show_fields(values.find(self._number), restore=True)
             self._board.say(str(error), "error")
             ui.notify(str(error), type="negative", multi_line=True)
 

@@ -106,6 +106,9 @@ class FlatRule:
 
 _RULE = FlatRule()
 
+_LARGEST_CIRCLE = 1e6
+"""Radius of a circle, relative to the extent of its places, above which they are collinear within rounding errors."""
+
 _facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
 
 
@@ -616,9 +619,9 @@ def _fit_circle(places: np.ndarray) -> np.ndarray:
         design = np.column_stack([away / distance[:, None], np.ones(len(away))])
         step = np.linalg.lstsq(design, distance - result[2], rcond=None)[0]
         result = result + step
-        if np.abs(step).max() < 1e-9:
+        if np.abs(step).max() < 1e-9 and result[2] < _LARGEST_CIRCLE * np.ptp(local, axis=0).max():
             return result
-    raise EvaluationError(f"no circle fits the {len(places)} places: the least-squares fit does not converge")
+    raise EvaluationError(f"no circle fits the {len(places)} places: they lie on a line, or the fit does not converge")
 
 
 def _make_diameter(kind: FeatureKind, name: str, hole: _Hole) -> FeatureValue:

@@ -74,7 +74,14 @@ def test_ply_is_lean_and_other_programs_read_it(tmp_path, coloured):
         write_cloud(tmp_path / name, cloud, colours=colours)
     seen = trimesh.load(tmp_path / "a.ply")
     kinds = seen.metadata["_ply_raw"]["vertex"]["properties"]
-    assert list(kinds) == [*"xyz", *["red", "green", "blue"] * coloured, "intensity", "normal_std", "frame", "line"]
+    assert list(kinds) == [
+        *"xyz",
+        *["red", "green", "blue"] * coloured,
+        "scalar_" * coloured + "intensity",
+        "normal_std",
+        "frame",
+        "line",
+    ]
     assert all(kinds[name] == "<u1" for name in ("red", "green", "blue") if coloured)
     np.testing.assert_array_equal(seen.vertices, cloud.points_mm)
     if coloured:
