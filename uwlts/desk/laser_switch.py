@@ -96,8 +96,10 @@ class LaserSwitch:
         lent = [stage.descriptor] if isinstance(stage, GrblStage) else []
         if self._ask(b"port" if lent else b"none", lent, _ANSWER_S):
             return
-        # It must not keep the port.
+        # It must not keep the port, which is free when the process has ended.
         self._process.kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
         if lent:
             raise HardwareError(
                 "the process that listens for Laser off has ended or is suspended: restart this program"
