@@ -40,7 +40,7 @@ def place(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def page(place: Path, chromium: "Browser") -> "Iterator[Page]":
-    words = ["desk", str(place), "--port", "18350"]
+    words = ["desk", str(place), "--port", "0"]
     with subprocess.Popen([sys.executable, "-m", "uwlts", *words], stdout=subprocess.PIPE, text=True) as desk:
         try:
             assert desk.stdout
