@@ -235,7 +235,10 @@ PAGES_RUN = {
             "small-pipe.toml": 'base = "pipe"\ntitle = "small pipe"\n',
         },
         tables={"small-pipe-campaign.toml": 0},
-        instead={"--campaigns 2 --every 4": "--campaigns 1 --every 40", "--campaigns 10": "--campaigns 1"},
+        instead={
+            "--campaigns 2 --every 4": "--campaign small-pipe-campaign.toml --campaigns 1 --every 4",
+            "--campaigns 10": "--campaigns 1 --every 4",
+        },
     ),
     "docs/how-to/inspect-a-pipe.md": Page(
         given={name: name for name in ("pipe.cloud.h5", "pipe.h5", "weld.cloud.h5", "flange.cloud.h5")}

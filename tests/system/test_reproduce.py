@@ -334,7 +334,7 @@ def test_a_take_that_fails_is_named(reproduce, described: Path, tmp_path: Path):
     code, said = reproduce(described / "impossible.toml", "--out", tmp_path / "runs", "--campaigns", 1, "--spp", 2)
     assert code == 2
     assert said.startswith("error: ")
-    assert "campaign-0/board-moon-air.h5: the objects are at Z = " in said
+    assert "campaign-0/board-moon-air.h5: " in said and "choose another placement" in said
     assert len(said.splitlines()) == 1
     assert not list(tmp_path.rglob("board-moon-air*"))
 
@@ -364,8 +364,7 @@ def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: 
     assert time.monotonic() - start < 15
     assert command.returncode == 130, errors
     assert output == ""
-    assert errors.startswith("interrupted; ")
-    assert len(errors.splitlines()) == 1
+    assert errors.splitlines()[-1].startswith("interrupted; ")
     assert sorted(contents(tmp_path / "runs")) == ["campaign-0/first.h5.part", "campaign-0/second.h5.part", "plan.json"]
     for part in parts:
         with Capture(part) as capture:

@@ -358,7 +358,10 @@ class JointRegistration:
             residuals.append(found.distance_mm)
             weights.append(weight)
             deviations.append(found.std_mm)
-            spurious += slope_information(found.normals, weight * spread**2 * found.slope_variance, by_poses)
+            # A scatter above the noise may come from a deformation, which does not turn the normals.
+            spurious += slope_information(
+                found.normals, weight * min(spread, 1.0) ** 2 * found.slope_variance, by_poses
+            )
         for first, second, views in spheres:
             covariance = first.covariance + second.covariance
             root = np.linalg.cholesky(np.linalg.inv(covariance)).T
