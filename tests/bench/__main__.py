@@ -284,7 +284,7 @@ def commands() -> list[Row]:
         return median_seconds(lambda k: subprocess.run([sys.executable, *arguments], check=True, capture_output=True))
 
     started = seconds("-c", "")
-    python, numpy = Floor("an empty Python", started, 30.0), Floor("import numpy", seconds("-c", "import numpy"), 1.0)
+    python, numpy = Floor("an empty Python", started, 20.0), Floor("import numpy", seconds("-c", "import numpy"), 1.0)
     return [
         at_most("uwlts --help", seconds("-m", "uwlts", "--help"), "s", 0.3, python),
         at_most("import uwlts, beyond an empty Python", seconds("-c", "import uwlts") - started, "s", 0.2, numpy),
