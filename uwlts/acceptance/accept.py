@@ -165,7 +165,7 @@ class Acceptance(Brief, _Stored):
 def format_characteristic(each: Characteristic) -> str:
     """Return a characteristic as one line of text."""
     words, _ = NAMES[each.symbol]
-    limit = "no MPE stated" if each.mpe_mm is None else f"MPE {each.mpe_mm:g} mm"
+    limit = f"MPE {each.limit_text()} mm" if each.limit_text() else "no MPE stated"
     if each.worst is None:
         return f"{each.symbol:5} {words}: not measured, {limit}"
     u = "U not known" if each.worst.expanded_mm is None else f"U {each.worst.expanded_mm:.4f} mm"
@@ -240,7 +240,9 @@ def accept(
         [each.stage_direction or stated.stage_direction for _, each in values],
     )
     characteristics = tuple(
-        judge_characteristic(symbol, [value for value, _ in values], stated.mpe.of(symbol))
+        judge_characteristic(
+            symbol, [value for value, _ in values], stated.mpe.of(symbol), mpe_mm_per_m=stated.mpe.per_metre(symbol)
+        )
         for symbol in SYMBOLS
         if stated.mpe.of(symbol) is not None or any(value.symbol == symbol for value, _ in values)
     )

@@ -91,7 +91,9 @@ class Characteristic(_Stored):
     count, wanted : int
         Number of measured values, and the least number of the guideline.
     mpe_mm : float or None
-        Maximum permissible error.
+        Maximum permissible error, for lengths without ``mpe_mm_per_m``.
+    mpe_mm_per_m : float
+        Growth of the maximum permissible error with the length.
     decision : str
         "conformity proven" if the interval of every value is within the limits, "nonconformity proven" if the
         interval of a value is outside, else "not proven"; or the reason why there is no decision.
@@ -103,6 +105,16 @@ class Characteristic(_Stored):
     wanted: Annotated[int, Field(ge=0)]
     mpe_mm: Positive | None
     decision: Decision
+    mpe_mm_per_m: NotNegative = 0.0
+
+    def limit_mm(self, value: CharacteristicValue) -> float | None:
+        """Return the maximum permissible error of a value, mm; None if it is not stated."""
+        return _limit_mm(value, self.mpe_mm, self.mpe_mm_per_m)
+
+    def limit_text(self) -> str:
+        """Return the maximum permissible error as text without its unit mm; empty if it is not stated."""
+        growth = f" + {self.mpe_mm_per_m:g} L / m" if self.mpe_mm_per_m else ""
+        return "" if self.mpe_mm is None else f"{self.mpe_mm:g}{growth}"
 
 
 def measure_position(
@@ -148,11 +160,18 @@ def measure_position(
             raise EvaluationError(f"a {found.kind} has no characteristic of an acceptance test")
 
 
-def judge_characteristic(symbol: Symbol, values: list[CharacteristicValue], mpe_mm: float | None) -> Characteristic:
-    """Return a characteristic with its worst value and the decision."""
+def judge_characteristic(
+    symbol: Symbol, values: list[CharacteristicValue], mpe_mm: float | None, *, mpe_mm_per_m: float = 0.0
+) -> Characteristic:
+    """Return a characteristic with its worst value and the decision; for the limits see `Characteristic`."""
     own = [each for each in values if each.symbol == symbol]
-    worst = max(own, key=lambda each: abs(each.value_mm) + (each.expanded_mm or 0.0), default=None)
-    decisions = {_decide(each, mpe_mm) for each in own} or {"no MPE" if mpe_mm is None else "not measured"}
+    limits = {id(each): _limit_mm(each, mpe_mm, mpe_mm_per_m) for each in own}
+
+    def beyond(each: CharacteristicValue) -> float:
+        return abs(each.value_mm) + (each.expanded_mm or 0.0) - (limits[id(each)] or 0.0)
+
+    worst = max(own, key=beyond, default=None)
+    decisions = {_decide(each, limits[id(each)]) for each in own} or {"no MPE" if mpe_mm is None else "not measured"}
     order: tuple[Decision, ...] = (
         "nonconformity proven",
         "not proven",
@@ -168,7 +187,12 @@ def judge_characteristic(symbol: Symbol, values: list[CharacteristicValue], mpe_
         wanted=WANTED[symbol],
         mpe_mm=mpe_mm,
         decision=next(each for each in order if each in decisions),
+        mpe_mm_per_m=mpe_mm_per_m,
     )
+
+
+def _limit_mm(value: CharacteristicValue, mpe_mm: float | None, mpe_mm_per_m: float) -> float | None:
+    return None if mpe_mm is None else mpe_mm + 1e-3 * mpe_mm_per_m * (value.length_mm or 0.0)
 
 
 def _decide(value: CharacteristicValue, mpe_mm: float | None) -> Decision:

@@ -22,7 +22,8 @@ class PermissibleErrors(Description):
 
     ``PF`` and ``PF95`` limit the probing error of form, by all points and by 95 % of them. ``PS`` limits the probing
     error of size, ``SD`` the sphere-spacing error, ``F`` and ``F95`` the flatness measurement error, and ``E`` the
-    error of the step's height.
+    error of the step's height. ``SD`` and ``E`` may grow with the length: ``SD_mm_per_m`` and ``E_mm_per_m`` are added
+    for each metre (the form A + L / K of ISO 10360).
     """
 
     PF_mm: Positive | None = None
@@ -32,10 +33,23 @@ class PermissibleErrors(Description):
     F_mm: Positive | None = None
     F95_mm: Positive | None = None
     E_mm: Positive | None = None
+    SD_mm_per_m: NotNegative = 0.0
+    E_mm_per_m: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _has_constant_parts(self) -> "PermissibleErrors":
+        for symbol in ("SD", "E"):
+            if getattr(self, f"{symbol}_mm_per_m") and getattr(self, f"{symbol}_mm") is None:
+                raise ValueError(f"{symbol}_mm_per_m needs {symbol}_mm, the limit for short lengths")
+        return self
 
     def of(self, symbol: Symbol) -> float | None:
         """Return the maximum permissible error of a characteristic, mm; None if it is not stated."""
         return getattr(self, f"{symbol}_mm")
+
+    def per_metre(self, symbol: Symbol) -> float:
+        """Return the growth of the maximum permissible error with the length, mm/m."""
+        return getattr(self, f"{symbol}_mm_per_m", 0.0)
 
 
 class CertifiedArtefact(Description):

@@ -139,7 +139,7 @@ def _characteristic_row(each: Characteristic) -> tuple[str, ...]:
     value = MISSING if worst is None else format_fixed(worst.value_mm, 4, signed=each.symbol in _SIGNED)
     expanded = MISSING if worst is None or worst.expanded_mm is None else format_fixed(worst.expanded_mm, 4)
     place = MISSING if worst is None else f"{worst.position}, {worst.label}"
-    limit = MISSING if each.mpe_mm is None else f"{each.mpe_mm:g}"
+    limit = each.limit_text() or MISSING
     measured = f"{each.count} ({each.wanted})"
     return each.symbol, each.decision, value, expanded, limit, place, measured, f"{words}; {guideline}"
 
@@ -211,14 +211,13 @@ def _draw_limits(acceptance: Acceptance) -> Markup:
     limited = [each for each in acceptance.characteristics if each.mpe_mm is not None]
     figure, (axes,) = new_figure(9.0, 0.8 + 0.42 * max(len(limited), 1))
     for row, each in enumerate(reversed(limited)):
-        assert each.mpe_mm is not None
         own = [value for value in acceptance.values if value.symbol == each.symbol]
-        shares = [abs(value.value_mm) / each.mpe_mm for value in own]
+        shares = [abs(value.value_mm) / (each.limit_mm(value) or 1.0) for value in own]
         axes.plot(shares, [row] * len(shares), "o", markersize=3, color=SOFT, alpha=0.6)
         if each.worst is not None:
             colour = _colour_of(each.decision)
-            half = (each.worst.expanded_mm or 0.0) / each.mpe_mm
-            middle = abs(each.worst.value_mm) / each.mpe_mm
+            limit = each.limit_mm(each.worst) or 1.0
+            half, middle = (each.worst.expanded_mm or 0.0) / limit, abs(each.worst.value_mm) / limit
             axes.errorbar(middle, row, xerr=half, fmt="o", color=colour, markersize=7, capsize=4, linewidth=2)
     axes.axvline(1.0, color=RED, linewidth=1.5)
     axes.set_yticks(range(len(limited)), [each.symbol for each in reversed(limited)])
@@ -254,12 +253,12 @@ def _draw_lengths(acceptance: Acceptance) -> Markup:
     """Draw the error of each length with its test value uncertainty and limit."""
     lengths = [value for value in acceptance.values if value.length_mm is not None]
     figure, (axes,) = new_figure(9.0, 3.6)
-    limits = {each.symbol: each.mpe_mm for each in acceptance.characteristics}
+    judged = {each.symbol: each for each in acceptance.characteristics}
     for place, value in enumerate(lengths):
         axes.errorbar(
             place, 1e3 * value.value_mm, yerr=1e3 * (value.expanded_mm or 0.0), fmt="o", color=BLUE, capsize=4
         )
-        if (limit := limits.get(value.symbol)) is not None:
+        if value.symbol in judged and (limit := judged[value.symbol].limit_mm(value)) is not None:
             for sign in (-1, 1):
                 axes.plot([place - 0.35, place + 0.35], [sign * 1e3 * limit] * 2, color=RED, linewidth=1.5)
     axes.axhline(0, color=INK, linewidth=0.8)

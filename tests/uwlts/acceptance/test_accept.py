@@ -148,6 +148,19 @@ def test_a_decision_needs_the_whole_interval(found, folder, share, decision):
     assert judged.verdict == verdicts.get(decision, decision)
 
 
+def test_limits_may_grow_with_the_length(found, folder):
+    worst = of(found, "SD").worst
+    reach = abs(worst.value_mm) + worst.expanded_mm
+    constant = 0.5 * reach
+    for per_m, decision in ((1.1, "conformity proven"), (0.9, "not proven")):
+        growth = (per_m * reach - constant) / (1e-3 * worst.length_mm)
+        limits = content_of()["mpe"] | {"SD_mm": constant, "SD_mm_per_m": growth}
+        judged = of(uwlts.accept(write_plan(folder, "growing.toml", mpe=limits), earlier=found), "SD")
+        assert judged.decision == decision
+        assert judged.limit_mm(judged.worst) == pytest.approx(constant + 1e-3 * growth * judged.worst.length_mm)
+        assert judged.limit_text() == f"{constant:g} + {growth:g} L / m"
+
+
 def test_what_is_missing_is_named(folder, tmp_path):
     """Missing files, unstated limits and certificates, and too few measurements: nothing is skipped in silence."""
     bare = content_of()["artefacts"]
@@ -186,6 +199,7 @@ def test_a_cloud_without_the_artefact_fails_with_the_reason(folder):
         ({"artefacts": {"pipe": {"standard": {"kind": "pipe", "diameter_mm": 3.0}}}}, "a pipe is no artefact"),
         ({"mpe": {"PF": 0.1}}, "mpe.PF: unknown key"),
         ({"mpe": {"PF_mm": -0.1}}, "mpe.PF_mm"),
+        ({"mpe": {"SD_mm_per_m": 0.1}}, "SD_mm_per_m needs SD_mm"),
     ],
 )
 def test_wrong_plans_are_refused(tmp_path, changes, said):
