@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -182,9 +181,15 @@ def _read_table(path: Path) -> list[tuple[str, str, float]]:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DescriptionError(f"{path} is not a text file: {error}") from error
-    first = text.partition("\n")[0]
-    mark = next((each for each in (";", "\t", ",") if each in first), ",")
-    reader = csv.DictReader(io.StringIO(text), delimiter=mark)
+    lines = text.splitlines()
+    mark = next((each for each in (";", "\t", ",") if each in lines[0]), ",") if lines else ","
+    try:
+        return _read_rows(csv.DictReader(lines, delimiter=mark), path, decimal_comma=mark == ";")
+    except csv.Error as error:
+        raise DescriptionError(f"{path} is no CSV table: {error}") from error
+
+
+def _read_rows(reader: csv.DictReader[str], path: Path, *, decimal_comma: bool) -> list[tuple[str, str, float]]:
     names = {name.strip().lower(): name for name in reader.fieldnames or () if name}
     if "value" not in names:
         raise DescriptionError(
@@ -194,7 +199,7 @@ def _read_table(path: Path) -> list[tuple[str, str, float]]:
     for number, row in enumerate(reader, start=2):
         written = (row[names["value"]] or "").strip()
         try:
-            value = float(written.replace(",", ".") if mark == ";" else written)
+            value = float(written.replace(",", ".") if decimal_comma else written)
         except ValueError as error:
             raise DescriptionError(f"{path}, line {number}: found '{written}', expected a number") from error
         part, operator = ((row[names[key]] or "").strip() if key in names else "" for key in ("part", "operator"))

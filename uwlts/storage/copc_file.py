@@ -45,6 +45,9 @@ _INFO, _INFO_BYTES, _ENTRY, _EXTENDED = 429, 160, 32, 60
 _ITEMS = 32  # place of the number of items in the record of LASzip
 _LAYERS = {6: (30, 9), 7: (36, 10), 8: (38, 11)}
 """Bytes of a point (LAS 1.4, 2.6) and compressed layers of a node, by point format; each extra byte is one more."""
+_POINT, _RGB, _RGB_NIR, _EXTRA_BYTES = 10, 11, 12, 14
+_ITEMS_OF_FORMAT = {6: ((_POINT, 30),), 7: ((_POINT, 30), (_RGB, 6)), 8: ((_POINT, 30), (_RGB_NIR, 8))}
+"""Types and bytes of the compressed items of a point by point format, before those of extra bytes (LASzip 3)."""
 _LARGEST_RATIO = 10_000
 """Largest number of points in a byte; equal points have 600. Higher ones are damage, and exhaust the memory."""
 _FIELDS: dict[str, type] = {"amplitude": np.float32, "frame": np.int32, "line": np.int32, "deviation_mm": np.float32}
@@ -203,7 +206,9 @@ def read_copc(
         with open_regular(path, called="cloud") as file:
             _require_sound_octree(file)
             reader = laspy.CopcReader(file)
-            _require_sound_items(reader.laszip_vlr.record_data, reader.header.point_format.size)
+            _require_sound_items(
+                reader.laszip_vlr.record_data, reader.header.point_format.id, reader.header.point_format.size
+            )
             total = int(reader.header.point_count)
             box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
             found = _query(reader, box, at_most)
@@ -267,12 +272,15 @@ def _require_sound_octree(file: BufferedReader) -> None:
     file.seek(0)
 
 
-def _require_sound_items(record: bytes, point_bytes: int) -> None:
-    """Raise ValueError if the items of a LASzip record, on which memory depends, are not those of a point."""
+def _require_sound_items(record: bytes, point_format: int, point_bytes: int) -> None:
+    """Raise ValueError if the items of a LASzip record are not those of the points: sizes of layers depend on them."""
     (count,) = struct.unpack_from("<H", record, _ITEMS)
-    sizes = [size for _, size, _ in struct.iter_unpack("<3H", record[_ITEMS + 2 :])]
-    if len(sizes) != count or sum(sizes) != point_bytes or not all(sizes):
-        raise ValueError(f"its compressed points have items of {sizes} bytes, and points of {point_bytes}")
+    items = [(kind, size) for kind, size, _ in struct.iter_unpack("<3H", record[_ITEMS + 2 :])]
+    expected = [*_ITEMS_OF_FORMAT[point_format]]
+    if extra := point_bytes - sum(size for _, size in expected):
+        expected.append((_EXTRA_BYTES, extra))
+    if len(items) != count or items != expected:
+        raise ValueError(f"its compressed points have the items {items}; expected {expected}, as type and bytes")
 
 
 def _query(reader: Any, box: Any, at_most: int | None) -> Any:

@@ -100,7 +100,10 @@ def profile_rows(rows: list[ImageRow], given: CentreLines, camera: Camera, *, fo
 def _read_table(path: Path) -> list[dict[str, float]]:
     text = read_text(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table of profiles")
     reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
-    columns = [name.strip() for name in reader.fieldnames or ()]
+    try:
+        columns = [name.strip() for name in reader.fieldnames or ()]
+    except csv.Error as error:
+        raise DescriptionError(f"{path} is no CSV table: {error}") from error
     if not columns or not set(columns) <= set(_OF_PROFILES) or len(set(columns)) < len(columns):
         raise DescriptionError(
             f"{path} has the columns {', '.join(columns)}; expected any of {', '.join(_OF_PROFILES)}"
@@ -108,7 +111,7 @@ def _read_table(path: Path) -> list[dict[str, float]]:
     reader.fieldnames = columns
     try:
         table = [{name: float(cell) for name, cell in row.items()} for row in reader]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, csv.Error) as error:
         raise DescriptionError(f"{path}, line {reader.line_num}: expected a number in every column") from error
     if not all(np.isfinite(list(row.values())).all() for row in table):
         raise DescriptionError(f"{path} holds values that are not finite")
