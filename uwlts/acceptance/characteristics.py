@@ -11,12 +11,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from uwlts.acceptance.plan import REFERENCE_C, CertifiedArtefact, Symbol, Temperature
+from uwlts.acceptance.plan import REFERENCE_C, CertifiedArtefact, Length, Size, Spread, Symbol, Temperature
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import PlaneEvaluation, StepEvaluation, evaluate_cloud
 from uwlts.evaluation.spheres import SphereEvaluation
 from uwlts.model.artefacts import PlaneStandard, SphereStandard, StepStandard
-from uwlts.model.sensor import NotNegative, Positive, UnitVector, Vector
+from uwlts.model.sensor import UnitVector, Vector
 from uwlts.storage.cloud import PointCloud
 
 Decision = Literal[
@@ -71,12 +71,12 @@ class CharacteristicValue(_Stored):
     symbol: Symbol
     position: str
     label: str
-    value_mm: float
-    expanded_mm: NotNegative | None
-    place_mm: Vector
-    length_mm: Positive | None = None
+    value_mm: Length
+    expanded_mm: Spread | None
+    place_mm: tuple[Length, Length, Length]
+    length_mm: Size | None = None
     direction: UnitVector | None = None
-    calibration_std_mm: NotNegative | None = None
+    calibration_std_mm: Spread | None = None
 
 
 class Characteristic(_Stored):
@@ -103,9 +103,9 @@ class Characteristic(_Stored):
     worst: CharacteristicValue | None
     count: Annotated[int, Field(ge=0)]
     wanted: Annotated[int, Field(ge=0)]
-    mpe_mm: Positive | None
+    mpe_mm: Size | None
     decision: Decision
-    mpe_mm_per_m: NotNegative = 0.0
+    mpe_mm_per_m: Spread = 0.0
 
     def limit_mm(self, value: CharacteristicValue) -> float | None:
         """Return the maximum permissible error of a value, mm; None if it is not stated."""

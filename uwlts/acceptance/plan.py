@@ -1,17 +1,24 @@
 """Plan of an acceptance test: artefacts with certificates, maximum permissible errors, and what is to be measured."""
 
 from pathlib import Path
-from typing import Literal, assert_never, get_args
+from typing import Annotated, Literal, assert_never, get_args
 
 from pydantic import Field, model_validator
 
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.library import read_table, validate_description
-from uwlts.model.sensor import Description, NotNegative, Positive, UnitVector
+from uwlts.model.sensor import Description, NotNegative, UnitVector
 
 Symbol = Literal["PF", "PF95", "PS", "SD", "F", "F95", "E"]
 """Symbols of the characteristics, as in the names of the permissible errors."""
 SYMBOLS: tuple[Symbol, ...] = get_args(Symbol)
+
+Length = Annotated[float, Field(ge=-1e6, le=1e6)]
+"""Length or coordinate in mm: larger ones than a kilometre are damage."""
+Size = Annotated[float, Field(ge=1e-6, le=1e6)]
+"""Positive length in mm, between a nanometre and a kilometre."""
+Spread = Annotated[float, Field(ge=0, le=1e6)]
+"""Uncertainty in mm, or growth of a limit in mm/m."""
 
 REFERENCE_C = 20.0
 """Reference temperature of lengths (ISO 1)."""
@@ -26,15 +33,15 @@ class PermissibleErrors(Description):
     for each metre (the form A + L / K of ISO 10360).
     """
 
-    PF_mm: Positive | None = None
-    PF95_mm: Positive | None = None
-    PS_mm: Positive | None = None
-    SD_mm: Positive | None = None
-    F_mm: Positive | None = None
-    F95_mm: Positive | None = None
-    E_mm: Positive | None = None
-    SD_mm_per_m: NotNegative = 0.0
-    E_mm_per_m: NotNegative = 0.0
+    PF_mm: Size | None = None
+    PF95_mm: Size | None = None
+    PS_mm: Size | None = None
+    SD_mm: Size | None = None
+    F_mm: Size | None = None
+    F95_mm: Size | None = None
+    E_mm: Size | None = None
+    SD_mm_per_m: Spread = 0.0
+    E_mm_per_m: Spread = 0.0
 
     @model_validator(mode="after")
     def _has_constant_parts(self) -> "PermissibleErrors":
@@ -149,7 +156,7 @@ class AcceptancePlan(Description):
     client: str | None = None
     operator: str | None = None
     calibration: str | None = None
-    volume_mm: tuple[Positive, Positive, Positive]
+    volume_mm: tuple[Size, Size, Size]
     stage_direction: UnitVector = (1.0, 0.0, 0.0)
     mpe: PermissibleErrors = Field(default_factory=PermissibleErrors)
     temperature: Temperature | None = None
