@@ -58,14 +58,12 @@ def _read_text(path: Path, unit: Unit | None) -> PointCloud:
         columns, scale = table.columns, table.mm_per_unit(unit=unit)
     except DescriptionError as error:
         raise CaptureError(str(error)) from error
-    axes = [columns[axis] for axis in "xyz" if axis in columns]
-    if len(axes) < 3:
-        if "0" not in columns or len(columns) < 3:
-            raise CaptureError(f"{path} has the columns {', '.join(columns)}; expected x, y and z in mm")
-        axes = [columns[number] for number in "012"]
-        if len(columns) > 3 and len(axes[0]) > 2 and (np.diff(axes[0]) == 1).all():
-            raise CaptureError(f"{path} counts its rows in the first column: name the columns, such as n x y z")
-    points, used = np.column_stack(axes), "xyz" if "x" in columns else "012"
+    used = next((names for names in ("xyz", "012") if set(names) <= columns.keys()), None)
+    if used is None:
+        raise CaptureError(f"{path} has the columns {', '.join(columns)}; expected x, y and z in mm")
+    points = np.column_stack([columns[name] for name in used])
+    if used == "012" and len(columns) > 3 and len(points) > 2 and (np.diff(points[:, 0]) == 1).all():
+        raise CaptureError(f"{path} counts its rows in the first column: name the columns, such as n x y z")
     step = scale * max(find_float_step(points), *(table.steps.get(name, 0.0) for name in used))
     cloud = make_foreign_cloud(scale * points, intensity=columns.get("intensity"), step_mm=step)
     return replace(cloud, warnings=[*table.notes, *cloud.warnings])
