@@ -101,8 +101,8 @@ def read_las(path: Path) -> PointCloud:
     try:
         # The library reads as many records before the points as the header declares, without a limit.
         points_begin, records = struct.unpack("<II", start[96:START_BYTES])
-        if records * RECORD_BYTES > points_begin:
-            raise ValueError(f"{records} records do not fit before its points")
+        if points_begin > path.stat().st_size or records * RECORD_BYTES > points_begin:
+            raise ValueError(f"{records} records do not fit before its points, or these begin beyond its end")
         with laspy.open(path, read_evlrs=False) as reader:
             header = reader.header
             needed = header.offset_to_point_data + header.point_count * header.point_format.size
