@@ -4,6 +4,7 @@ Each command calls a function of `twin`; its options, defaults and help texts ar
 """
 
 import sys
+from typing import Any
 
 import twin
 from uwlts.errors import CommandFailed
@@ -52,10 +53,7 @@ def reproduce(call: Call) -> None:
 @command_from(app, twin, "follow", job="Simulate")
 def follow(call: Call) -> None:
     """Example: twin follow wall.h5 --calibration calibration.json --out runs/follow"""
-    try:
-        say(f"wrote {call()}")
-    except CommandFailed as error:
-        sys.exit(error.returncode)
+    say(f"wrote {_run_others(call)}")
 
 
 @command_from(app, twin, "demo", job="Simulate")
@@ -64,10 +62,10 @@ def demo(call: Call) -> None:
     _run_others(call)
 
 
-def _run_others(call: Call) -> None:
+def _run_others(call: Call) -> Any:
     """Call a function that runs other commands; exit with the status of a failed one, which has printed its error."""
     try:
-        call()
+        return call()
     except CommandFailed as error:
         sys.exit(error.returncode)
 
@@ -75,11 +73,7 @@ def _run_others(call: Call) -> None:
 @command_from(app, twin, "predict", job="Design")
 def predict(call: Call) -> None:
     """Example: twin predict thesis --campaigns 3 --out runs/predicted"""
-    try:
-        result = call()
-    except CommandFailed as error:
-        sys.exit(error.returncode)
-    show(result.lines())
+    show(_run_others(call).lines())
 
 
 @command_from(app, twin, "sweep", job="Design")

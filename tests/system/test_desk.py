@@ -142,6 +142,11 @@ def connected(page: "Page") -> None:
 def scanning(page: "Page") -> None:
     """A scan of 60 images is being recorded."""
     connected(page)
+    start_scan(page)
+
+
+def start_scan(page: "Page") -> None:
+    """Start a scan of 60 images."""
     tab(page, "Scan")
     page.get_by_label("positions").fill("60")
     page.get_by_label("step, mm").fill("0.2")

@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from tests.system.test_desk import DESCRIPTIONS, TABS, LaserOff, desk, press, says, served, shows, sized, tab
+from tests.system.test_desk import (
+    DESCRIPTIONS,
+    TABS,
+    LaserOff,
+    desk,
+    press,
+    says,
+    served,
+    shows,
+    sized,
+    start_scan,
+    tab,
+)
 from tests.system.test_desk_analyses import choose
 from tests.uwlts.desk.test_analyses import step_cloud
 from tests.waiting import within
@@ -172,11 +184,7 @@ def test_laser_off_works_in_every_phase(desk, sized: "Page", served: "ServedTwin
     show_laser(page, reload=True)
     off.ends_flashes("live-laser-reloaded")
     unlock(page)
-    tab(page, "Scan")
-    page.get_by_label("positions").fill("60")
-    page.get_by_label("step, mm").fill("0.2")
-    press(page, "start")
-    shows(page, "of 60")
+    start_scan(page)
     off.ends_flashes("scanning")
     unlock(page)
     tab(page, "Scan")

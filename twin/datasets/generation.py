@@ -25,8 +25,8 @@ from twin.datasets.labels import make_labels
 from twin.datasets.loading import CARD
 from twin.datasets.shards import SUFFIXES, Sample, open_shard
 from twin.options import CPU, Variant, use_variant
-from twin.recording.campaigns import PLAN, keep_to_plan, make_folder
-from uwlts.errors import DescriptionError, DesignError
+from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
+from uwlts.errors import DesignError
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import OtherWriterError, lock_output, refuse_other_writer
 from uwlts.model.placement import camera_from_object
@@ -105,8 +105,7 @@ def dataset(
     >>> folder = twin.dataset("stripe-turbid", out="runs/turbid", scenes=200)
     >>> test = twin.load_dataset(folder, split="test")
     """
-    if workers is not None and workers < 1:
-        raise DescriptionError(f"workers is {workers}; it must be at least 1")
+    require_at_least(1, workers=workers)
     described, folder = load_description(description, scenes=scenes, seed=seed), Path(out)
     draw_scene(described, 0)
     jobs = _jobs(described, folder, variant)

@@ -23,7 +23,7 @@ from twin.design.screening import JOURNAL, PARTS, evaluate_study, read_parts, wr
 from twin.design.study import Study, load_study
 from twin.design.verification import Agreement, verify_candidates
 from twin.options import CPU, Variant
-from twin.recording.campaigns import PLAN
+from twin.recording.campaigns import PLAN, require_at_least
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
@@ -160,8 +160,7 @@ def sweep(
     >>> result = twin.sweep("baseline-angle", out="runs/baseline-angle", verify=0)
     >>> result.winner.design.figures["sigma_z_rms_mm"]
     """
-    if workers is not None and workers < 1:
-        raise DescriptionError(f"workers is {workers}; it must be at least 1")
+    require_at_least(1, workers=workers)
     if out is None and isinstance(study, Study):
         raise DescriptionError("`out` is missing: give the folder for a study that is not read from a file")
     folder = Path("runs") / Path(str(study)).stem if out is None else Path(out)

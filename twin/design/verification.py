@@ -29,7 +29,7 @@ from twin.design.parameters import extract_parameters
 from twin.design.study import Study
 from twin.design.verification_scenes import PlannedRecording, plan_recordings
 from twin.options import CPU, Options, use_variant
-from twin.recording.campaigns import make_folder
+from twin.recording.campaigns import make_folder, require_at_least
 from uwlts import errors
 from uwlts.errors import Error
 from uwlts.files.writing import write_atomically
@@ -126,8 +126,7 @@ def verify(
     SetupError
         A process was ended from outside, or the machine cannot render.
     """
-    if workers < 1:
-        raise errors.DescriptionError(f"workers is {workers}; it must be at least 1")
+    require_at_least(1, workers=workers)
     planned = plan_recordings(sensor, medium, reflectance=reflectance)
     calibration, cloud = folder / "calibration.json", folder / "standard.ply"
     make_folder(folder)

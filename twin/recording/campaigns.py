@@ -68,19 +68,21 @@ def record(
     DescriptionError, DesignError, OutputError, SetupError
         As `record_campaigns`, or an argument is out of its range.
     """
-    for name, value, least in (
-        ("every", every, 1),
-        ("seed", seed, 0),
-        ("workers", 1 if workers is None else workers, 1),
-    ):
-        if value < least:
-            raise DescriptionError(f"{name} is {value}; it must be at least {least}")
+    require_at_least(1, every=every, workers=workers)
+    require_at_least(0, seed=seed)
     described, folder = load_campaign(campaign), Path(out)
     flaws = Flaws.parse(*effects)
     jobs = _jobs(described, folder, seed=seed, every=every, spp=spp, variant=variant, flaws=flaws)
     plan = _plan(described, every=every, spp=spp, variant=variant) | {"seed": seed, "effects": flaws.names()}
     _record_all(jobs, folder, plan, recorded="*.h5*", workers=workers, overwrite=overwrite, progress=progress)
     return folder
+
+
+def require_at_least(least: int, **values: int | None) -> None:
+    """Raise DescriptionError for a value below the least one; None is the default of a function."""
+    for name, value in values.items():
+        if value is not None and value < least:
+            raise DescriptionError(f"{name} is {value}; it must be at least {least}")
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,14 @@ import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 
 from uwlts.errors import CommandFailed, SetupError
 from uwlts.runtime.console import INTERRUPTED
 from uwlts.runtime.workers import Lost, Workers
+
+AT_ONCE = 2
+"""Number of parallel commands of a stage: only rendering uses all processors by itself."""
 
 
 def run_lines(workers: Workers, lines: Iterable[str], *, quiet: bool = False) -> None:
@@ -31,7 +35,8 @@ def run_lines(workers: Workers, lines: Iterable[str], *, quiet: bool = False) ->
     SetupError
         A worker process ended unexpectedly.
     """
-    for line, ended in workers.map_unordered(_run_quietly if quiet else _run, lines if quiet else _announce(lines)):
+    run = partial(_run, quiet=quiet)
+    for line, ended in workers.map_unordered(run, lines if quiet else _announce(lines)):
         if isinstance(ended, Lost):
             raise SetupError(f"{line}: {ended.reason}")
         code, output = ended
@@ -58,26 +63,17 @@ class _PlainErrors(io.TextIOBase):
         return len(text)
 
 
-def _run(line: str) -> tuple[int, str]:
-    """Run a command and return its exit code and output; errors and progress appear at once."""
-    return _run_module(line, _PlainErrors())
+def _run(line: str, *, quiet: bool) -> tuple[int, str]:
+    """Run a command as ``python -m`` does, and return its exit code and output.
 
-
-def _run_quietly(line: str) -> tuple[int, str]:
-    """Run a command and return its exit code, and its output with errors and progress."""
-    return _run_module(line, None)
-
-
-def _run_module(line: str, errors: io.TextIOBase | None) -> tuple[int, str]:
-    """Run a command as ``python -m`` does; without a stream for errors, they are a part of the output.
-
-    It runs in this process: importing the shared modules takes most commands longer than their work.
+    Errors and progress appear at once, or are a part of the output if ``quiet``. The command runs in this process:
+    importing the shared modules takes most commands longer than their work.
     """
     program, *arguments = shlex.split(line)
     output = io.StringIO()
     sys.argv = [program, *arguments]
     code = 0
-    with redirect_stdout(output), redirect_stderr(errors or output):
+    with redirect_stdout(output), redirect_stderr(output if quiet else _PlainErrors()):
         try:
             runpy.run_module(program, run_name="__main__", alter_sys=True)
         except SystemExit as end:

@@ -6,12 +6,10 @@ import time
 from itertools import groupby
 from pathlib import Path
 
-from twin.recording.command_lines import run_lines
+from twin.recording.command_lines import AT_ONCE, run_lines
 from uwlts.runtime.workers import open_workers
 
 STAGES = ("render", "calibrate", "reconstruct", "evaluate", "report")
-AT_ONCE = 2
-"""Number of parallel commands of a stage: only rendering uses all processors by itself."""
 CAMPAIGN = "demo"
 PLACEMENTS = ("near", "standoff", "far")
 SPHERES = tuple(f"spheres-{place}" for place in PLACEMENTS)

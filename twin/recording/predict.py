@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from twin.options import CPU, Variant
-from twin.recording.campaigns import record_campaigns
-from twin.recording.command_lines import run_lines
+from twin.recording.campaigns import record_campaigns, require_at_least
+from twin.recording.command_lines import AT_ONCE, run_lines
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign, replace_values
 from uwlts._version import __version__
 from uwlts.errors import CaptureError, DescriptionError
@@ -23,7 +23,6 @@ from uwlts.runtime.workers import open_workers
 
 RESULT = "prediction.json"
 PAGE = "prediction.html"
-_AT_ONCE = 2
 _STEP_IMAGES = 5
 """Fewer images of a step standard belong to a calibration; a scan has at least this many profiles."""
 _CERTIFICATE = {
@@ -179,14 +178,8 @@ def predict(
     CaptureError
         A result cannot be read.
     """
-    for name, value, least in (
-        ("campaigns", campaigns, 1),
-        ("first", first, 0),
-        ("every", every, 1),
-        ("workers", 1 if workers is None else workers, 1),
-    ):
-        if value < least:
-            raise DescriptionError(f"{name} is {value}; it must be at least {least}")
+    require_at_least(1, campaigns=campaigns, every=every, workers=workers)
+    require_at_least(0, first=first)
     described = load_campaign(campaign)
     if sensor is not None:
         described = replace_values(described, sensor=str(sensor), as_built=str(sensor))
@@ -205,7 +198,7 @@ def predict(
         progress=progress,
     )
     by_folder = [_command_lines(place, evidence, scans) for place in folders]
-    with open_workers(workers=_AT_ONCE) as processes:
+    with open_workers(workers=AT_ONCE) as processes:
         for number, stage in enumerate(zip(*by_folder, strict=True)):
             progress(number, len(by_folder[0]), "evaluate")
             run_lines(processes, [line for lines in stage for line in lines], quiet=True)

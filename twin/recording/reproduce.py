@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from twin.options import CPU, Variant
-from twin.recording.campaigns import record_campaigns
+from twin.recording.campaigns import record_campaigns, require_at_least
 from twin.scene.campaign import load_campaign
 from uwlts.errors import CommandFailed, DescriptionError
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -72,9 +72,7 @@ def reproduce(
     CommandFailed
         The evaluation failed; its output gives the reason.
     """
-    for name, value in (("campaigns", campaigns), ("every", every), ("workers", 1 if workers is None else workers)):
-        if value < 1:
-            raise DescriptionError(f"{name} is {value}; it must be at least 1")
+    require_at_least(1, campaigns=campaigns, every=every, workers=workers)
     if first < 0:
         raise DescriptionError(f"first is {first}; a seed must not be negative")
     if trials != 0 and trials < _LEAST_TRIALS:

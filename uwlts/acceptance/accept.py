@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from uwlts._version import __version__
 from uwlts.acceptance.characteristics import (
@@ -14,6 +14,7 @@ from uwlts.acceptance.characteristics import (
     Characteristic,
     CharacteristicValue,
     Decision,
+    StoredPart,
     describe_missing,
     judge_characteristic,
     measure_position,
@@ -45,12 +46,7 @@ _LEAST_SPACING = 0.3
 """Least sphere spacing relative to the diagonal of the measuring volume (VDI/VDE 2634 part 2)."""
 
 
-class _Stored(BaseModel):
-    # Fields of newer versions are kept.
-    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
-
-
-class JudgedPosition(_Stored):
+class JudgedPosition(StoredPart):
     """Position of the plan: whether its file is missing, could not be evaluated (with the reason), or is judged.
 
     ``inputs`` is the digest of file, calibration and artefact; a later run takes the values of an unchanged position
@@ -70,7 +66,7 @@ class JudgedPosition(_Stored):
     values: tuple[CharacteristicValue, ...] = ()
 
 
-class Acceptance(Brief, _Stored):
+class Acceptance(Brief, StoredPart):
     """Result of `accept`, and the content of its file.
 
     Attributes

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from uwlts.acceptance.plan import REFERENCE_C, CertifiedArtefact, Length, Size, Spread, Symbol, Temperature
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import PlaneEvaluation, StepEvaluation, evaluate_cloud
+from uwlts.evaluation.decision import Verdict, judge_interval
 from uwlts.evaluation.spheres import SphereEvaluation
 from uwlts.model.artefacts import PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.sensor import UnitVector, Vector
@@ -39,13 +40,20 @@ WANTED: dict[Symbol, int] = {"PF": 10, "PF95": 10, "PS": 10, "SD": 7, "F": 6, "F
 
 COVERAGE_FACTOR = 2.0
 
+_DECISIONS: dict[Verdict, Decision] = {
+    "within the limit": "conformity proven",
+    "exceeds the limit": "nonconformity proven",
+    "undecided": "not proven",
+}
 
-class _Stored(BaseModel):
-    # Fields of newer versions are kept.
+
+class StoredPart(BaseModel):
+    """Part of a stored result; fields of newer versions are kept."""
+
     model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 
 
-class CharacteristicValue(_Stored):
+class CharacteristicValue(StoredPart):
     """Measured value of a characteristic at one position.
 
     Attributes
@@ -79,7 +87,7 @@ class CharacteristicValue(_Stored):
     calibration_std_mm: Spread | None = None
 
 
-class Characteristic(_Stored):
+class Characteristic(StoredPart):
     """Characteristic with its worst value, the maximum permissible error, and the decision (ISO 14253-1).
 
     Attributes
@@ -196,14 +204,13 @@ def _limit_mm(value: CharacteristicValue, mpe_mm: float | None, mpe_mm_per_m: fl
 
 
 def _decide(value: CharacteristicValue, mpe_mm: float | None) -> Decision:
-    """Return the decision on one value by its coverage interval (ISO 14253-1)."""
+    """Return the decision on one value by its coverage interval."""
     if mpe_mm is None:
         return "no MPE"
     if value.expanded_mm is None:
         return "no test value uncertainty"
-    if abs(value.value_mm) + value.expanded_mm <= mpe_mm:
-        return "conformity proven"
-    return "nonconformity proven" if abs(value.value_mm) - value.expanded_mm > mpe_mm else "not proven"
+    size = abs(value.value_mm)
+    return _DECISIONS[judge_interval(size - value.expanded_mm, size + value.expanded_mm, upper=mpe_mm)]
 
 
 def _sphere_values(
@@ -284,19 +291,13 @@ def _mean_place(cloud: PointCloud, deviation_mm: np.ndarray) -> Vector:
 
 def describe_missing(artefact: CertifiedArtefact) -> list[str]:
     """Return what a certificate does not state, but the test value uncertainty needs."""
-    standard = artefact.standard
-    missing = []
-    match standard:
-        case SphereStandard():
-            missing += ["diameter_uncertainty_mm"] if standard.diameter_uncertainty_mm is None else []
-            missing += (
-                ["spacing_uncertainty_mm"] if standard.spacings_mm and standard.spacing_uncertainty_mm is None else []
-            )
-            missing += ["form_mm"] if artefact.stated_form_mm() is None else []
-        case PlaneStandard():
-            missing += ["form_mm"] if artefact.stated_form_mm() is None else []
-        case StepStandard():
-            missing += ["height_uncertainty_mm"] if standard.height_uncertainty_mm is None else []
-        case _:
-            pass
-    return missing
+    standard, needed = artefact.standard, dict[str, float | None]()
+    if isinstance(standard, SphereStandard):
+        needed["diameter_uncertainty_mm"] = standard.diameter_uncertainty_mm
+        if standard.spacings_mm:
+            needed["spacing_uncertainty_mm"] = standard.spacing_uncertainty_mm
+    if isinstance(standard, SphereStandard | PlaneStandard):
+        needed["form_mm"] = artefact.stated_form_mm()
+    if isinstance(standard, StepStandard):
+        needed["height_uncertainty_mm"] = standard.height_uncertainty_mm
+    return [name for name, value in needed.items() if value is None]

@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 from scipy.stats import t as t_distribution
 
-from uwlts.acceptance.characteristics import CharacteristicValue
+from uwlts.acceptance.characteristics import CharacteristicValue, StoredPart
 from uwlts.model.sensor import Vector
 
 Component = Literal["XX", "YY", "ZZ", "YZ", "XY", "XZ"]
@@ -43,15 +42,13 @@ _ACROSS = 0.1
 """Largest component of the stage's direction along the sheet at which lengths along X are those of the stage."""
 
 
-class ScaleComponent(BaseModel):
+class ScaleComponent(StoredPart):
     """Scale or shear of the measured lengths, and whose share it is.
 
     ``value`` is relative: 1e-4 is 0.01 mm per 100 mm. ``std`` is the standard error by the scatter of the lengths and
     the calibration of the artefacts, and ``half_interval`` half of the 95 % interval. All are None if the positions do
     not determine the component.
     """
-
-    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 
     component: Component
     words: str
@@ -66,7 +63,7 @@ class ScaleComponent(BaseModel):
         return self.value is not None and self.half_interval is not None and abs(self.value) > self.half_interval
 
 
-class DirectionalScale(BaseModel):
+class DirectionalScale(StoredPart):
     """Regression of length errors on their directions.
 
     Attributes
@@ -82,8 +79,6 @@ class DirectionalScale(BaseModel):
     remarks : tuple of str
         What the lengths cannot separate.
     """
-
-    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 
     components: tuple[ScaleComponent, ...]
     anisotropy: ScaleComponent | None

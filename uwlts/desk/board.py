@@ -11,8 +11,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from uwlts.desk.frame_profile import FrameProfile
 from uwlts.desk.thinned_cloud import ThinnedCloud
-from uwlts.inspection.section import Section
 
 Kind = Literal["note", "warning", "error"]
 LaserState = Literal["none", "off", "flashing", "on", "unknown"]
@@ -100,7 +100,7 @@ class Board:
 
     ``request`` is what the operator should do, and ``answers`` are the labels of its buttons. ``coverage`` is a PNG of
     the image area covered in a guided calibration. ``detail`` returns, for a cloud that is shown thinned, the points in
-    a box from low to high (3,) in mm, in the form of `point_table`. ``profile`` has the points of the latest laser
+    a box from low to high (3,) in mm, in the form of `point_table`. ``profile`` is that of the latest laser
     image, if a calibration is chosen.
     """
 
@@ -116,7 +116,7 @@ class Board:
     cloud: ThinnedCloud = field(default_factory=ThinnedCloud)
     cloud_name: str = ""
     detail: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-    profile: Section | None = None
+    profile: FrameProfile | None = None
 
     def __post_init__(self) -> None:
         self._lines: deque[Line] = deque(maxlen=KEPT_LINES)

@@ -20,9 +20,10 @@ import numpy as np
 
 from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.board import Board, Picture
+from uwlts.desk.frame_profile import FrameProfile
 from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.recording_view import BackgroundView, RecordingView, reconstruct_frame
+from uwlts.desk.recording_view import BackgroundView, RecordingView
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
@@ -34,7 +35,6 @@ from uwlts.hardware.guided.record import guide
 from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, record_scan
-from uwlts.inspection.section import order_profile
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
@@ -410,13 +410,13 @@ class Instrument:
         # Until the first movement the position may be unknown.
         place_mm, exposure_ms = self._board.position_mm or 0.0, frame.exposure_ms or 0.0
         placed = Frame(frame.seen, place_mm, True, exposure_ms, frame.time_s)
+        profile = FrameProfile(placed, stripe, connected.plan.header("live"), self.calibration)
         try:
-            found = reconstruct_frame(placed, stripe, connected.plan.header("live"), self.calibration)
+            # Making the points shows whether the calibration fits.
+            self._board.profile = profile if len(stripe.lines) and len(profile.points) else None
         except Error as error:
             self.calibration = None
             self._board.say(f"no profile is shown: {error}", "error")
-            return
-        self._board.profile = None if found is None else order_profile(found)
 
     def _scan(self, plan: ScanPlan, out: Path, calibration: Path | None, resume: bool, overwrite: bool) -> None:
         known: AnyCalibration | None = None if calibration is None else load_calibration(calibration)

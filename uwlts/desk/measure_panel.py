@@ -103,8 +103,8 @@ class MeasurePanel:
 
     def refresh(self) -> None:
         """Show changes of the list, and the latest profile."""
-        if self._live and self._board.profile is not None and self._board.profile is not self._section:
-            self._section = self._board.profile
+        if self._live and (latest := self._board.profile) is not None and latest.section is not self._section:
+            self._section = latest.section
             self._show_section()
         values = self._measuring.values
         if values is not self._shown:

@@ -11,16 +11,13 @@ from typing import Self
 import numpy as np
 
 from uwlts.desk.board import Board, Picture
+from uwlts.desk.frame_profile import FrameProfile
 from uwlts.desk.server import DeskServer
 from uwlts.errors import CaptureError
-from uwlts.inspection.section import order_profile
 from uwlts.model.any_calibration import AnyCalibration
-from uwlts.model.calibration import Calibration
-from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.calibration_file import resolve_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, drawable_image, part_path
-from uwlts.storage.cloud import PointCloud
-from uwlts.stripe import CaptureStripes, Stripe, find_stripe, warm_up
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, drawable_image, part_path
+from uwlts.stripe import find_stripe, warm_up
 
 LOOK_S = 0.1
 """Interval between checks for new images; a check takes a few ms."""
@@ -32,11 +29,11 @@ too little of the stripe below this fraction of lines with a point."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Profile:
-    """Stripe of one laser image: pixels (N, 2), points if a calibration is known, warnings."""
+class _SeenStripe:
+    """Stripe of one laser image: pixels (N, 2), profile if a calibration is known, warnings."""
 
     pixels: np.ndarray
-    cloud: PointCloud | None
+    profile: FrameProfile | None
     lines: int
     saturated: float | None
     remarks: tuple[str, ...]
@@ -65,32 +62,34 @@ class RecordingView:
         if not frame.laser_on:
             board.show(Picture(frame.image, full_dn=full, caption=caption))
             return
-        profile = _profile(frame, self._header, self._calibration)
-        self._found, self._lines = self._found + len(profile.pixels), self._lines + profile.lines
+        seen = _find(frame, self._header, self._calibration)
+        self._found, self._lines = self._found + len(seen.pixels), self._lines + seen.lines
         caption += f"; stripe on {self._found:,} of {self._lines:,} profile lines so far"
         board.show(
             Picture(
                 drawable_image(frame.seen, self._header.sensor.camera),
                 full_dn=full,
                 caption=caption,
-                stripe=profile.pixels,
-                saturated=profile.saturated,
+                stripe=seen.pixels,
+                saturated=seen.saturated,
             )
         )
-        if (cloud := profile.cloud) is not None:
-            board.cloud.add(cloud.points_mm, intensity=cloud.intensity)
-            board.profile = order_profile(cloud)
-        for remark in profile.remarks:
+        if (profile := seen.profile) is not None:
+            board.cloud.add(profile.points.points_mm, intensity=profile.points.intensity)
+            board.profile = profile
+        for remark in seen.remarks:
             # Once each, because they stay in the log.
             if remark not in self._said:
                 self._said.add(remark)
                 board.say(f"image {number + 1}: {remark}", "warning")
 
 
-def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | None) -> _Profile:
+def _find(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | None) -> _SeenStripe:
     along, full = header.sensor.camera.stripe_along, header.saturation_dn
     stripe = find_stripe(frame.seen, stripe_along=along, saturation=full)
-    cloud = None if calibration is None else reconstruct_frame(frame, stripe, header, calibration)
+    profile = None
+    if calibration is not None and len(stripe.lines):
+        profile = FrameProfile(frame, stripe, header, calibration)
     saturated, remarks = None, []
     if isinstance(frame.seen, np.ndarray):
         brightest = frame.seen.max(axis=0 if along == "width" else 1)
@@ -101,24 +100,7 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
             remarks.append("faint: lengthen the exposure, or is the laser off?")
     if len(stripe.lines) < _FEW * len(stripe.status):
         remarks.append("almost no stripe: is the object in the volume?")
-    return _Profile(stripe.pixels(), cloud, len(stripe.status), saturated, tuple(remarks))
-
-
-def reconstruct_frame(
-    frame: Frame, stripe: Stripe, header: CaptureHeader, calibration: AnyCalibration
-) -> PointCloud | None:
-    """Return the points of a laser image, with uncertainty if the calibration states it; None without a stripe.
-
-    The errors are those of `reconstruct_stripes`.
-    """
-    line = stripe.lines
-    if len(line) == 0:
-        return None
-    own, centre = np.zeros(len(line), dtype=int), stripe.centre_px[line]
-    stripes = CaptureStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
-    known = isinstance(calibration, Calibration) and calibration.joint is not None
-    table = FrameTable.from_frames(header, [frame])
-    return reconstruct_stripes(table, stripes, calibration, with_uncertainty=known)
+    return _SeenStripe(stripe.pixels(), profile, len(stripe.status), saturated, tuple(remarks))
 
 
 def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:

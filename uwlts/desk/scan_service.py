@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from uwlts.desk.frame_profile import FrameProfile
 from uwlts.desk.guided import Ended
-from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames, reconstruct_frame
+from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames
 from uwlts.errors import Error, HardwareError
 from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.grbl import GrblStage
@@ -165,7 +166,8 @@ class ScanService:
         stripe = find_stripe(
             frame.seen, stripe_along=header.sensor.camera.stripe_along, saturation=header.saturation_dn
         )
-        if (cloud := reconstruct_frame(frame, stripe, header, self._calibration)) is not None:
+        if len(stripe.lines):
+            cloud = FrameProfile(frame, stripe, header, self._calibration).measured()
             placed = {"frame": np.full(len(cloud), number), "time_s": np.full(len(cloud), frame.time_s)}
             self._publish(replace(cloud, **placed), frame.time_s)
 

@@ -1,7 +1,8 @@
 """Propagation of point errors to derived figures: by patterns, by random draws, and linearly.
 
 Systematic patterns are added one by one, and the squared changes are summed (GUM, JCGM 100:2008, section 5.1, for
-independent inputs). Noise is simulated by random draws (GUM Supplement 1, JCGM 101:2008).
+independent inputs). Noise is simulated by random draws (GUM Supplement 1, JCGM 101:2008). If no errors are stated, the
+covariance of parameters follows from fits without parts of the data (`jackknife`).
 """
 
 from __future__ import annotations
@@ -156,3 +157,11 @@ def noise_shifts(uncertainty: PointUncertainty) -> np.ndarray:
 def _group_numbers(group: np.ndarray) -> np.ndarray:
     """Return consecutive group numbers (N,), starting at 0."""
     return np.unique(group, return_inverse=True)[1].ravel()
+
+
+def jackknife(changes: np.ndarray) -> np.ndarray:
+    """Return the covariance (P, P) of parameters from their changes (F, P) without each group of observations.
+
+    Delete-one-group jackknife: (F - 1) / F times the sum of squares (Efron and Stein, 1981, eq. 1.4).
+    """
+    return (len(changes) - 1) / max(len(changes), 1) * changes.T @ changes

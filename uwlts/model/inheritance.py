@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.errors import DesignError
-from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.placement import apparent_depth_mm, camera_from_object, laser_pose
 from uwlts.model.sensor import Medium, Sensor, Table, Window
 
 _SAME_WAVELENGTH_NM = 5.0
@@ -200,8 +200,8 @@ def _apparent_mm(window: Window, distance_mm: float, *, index: float, wavelength
     """Return the apparent distance from the pupil, for paraxial rays, of a point behind a window."""
     if not window.mounted:
         return distance_mm
-    outer = window.distance_mm + window.thickness_mm
-    return window.distance_mm + window.thickness_mm / window.index(wavelength_nm) + (distance_mm - outer) / index
+    behind = window.distance_mm, window.thickness_mm
+    return apparent_depth_mm(distance_mm, *behind, glass_index=window.index(wavelength_nm), medium_index=index)
 
 
 def _check_medium(inherited: _Inherited, name: str, medium: Medium, nm: str) -> Iterator[str]:

@@ -2,11 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from uwlts.errors import DesignError
 from uwlts.model.sensor import Medium, Sensor, Window
+
+ArrayT = TypeVar("ArrayT", float, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -142,3 +145,13 @@ def check_design(sensor: Sensor, medium: Medium) -> SheetView:
             f"but the measuring volume reaches from {sensor.volume.near_mm:g} to {sensor.volume.far_mm:g} mm"
         )
     return view
+
+
+def apparent_depth_mm(
+    depth_mm: ArrayT, inner_mm: float, thickness_mm: float, *, glass_index: float, medium_index: float
+) -> ArrayT:
+    """Return the apparent depth of points behind a window for rays near the axis.
+
+    A layer of index n appears n times thinner. ``inner_mm`` is the depth of the window's inner face.
+    """
+    return inner_mm + thickness_mm / glass_index + (depth_mm - inner_mm - thickness_mm) / medium_index

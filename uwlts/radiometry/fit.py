@@ -17,9 +17,12 @@ from scipy.special import erf
 
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.files.json_files import trusting
+from uwlts.fitting.least_squares import robust_std
+from uwlts.fitting.propagation import jackknife
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.phase_functions import PetzoldAverage, PhaseFunction
+from uwlts.model.placement import apparent_depth_mm
 from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.optics.fitness import check_fits
 from uwlts.radiometry.followed_sensor import follow_sensor
@@ -34,7 +37,7 @@ from uwlts.radiometry.stripe_images import (
     measure_noise,
     measure_stripes,
 )
-from uwlts.radiometry.stripe_light import StripeLight, stripe_light
+from uwlts.radiometry.stripe_light import StripeLight, stripe_light, working_f_number
 from uwlts.radiometry.water_outlook import outlook
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import resolve_calibration
@@ -158,7 +161,9 @@ def fit_radiometry(
         scale = np.where(std > 0, std, 1.0)
         correlation = covariance / np.outer(scale, scale)
         kept = tuple(estimate for estimate in estimates if math.isfinite(estimate.value))
-        statistics = StripeStatistics.from_estimates(kept, gaps=gaps, tail=evidence.tail_shares())
+        statistics = StripeStatistics.from_estimates(
+            kept, gaps=gaps, tail=evidence.tail_shares(whole[_NAMES.index("background_dn")])
+        )
         by_name = {estimate.name: estimate for estimate in kept}
         sensor = follow_sensor(
             scan.header,
@@ -289,8 +294,7 @@ class _Evidence:
         every = np.ones(BLOCKS, bool)
         whole = self.estimate(every, attenuation_per_m)
         left = np.array([self.estimate(np.arange(BLOCKS) != j, attenuation_per_m) for j in range(BLOCKS)])
-        away = left - left.mean(axis=0)
-        covariance = (BLOCKS - 1) / BLOCKS * away.T @ away
+        covariance = jackknife(left - left.mean(axis=0))
         for fan in np.eye(2):
             moved = self.estimate(every, attenuation_per_m, fan=_FAN_STD * fan) - whole
             covariance += np.outer(moved, moved)
@@ -364,12 +368,11 @@ class _Evidence:
         )  # fmt: skip
         return float(found.x), background_and_misfit(float(found.x))[0]
 
-    def tail_shares(self) -> tuple[float, ...]:
+    def tail_shares(self, background_dn: float) -> tuple[float, ...]:
         """Return the light per px at 8, 16 and 32 px beside the stripe, divided by that of the stripe."""
-        images, every = self.images, np.ones(BLOCKS, bool)
-        background = self.estimate(every)[_NAMES.index("background_dn")]
-        light = float(np.mean(images.light)) - images.width * background
-        return tuple(float(np.mean(images.tail[:, at - 1]) - background) / light for at in (8, 16, 32))
+        images = self.images
+        light = float(np.mean(images.light)) - images.width * background_dn
+        return tuple(float(np.mean(images.tail[:, at - 1]) - background_dn) / light for at in (8, 16, 32))
 
 
 def _phase(header: CaptureHeader) -> Callable[[np.ndarray], np.ndarray]:
@@ -390,12 +393,11 @@ def _defocus_variance(
     A disc of radius r has the variance r² / 4. Behind the window, depths appear divided by their index.
     """
     camera, window = sensor.camera, calibration.window
-    magnified = camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
-    pupil = 0.5 * camera.focal_length_mm / (camera.f_number * (1 + magnified))
+    pupil = 0.5 * camera.focal_length_mm / working_f_number(camera)
     apparent = depth_mm
     if window is not None and camera.window.mounted:
-        outer = window.distance_mm + window.thickness_mm
-        apparent = window.distance_mm + window.thickness_mm / window.glass_index + (depth_mm - outer) / medium_index
+        behind = window.distance_mm, window.thickness_mm
+        apparent = apparent_depth_mm(depth_mm, *behind, glass_index=window.glass_index, medium_index=medium_index)
     radius = pupil * camera.focal_length_px() * np.abs(1 / apparent - 1 / camera.focus_distance_mm)
     return radius**2 / 4
 
@@ -422,7 +424,7 @@ def _huber_weights(design: np.ndarray, values: np.ndarray) -> np.ndarray:
     for _ in range(5):
         root = np.sqrt(weight)
         rest = values - design @ np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
-        scale = 1.4826 * float(np.median(np.abs(rest))) + 1e-12
+        scale = robust_std(rest) + 1e-12
         weight = np.minimum(1.0, 1.5 * scale / np.maximum(np.abs(rest), 1e-12))
     return weight
 

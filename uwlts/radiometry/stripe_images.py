@@ -11,6 +11,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from uwlts.errors import CaptureError
+from uwlts.fitting.propagation import jackknife
 from uwlts.model.stripe import CaptureStripes
 from uwlts.runtime.progress import ProgressListener
 from uwlts.storage.capture import Capture
@@ -290,7 +291,7 @@ def measure_noise(capture: Capture, stripes: CaptureStripes, *, repeats: Capture
         whole = _fit_transfer(counted.sum(axis=0), background_dn)
         if whole is not None:
             left = np.array([_fit_transfer(counted.sum(axis=0) - part, background_dn) or whole for part in counted])
-            std = np.sqrt((BLOCKS - 1) / BLOCKS * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
+            std = np.sqrt(np.diag(jackknife(left - left.mean(axis=0))))
             dark = math.sqrt(max(whole[1], 0.0))
             return CameraNoise(whole[0], float(std[0]), dark, float(std[1]) / max(2 * dark, 1e-3))
     return _dark_noise(capture, stripes)

@@ -17,7 +17,7 @@ from uwlts.errors import CaptureError
 from uwlts.fitting.local_surface import surface_normals
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import LaserPose
-from uwlts.model.sensor import CaptureHeader, Laser, Sensor, Window
+from uwlts.model.sensor import Camera, CaptureHeader, Laser, Sensor, Window
 from uwlts.model.stripe import CaptureStripes, stack_pixels
 from uwlts.optics.camera import directions
 from uwlts.optics.triangulation import points_on_sheet, rays_on_sheet, to_object
@@ -149,6 +149,12 @@ def transmission(window: Window, *, wavelength_nm: float, medium_index: float) -
     return faces[0] * faces[1] * math.exp(-window.absorption_per_mm() * window.thickness_mm)
 
 
+def working_f_number(camera: Camera) -> float:
+    """Return the f-number for the magnification m at the described focus: N (1 + m)."""
+    magnified = camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
+    return camera.f_number * (1 + magnified)
+
+
 def _grey_per_radiance(sensor: Sensor, index: float) -> float:
     """Return the grey values per ms, and per radiance in the medium in mW / (mm2 sr), on the lens's axis.
 
@@ -156,8 +162,7 @@ def _grey_per_radiance(sensor: Sensor, index: float) -> float:
     to air. Photo-electrons follow from EMVA 1288 release 4, Eq. 4.
     """
     camera, detector, wavelength = sensor.camera, sensor.detector, sensor.laser.wavelength_nm
-    magnified = camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
-    aperture = math.pi / (4 * (camera.f_number * (1 + magnified)) ** 2)
+    aperture = math.pi / (4 * working_f_number(camera) ** 2)
     area_mm2 = (1e-3 * camera.pixel_size_um) ** 2 / camera.pixel_aspect
     electrons_per_mj = 1e-3 * wavelength / _JOULE_NM * detector.quantum_efficiency
     windows = [

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import datetime
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
 from pydantic import Field
 
 from uwlts.errors import EvaluationError
+from uwlts.evaluation.decision import VERDICTS, Verdict, judge_interval
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue
 from uwlts.model.library import read_table, validate_description
 from uwlts.model.sensor import Description, Positive, Vector
-
-Verdict = Literal["exceeds the limit", "undecided", "within the limit", "no limit"]
-VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
-"""Verdicts in order of severity."""
 
 
 class FindingLimits(Description):
@@ -76,19 +72,6 @@ def judge_value(value: FeatureValue, limits: FindingLimits) -> Verdict:
     if value.name == "remaining wall":
         return judge_interval(value.low, value.high, lower=limit)
     return judge_interval(value.low, value.high, upper=limit)
-
-
-def judge_interval(low: float, high: float, *, lower: float | None = None, upper: float | None = None) -> Verdict:
-    """Return the verdict on a coverage interval from ``low`` to ``high``: conformity and non-conformity are proven.
-
-    This is the decision rule of ISO 14253-1. An interval that contains a limit leaves the verdict undecided.
-    """
-    if lower is None and upper is None:
-        return "no limit"
-    least, most = -np.inf if lower is None else lower, np.inf if upper is None else upper
-    if least <= low and high <= most:
-        return "within the limit"
-    return "exceeds the limit" if high < least or low > most else "undecided"
 
 
 def judge_feature(feature: Feature, limits: FindingLimits) -> tuple[Verdict, list[str]]:

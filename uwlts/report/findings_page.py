@@ -13,6 +13,7 @@ import numpy as np
 
 from uwlts._version import __version__
 from uwlts.errors import EvaluationError
+from uwlts.evaluation.decision import VERDICTS
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.json_files import EDITED, json_text, trusting
@@ -44,14 +45,7 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import check_certificate
-from uwlts.report.findings_order import (
-    VERDICTS,
-    FindingOrder,
-    format_place,
-    judge_feature,
-    load_order,
-    sort_by_severity,
-)
+from uwlts.report.findings_order import FindingOrder, format_place, judge_feature, load_order, sort_by_severity
 from uwlts.report.measured_values import COLUMNS, MeasuredValues, read_measured
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration

@@ -12,6 +12,7 @@ from pydantic import ConfigDict, Field, computed_field, model_validator
 
 from uwlts._version import __version__
 from uwlts.errors import DescriptionError
+from uwlts.evaluation.decision import Verdict, judge_interval
 from uwlts.files.json_files import read_model, write_model
 from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.inspection.picking import PickedMeasurement
@@ -19,7 +20,6 @@ from uwlts.model.library import validate_description
 from uwlts.model.sensor import Description
 from uwlts.pages.numbers import format_to_scale
 from uwlts.pages.toolkit import MISSING, render_page, write_page
-from uwlts.report.findings_order import Verdict, judge_interval
 
 FORMAT = "uwlts-measured-values"
 VERSION = 1

@@ -19,6 +19,7 @@ from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.propagation import jackknife
 from uwlts.model.calibration import CameraModel
 from uwlts.model.sensor import Uncertainty
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -429,11 +430,3 @@ def _solve_subsets(
         except CalibrationError:
             found.append(None)
     return found
-
-
-def jackknife(changes: np.ndarray) -> np.ndarray:
-    """Return the covariance (P, P) of parameters from their changes (F, P) without each group of observations.
-
-    Delete-one-group jackknife: (F - 1) / F times the sum of squares (Efron and Stein, 1981, eq. 1.4).
-    """
-    return (len(changes) - 1) / max(len(changes), 1) * changes.T @ changes

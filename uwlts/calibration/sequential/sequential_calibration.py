@@ -13,7 +13,7 @@ from pydantic import JsonValue
 
 from uwlts._version import __version__
 from uwlts.calibration.camera.camera_parameters import CameraOptions
-from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
+from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_turned_travel, solve_camera
 from uwlts.calibration.capture_evidence import (
@@ -34,6 +34,7 @@ from uwlts.calibration.sequential.sheet_fit import (
 from uwlts.calibration.sequential.step_images import label_steps
 from uwlts.calibration.sequential.window_distance import WindowSolution, solve_window
 from uwlts.errors import CalibrationError
+from uwlts.fitting.propagation import jackknife
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Window
