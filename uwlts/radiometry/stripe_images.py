@@ -29,7 +29,7 @@ _LAGS = 8
 _FINE_PX = 0.25
 """Cells of the mean profile across the stripe."""
 GROUP_LINES = 16
-"""Lines whose light is added: many grains, so that the logarithm of the sum has no bias to speak of."""
+"""Lines whose light is added: many grains, so that the bias of the logarithm of the sum is negligible."""
 BLOCKS = 20
 """Blocks of consecutive groups for the jackknife: a standard uncertainty is then known to a sixth."""
 _CLIPPED = 0.98
