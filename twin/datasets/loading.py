@@ -16,7 +16,7 @@ from uwlts.model.sensor import Description, Table
 
 CARD = "dataset.json"
 CARD_FORMAT = "uwlts-dataset"
-CARD_VERSION = 1
+CARD_VERSION = 1  # of the file format
 
 
 class Shard(Description):

@@ -262,7 +262,7 @@ def _coverage(xp: ModuleType, p: SensorArrays, f: Field, mean: Mean) -> Array:
     return (far - near) / (p.far_mm - p.near_mm)
 
 
-MIDDLE = DEPTHS // 2
+MIDDLE = DEPTHS // 2  # index of the middle depth
 SMOOTH: dict[str, Smooth] = {
     "sigma_z_rms_mm": _rms("sigma_z_mm"),
     "sigma_z_mm": lambda xp, p, f, mean: _largest(xp, f.sigma_z_mm),

@@ -22,7 +22,7 @@ OTHER_COLUMNS = ("design", "violation", "failure")
 """Columns of results in addition to values and figures."""
 FOLLOWING: dict[Follow, str] = {"focus": "camera.focus_distance_mm", "waist": "laser.waist_distance_mm"}
 """Paths that `Study.follow` sets; they must not be free at the same time."""
-MOST_DESIGNS = 10**8
+MOST_DESIGNS = 10**8  # hours of screening
 
 
 class Variable(Description):

@@ -40,11 +40,11 @@ from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.truth import truth_path
 
-_USER_ERROR = 2
-_FEWEST_POINTS = 20
+_USER_ERROR = 2  # exit code of the commands for a mistake of the user
+_FEWEST_POINTS = 20  # of a profile, for its scatter to be known within a sixth
 _LARGEST_RESIDUAL = 5.0
 """Limit of residuals from the profile's trend in robust standard deviations; larger ones are outliers."""
-_MAD_TO_STD = 1.4826
+_MAD_TO_STD = 1.4826  # of normally distributed values
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ GLARE_REACH = 0.15
 """Decay length of glare (1 / e) as a fraction of the image width (assumed from its visual appearance)."""
 _SPOT_MM = 0.2, 3.0
 """Range of the diameters of spots on the window, from silt and fouling films to drops and fingerprints."""
-_CELLS_PER_SPOT = 4
+_CELLS_PER_SPOT = 4  # so that a round spot stays round
 _DIRT_STREAM = 41
 """Random number stream of the spots, separate from others of the same seed."""
 _CELLS_PER_REACH = 16

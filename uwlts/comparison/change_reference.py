@@ -26,7 +26,7 @@ _SAMPLES_PER_DISC = 60
 """Samples of a mesh in a disc: twice the points of a cloud, so that the cloud's noise dominates."""
 _MOST_SAMPLES = 3_000_000
 """Limit of memory for samples of a mesh."""
-_AT_A_TIME = 20_000
+_AT_A_TIME = 20_000  # places, to limit memory
 _IN_METRES = (".glb", ".gltf")
 
 Reference = PointCloud | IdealShape | str | os.PathLike[str]

@@ -22,7 +22,7 @@ from uwlts.hardware.guided.record import GuidedRecording, guide
 from uwlts.hardware.rig import LaserStage
 
 _COVERED, _EMPTY, _DOT = (70, 140, 70), (120, 60, 60), (230, 230, 230)
-_MAP_CELL_PX = 48
+_MAP_CELL_PX = 48  # size of a cell of the map on the screen
 
 
 class Ended(Exception):

@@ -22,7 +22,7 @@ from uwlts.report.measured_values import MEASURED_ENDINGS, MeasuredValue, Measur
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import name_cloud
 
-_BINS = 60
+_BINS = 60  # of the displayed histogram
 _DEFAULT_RADIUS_MM, _DEFAULT_WIDTH_MM = 15.0, 2.0
 _GROWING = "points of a running scan have no uncertainty: reconstruct it"
 _WITHOUT = "the cloud has no uncertainty"

@@ -323,7 +323,7 @@ _THIN = "#b9c2cc"
 _HOUSING = "#aab4c0"
 _VOLUME = "#f1ecd9"
 _VOLUME_END = "#bda96b"
-_INCHES = (11.5, 7.0)
+_INCHES = (11.5, 7.0)  # width and height
 _MARGIN = 0.1
 """Margin around a view for dimensions, relative to its larger side."""
 _LABELS = 0.35

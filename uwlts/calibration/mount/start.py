@@ -21,7 +21,7 @@ _TURNS = 5000  # rotations tried for a plane, some 12 deg apart
 _TURNS_TRIED = 10  # best rotations, which are refined
 _RADII = (1.02, 1.15, 1.5)
 """Trial radii of an unknown sphere, relative to its largest section."""
-_REWEIGHTED = 10
+_REWEIGHTED = 10  # rounds of Cauchy weights; a start needs no more digits
 _FAR = 4.0
 """Standard uncertainties within which points of a ring's wall are sought; poses beyond as many misfits are rejected."""
 _CLEAR = 6.0
