@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.datasets.data_set import EXPOSURE, SPLITS, DataSetDescription, Split
-from twin.options import Options
+from twin.rendering_options import Options
 from twin.scene.description import Scene
 from twin.scene.paths import Value, with_values
 from uwlts.errors import Error

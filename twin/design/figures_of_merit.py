@@ -32,7 +32,7 @@ from twin.design.geometry import (
     standoff_mm,
     trace_to_points,
 )
-from twin.design.parameters import Follow, SensorArrays, compute_adjustments
+from twin.design.sensor_arrays import Follow, SensorArrays, compute_adjustments
 from twin.sensor.detector import PLANCK_TIMES_LIGHT
 from uwlts.errors import RangeError
 

@@ -25,11 +25,11 @@ import pyarrow.parquet as pq
 from twin.backend.llvm import preserve_threads
 from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import compute_figures, predict_scatter
-from twin.design.parameters import extract_parameters
+from twin.design.sensor_arrays import extract_parameters
 from twin.design.study import Study
 from twin.design.verification_scenes import PlannedRecording, plan_recordings
-from twin.options import CPU, Options, use_variant
 from twin.recording.campaigns import make_folder, require_at_least
+from twin.rendering_options import CPU, Options, use_variant
 from uwlts import errors
 from uwlts.errors import Error
 from uwlts.files.writing import write_atomically

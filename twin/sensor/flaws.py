@@ -1,4 +1,4 @@
-"""Flaws of real recordings that standard rendering does not include; see `twin.options.Flaws`.
+"""Flaws of real recordings that standard rendering does not include; see `twin.rendering_options.Flaws`.
 
 Some are properties of the sensor (`as_built`). Others change the light on the image sensor (`vignette`, `add_glare`,
 `laser_shares`) or the grey values that the camera delivers (`deliver_image`).
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.signal import fftconvolve
 
-from twin.options import Flaws
+from twin.rendering_options import Flaws
 from uwlts.errors import DescriptionError
 from uwlts.model.library import merge_tables, validate_description
 from uwlts.model.sensor import Camera, Sensor

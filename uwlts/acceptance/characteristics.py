@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from uwlts.acceptance.plan import REFERENCE_C, CertifiedArtefact, Length, Size, Spread, Symbol, Temperature
+from uwlts.acceptance.acceptance_plan import REFERENCE_C, CertifiedArtefact, Length, Size, Spread, Symbol, Temperature
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import PlaneEvaluation, StepEvaluation, evaluate_cloud
 from uwlts.evaluation.decision import Verdict, judge_interval

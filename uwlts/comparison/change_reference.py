@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial import KDTree
 
+from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.comparison.ideal_shapes import KINDS, IdealShape, read_shape
-from uwlts.comparison.options import OPTIONS
 from uwlts.errors import DescriptionError, EvaluationError, describe_problems
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text

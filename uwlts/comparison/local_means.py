@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import t as t_distribution
 
-from uwlts.comparison.options import OPTIONS
+from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.storage.cloud import PointUncertainty, project_variance
 
 TWO_SIDED = 1.96

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, SphereShape, StepShape, perpendicular_to
-from uwlts.calibration.mount.estimate import RestrictedEstimate
+from uwlts.calibration.mount.artefact_shapes import PlaneShape, RingShape, SphereShape, StepShape, perpendicular_to
 from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet, point_by_mount, to_sheet
 from uwlts.calibration.mount.profiles import Detection, ProfileArc, ProfileLine, circles_through
+from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError
 
 _SUBSET = 8  # poses of a random subset: 24 linear equations for 12 unknowns

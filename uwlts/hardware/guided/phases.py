@@ -47,8 +47,8 @@ from uwlts.calibration.guidance.step import (
     next_depth_mm,
 )
 from uwlts.errors import CalibrationError, TargetError
+from uwlts.hardware.guided.guided_plan import GuidedPlan, GuidedStep
 from uwlts.hardware.guided.operator import Operator, Screen
-from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
 from uwlts.hardware.rig import START_MS, Rig
 from uwlts.hardware.scan_plan import Light, RigPlan
 from uwlts.model.calibration import Calibration, WindowModel
