@@ -44,6 +44,39 @@ class WindowRule(NamedTuple):
 
 WINDOW_RULE = WindowRule()
 
+LANES = 64
+"""Number of lines processed in parallel, which fills the processor's vector units.
+
+A number per line is a row of lanes, a window of W pixels W rows. Rows are parts of flat arrays.
+"""
+
+# Rows of lanes that `measure_peaks` fills; the names are those of `PeakWindow`, or explained beside them.
+TOP = 0 * LANES
+"""Highest pixel after the low-pass."""
+MIDDLE, SIGMA, REACH, BASE, SLOPE, HEIGHT = range(1 * LANES, 7 * LANES, LANES)
+CLOSED = 7 * LANES
+"""1 if both half-height crossings are in the window, otherwise 0."""
+CROWDED = 8 * LANES
+"""1 if the profile rises again outside the crossings, otherwise 0: above half height, or to the required fraction of
+the height after a valley of half its own height."""
+_GROUND = 9 * LANES
+"""Lowest value of the higher surroundings."""
+_LEVEL = 10 * LANES
+"""Half height."""
+_LEFT, _RIGHT = 11 * LANES, 12 * LANES
+"""Nearest pixels below half height on both sides; -1 and the window's size if there is none."""
+_BEGIN, _END = 13 * LANES, 14 * LANES
+"""Pixels that are searched for a second stripe."""
+_OTHER = 15 * LANES
+"""Buffer: greatest or least value of some pixels."""
+_LOW, _HIGH, _NEAR = range(16 * LANES, 19 * LANES, LANES)
+"""Buffers: two pixels, and the pixel nearest to the middle."""
+MEASURED = 19 * LANES
+"""Number of elements of all rows."""
+
+_NO_GROUND = -1e38
+"""Surroundings of a window without a side inside the image: lower than all pixels, and finite in float32."""
+
 FIRST = -1
 """Order of `SearchRules` for the rule `PeakRule.FIRST`."""
 STRONGEST = 0
@@ -86,41 +119,6 @@ class SearchRules(NamedTuple):
     bright: float
 
 
-class Peak(NamedTuple):
-    """Peak in a window; positions in px from the window's first pixel, heights in grey levels.
-
-    Attributes
-    ----------
-    top : int
-        Highest pixel after the low-pass.
-    middle : float
-        Midpoint of the half-height crossings.
-    sigma : float
-        Half-height width divided by 2.355, without the low-pass (variances add).
-    reach : int
-        Number of pixels from ``middle`` to the first background pixel.
-    base, slope : float
-        Background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
-    height : float
-        Height of the top above ``base``; above the lowest surroundings unless ``closed``.
-    closed : bool
-        Both half-height crossings are in the window.
-    crowded : bool
-        The profile rises again outside the crossings: above half height, or to the required fraction of the height
-        after a valley of half its own height.
-    """
-
-    top: int
-    middle: np.floating
-    sigma: float | np.floating
-    reach: int
-    base: np.floating
-    slope: np.floating
-    height: np.floating
-    closed: bool
-    crowded: np.bool_
-
-
 class PeakWindow(NamedTuple):
     """Peaks in M windows of W pixels, in the form for compiled code.
 
@@ -130,8 +128,16 @@ class PeakWindow(NamedTuple):
         First pixel of each window on its line.
     window : (M, W) float32
         Pixels; beyond the image the border pixel is repeated.
-    middle, sigma, reach, base, slope, height : (M,) float32
-        See `Peak`.
+    middle : (M,) float32
+        Midpoint of the half-height crossings, px from the window's first pixel.
+    sigma : (M,) float32
+        Half-height width divided by 2.355, px, without the low-pass (variances add).
+    reach : (M,) float32
+        Number of pixels from ``middle`` to the first background pixel.
+    base, slope : (M,) float32
+        Background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
+    height : (M,) float32
+        Height of the highest pixel above ``base``; above the lowest surroundings if a crossing is outside the window.
     smoothing : float
         Sigma of the low-pass, px.
     """
@@ -186,104 +192,157 @@ def cut_window(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> 
 
 
 @compiled_part
-def filter_window(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
-    """Filter a window with a symmetric low-pass of 2 R + 1 weights.
+def filter_windows(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
+    """Filter windows in lanes with a symmetric low-pass of 2 R + 1 weights.
 
-    ``pixels`` has R further elements on either side, which are overwritten with the window's border pixels.
+    ``pixels`` has R further rows on either side, which are overwritten with the windows' border pixels.
     """
-    size, reach = out.size, kernel.size // 2
-    middle = pixels[reach : reach + size]
-    for k in range(reach):
-        pixels[k], pixels[reach + size + k] = middle[0], middle[size - 1]
+    size, border = out.size, kernel.size // 2 * LANES
+    middle = pixels[border : border + size]
+    for x in range(0, border, LANES):
+        for k in range(LANES):
+            pixels[x + k], pixels[border + size + x + k] = middle[k], middle[size - LANES + k]
     for k in range(size):
-        out[k] = kernel[reach] * middle[k]
-    for j in range(reach):
-        before, after = pixels[j : j + size], pixels[2 * reach - j : 2 * reach - j + size]
+        out[k] = kernel[kernel.size // 2] * middle[k]
+    for j in range(kernel.size // 2):
+        before, after = pixels[j * LANES :][:size], pixels[2 * border - j * LANES :][:size]
         for k in range(size):
             out[k] += kernel[j] * (before[k] + after[k])
 
 
 @compiled_part
-def measure_peak(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> Peak:
-    """Measure the peak in the filtered window `smooth`, which starts at pixel `start` of `count`.
+def measure_peaks(smooth: np.ndarray, starts: np.ndarray, count: int, rules: SearchRules, found: np.ndarray) -> None:
+    """Measure the peaks in filtered windows `smooth`, in lanes, which start at pixels `starts` (lanes,) of `count`.
 
-    The window may extend beyond the image. The peak is the highest pixel of the central block and half a block on
+    The windows may extend beyond the image. The peak is the highest pixel of the central block and half a block on
     either side.
     """
-    half, block = rules.half, rules.block
-    size, first = smooth.size, half - block // 2
-    highest = find_greatest(smooth, first, first + 2 * block)
-    top = first
-    while smooth[top] != highest:
-        top += 1
+    block, size, first = rules.block, smooth.size // LANES, rules.half - rules.block // 2
+    for k in range(LANES):
+        found[_OTHER + k], found[_GROUND + k] = np.float32(-np.inf), np.float32(_NO_GROUND)
+        found[_LEFT + k], found[_RIGHT + k] = np.float32(-1), np.float32(size)
+    for x in range(first, first + 2 * block):
+        pixels = smooth[x * LANES :][:LANES]
+        for k in range(LANES):
+            found[_OTHER + k] = max(found[_OTHER + k], pixels[k])
+    for x in range(first + 2 * block - 1, first - 1, -1):
+        pixels, place = smooth[x * LANES :][:LANES], np.float32(x)
+        for k in range(LANES):
+            top = found[TOP + k]
+            found[TOP + k] = place if pixels[k] == found[_OTHER + k] else top
+    for k in range(LANES):
+        found[HEIGHT + k] = found[_OTHER + k]
     # Repeated border pixels may belong to the stripe: use only sides inside the image.
-    ground = np.float32(-np.inf)
-    for side in range(2):
-        begin = side * (size - block)
-        if start + begin >= 0 and start + begin + block <= count:
-            ground = max(ground, _find_least(smooth, begin, begin + block))
-    rise = highest - ground
-    level = ground + np.float32(0.5) * rise
-
-    if rise <= 0:
-        # The surroundings are as high: there is no peak.
-        zero = np.float32(0.0)
-        return Peak(top, np.float32(top), zero, 0, ground, zero, zero, False, rise > 0)
-
-    left, right = top, top
-    while left >= 0 and smooth[left] >= level:
-        left -= 1
-    while right < size and smooth[right] >= level:
-        right += 1
-    closed = left >= 0 and right < size
-    x_left = np.float32(left) + _interpolate_level(smooth[max(left, 0)], smooth[left + 1], level)
-    x_right = np.float32(right) - _interpolate_level(smooth[min(right, size - 1)], smooth[right - 1], level)
-    middle = np.float32(0.5) * (x_left + x_right)
-    smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
-    sigma = math.sqrt(max(smooth_sigma * smooth_sigma - np.float32(rules.smoothing * rules.smoothing), np.float32(0.0)))
-
-    reach = min(math.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma), half - WINDOW_RULE.flank)
-    near = math.floor(middle + np.float32(0.5))
-    before = _flank(smooth, near - reach - WINDOW_RULE.flank + 1)
-    after = _flank(smooth, near + reach - 1)
-    slope = (after - before) / np.float32(2 * reach + WINDOW_RULE.flank - 2)
-    base = np.float32(0.5) * (before + after) + slope * (middle - np.float32(near))
-    extent = size if rules.order == STRONGEST else reach + WINDOW_RULE.flank - 1
-    begin, end = max(near - extent, 0), min(near + extent + 1, size)
-    beside = max(find_greatest(smooth, begin, left + 1), find_greatest(smooth, right, end))
-    crowded = beside >= ground + np.float32(rules.share) * rise
-    if crowded:
-        # A monotonic tail is no second stripe.
-        crowded = beside < ground
-        for side in (-1, 1):
-            first, last = (left, begin - 1) if side < 0 else (right, end)
-            crowded |= _rises_again(smooth, first, last, side, ground, rise, rules)
-    return Peak(top, middle, sigma, reach, base, slope, highest - (base if closed else ground), closed, crowded)
+    for begin in (0, size - block):
+        for k in range(LANES):
+            found[_OTHER + k] = np.float32(np.inf)
+        for x in range(begin, begin + block):
+            pixels = smooth[x * LANES :][:LANES]
+            for k in range(LANES):
+                found[_OTHER + k] = min(found[_OTHER + k], pixels[k])
+        for k in range(LANES):
+            ground, inside = found[_GROUND + k], (starts[k] + begin >= 0) & (starts[k] + begin + block <= count)
+            found[_GROUND + k] = max(ground, found[_OTHER + k] if inside else np.float32(_NO_GROUND))
+    for k in range(LANES):
+        found[_LEVEL + k] = found[_GROUND + k] + np.float32(0.5) * (found[HEIGHT + k] - found[_GROUND + k])
+        found[_OTHER + k] = np.float32(-np.inf)
+    for x in range(size):
+        pixels, place = smooth[x * LANES :][:LANES], np.float32(x)
+        for k in range(LANES):
+            left, low = found[_LEFT + k], pixels[k] < found[_LEVEL + k]
+            found[_LEFT + k] = place if low & (place < found[TOP + k]) else left
+    for x in range(size - 1, -1, -1):
+        pixels, place = smooth[x * LANES :][:LANES], np.float32(x)
+        for k in range(LANES):
+            right, low = found[_RIGHT + k], pixels[k] < found[_LEVEL + k]
+            found[_RIGHT + k] = place if low & (place > found[TOP + k]) else right
+    _measure_widths(smooth, rules, found)
+    for x in range(size):
+        pixels, place = smooth[x * LANES :][:LANES], np.float32(x)
+        for k in range(LANES):
+            before = (place >= found[_BEGIN + k]) & (place <= found[_LEFT + k])
+            after = (place >= found[_RIGHT + k]) & (place < found[_END + k])
+            found[_OTHER + k] = max(found[_OTHER + k], pixels[k] if before | after else np.float32(-np.inf))
+    for k in range(LANES):
+        _finish_peak(smooth[k:], rules, found[k:])
 
 
 @compiled_part
-def find_greatest(values: np.ndarray, first: int, end: int) -> np.float32:
-    """Return the maximum of ``values[first:end]``; -inf if empty."""
-    result, part = np.float32(-np.inf), values[first:end]
-    for k in range(part.size):
-        result = max(result, part[k])
-    return result
+def _measure_widths(smooth: np.ndarray, rules: SearchRules, found: np.ndarray) -> None:
+    """Measure middle, width and background of the peaks."""
+    size, half, most = np.float32(smooth.size // LANES), np.float32(0.5), np.float32(rules.half - WINDOW_RULE.flank)
+    one, flank, variance = np.float32(1.0), np.float32(WINDOW_RULE.flank), np.float32(rules.smoothing**2)
+    _pick_pixels(smooth, found, _LEFT, 0, _LOW)
+    _pick_pixels(smooth, found, _LEFT, 1, _HIGH)
+    for k in range(LANES):
+        found[MIDDLE + k] = found[_LEFT + k] + _interpolate_level(found[_LOW + k], found[_HIGH + k], found[_LEVEL + k])
+    _pick_pixels(smooth, found, _RIGHT, 0, _LOW)
+    _pick_pixels(smooth, found, _RIGHT, -1, _HIGH)
+    for k in range(LANES):
+        right = found[_RIGHT + k] - _interpolate_level(found[_LOW + k], found[_HIGH + k], found[_LEVEL + k])
+        smooth_sigma = (right - found[MIDDLE + k]) * np.float32(1.0 / FWHM_PER_SIGMA)
+        middle = half * (found[MIDDLE + k] + right)
+        near, reach = np.floor(middle + half), min(np.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma), most)
+        found[MIDDLE + k], found[REACH + k], found[_NEAR + k] = middle, reach, near
+        found[SIGMA + k] = np.sqrt(max(smooth_sigma * smooth_sigma - variance, np.float32(0.0)))
+        found[_BEGIN + k] = min(max(near - reach - flank + one, np.float32(0.0)), size - flank)
+        found[_END + k] = min(max(near + reach - one, np.float32(0.0)), size - flank)
+        closed = (found[_LEFT + k] >= np.float32(0.0)) & (found[_RIGHT + k] < size)
+        found[CLOSED + k] = one if closed else np.float32(0.0)
+    # The lower of two low-passed values, to ignore hot pixels.
+    _pick_pixels(smooth, found, _BEGIN, 1, _LOW)
+    _pick_pixels(smooth, found, _BEGIN, WINDOW_RULE.flank - 1, _HIGH)
+    for k in range(LANES):
+        found[BASE + k] = min(found[_LOW + k], found[_HIGH + k])
+    _pick_pixels(smooth, found, _END, 1, _LOW)
+    _pick_pixels(smooth, found, _END, WINDOW_RULE.flank - 1, _HIGH)
+    for k in range(LANES):
+        before, after = found[BASE + k], min(found[_LOW + k], found[_HIGH + k])
+        reach, near = found[REACH + k], found[_NEAR + k]
+        slope = (after - before) / (np.float32(2.0) * reach + flank - np.float32(2.0))
+        extent = size if rules.order == STRONGEST else reach + flank - one
+        found[SLOPE + k], found[BASE + k] = slope, half * (before + after) + slope * (found[MIDDLE + k] - near)
+        found[_BEGIN + k] = max(near - extent, np.float32(0.0))
+        found[_END + k] = min(near + extent + one, size)
 
 
-@compiled_inline
-def _find_least(values: np.ndarray, first: int, end: int) -> np.float32:
-    """Return the minimum of ``values[first:end]``; inf if empty."""
-    result, part = np.float32(np.inf), values[first:end]
-    for k in range(part.size):
-        result = min(result, part[k])
-    return result
+@compiled_part
+def _pick_pixels(smooth: np.ndarray, found: np.ndarray, place: int, beyond: int, result: int) -> None:
+    """Copy the pixels ``beyond`` those in the row `place` to the row `result`; outside the window, its border pixels.
+
+    Only this is done lane by lane, because vector units read scattered elements slowly.
+    """
+    last = np.int32(smooth.size // LANES - 1)
+    for k in range(LANES):
+        x = min(max(np.int32(found[place + k]) + np.int32(beyond), np.int32(0)), last)
+        found[result + k] = smooth[x * np.int32(LANES) + np.int32(k)]
+
+
+@compiled_part
+def _finish_peak(smooth: np.ndarray, rules: SearchRules, found: np.ndarray) -> None:
+    """Compute height and crowding of the peak in the first lane, from its highest pixel and the highest one beside."""
+    ground, rise = found[_GROUND], found[HEIGHT] - found[_GROUND]
+    if rise <= 0:
+        # The surroundings are as high: there is no peak.
+        found[MIDDLE], found[BASE] = found[TOP], ground
+        for row in (SIGMA, REACH, SLOPE, HEIGHT, CLOSED, CROWDED):
+            found[row] = 0
+        return
+    found[HEIGHT] -= found[BASE] if found[CLOSED] else ground
+    crowded = False
+    if found[_OTHER] >= ground + np.float32(rules.share) * rise:
+        # A monotonic tail is no second stripe.
+        for side in (-1, 1):
+            first, last = (found[_LEFT], found[_BEGIN] - 1) if side < 0 else (found[_RIGHT], found[_END])
+            crowded |= _rises_again(smooth, int(first), int(last), side, ground, rise, rules)
+    found[CROWDED] = crowded
 
 
 @compiled_inline
 def _rises_again(
     values: np.ndarray, first: int, end: int, step: int, ground: np.floating, rise: np.floating, rules: SearchRules
 ) -> np.bool_:
-    """Return True if the profile outside a peak reaches half height, or the required fraction after a valley.
+    """Return True if the first lane outside a peak reaches half height, or the required fraction after a valley.
 
     The valley is at most half as high as the values after it. They must exceed it by at least ``fine``, the noise
     limit.
@@ -291,8 +350,9 @@ def _rises_again(
     level, share, fine = np.float32(0.5) * rise, np.float32(rules.share) * rise, np.float32(rules.fine)
     lowest, found = np.float32(np.inf), rise < 0
     for k in range(first, end, step):
-        lowest, above = min(lowest, values[k]), values[k] - ground
-        found |= above >= level or (above >= share and values[k] - lowest >= max(np.float32(0.5) * above, fine))
+        value = values[k * LANES]
+        lowest, above = min(lowest, value), value - ground
+        found |= above >= level or (above >= share and value - lowest >= max(np.float32(0.5) * above, fine))
     return found
 
 
@@ -300,13 +360,6 @@ def _rises_again(
 def _interpolate_level(low: np.floating, high: np.floating, level: np.floating) -> np.float32:
     """Return the position, from 0 to 1, of a level on the straight line between two neighbouring pixels."""
     return np.float32(min(max((level - low) / max(high - low, np.float32(1e-6)), np.float32(0.0)), np.float32(1.0)))
-
-
-@compiled_part
-def _flank(smooth: np.ndarray, first: int) -> np.float32:
-    """Return the background in a flank: the lower of two low-passed values, to ignore hot pixels."""
-    first = min(max(first, 0), smooth.size - WINDOW_RULE.flank)
-    return min(smooth[first + 1], smooth[first + WINDOW_RULE.flank - 1])
 
 
 @lru_cache(maxsize=16)
