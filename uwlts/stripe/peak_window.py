@@ -67,15 +67,14 @@ _LEFT, _RIGHT = 11 * LANES, 12 * LANES
 """Nearest pixels below half height on both sides; -1 and the window's size if there is none."""
 _BEGIN, _END = 13 * LANES, 14 * LANES
 """Pixels that are searched for a second stripe."""
-_OTHER = 15 * LANES
-"""Buffer: greatest or least value of some pixels."""
-_LOW, _HIGH, _NEAR = range(16 * LANES, 19 * LANES, LANES)
-"""Buffers: two pixels, and the pixel nearest to the middle."""
-MEASURED = 19 * LANES
+_BESIDE = 15 * LANES
+"""Greatest value of these pixels outside the half-height crossings."""
+MEASURED = 16 * LANES
 """Number of elements of all rows."""
 
-_NO_GROUND = -1e38
-"""Surroundings of a window without a side inside the image: lower than all pixels, and finite in float32."""
+_LOWEST = np.float32(-1e38)
+"""Lower than all pixels, and finite: surroundings of a window without a side inside the image."""
+_HALF = np.float32(0.5)
 
 FIRST = -1
 """Order of `SearchRules` for the rule `PeakRule.FIRST`."""
@@ -180,15 +179,18 @@ class PeakWindow(NamedTuple):
 
 
 @compiled_part
-def cut_window(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
-    """Copy pixels of a line of the profiles (N, L) from `start` on; beyond the image the border pixel is repeated."""
+def cut_window(profiles: np.ndarray, line: int, start: int, k: int, cut: np.ndarray, pixels: np.ndarray) -> None:
+    """Copy pixels of a line of the profiles (N, L) from `start` on to row `k` of `cut`, and to lane `k` of `pixels`.
+
+    Beyond the image the border pixel is repeated.
+    """
     last = profiles.shape[0] - 1
-    if start >= 0 and start + out.size - 1 <= last:
-        for k in range(out.size):
-            out[k] = profiles[start + k, line]
+    if start >= 0 and start + pixels.shape[0] - 1 <= last:
+        for x in range(pixels.shape[0]):
+            cut[k, x] = pixels[x, k] = profiles[start + x, line]
     else:
-        for k in range(out.size):
-            out[k] = profiles[min(max(start + k, 0), last), line]
+        for x in range(pixels.shape[0]):
+            cut[k, x] = pixels[x, k] = profiles[min(max(start + x, 0), last), line]
 
 
 @compiled_part
@@ -212,137 +214,107 @@ def filter_windows(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> N
 
 @compiled_part
 def measure_peaks(smooth: np.ndarray, starts: np.ndarray, count: int, rules: SearchRules, found: np.ndarray) -> None:
-    """Measure the peaks in filtered windows `smooth`, in lanes, which start at pixels `starts` (lanes,) of `count`.
+    """Measure the peaks in filtered windows `smooth` (W, lanes), which start at pixels `starts` (lanes,) of `count`.
 
     The windows may extend beyond the image. The peak is the highest pixel of the central block and half a block on
     either side.
     """
-    block, size, first = rules.block, smooth.size // LANES, rules.half - rules.block // 2
+    block, size, first = rules.block, smooth.shape[0], rules.half - rules.block // 2
+    none, end = np.float32(-1.0), np.float32(size)
     for k in range(LANES):
-        found[_OTHER + k], found[_GROUND + k] = np.float32(-np.inf), np.float32(_NO_GROUND)
-        found[_LEFT + k], found[_RIGHT + k] = np.float32(-1), np.float32(size)
+        found[HEIGHT + k], found[_GROUND + k], found[_BESIDE + k] = _LOWEST, _LOWEST, _LOWEST
+        found[_LEFT + k], found[_RIGHT + k] = none, end
     for x in range(first, first + 2 * block):
-        pixels = smooth[x * LANES :][:LANES]
+        pixels, place = smooth[x], np.float32(x)
         for k in range(LANES):
-            found[_OTHER + k] = max(found[_OTHER + k], pixels[k])
-    for x in range(first + 2 * block - 1, first - 1, -1):
-        pixels, place = smooth[x * LANES :][:LANES], np.float32(x)
-        for k in range(LANES):
-            top = found[TOP + k]
-            found[TOP + k] = place if pixels[k] == found[_OTHER + k] else top
-    for k in range(LANES):
-        found[HEIGHT + k] = found[_OTHER + k]
+            value, highest, top = pixels[k], found[HEIGHT + k], found[TOP + k]
+            found[TOP + k] = place if value > highest else top
+            found[HEIGHT + k] = max(highest, value)
     # Repeated border pixels may belong to the stripe: use only sides inside the image.
     for begin in (0, size - block):
         for k in range(LANES):
-            found[_OTHER + k] = np.float32(np.inf)
+            found[_LEVEL + k] = -_LOWEST
         for x in range(begin, begin + block):
-            pixels = smooth[x * LANES :][:LANES]
+            pixels = smooth[x]
             for k in range(LANES):
-                found[_OTHER + k] = min(found[_OTHER + k], pixels[k])
+                found[_LEVEL + k] = min(found[_LEVEL + k], pixels[k])
         for k in range(LANES):
-            ground, inside = found[_GROUND + k], (starts[k] + begin >= 0) & (starts[k] + begin + block <= count)
-            found[_GROUND + k] = max(ground, found[_OTHER + k] if inside else np.float32(_NO_GROUND))
+            inside = (starts[k] + begin >= 0) & (starts[k] + begin + block <= count)
+            ground = max(found[_GROUND + k], found[_LEVEL + k] if inside else _LOWEST)
+            found[_GROUND + k], found[_LEVEL + k] = ground, ground + _HALF * (found[HEIGHT + k] - ground)
+    for x in range(size):
+        pixels, place = smooth[x], np.float32(x)
+        for k in range(LANES):
+            top, low = found[TOP + k], pixels[k] < found[_LEVEL + k]
+            found[_LEFT + k] = max(found[_LEFT + k], place if low & (place < top) else none)
+            found[_RIGHT + k] = min(found[_RIGHT + k], place if low & (place > top) else end)
     for k in range(LANES):
-        found[_LEVEL + k] = found[_GROUND + k] + np.float32(0.5) * (found[HEIGHT + k] - found[_GROUND + k])
-        found[_OTHER + k] = np.float32(-np.inf)
+        _measure_width(smooth, k, rules, found)
     for x in range(size):
-        pixels, place = smooth[x * LANES :][:LANES], np.float32(x)
-        for k in range(LANES):
-            left, low = found[_LEFT + k], pixels[k] < found[_LEVEL + k]
-            found[_LEFT + k] = place if low & (place < found[TOP + k]) else left
-    for x in range(size - 1, -1, -1):
-        pixels, place = smooth[x * LANES :][:LANES], np.float32(x)
-        for k in range(LANES):
-            right, low = found[_RIGHT + k], pixels[k] < found[_LEVEL + k]
-            found[_RIGHT + k] = place if low & (place > found[TOP + k]) else right
-    _measure_widths(smooth, rules, found)
-    for x in range(size):
-        pixels, place = smooth[x * LANES :][:LANES], np.float32(x)
+        pixels, place = smooth[x], np.float32(x)
         for k in range(LANES):
             before = (place >= found[_BEGIN + k]) & (place <= found[_LEFT + k])
             after = (place >= found[_RIGHT + k]) & (place < found[_END + k])
-            found[_OTHER + k] = max(found[_OTHER + k], pixels[k] if before | after else np.float32(-np.inf))
+            found[_BESIDE + k] = max(found[_BESIDE + k], pixels[k] if before | after else _LOWEST)
     for k in range(LANES):
-        _finish_peak(smooth[k:], rules, found[k:])
+        _finish_peak(smooth, k, rules, found)
 
 
 @compiled_part
-def _measure_widths(smooth: np.ndarray, rules: SearchRules, found: np.ndarray) -> None:
-    """Measure middle, width and background of the peaks."""
-    size, half, most = np.float32(smooth.size // LANES), np.float32(0.5), np.float32(rules.half - WINDOW_RULE.flank)
-    one, flank, variance = np.float32(1.0), np.float32(WINDOW_RULE.flank), np.float32(rules.smoothing**2)
-    _pick_pixels(smooth, found, _LEFT, 0, _LOW)
-    _pick_pixels(smooth, found, _LEFT, 1, _HIGH)
-    for k in range(LANES):
-        found[MIDDLE + k] = found[_LEFT + k] + _interpolate_level(found[_LOW + k], found[_HIGH + k], found[_LEVEL + k])
-    _pick_pixels(smooth, found, _RIGHT, 0, _LOW)
-    _pick_pixels(smooth, found, _RIGHT, -1, _HIGH)
-    for k in range(LANES):
-        right = found[_RIGHT + k] - _interpolate_level(found[_LOW + k], found[_HIGH + k], found[_LEVEL + k])
-        smooth_sigma = (right - found[MIDDLE + k]) * np.float32(1.0 / FWHM_PER_SIGMA)
-        middle = half * (found[MIDDLE + k] + right)
-        near, reach = np.floor(middle + half), min(np.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma), most)
-        found[MIDDLE + k], found[REACH + k], found[_NEAR + k] = middle, reach, near
-        found[SIGMA + k] = np.sqrt(max(smooth_sigma * smooth_sigma - variance, np.float32(0.0)))
-        found[_BEGIN + k] = min(max(near - reach - flank + one, np.float32(0.0)), size - flank)
-        found[_END + k] = min(max(near + reach - one, np.float32(0.0)), size - flank)
-        closed = (found[_LEFT + k] >= np.float32(0.0)) & (found[_RIGHT + k] < size)
-        found[CLOSED + k] = one if closed else np.float32(0.0)
-    # The lower of two low-passed values, to ignore hot pixels.
-    _pick_pixels(smooth, found, _BEGIN, 1, _LOW)
-    _pick_pixels(smooth, found, _BEGIN, WINDOW_RULE.flank - 1, _HIGH)
-    for k in range(LANES):
-        found[BASE + k] = min(found[_LOW + k], found[_HIGH + k])
-    _pick_pixels(smooth, found, _END, 1, _LOW)
-    _pick_pixels(smooth, found, _END, WINDOW_RULE.flank - 1, _HIGH)
-    for k in range(LANES):
-        before, after = found[BASE + k], min(found[_LOW + k], found[_HIGH + k])
-        reach, near = found[REACH + k], found[_NEAR + k]
-        slope = (after - before) / (np.float32(2.0) * reach + flank - np.float32(2.0))
-        extent = size if rules.order == STRONGEST else reach + flank - one
-        found[SLOPE + k], found[BASE + k] = slope, half * (before + after) + slope * (found[MIDDLE + k] - near)
-        found[_BEGIN + k] = max(near - extent, np.float32(0.0))
-        found[_END + k] = min(near + extent + one, size)
+def _measure_width(smooth: np.ndarray, k: int, rules: SearchRules, found: np.ndarray) -> None:
+    """Measure middle, width and background of the peak in lane `k`."""
+    left, right, level, size = int(found[_LEFT + k]), int(found[_RIGHT + k]), found[_LEVEL + k], smooth.shape[0]
+    x_left = found[_LEFT + k] + _interpolate_level(smooth[max(left, 0), k], smooth[left + 1, k], level)
+    last = smooth[min(right, size - 1), k]
+    x_right = found[_RIGHT + k] - _interpolate_level(last, smooth[right - 1, k], level)
+    middle, smooth_sigma = _HALF * (x_left + x_right), (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
+    square = smooth_sigma * smooth_sigma - np.float32(rules.smoothing * rules.smoothing)
+    reach = min(math.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma), rules.half - WINDOW_RULE.flank)
+    near = math.floor(middle + _HALF)
+    before = _flank(smooth, k, near - reach - WINDOW_RULE.flank + 1)
+    after = _flank(smooth, k, near + reach - 1)
+    slope = (after - before) / np.float32(2 * reach + WINDOW_RULE.flank - 2)
+    extent = size if rules.order == STRONGEST else reach + WINDOW_RULE.flank - 1
+    found[MIDDLE + k], found[REACH + k], found[SLOPE + k] = middle, reach, slope
+    found[SIGMA + k] = math.sqrt(max(square, np.float32(0.0)))
+    found[BASE + k] = _HALF * (before + after) + slope * (middle - np.float32(near))
+    found[CLOSED + k] = left >= 0 and right < size
+    found[_BEGIN + k], found[_END + k] = max(near - extent, 0), min(near + extent + 1, size)
 
 
 @compiled_part
-def _pick_pixels(smooth: np.ndarray, found: np.ndarray, place: int, beyond: int, result: int) -> None:
-    """Copy the pixels ``beyond`` those in the row `place` to the row `result`; outside the window, its border pixels.
-
-    Only this is done lane by lane, because vector units read scattered elements slowly.
-    """
-    last = np.int32(smooth.size // LANES - 1)
-    for k in range(LANES):
-        x = min(max(np.int32(found[place + k]) + np.int32(beyond), np.int32(0)), last)
-        found[result + k] = smooth[x * np.int32(LANES) + np.int32(k)]
-
-
-@compiled_part
-def _finish_peak(smooth: np.ndarray, rules: SearchRules, found: np.ndarray) -> None:
-    """Compute height and crowding of the peak in the first lane, from its highest pixel and the highest one beside."""
-    ground, rise = found[_GROUND], found[HEIGHT] - found[_GROUND]
+def _finish_peak(smooth: np.ndarray, k: int, rules: SearchRules, found: np.ndarray) -> None:
+    """Compute height and crowding of the peak in lane `k`, from its highest pixel and the highest one beside."""
+    ground, rise = found[_GROUND + k], found[HEIGHT + k] - found[_GROUND + k]
+    crowded = False
     if rise <= 0:
         # The surroundings are as high: there is no peak.
-        found[MIDDLE], found[BASE] = found[TOP], ground
-        for row in (SIGMA, REACH, SLOPE, HEIGHT, CLOSED, CROWDED):
-            found[row] = 0
-        return
-    found[HEIGHT] -= found[BASE] if found[CLOSED] else ground
-    crowded = False
-    if found[_OTHER] >= ground + np.float32(rules.share) * rise:
-        # A monotonic tail is no second stripe.
-        for side in (-1, 1):
-            first, last = (found[_LEFT], found[_BEGIN] - 1) if side < 0 else (found[_RIGHT], found[_END])
-            crowded |= _rises_again(smooth, int(first), int(last), side, ground, rise, rules)
-    found[CROWDED] = crowded
+        found[MIDDLE + k], found[SIGMA + k], found[REACH + k] = found[TOP + k], 0, 0
+        found[BASE + k], found[SLOPE + k], found[HEIGHT + k], found[CLOSED + k] = ground, 0, 0, 0
+    else:
+        found[HEIGHT + k] -= found[BASE + k] if found[CLOSED + k] else ground
+        if found[_BESIDE + k] >= ground + np.float32(rules.share) * rise:
+            # A monotonic tail is no second stripe.
+            for side in (-1, 1):
+                begin, end = (
+                    (found[_LEFT + k], found[_BEGIN + k] - 1) if side < 0 else (found[_RIGHT + k], found[_END + k])
+                )
+                crowded |= _rises_again(smooth, k, int(begin), int(end), side, ground, rise, rules)
+    found[CROWDED + k] = crowded
 
 
 @compiled_inline
 def _rises_again(
-    values: np.ndarray, first: int, end: int, step: int, ground: np.floating, rise: np.floating, rules: SearchRules
+    smooth: np.ndarray,
+    lane: int,
+    first: int,
+    end: int,
+    step: int,
+    ground: np.floating,
+    rise: np.floating,
+    rules: SearchRules,
 ) -> np.bool_:
-    """Return True if the first lane outside a peak reaches half height, or the required fraction after a valley.
+    """Return True if a lane outside a peak reaches half height, or the required fraction after a valley.
 
     The valley is at most half as high as the values after it. They must exceed it by at least ``fine``, the noise
     limit.
@@ -350,7 +322,7 @@ def _rises_again(
     level, share, fine = np.float32(0.5) * rise, np.float32(rules.share) * rise, np.float32(rules.fine)
     lowest, found = np.float32(np.inf), rise < 0
     for k in range(first, end, step):
-        value = values[k * LANES]
+        value = smooth[k, lane]
         lowest, above = min(lowest, value), value - ground
         found |= above >= level or (above >= share and value - lowest >= max(np.float32(0.5) * above, fine))
     return found
@@ -360,6 +332,13 @@ def _rises_again(
 def _interpolate_level(low: np.floating, high: np.floating, level: np.floating) -> np.float32:
     """Return the position, from 0 to 1, of a level on the straight line between two neighbouring pixels."""
     return np.float32(min(max((level - low) / max(high - low, np.float32(1e-6)), np.float32(0.0)), np.float32(1.0)))
+
+
+@compiled_part
+def _flank(smooth: np.ndarray, k: int, first: int) -> np.float32:
+    """Return the background in a flank of lane `k`: the lower of two low-passed values, to ignore hot pixels."""
+    first = min(max(first, 0), smooth.shape[0] - WINDOW_RULE.flank)
+    return min(smooth[first + 1, k], smooth[first + WINDOW_RULE.flank - 1, k])
 
 
 @lru_cache(maxsize=16)

@@ -112,6 +112,8 @@ class _Buffers(NamedTuple):
         Pixels of the windows of a group of lines, as in the image.
     pixels, smooth : (lanes (W + 2 R),), (lanes W,) float32
         The same in lanes, before and after the low-pass.
+    inner, rows : (W, lanes) float32
+        Views of these arrays, without borders.
     found : (`MEASURED`,) float32
         Measurements of the group.
     highest : (M,)
@@ -128,6 +130,8 @@ class _Buffers(NamedTuple):
     cut: np.ndarray
     pixels: np.ndarray
     smooth: np.ndarray
+    inner: np.ndarray
+    rows: np.ndarray
     found: np.ndarray
     highest: np.ndarray
     chosen: np.ndarray
@@ -141,11 +145,15 @@ class _Buffers(NamedTuple):
         kernel, size = low_pass(rules.smoothing), _window_size(rules)
         # Whole groups of lines: the last one is filled up.
         queue, starts = np.zeros((2, count + LANES), np.intp)
+        pixels, smooth = np.empty((size + kernel.size - 1, LANES), np.float32), np.empty((size, LANES), np.float32)
+        border = kernel.size // 2
         return cls(
             kernel,
             np.empty((LANES, size), profiles.dtype),
-            np.empty(LANES * (size + kernel.size - 1), np.float32),
-            np.empty(LANES * size, np.float32),
+            pixels.ravel(),
+            smooth.ravel(),
+            pixels[border : border + size],
+            smooth,
             np.empty(MEASURED, np.float32),
             np.empty(count, contrast),
             np.empty(count, np.uint16),
@@ -460,25 +468,20 @@ def _measure_group(
 
     If a peak is not in the middle, its window and start are moved, unless ``follow`` is False.
     """
-    size, border, moved = buffers.cut.shape[1], buffers.kernel.size // 2 * LANES, 1
-    inner, starts = buffers.pixels[border:][: size * LANES], buffers.starts[number:][:LANES]
+    starts, moved = buffers.starts[number:], 1
     for attempt in range(2):
         if attempt == 1:
             moved = 0
             for k in range(LANES if follow else 0):
-                offset = _window_offset(buffers.found[k:], size, rules)
+                offset = _window_offset(buffers.found[k:], buffers.cut.shape[1], rules)
                 starts[k] += offset
                 moved += offset != 0
         if moved == 0:
             break
         for k in range(LANES):
-            cut_window(profiles, lines[buffers.queue[number + k]], starts[k], buffers.cut[k])
-        for x in range(size):
-            row = inner[x * LANES :][:LANES]
-            for k in range(LANES):
-                row[k] = buffers.cut[k, x]
+            cut_window(profiles, lines[buffers.queue[number + k]], starts[k], k, buffers.cut, buffers.inner)
         filter_windows(buffers.pixels, buffers.kernel, buffers.smooth)
-        measure_peaks(buffers.smooth, starts, profiles.shape[0], rules, buffers.found)
+        measure_peaks(buffers.rows, starts, profiles.shape[0], rules, buffers.found)
 
 
 @compiled_inline
