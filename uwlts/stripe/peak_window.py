@@ -44,38 +44,6 @@ class WindowRule(NamedTuple):
 
 WINDOW_RULE = WindowRule()
 
-LANES = 64
-"""Number of lines processed in parallel, which fills the processor's vector units.
-
-A number per line is a row of lanes, a window of W pixels W rows. Rows are parts of flat arrays.
-"""
-
-# Rows of lanes that `measure_peaks` fills; the names are those of `PeakWindow`, or explained beside them.
-TOP = 0 * LANES
-"""Highest pixel after the low-pass."""
-MIDDLE, SIGMA, REACH, BASE, SLOPE, HEIGHT = range(1 * LANES, 7 * LANES, LANES)
-CLOSED = 7 * LANES
-"""1 if both half-height crossings are in the window, otherwise 0."""
-CROWDED = 8 * LANES
-"""1 if the profile rises again outside the crossings, otherwise 0: above half height, or to the required fraction of
-the height after a valley of half its own height."""
-_GROUND = 9 * LANES
-"""Lowest value of the higher surroundings."""
-_LEVEL = 10 * LANES
-"""Half height."""
-_LEFT, _RIGHT = 11 * LANES, 12 * LANES
-"""Nearest pixels below half height on both sides; -1 and the window's size if there is none."""
-_BEGIN, _END = 13 * LANES, 14 * LANES
-"""Pixels that are searched for a second stripe."""
-_BESIDE = 15 * LANES
-"""Greatest value of these pixels outside the half-height crossings."""
-MEASURED = 16 * LANES
-"""Number of elements of all rows."""
-
-_LOWEST = np.float32(-1e38)
-"""Lower than all pixels, and finite: surroundings of a window without a side inside the image."""
-_HALF = np.float32(0.5)
-
 FIRST = -1
 """Order of `SearchRules` for the rule `PeakRule.FIRST`."""
 STRONGEST = 0
@@ -118,6 +86,41 @@ class SearchRules(NamedTuple):
     bright: float
 
 
+class Peak(NamedTuple):
+    """Peak in a window; positions in px from the window's first pixel, heights in grey levels.
+
+    Attributes
+    ----------
+    top : int
+        Highest pixel after the low-pass.
+    middle : float
+        Midpoint of the half-height crossings.
+    sigma : float
+        Half-height width divided by 2.355, without the low-pass (variances add).
+    reach : int
+        Number of pixels from ``middle`` to the first background pixel.
+    base, slope : float
+        Background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
+    height : float
+        Height of the top above ``base``; above the lowest surroundings unless ``closed``.
+    closed : bool
+        Both half-height crossings are in the window.
+    crowded : bool
+        The profile rises again outside the crossings: above half height, or to the required fraction of the height
+        after a valley of half its own height.
+    """
+
+    top: int
+    middle: np.floating
+    sigma: float | np.floating
+    reach: int
+    base: np.floating
+    slope: np.floating
+    height: np.floating
+    closed: bool
+    crowded: np.bool_
+
+
 class PeakWindow(NamedTuple):
     """Peaks in M windows of W pixels, in the form for compiled code.
 
@@ -127,16 +130,8 @@ class PeakWindow(NamedTuple):
         First pixel of each window on its line.
     window : (M, W) float32
         Pixels; beyond the image the border pixel is repeated.
-    middle : (M,) float32
-        Midpoint of the half-height crossings, px from the window's first pixel.
-    sigma : (M,) float32
-        Half-height width divided by 2.355, px, without the low-pass (variances add).
-    reach : (M,) float32
-        Number of pixels from ``middle`` to the first background pixel.
-    base, slope : (M,) float32
-        Background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
-    height : (M,) float32
-        Height of the highest pixel above ``base``; above the lowest surroundings if a crossing is outside the window.
+    middle, sigma, reach, base, slope, height : (M,) float32
+        See `Peak`.
     smoothing : float
         Sigma of the low-pass, px.
     """
@@ -179,142 +174,116 @@ class PeakWindow(NamedTuple):
 
 
 @compiled_part
-def cut_window(profiles: np.ndarray, line: int, start: int, k: int, cut: np.ndarray, pixels: np.ndarray) -> None:
-    """Copy pixels of a line of the profiles (N, L) from `start` on to row `k` of `cut`, and to lane `k` of `pixels`.
-
-    Beyond the image the border pixel is repeated.
-    """
+def cut_window(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
+    """Copy pixels of a line of the profiles (N, L) from `start` on; beyond the image the border pixel is repeated."""
     last = profiles.shape[0] - 1
-    if start >= 0 and start + pixels.shape[0] - 1 <= last:
-        for x in range(pixels.shape[0]):
-            cut[k, x] = pixels[x, k] = profiles[start + x, line]
+    if start >= 0 and start + out.size - 1 <= last:
+        for k in range(out.size):
+            out[k] = profiles[start + k, line]
     else:
-        for x in range(pixels.shape[0]):
-            cut[k, x] = pixels[x, k] = profiles[min(max(start + x, 0), last), line]
+        for k in range(out.size):
+            out[k] = profiles[min(max(start + k, 0), last), line]
 
 
 @compiled_part
-def filter_windows(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
-    """Filter windows in lanes with a symmetric low-pass of 2 R + 1 weights.
+def filter_window(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
+    """Filter a window with a symmetric low-pass of 2 R + 1 weights.
 
-    ``pixels`` has R further rows on either side, which are overwritten with the windows' border pixels.
+    ``pixels`` has R further elements on either side, which are overwritten with the window's border pixels.
     """
-    size, border = out.size, kernel.size // 2 * LANES
-    middle = pixels[border : border + size]
-    for x in range(0, border, LANES):
-        for k in range(LANES):
-            pixels[x + k], pixels[border + size + x + k] = middle[k], middle[size - LANES + k]
+    size, reach = out.size, kernel.size // 2
+    middle = pixels[reach : reach + size]
+    for k in range(reach):
+        pixels[k], pixels[reach + size + k] = middle[0], middle[size - 1]
     for k in range(size):
-        out[k] = kernel[kernel.size // 2] * middle[k]
-    for j in range(kernel.size // 2):
-        before, after = pixels[j * LANES :][:size], pixels[2 * border - j * LANES :][:size]
+        out[k] = kernel[reach] * middle[k]
+    for j in range(reach):
+        before, after = pixels[j : j + size], pixels[2 * reach - j : 2 * reach - j + size]
         for k in range(size):
             out[k] += kernel[j] * (before[k] + after[k])
 
 
 @compiled_part
-def measure_peaks(smooth: np.ndarray, starts: np.ndarray, count: int, rules: SearchRules, found: np.ndarray) -> None:
-    """Measure the peaks in filtered windows `smooth` (W, lanes), which start at pixels `starts` (lanes,) of `count`.
+def measure_peak(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> Peak:
+    """Measure the peak in the filtered window `smooth`, which starts at pixel `start` of `count`.
 
-    The windows may extend beyond the image. The peak is the highest pixel of the central block and half a block on
+    The window may extend beyond the image. The peak is the highest pixel of the central block and half a block on
     either side.
     """
-    block, size, first = rules.block, smooth.shape[0], rules.half - rules.block // 2
-    none, end = np.float32(-1.0), np.float32(size)
-    for k in range(LANES):
-        found[HEIGHT + k], found[_GROUND + k], found[_BESIDE + k] = _LOWEST, _LOWEST, _LOWEST
-        found[_LEFT + k], found[_RIGHT + k] = none, end
-    for x in range(first, first + 2 * block):
-        pixels, place = smooth[x], np.float32(x)
-        for k in range(LANES):
-            value, highest, top = pixels[k], found[HEIGHT + k], found[TOP + k]
-            found[TOP + k] = place if value > highest else top
-            found[HEIGHT + k] = max(highest, value)
+    half, block = rules.half, rules.block
+    size, first = smooth.size, half - block // 2
+    highest = find_greatest(smooth, first, first + 2 * block)
+    top = first
+    while smooth[top] != highest:
+        top += 1
     # Repeated border pixels may belong to the stripe: use only sides inside the image.
-    for begin in (0, size - block):
-        for k in range(LANES):
-            found[_LEVEL + k] = -_LOWEST
-        for x in range(begin, begin + block):
-            pixels = smooth[x]
-            for k in range(LANES):
-                found[_LEVEL + k] = min(found[_LEVEL + k], pixels[k])
-        for k in range(LANES):
-            inside = (starts[k] + begin >= 0) & (starts[k] + begin + block <= count)
-            ground = max(found[_GROUND + k], found[_LEVEL + k] if inside else _LOWEST)
-            found[_GROUND + k], found[_LEVEL + k] = ground, ground + _HALF * (found[HEIGHT + k] - ground)
-    for x in range(size):
-        pixels, place = smooth[x], np.float32(x)
-        for k in range(LANES):
-            top, low = found[TOP + k], pixels[k] < found[_LEVEL + k]
-            found[_LEFT + k] = max(found[_LEFT + k], place if low & (place < top) else none)
-            found[_RIGHT + k] = min(found[_RIGHT + k], place if low & (place > top) else end)
-    for k in range(LANES):
-        _measure_width(smooth, k, rules, found)
-    for x in range(size):
-        pixels, place = smooth[x], np.float32(x)
-        for k in range(LANES):
-            before = (place >= found[_BEGIN + k]) & (place <= found[_LEFT + k])
-            after = (place >= found[_RIGHT + k]) & (place < found[_END + k])
-            found[_BESIDE + k] = max(found[_BESIDE + k], pixels[k] if before | after else _LOWEST)
-    for k in range(LANES):
-        _finish_peak(smooth, k, rules, found)
+    ground = np.float32(-np.inf)
+    for side in range(2):
+        begin = side * (size - block)
+        if start + begin >= 0 and start + begin + block <= count:
+            ground = max(ground, _find_least(smooth, begin, begin + block))
+    rise = highest - ground
+    level = ground + np.float32(0.5) * rise
 
-
-@compiled_part
-def _measure_width(smooth: np.ndarray, k: int, rules: SearchRules, found: np.ndarray) -> None:
-    """Measure middle, width and background of the peak in lane `k`."""
-    left, right, level, size = int(found[_LEFT + k]), int(found[_RIGHT + k]), found[_LEVEL + k], smooth.shape[0]
-    x_left = found[_LEFT + k] + _interpolate_level(smooth[max(left, 0), k], smooth[left + 1, k], level)
-    last = smooth[min(right, size - 1), k]
-    x_right = found[_RIGHT + k] - _interpolate_level(last, smooth[right - 1, k], level)
-    middle, smooth_sigma = _HALF * (x_left + x_right), (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
-    square = smooth_sigma * smooth_sigma - np.float32(rules.smoothing * rules.smoothing)
-    reach = min(math.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma), rules.half - WINDOW_RULE.flank)
-    near = math.floor(middle + _HALF)
-    before = _flank(smooth, k, near - reach - WINDOW_RULE.flank + 1)
-    after = _flank(smooth, k, near + reach - 1)
-    slope = (after - before) / np.float32(2 * reach + WINDOW_RULE.flank - 2)
-    extent = size if rules.order == STRONGEST else reach + WINDOW_RULE.flank - 1
-    found[MIDDLE + k], found[REACH + k], found[SLOPE + k] = middle, reach, slope
-    found[SIGMA + k] = math.sqrt(max(square, np.float32(0.0)))
-    found[BASE + k] = _HALF * (before + after) + slope * (middle - np.float32(near))
-    found[CLOSED + k] = left >= 0 and right < size
-    found[_BEGIN + k], found[_END + k] = max(near - extent, 0), min(near + extent + 1, size)
-
-
-@compiled_part
-def _finish_peak(smooth: np.ndarray, k: int, rules: SearchRules, found: np.ndarray) -> None:
-    """Compute height and crowding of the peak in lane `k`, from its highest pixel and the highest one beside."""
-    ground, rise = found[_GROUND + k], found[HEIGHT + k] - found[_GROUND + k]
-    crowded = False
     if rise <= 0:
         # The surroundings are as high: there is no peak.
-        found[MIDDLE + k], found[SIGMA + k], found[REACH + k] = found[TOP + k], 0, 0
-        found[BASE + k], found[SLOPE + k], found[HEIGHT + k], found[CLOSED + k] = ground, 0, 0, 0
-    else:
-        found[HEIGHT + k] -= found[BASE + k] if found[CLOSED + k] else ground
-        if found[_BESIDE + k] >= ground + np.float32(rules.share) * rise:
-            # A monotonic tail is no second stripe.
-            for side in (-1, 1):
-                begin, end = (
-                    (found[_LEFT + k], found[_BEGIN + k] - 1) if side < 0 else (found[_RIGHT + k], found[_END + k])
-                )
-                crowded |= _rises_again(smooth, k, int(begin), int(end), side, ground, rise, rules)
-    found[CROWDED + k] = crowded
+        zero = np.float32(0.0)
+        return Peak(top, np.float32(top), zero, 0, ground, zero, zero, False, rise > 0)
+
+    left, right = top, top
+    while left >= 0 and smooth[left] >= level:
+        left -= 1
+    while right < size and smooth[right] >= level:
+        right += 1
+    closed = left >= 0 and right < size
+    x_left = np.float32(left) + _interpolate_level(smooth[max(left, 0)], smooth[left + 1], level)
+    x_right = np.float32(right) - _interpolate_level(smooth[min(right, size - 1)], smooth[right - 1], level)
+    middle = np.float32(0.5) * (x_left + x_right)
+    smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
+    sigma = math.sqrt(max(smooth_sigma * smooth_sigma - np.float32(rules.smoothing * rules.smoothing), np.float32(0.0)))
+
+    reach = min(math.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma), half - WINDOW_RULE.flank)
+    near = math.floor(middle + np.float32(0.5))
+    before = _flank(smooth, near - reach - WINDOW_RULE.flank + 1)
+    after = _flank(smooth, near + reach - 1)
+    slope = (after - before) / np.float32(2 * reach + WINDOW_RULE.flank - 2)
+    base = np.float32(0.5) * (before + after) + slope * (middle - np.float32(near))
+    extent = size if rules.order == STRONGEST else reach + WINDOW_RULE.flank - 1
+    begin, end = max(near - extent, 0), min(near + extent + 1, size)
+    beside = max(find_greatest(smooth, begin, left + 1), find_greatest(smooth, right, end))
+    crowded = beside >= ground + np.float32(rules.share) * rise
+    if crowded:
+        # A monotonic tail is no second stripe.
+        crowded = beside < ground
+        for side in (-1, 1):
+            first, last = (left, begin - 1) if side < 0 else (right, end)
+            crowded |= _rises_again(smooth, first, last, side, ground, rise, rules)
+    return Peak(top, middle, sigma, reach, base, slope, highest - (base if closed else ground), closed, crowded)
+
+
+@compiled_part
+def find_greatest(values: np.ndarray, first: int, end: int) -> np.float32:
+    """Return the maximum of ``values[first:end]``; -inf if empty."""
+    result, part = np.float32(-np.inf), values[first:end]
+    for k in range(part.size):
+        result = max(result, part[k])
+    return result
+
+
+@compiled_inline
+def _find_least(values: np.ndarray, first: int, end: int) -> np.float32:
+    """Return the minimum of ``values[first:end]``; inf if empty."""
+    result, part = np.float32(np.inf), values[first:end]
+    for k in range(part.size):
+        result = min(result, part[k])
+    return result
 
 
 @compiled_inline
 def _rises_again(
-    smooth: np.ndarray,
-    lane: int,
-    first: int,
-    end: int,
-    step: int,
-    ground: np.floating,
-    rise: np.floating,
-    rules: SearchRules,
+    values: np.ndarray, first: int, end: int, step: int, ground: np.floating, rise: np.floating, rules: SearchRules
 ) -> np.bool_:
-    """Return True if a lane outside a peak reaches half height, or the required fraction after a valley.
+    """Return True if the profile outside a peak reaches half height, or the required fraction after a valley.
 
     The valley is at most half as high as the values after it. They must exceed it by at least ``fine``, the noise
     limit.
@@ -322,9 +291,8 @@ def _rises_again(
     level, share, fine = np.float32(0.5) * rise, np.float32(rules.share) * rise, np.float32(rules.fine)
     lowest, found = np.float32(np.inf), rise < 0
     for k in range(first, end, step):
-        value = smooth[k, lane]
-        lowest, above = min(lowest, value), value - ground
-        found |= above >= level or (above >= share and value - lowest >= max(np.float32(0.5) * above, fine))
+        lowest, above = min(lowest, values[k]), values[k] - ground
+        found |= above >= level or (above >= share and values[k] - lowest >= max(np.float32(0.5) * above, fine))
     return found
 
 
@@ -335,10 +303,10 @@ def _interpolate_level(low: np.floating, high: np.floating, level: np.floating) 
 
 
 @compiled_part
-def _flank(smooth: np.ndarray, k: int, first: int) -> np.float32:
-    """Return the background in a flank of lane `k`: the lower of two low-passed values, to ignore hot pixels."""
-    first = min(max(first, 0), smooth.shape[0] - WINDOW_RULE.flank)
-    return min(smooth[first + 1, k], smooth[first + WINDOW_RULE.flank - 1, k])
+def _flank(smooth: np.ndarray, first: int) -> np.float32:
+    """Return the background in a flank: the lower of two low-passed values, to ignore hot pixels."""
+    first = min(max(first, 0), smooth.size - WINDOW_RULE.flank)
+    return min(smooth[first + 1], smooth[first + WINDOW_RULE.flank - 1])
 
 
 @lru_cache(maxsize=16)
