@@ -79,7 +79,9 @@ def least_scattered(
         Modules of further methods. One of all is used if it scatters less by `ScatterRule.gain` and ``gain_px``.
     """
     rows = _select_runs(peak.start.size)
-    if rows.shape[1] <= 2 * _RULE.reach or np.median(peak.sigma) < _RULE.narrowest:
+    # Half of the sample's stripes are narrower: their number is counted faster than a median is found.
+    narrow = np.count_nonzero(peak.sigma[rows[::2]] < _RULE.narrowest)
+    if rows.shape[1] <= 2 * _RULE.reach or 2 * narrow > rows[::2].size:
         return centre
     own, (of_first,) = _measure_scatters(peak, centre, (first,), rows[::2])
     if not of_first <= _RULE.advantage * own:
@@ -135,6 +137,7 @@ def _sum_squares(
     return total, count
 
 
+@lru_cache(maxsize=16)
 def _select_runs(count: int) -> np.ndarray:
     """Return the indices (R, K) of runs spread over ``count`` lines, or all lines as one run if they are few."""
     if count <= _RULE.run * _RULE.runs:

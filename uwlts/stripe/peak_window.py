@@ -326,26 +326,34 @@ def noise_gain(sigma: float) -> float:
 @compiled
 def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, moments: np.ndarray) -> None:
     """Compute moments M0, M1, M2 (M, 3) of the windows above `base`, weighted at `centre`; see `zero_crossing`."""
-    count, size = peak.window.shape
-    for m in range(count):
-        pixels, ground, middle, width = peak.window[m], peak.base[m], float(centre[m]), float(sigma[m])
-        reach, sharpness = math.ceil(WINDOW_RULE.tail * width), 1.0 / (width * width)
+    half, last = np.float32(0.5), peak.window.shape[1] - 1
+    for m in range(centre.size):
+        ground, middle, inverse = peak.base[m], centre[m], np.float32(1.0) / sigma[m]
         # The centre may be outside its window.
-        near = min(max(math.floor(middle + 0.5), 0), size - 1)
-        # Gaussian by recurrence: the ratio of neighbouring values decreases by a constant factor per pixel.
-        falling = math.exp(-sharpness)
-        highest = math.exp(-0.5 * sharpness * (near - middle) ** 2)
-        total, first, second = 0.0, 0.0, 0.0
-        for side in (1, -1):
-            weight, ratio = highest, math.exp(-sharpness * (side * (near - middle) + 0.5))
-            pixel, last = near, min(near + reach, size - 1) if side > 0 else max(near - reach, 0)
-            if side < 0:
-                weight, ratio, pixel = weight * ratio, ratio * falling, near - 1
-            while (last - pixel) * side >= 0:
-                t, value = (pixel - middle) / width, weight * (pixels[pixel] - ground)
-                total, first, second = total + value, first + value * t, second + value * t * t
-                weight, ratio, pixel = weight * ratio, ratio * falling, pixel + side
-        moments[m, 0], moments[m, 1], moments[m, 2] = total, first, second
+        reach, near = math.ceil(np.float32(WINDOW_RULE.tail) * sigma[m]), min(max(math.floor(middle + half), 0), last)
+        first, end = max(near - reach, 0), min(near + reach, last) + 1
+        pixels, start = peak.window[m, first:end], np.float32(first) - middle
+        m0, m1, m2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for k in range(pixels.size):
+            t = (start + np.float32(k)) * inverse
+            value = exponential(-half * t * t) * (pixels[k] - ground)
+            m0, m1, m2 = m0 + value, m1 + value * t, m2 + value * t * t
+        moments[m, 0], moments[m, 1], moments[m, 2] = m0, m1, m2
+
+
+@compiled_part
+def exponential(x: np.float32) -> np.float32:
+    """Return e^x as (e^(x / 16))^16, which vector units can compute.
+
+    The relative error is below 2e-5 for |x| < 5; below x = -12 the value of e^-12 is returned.
+    """
+    y = max(x, np.float32(-12.0)) * np.float32(1.0 / 16.0)
+    rest = np.float32(1 / 6) + y * (np.float32(1 / 24) + y * np.float32(1 / 120))
+    power = np.float32(1.0) + y * (np.float32(1.0) + y * (np.float32(0.5) + y * rest))
+    power *= power
+    power *= power
+    power *= power
+    return power * power
 
 
 @compiled_part

@@ -14,7 +14,7 @@ import numpy as np
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 from uwlts.stripe.line_scatter import least_scattered
 from uwlts.stripe.methods import centre_of_mass, quadratic, zero_crossing
-from uwlts.stripe.peak_window import FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow
+from uwlts.stripe.peak_window import FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow, exponential
 
 _STEPS = 5
 """Number of steps of the fit, equal for all lines, which are fitted in parallel."""
@@ -209,13 +209,11 @@ def _arrange_lanes(peak: PeakWindow, noise: float, signal: np.ndarray, known: np
         for k in range(_LANES):
             m = min(group * _LANES + k, count - 1)
             near = math.floor(peak.middle[m] + np.float32(0.5))
-            centre, offset = (
-                peak.middle[m] - np.float32(near),
-                peak.base[m] + peak.slope[m] * (np.float32(near) - peak.middle[m]),
-            )
+            centre, slope, window = peak.middle[m] - np.float32(near), peak.slope[m], peak.window[m]
+            offset = peak.base[m] - slope * centre
             for x in range(-most, most + 1):
-                pixel = peak.window[m, min(max(near + x, 0), size - 1)]
-                signal[group, (most + x) * _LANES + k] = pixel - (offset + peak.slope[m] * np.float32(x))
+                pixel = window[min(max(near + x, 0), size - 1)]
+                signal[group, (most + x) * _LANES + k] = pixel - (offset + slope * np.float32(x))
             half_width = np.float32(0.5 * FWHM_PER_SIGMA) * peak.sigma[m]
             broad = max(peak.sigma[m], np.float32(_NARROWEST))
             known[group, _CENTRE + k], known[group, _HEIGHT + k] = centre, max(peak.height[m], _TINY)
@@ -262,15 +260,15 @@ def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.flo
         centre, inverse = known[_CENTRE + k], np.float32(1.0) / known[_SIGMA + k]
         u, sharpness = -centre * inverse, inverse * inverse
         square = u * u
-        f = known[_HEIGHT + k] * _exp(np.float32(-0.5) * square)
+        f = known[_HEIGHT + k] * exponential(np.float32(-0.5) * square)
         weight = f / (f * f * squared_contrast + known[_FLOOR + k])
         left, weight = weight * (y[k] - f), weight * f
         sums[k], sums[_LANES + k], sums[2 * _LANES + k] = weight, weight * u, weight * square
         sums[3 * _LANES + k], sums[4 * _LANES + k] = weight * square * u, weight * square * square
         sums[5 * _LANES + k], sums[6 * _LANES + k], sums[7 * _LANES + k] = left, left * u, left * square
-        after = _exp(sharpness * (centre - np.float32(0.5)))
-        before = _exp(sharpness * (-centre - np.float32(0.5)))
-        falling = _exp(-sharpness)
+        after = exponential(sharpness * (centre - np.float32(0.5)))
+        before = exponential(sharpness * (-centre - np.float32(0.5)))
+        falling = exponential(-sharpness)
         sums[_AFTER + k], sums[_BEFORE + k], sums[_INVERSE + k] = f * after, f * before, inverse
         sums[_RISE_AFTER + k], sums[_RISE_BEFORE + k] = after * falling, before * falling
         sums[_FALLING + k] = falling
@@ -302,21 +300,6 @@ def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.flo
 
 
 @compiled_part
-def _exp(x: np.float32) -> np.float32:
-    """Return e^x as (e^(x / 16))^16, which vector units can compute.
-
-    The relative error is below 2e-5 for x > -5; below x = -12 the value of e^-12 is returned.
-    """
-    y = max(x, np.float32(-12.0)) * np.float32(1.0 / 16.0)
-    rest = np.float32(1 / 6) + y * (np.float32(1 / 24) + y * np.float32(1 / 120))
-    power = np.float32(1.0) + y * (np.float32(1.0) + y * (np.float32(0.5) + y * rest))
-    power *= power
-    power *= power
-    power *= power
-    return power * power
-
-
-@compiled_part
 def _update_fit(known: np.ndarray, sums: np.ndarray) -> None:
     """Update the fit from the normal equations by Cramer's rule, with limited changes.
 
@@ -333,8 +316,8 @@ def _update_fit(known: np.ndarray, sums: np.ndarray) -> None:
         higher = min(max(scale * (c00 * b0 + c01 * b1 + c02 * b2), -longest), longest)
         further = min(max(scale * (c01 * b0 + c11 * b1 + c12 * b2), -longest), longest)
         wider = min(max(scale * (c02 * b0 + c12 * b1 + c22 * b2), -longest), longest)
-        known[_HEIGHT + k] *= _exp(higher)
+        known[_HEIGHT + k] *= exponential(higher)
         moved = known[_CENTRE + k] + known[_SIGMA + k] * further
         known[_CENTRE + k] = min(max(moved, known[_FIRST + k]), known[_LAST + k])
-        broad = min(known[_SIGMA + k] * _exp(wider), known[_WIDEST + k])
+        broad = min(known[_SIGMA + k] * exponential(wider), known[_WIDEST + k])
         known[_SIGMA + k] = max(broad, np.float32(_NARROWEST))
