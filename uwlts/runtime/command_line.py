@@ -45,7 +45,8 @@ _ADVANCED = Group("Advanced", sort_key=1)
 
 def make_program(name: str, title: str) -> App:
     """Return a program without commands, with the options for its version, its messages and completion by the shell."""
-    app = App(name=name, help=title, version=__version__, help_format="markdown", group_commands=JOBS["Files"])
+    # The list of commands has no markup, and is shown earlier without Markdown's libraries.
+    app = App(name=name, help=title, version=__version__, help_format="plaintext", group_commands=JOBS["Files"])
     app.register_install_completion_command(group=_PROGRAM, help="Install completion of commands for your shell.")
     for words, text in SWITCHES.values():
         # `uwlts.runtime.console.run` takes them out of every command line; alone they do nothing.
@@ -110,7 +111,8 @@ def command_from(
     def register(body: Callable[..., None]) -> DerivedCommand:
         made = DerivedCommand(package, function, body, tuple(also), shortcuts, summary)
         name = body.__name__.strip("_").replace("_", "-")
-        app.command(f"{body.__module__}:{body.__name__}", name=name, help=made.__doc__, group=JOBS[job])
+        place = f"{body.__module__}:{body.__name__}"
+        app.command(place, name=name, help=made.__doc__, help_format="markdown", group=JOBS[job])
         return made
 
     return register
