@@ -79,7 +79,7 @@ def least_scattered(
         Modules of further methods. One of all is used if it scatters less by `ScatterRule.gain` and ``gain_px``.
     """
     rows = _select_runs(peak.start.size)
-    # Half of the sample's stripes are narrower: their number is counted faster than a median is found.
+    # The median of the lines that are compared, because only their scatter decides; counting is faster than sorting.
     narrow = np.count_nonzero(peak.sigma[rows[::2]] < _RULE.narrowest)
     if rows.shape[1] <= 2 * _RULE.reach or 2 * narrow > rows[::2].size:
         return centre

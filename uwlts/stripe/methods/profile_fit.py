@@ -209,11 +209,13 @@ def _arrange_lanes(peak: PeakWindow, noise: float, signal: np.ndarray, known: np
         for k in range(_LANES):
             m = min(group * _LANES + k, count - 1)
             near = math.floor(peak.middle[m] + np.float32(0.5))
-            centre, slope, window = peak.middle[m] - np.float32(near), peak.slope[m], peak.window[m]
-            offset = peak.base[m] - slope * centre
+            centre, offset = (
+                peak.middle[m] - np.float32(near),
+                peak.base[m] + peak.slope[m] * (np.float32(near) - peak.middle[m]),
+            )
             for x in range(-most, most + 1):
-                pixel = window[min(max(near + x, 0), size - 1)]
-                signal[group, (most + x) * _LANES + k] = pixel - (offset + slope * np.float32(x))
+                pixel = peak.window[m, min(max(near + x, 0), size - 1)]
+                signal[group, (most + x) * _LANES + k] = pixel - (offset + peak.slope[m] * np.float32(x))
             half_width = np.float32(0.5 * FWHM_PER_SIGMA) * peak.sigma[m]
             broad = max(peak.sigma[m], np.float32(_NARROWEST))
             known[group, _CENTRE + k], known[group, _HEIGHT + k] = centre, max(peak.height[m], _TINY)
