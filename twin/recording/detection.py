@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel
-from scipy import optimize, stats
+from scipy import optimize, special, stats
 
 from twin.scene.campaign import Take
 from twin.scene.description import Scene
@@ -35,8 +35,6 @@ _NINETY = 0.9
 _ONE_SIDED = 0.95
 _SLOPES = (-1.0, 5.0)
 """Range of the logarithm of the logistic's slope: from a factor of 400 between 10 and 90 % to one of 1.03."""
-_GRID = 600
-"""Depths at which the likelihood is profiled, over e times the range of depths on both sides."""
 _SIGNAL_VALUES = ("undercut left", "undercut right")
 
 
@@ -99,6 +97,8 @@ class Detection(BaseModel, frozen=True):
             found.append("hits and misses do not determine a90")
         elif self.a90_95_mm is None:
             found.append("a90 is not bounded")
+        if self.method == "signal response" and (false := float(self.probability(np.zeros(1))[0])) > 1 - _ONE_SIDED:
+            found.append(f"false calls with {100 * false:.0f} % probability")
         return "; ".join(found)
 
 
@@ -134,18 +134,27 @@ def fit_hit_miss(depth_mm: np.ndarray, found: np.ndarray) -> Fitted:
         return float(np.sum(np.logaddexp(0, np.where(found, -logit, logit))))
 
     def best_slope(at_90: float) -> tuple[float, float]:
-        best = optimize.minimize_scalar(lambda s: loss(at_90, math.exp(s)), bounds=_SLOPES, method="bounded")
-        return float(best.fun), math.exp(float(best.x))
+        logarithm, least = _minimise(lambda s: loss(at_90, math.exp(s)), _SLOPES)
+        return least, math.exp(logarithm)
 
-    grid = np.linspace(x.min() - 1, x.max() + 1, _GRID)
-    losses = np.array([best_slope(at)[0] for at in grid])
-    best = int(np.argmin(losses))
-    if best in (0, _GRID - 1):
+    # The likelihood is concave in intercept and slope, so that its profile has one maximum.
+    ends = float(x.min()) - 1, float(x.max()) + 1
+    at_90, least = _minimise(lambda at: best_slope(at)[0], ends)
+    if min(at_90 - ends[0], ends[1] - at_90) < 1e-3:
         return Fitted()
-    slope = best_slope(grid[best])[1]
-    within = np.flatnonzero(losses <= losses[best] + 0.5 * stats.chi2.ppf(2 * _ONE_SIDED - 1, 1))
-    bound = None if within[-1] == _GRID - 1 else math.exp(grid[within[-1]])
-    return Fitted(math.exp(grid[best]), bound, float(grid[best]) - odds / slope, 1 / slope)
+    limit = least + 0.5 * float(stats.chi2.ppf(2 * _ONE_SIDED - 1, 1))
+    bound = None
+    if best_slope(ends[1])[0] > limit:
+        crossing = optimize.root_scalar(lambda at: best_slope(at)[0] - limit, bracket=(at_90, ends[1]), xtol=1e-4)
+        bound = math.exp(crossing.root)
+    slope = best_slope(at_90)[1]
+    return Fitted(math.exp(at_90), bound, at_90 - odds / slope, 1 / slope)
+
+
+def _minimise(of: Callable[[float], float], ends: tuple[float, float]) -> tuple[float, float]:
+    """Return the place and the value of a function's minimum between two ends."""
+    found: Any = optimize.minimize_scalar(of, bounds=ends, method="bounded")
+    return float(found.x), float(found.fun)
 
 
 def fit_signal_response(depth_mm: np.ndarray, signal_mm: np.ndarray, *, threshold_mm: float) -> Fitted:
@@ -169,7 +178,7 @@ def fit_signal_response(depth_mm: np.ndarray, signal_mm: np.ndarray, *, threshol
 
     def loss(free: np.ndarray) -> float:
         z = (signal_mm - free[0] - free[1] * depth_mm) / math.exp(free[2])
-        logs = np.where(seen, stats.norm.logpdf(z) - free[2], stats.norm.logcdf(z))
+        logs = np.where(seen, -0.5 * z**2 - free[2], special.log_ndtr(z))
         return -float(np.sum(logs))
 
     best = optimize.minimize(loss, [offset, slope, math.log(scatter)], method="Nelder-Mead", options=_TIGHT).x
@@ -302,7 +311,7 @@ def _collect_pits(into: Findings, scene: Scene, inspection: dict[str, Any]) -> N
     )
     first, last = _scanned_mm(scene)
     along = pits[:, 0] + place[0, 3]
-    for pit in np.flatnonzero((along - reach > first) & (along + reach < last)):
+    for pit in np.flatnonzero((along - reach > first) & (along + reach < last)).tolist():
         depth = float(pit_depths(pipe)[pit])
         into.depths_mm.append(depth)
         into.found.append(pit in known)

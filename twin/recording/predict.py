@@ -21,6 +21,7 @@ from twin.scene.motion import Motion
 from uwlts._version import __version__
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.files.json_files import read_json, write_model
+from uwlts.model.artefacts import PlaneStandard, parse_artefact
 from uwlts.model.brief import Brief
 from uwlts.model.library import validate_description
 from uwlts.pages.toolkit import BLUE, figure_svg, new_figure, render_page, write_page
@@ -370,21 +371,22 @@ def _read_errors(take: Take, folders: list[Path]) -> Iterator[PredictedFigure]:
 
 
 def _read_values(take: Take, folders: list[Path]) -> Iterator[PredictedFigure]:
-    """Yield the flatness of an inspected plane, or diameter and ovality of a pipe, where they were measured."""
+    """Yield the flatness of an inspected plane, or diameter and ovality of a pipe if both were measured."""
     kind = _inspected_as(take.scene)
     if kind == "flange":
-        truth = {"flatness": float((take.scene.artefact or {}).get("flatness_mm") or 0.0)}
+        plane = parse_artefact(take.scene.artefact)
+        assert isinstance(plane, PlaneStandard)
+        truth = {"flatness": plane.flatness_mm or 0.0}
     elif kind == "pipe":
         pipe = next(thing for thing in take.scene.objects if isinstance(thing, PittedPipe))
         truth = {"diameter": pipe.diameter_mm, "ovality": pipe.diameter_mm * pipe.ovality}
     else:
         return
     wholes = [_read_inspection(take, folder)["features"][0]["values"] for folder in folders]
-    for name, true in truth.items():
-        if _is_evaluated(take.scene) and name == "diameter":
-            continue
-        values = [whole[name] for whole in wholes if name in whole]
-        if values:
+    # Without an ovality, the interval of a diameter is that of an assumed largest ovality.
+    if kind == "flange" or all("ovality" in whole for whole in wholes):
+        for name, true in truth.items():
+            values = [whole[name] for whole in wholes]
             yield PredictedFigure(
                 scan=take.name,
                 name=f"{name} error",
