@@ -120,7 +120,7 @@ def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
 
 
 def copied(folder: Path) -> Path:
-    """Copy the current files of the checkout, without those ignored by Git."""
+    """Copy the current files of the checkout, without those ignored by Git, except for Numba's compiled functions."""
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -128,7 +128,8 @@ def copied(folder: Path) -> Path:
         capture_output=True,
         text=True,
     )
-    for name in listed.stdout.splitlines():
+    compiled = (path for top in ("uwlts", "twin") for path in (ROOT / top).rglob("__pycache__/*.nb[ci]"))
+    for name in (*listed.stdout.splitlines(), *(str(path.relative_to(ROOT)) for path in compiled)):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
