@@ -34,13 +34,13 @@ from twin.scene.finish import read_grey
 from twin.scene.objects import _surface_from_file
 from uwlts.acceptance.accept import read_acceptance
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.mount.calibrate import calibrate_mount
+from uwlts.calibration.mount.calibrate_mount import calibrate_mount
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.comparison.change_reference import read_datums, read_reference
 from uwlts.comparison.ideal_shapes import read_shape
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.evaluation.gauge import gauge_study
-from uwlts.hardware.guided.plan import load_guided_plan
+from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
 from uwlts.model.artefacts import read_artefact
 from uwlts.model.library import library_folder, load_sensor, read_table, validate_description

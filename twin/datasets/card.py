@@ -27,7 +27,7 @@ README = "README.md"
 PAGE = "dataset.html"
 _SHOWN = 12
 """Number of frames on the page."""
-_SHOWN_WIDTH_PX = 480
+_SHOWN_WIDTH_PX = 480  # width of pictures on the page
 _GAMMA = 0.5
 """Exponent of the displayed brightness, which makes haze visible."""
 _OVERLAY = {

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
 from scipy.special import ndtr, ndtri
 
-from twin.options import Effects, Flaws, Options
+from twin.rendering_options import Effects, Flaws, Options
 from twin.scene.description import AnyMotion, PrintedPlate, Scene, load_scene
 from twin.scene.paths import Value, value_at
 from uwlts.errors import DescriptionError
@@ -209,7 +209,7 @@ class DataSetDescription(Description):
     - ``sensor.`` and a path of the sensor's description: changes the nominal and the rendered sensor.
     - ``as_built.`` and such a path: changes only the rendered sensor.
     - ``scene.`` and a path of the scene's description.
-    - ``effects.`` and the name of an effect: its strength (`twin.options.Flaws`).
+    - ``effects.`` and the name of an effect: its strength (`twin.rendering_options.Flaws`).
     - ``frame.exposure``: a factor of the exposure time, drawn for each frame.
 
     Indices in lists start at 0. Values of integers are rounded.

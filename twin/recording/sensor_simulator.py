@@ -8,8 +8,8 @@ import numpy as np
 
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
-from twin.options import Options
 from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth
+from twin.rendering_options import Options
 from twin.scene.description import PrintedPlate, Scene, replace_values
 from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot

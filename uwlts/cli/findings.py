@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import (
+from uwlts.cli.command_options import (
     STRIPE,
     ColouredOut,
     Overwrite,

@@ -38,7 +38,7 @@ _MOST_CLIPPED = 0.02
 """Largest fraction of lines with clipped pixels in a run; their light is too low by about a tenth."""
 LONGEST_GAP = 8
 """Longest gap along the stripe, lines, in which centres are interpolated."""
-_ROUNDS = 5
+_ROUNDS = 5  # of weights, which follow from the fitted variance
 _BINS = 24
 """Bins of the photon transfer."""
 _BAND_PX = 32

@@ -25,7 +25,9 @@ _CLIPPED = 0.98
 _LEAST_LIGHT = 0.2
 """Least smooth light, of its mean: where a parabola falls below it, the stripe ends in the window."""
 _CROP_PX = 60
-"""Half the height of the pictures of windows, px."""
+"""Half the height of the pictures of windows, px: the stripe and its halo."""
+_PICTURES = 8
+"""Largest number of pictures of an image: a page shows so many of a set."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class StripeWindows:
     image : (N,) int
         Number of the window's image.
     pictures : tuple of (2 `_CROP_PX` + 1, `WINDOW_LINES`) float32
-        One window of each image, with the stripe along its width, as fractions of full scale.
+        Windows of each image, with the stripe along their width, as fractions of full scale.
     """
 
     name: str
@@ -95,8 +97,8 @@ def measure_windows(images: ImageSet, *, most_images: int) -> StripeWindows:
                 values.append(found)
                 numbers.append(number)
                 own.append(lines)
-        if own:
-            pictures.append(_picture(profiles, stripe, own[len(own) // 2]))
+        chosen = np.unique(np.linspace(0, max(len(own) - 1, 0), _PICTURES).astype(int))
+        pictures += [_picture(profiles, stripe, own[k]) for k in chosen.tolist() if own]
     table = np.array(values).reshape(-1, len(STATISTICS))
     return StripeWindows(images.name, table, np.array(numbers, int), tuple(pictures))
 

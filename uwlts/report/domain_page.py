@@ -134,5 +134,5 @@ def _draw_pictures(found: DomainGap) -> str:
             cell.set_axis_off()
         for cell, number in zip(cells, chosen.tolist(), strict=False):
             cell.imshow(np.clip(own.pictures[number], 0, 1) ** _GAMMA, cmap="gray", vmin=0, vmax=1)
-        cells[0].set_title(plain_text(own.name))
+        cells[0].set_title(plain_text(own.name), loc="left")
     return png_data_uri(figure, dpi=110)

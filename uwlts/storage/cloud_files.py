@@ -47,7 +47,7 @@ from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
 from uwlts.storage.ply import encode_ply, read_ply
 
 FORMAT = "uwlts-cloud"
-VERSION = 1
+VERSION = 1  # of the file format
 
 POINTS_OF_PART = 1_000_000
 """Number of points in a part of a large cloud."""

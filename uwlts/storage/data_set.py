@@ -17,7 +17,7 @@ Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 CARD = "dataset.json"
 CARD_FORMAT = "uwlts-dataset"
-CARD_VERSION = 1
+CARD_VERSION = 1  # of the file format
 
 
 class Shard(Description):

@@ -21,7 +21,6 @@ from tests.virtual_sensors import (
     stripe_on_plate,
 )
 from twin.light.renderer import Renderer
-from twin.options import NONE
 from twin.recording.frame_truth import (
     FrameTruth,
     depth_map,
@@ -30,6 +29,7 @@ from twin.recording.frame_truth import (
     find_visible_surfaces,
     project_points,
 )
+from twin.rendering_options import NONE
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus
 

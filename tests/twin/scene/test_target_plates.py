@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.virtual_sensors import altered, camera_axes, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.options import NONE
 from twin.recording.sensor_simulator import with_window
+from twin.rendering_options import NONE
 from twin.scene.description import TargetPlate
 from twin.scene.finish import draw_print_errors, pattern_texture, register_pattern
 from uwlts.model.sensor import Sensor
