@@ -8,13 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-<<<<<<< HEAD
 from twin.datasets.data_set import EXPOSURE, DataSetDescription
-from twin.options import Options
-=======
-from twin.datasets.data_set import EXPOSURE, SPLITS, DataSetDescription, Split
 from twin.rendering_options import Options
->>>>>>> main
 from twin.scene.description import Scene
 from twin.scene.paths import Value, with_values
 from uwlts.errors import Error

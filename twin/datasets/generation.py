@@ -22,12 +22,6 @@ from twin.datasets.card import PAGE, README, write_card
 from twin.datasets.data_set import DataSetDescription, load_description
 from twin.datasets.draws import DrawnScene, choose_split, draw_scene
 from twin.datasets.labels import make_labels
-<<<<<<< HEAD
-from twin.options import CPU, Variant, use_variant
-=======
-from twin.datasets.loading import CARD
-from twin.datasets.shards import SUFFIXES, Sample, open_shard
->>>>>>> main
 from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
 from twin.rendering_options import CPU, Variant, use_variant
 from uwlts.errors import DesignError
