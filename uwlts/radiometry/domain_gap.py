@@ -30,13 +30,17 @@ from uwlts.stripe import StripeSettings
 _MOST_WINDOWS = 2000
 """Largest number of windows of a set whose pairs are compared; more are thinned evenly."""
 _FEWEST_WINDOWS = 6
+"""Least number of windows of a set: median and range of fewer say little."""
 _FEWEST_IMAGES = 6
 """Least number of images for a jackknife over images; with fewer, it is over parts of successive windows."""
 _PARTS = 8
+"""Parts of successive windows: a jackknife over fewer has no stable standard deviation."""
 _HALVINGS = 50
+"""Random halves of a real set: their mean is then known to a seventh of its scatter."""
 _COVERED = (0.01, 0.99)
 """Quantiles of the generated values between which a real value counts as covered."""
 QUANTILES = (0.05, 0.5, 0.95)
+"""Quantiles in tables: the middle, and the range without one of twenty on either side."""
 
 
 @dataclass(frozen=True)
