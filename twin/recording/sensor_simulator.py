@@ -144,6 +144,7 @@ class SensorSimulator:
             uneven_lamp=flaws.uneven_lamp,
             caustics=flaws.caustics,
             drifting={"particles": flaws.particles, "bubbles": flaws.bubbles},
+            surface_seed=options.seed,
         )
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser

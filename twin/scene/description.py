@@ -94,6 +94,7 @@ class PrintedPlate(SceneObject, ABC):
     errors_seed: Annotated[int, Field(ge=0)] = 0
 
     _no_texture: ClassVar[str] = "on a plate with a printed pattern: put it on an object of kind 'plate'"
+    _no_mottle: ClassVar[str] = "on a plate with a printed pattern: set mottle = 0, or use an object of kind 'plate'"
 
     @abstractmethod
     def described_target(self) -> Target:
@@ -109,8 +110,13 @@ class PrintedPlate(SceneObject, ABC):
 
     def scale_reflectance(self, scale: float) -> Self:
         """Return the plate with all reflectances multiplied by ``scale``."""
-        names = [name for name in type(self).model_fields if name.endswith("reflectance")]
-        return self.model_copy(update={name: scale * getattr(self, name) for name in names})
+        printed = [name for name in type(self).model_fields if name.endswith("_reflectance")]
+        values = {name: getattr(self, name) for name in printed} | {"reflectance": self.background_reflectance()}
+        return self.model_copy(update={name: scale * value for name, value in values.items()})
+
+    def background_reflectance(self) -> float:
+        """Return the reflectance of the plate around the print."""
+        return self.finish_properties().reflectance
 
 
 class CirclePlate(PrintedPlate):
@@ -184,7 +190,7 @@ class TargetPlate(PrintedPlate):
 
     def ink_and_gap_reflectance(self) -> tuple[float, float]:
         """Return the reflectance of the ink and of the background."""
-        return self.ink_reflectance, self.reflectance
+        return self.ink_reflectance, self.background_reflectance()
 
 
 AnyObject = Annotated[
