@@ -32,7 +32,7 @@ from twin.recording.frame_truth import (
     measure_line_light,
     project_points,
 )
-from twin.rendering_options import NONE
+from twin.rendering_options import NONE, Effects
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus
 
