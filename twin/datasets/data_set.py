@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from enum import IntEnum, IntFlag
 from pathlib import Path
-from typing import Annotated, Literal, Self, get_args
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
@@ -26,8 +26,6 @@ ROOTS = ("sensor", "as_built", "scene", "effects")
 EXPOSURE = "frame.exposure"
 _ONE_FOR_ALL = ("camera.width_px", "camera.height_px", "camera.stripe_along", "detector.bits", "motion.count")
 _PRINT_ERRORS = ("centre_std_mm", "stretch", "bow_mm", "detection_std_px")
-Split = Literal["train", "validation", "test"]
-SPLITS: tuple[Split, ...] = get_args(Split)
 Label = Literal["centre", "quality", "points", "masks", "light", "depth", "target", "sensor"]
 
 

@@ -83,8 +83,8 @@ class PrintedPlate(SceneObject, ABC):
     """Base of calibration targets on a flat plate that faces -z; its own frame is the target's.
 
     A real target differs from its description: each point (circle or corner) has an error of ``centre_std_mm`` along x
-    and y, the print is larger along x and y by the fractions ``stretch``, and the plate's centre is ``bow_mm`` in front
-    of its corners. ``detection_std_px`` shifts each point independently in each image, in addition to the detection
+    and y. The print is larger along x and y by the fractions ``stretch``. The plate's centre is ``bow_mm`` in front of
+    its corners. ``detection_std_px`` shifts each point independently in each image, in addition to the detection
     errors that image noise causes. ``errors_seed`` is the seed of these errors.
     """
 
