@@ -10,10 +10,10 @@ import numpy as np
 from markupsafe import Markup
 from pydantic import BaseModel
 
-from twin.options import CPU, Variant
 from twin.recording.campaigns import record_campaigns, require_at_least
 from twin.recording.command_lines import AT_ONCE, run_lines
 from twin.recording.detection import Detection, Findings, collect_findings, deep_values, flaws_of
+from twin.rendering_options import CPU, Variant
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign, replace_values
 from twin.scene.description import Scene, medium_of
 from twin.scene.forms import PittedPipe, Weld

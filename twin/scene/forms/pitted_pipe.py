@@ -103,7 +103,7 @@ def pit_places(pipe: PittedPipe) -> np.ndarray:
 
 
 def pit_depths(pipe: PittedPipe) -> np.ndarray:
-    """Return the depths (pits,) in mm; those of a range are even in the logarithm, in random order."""
+    """Return the depths (pits,) in mm; depths of a range are even in the logarithm, in random order."""
     if not isinstance(pipe.pit_depth_mm, tuple):
         return np.full(pipe.pits, float(pipe.pit_depth_mm))
     rng = np.random.default_rng([pipe.seed, _DEPTHS_STREAM])

@@ -89,7 +89,7 @@ class Weld(FreeForm):
 def undercut_depths(weld: Weld) -> np.ndarray:
     """Return the depths (beads, 2) in mm of the grooves on the negative and positive side across each bead.
 
-    Those of a range are drawn evenly in the logarithm.
+    Depths of a range are drawn evenly in the logarithm.
     """
     if not isinstance(weld.undercut_depth_mm, tuple):
         return np.full((weld.beads, 2), float(weld.undercut_depth_mm))
