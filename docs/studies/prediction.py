@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 from cyclopts import App
-from twin.design.parameters import adjust_to_standoff, extract_parameters
 
 import twin
 from docs.studies.result_tables import publish, table
+from twin.design.sensor_arrays import adjust_to_standoff, extract_parameters
 from twin.recording.predict import PredictedUncertainty
 from twin.scene.description import load_scene
 from uwlts.errors import Error
