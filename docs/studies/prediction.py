@@ -44,11 +44,12 @@ RECORDINGS: list[dict[str, Any]] = [
     {"name": "undercut-1", "scene": "undercut", "motion": {"step_mm": 2.0, "count": 13}},
     {"name": "undercut-2", "scene": "undercut", "motion": {"step_mm": 2.0, "count": 13}},
 ]
+_PIPE = load_scene("pits").objects[0]
 SCENES = {
     "step": {"base": "step", "placements": PLACES},
     "pits": {
         "base": "pits",
-        "objects": [load_scene("pits").objects[0].model_dump(mode="json") | {"pit_depth_mm": [0.05, 0.6]}],
+        "objects": [_PIPE.model_dump(mode="json", exclude_none=True) | {"pit_depth_mm": [0.05, 0.6]}],
     },
     "spheres": {
         "base": "spheres",
