@@ -1,6 +1,7 @@
 """Predictions for drawn sensors, against the errors and detection limits of campaigns that they have not seen.
 
     python -m docs.studies.prediction runs/prediction --sensors 30 --write
+    python -m docs.studies.prediction detection runs/detection --write
 
 Lens, baseline, angle, window and water of each sensor are drawn, and the deviations of the built sensor. Two campaigns
 are rendered with the imperfections of `scenes/campaigns/thesis.toml`. Each one predicts the other: its stated
@@ -210,5 +211,30 @@ def main(folder: Path, *, sensors: int = 30, first_seed: int = 7000, write: bool
     publish(tables | {"prediction of a90": table(head, detection_rows(done))}, write=write)
 
 
+def detect(folder: Path, *, every: int = 2, write: bool = False) -> None:
+    """Print the probability of detection with the small sensor in two waters; with `--write`, put it into its page."""
+    rows = []
+    for water in ("clear", "coastal"):
+        found = twin.predict(
+            "thesis-small",
+            campaign="detection",
+            water=water,
+            out=folder / water,
+            campaigns=1,
+            every=every,
+            spp=8,
+            workers=1,
+        )
+        for each in found.detections:
+            hits = f"{sum(each.found)} of {len(each.found)}"
+            depths = ("-" if depth is None else f"{depth:.3f}" for depth in (each.a90_mm, each.a90_95_mm))
+            flaw = f"{each.flaw}s, {each.width_mm:g} mm wide"
+            rows.append([water, flaw, each.method, hits, f"{each.false_calls}", *depths, each.limits()])
+    head = ["water", "flaws", "method", "found", "false calls", "a90, mm", "a90/95, mm", "limits"]
+    publish({"detection of flaws": table(head, rows)}, write=write)
+
+
 if __name__ == "__main__":
-    App(help=__doc__, help_format="plaintext", default_command=main)()
+    app = App(help=__doc__, help_format="plaintext", default_command=main)
+    app.command(detect, name="detection")
+    app()
