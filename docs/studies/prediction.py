@@ -140,7 +140,7 @@ def figure_of(name: str, scan: str) -> str:
     if name.startswith("diameter error"):
         return "pipe diameter, five sides" if scan == "pipe-around" else "sphere diameter"
     kinds = {"SSE": "sphere spacing", "height": "step height", "flatness": "flatness of the plane"}
-    kinds |= {"ovality": "ovality of the pipe", "pit": "depth of pits", "undercut": "depth of undercuts"}
+    kinds |= {"ovality": "ovality of the pipe", "depth": f"depth of {scan}"}
     return next(words for start, words in kinds.items() if name.startswith(start))
 
 
