@@ -242,7 +242,7 @@ def predict(
     if water is not None:
         described = validate_description(Campaign, described.model_dump() | {"water": water}, str(campaign))
     folder = Path(out or Path("runs") / f"predict-{Path(described.sensor).stem}")
-    evidence, scans = _sort_recordings(described)
+    evidence, scans = _sort_recordings(described, every)
     seeds = range(first, first + campaigns)
     folders = record_campaigns(
         described,
@@ -280,11 +280,11 @@ def predict(
     return result
 
 
-def _sort_recordings(campaign: Campaign) -> tuple[dict[str, list[str]], dict[str, Take]]:
+def _sort_recordings(campaign: Campaign, every: int) -> tuple[dict[str, list[str]], dict[str, Take]]:
     """Return the names of the recordings for each option of the calibration, and the scans by name."""
     evidence: dict[str, list[str]] = {"air": [], "water": [], "step": []}
     scans: dict[str, Take] = {}
-    for take in list_takes(campaign, seed=0):
+    for take in list_takes(campaign, seed=0, every=every):
         if (option := _evidence_of(take)) is not None:
             evidence[option].append(take.name)
         elif take.scene.artefact is not None or _inspected_as(take.scene) is not None:

@@ -108,6 +108,7 @@ def test_errors_of_a_rendered_campaign_are_within_the_prediction(tmp_path: Path)
         assert abs(each.errors_mm[0]) < 2 * each.expanded_mm[0], each
         assert 0.001 < each.predicted_mm < 1.0, each
         assert "a = 0." in each.checked, "the water is stated"
+    assert any("20 profiles 2.5 mm apart" in each.checked for each in result.detections), "thinned by `every`"
     assert {each.flaw for each in result.detections} == {"pit", "dent", "undercut"}
     written = json.loads((out / "prediction.json").read_text(encoding="utf-8"))
     assert written["format"] == "twin-prediction"
