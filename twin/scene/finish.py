@@ -362,7 +362,10 @@ def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -
 
 def draw_print_errors(plate: PrintedPlate) -> np.ndarray:
     """Return the print errors (rows, columns, 2) in mm of a target's points along x and y."""
-    return plate.centre_std_mm * _standard_normal(plate, 0)
+    drawn, target = _standard_normal(plate, 0), plate.described_target()
+    rows, columns = np.indices(drawn.shape[:2])
+    places = target.points_at(np.column_stack([columns.ravel(), rows.ravel()]))[:, :2].reshape(drawn.shape)
+    return plate.centre_std_mm * drawn + np.array(plate.stretch) * places
 
 
 def shift_points(scene: mi.Scene, plate: PrintedPlate, *, mm_per_px: float, image: int) -> None:

@@ -10,8 +10,8 @@ import pytest
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.options import NONE
 from twin.recording.frame_truth import find_true_stripe
+from twin.rendering_options import NONE
 from twin.scene.scene_object import Pose
 from twin.scene.subsurface import lateral_spread
 from uwlts.model.sensor import Sensor

@@ -13,7 +13,7 @@ from scipy.stats import lognorm
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
 from twin.backend.arrays import to_jit
 from twin.light.renderer import Renderer
-from twin.options import NONE
+from twin.rendering_options import NONE
 from twin.scene.objects import Objects, build_objects
 from twin.scene.scene_object import Pose
 from twin.scene.surfaces import FINISHES, clipped_share, draw_waves

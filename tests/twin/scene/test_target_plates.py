@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.virtual_sensors import altered, camera_axes, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.options import NONE
 from twin.recording.sensor_simulator import with_window
+from twin.rendering_options import NONE
 from twin.scene.description import TargetPlate
 from twin.scene.finish import draw_print_errors, pattern_texture, register_textures
 from uwlts.model.sensor import Sensor
@@ -129,6 +129,13 @@ def test_the_print_about_each_point_is_off_by_its_error(target):
     # Without the shifts some percent would differ; rounding to 32 bits (1e-5 mm) moves a place or two over an edge.
     assert np.count_nonzero(np.abs(seen - expected) > 1e-6) <= 2
     assert np.count_nonzero(expected != np.where(covered(target, points), INK, GROUND)) > 0.01 * len(points)
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.kind)
+def test_a_stretched_print_moves_each_point_by_its_place(target):
+    thing = TargetPlate(kind="target_plate", target=target, stretch=(1e-3, -2e-3))
+    columns, rows = target.indices.T
+    np.testing.assert_allclose(draw_print_errors(thing)[rows, columns], target.points_mm[:, :2] * [1e-3, -2e-3])
 
 
 def test_descriptions_need_no_detector():
