@@ -298,7 +298,8 @@ class Renderer:
             plane = dr.gather(mi.Vector4f, planes, pixel)
             away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
             same = dr.abs(away) <= here.sigma_mm
-            profile = here.irradiance / (here.in_middle * here.sigma_mm * math.sqrt(2 * math.pi))
+            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm)) / here.sigma_mm
+            profile /= math.sqrt(2 * math.pi)
             return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
 
         for part in _split_pixels(rows, columns, spp=spp):
@@ -339,7 +340,7 @@ class Renderer:
             scattered = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
                 ends = [light.evaluate(segment.end()) for light in sources]
-                across = [_sigmas(here, segment) for here in ends]
+                across = [_sigmas(here, segment, light.sheet.reach) for light, here in zip(sources, ends, strict=True)]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
                 if index == 0 and moment is pose and self._scatters:
@@ -582,9 +583,10 @@ class Renderer:
         return expand_cells(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
 
 
-def _sigmas(here: SheetLight, segment: RaySegment) -> Float:
-    """Return the distance of segment ends from a sheet in standard deviations; infinite without a surface."""
-    return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
+def _sigmas(here: SheetLight, segment: RaySegment, reach: float) -> Float:
+    """Return the distance of segment ends from a sheet in ``reach`` standard deviations; infinite without a surface."""
+    sigma = here.sigma_mm if reach == 1 else here.sigma_mm * opaque(reach)
+    return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
 
 
 def _split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
