@@ -14,31 +14,20 @@ from markupsafe import Markup
 from pydantic import JsonValue
 
 from twin.datasets.coco import write_coco
-from twin.datasets.data_set import (
-    SPLITS,
-    Constant,
-    DataSetDescription,
-    LineStatus,
-    LogUniform,
-    Mask,
-    Normal,
-    OneOf,
-    Split,
-    Uniform,
-)
+from twin.datasets.data_set import Constant, DataSetDescription, LineStatus, LogUniform, Mask, Normal, OneOf, Uniform
 from twin.datasets.labels import MEANINGS
-from twin.datasets.loading import CARD, CARD_FORMAT, CARD_VERSION, DataCard, DataSet, Shard
 from twin.scene.paths import Value
 from uwlts._version import __version__
 from uwlts.files.json_files import write_model
 from uwlts.files.writing import hash_file, write_atomically
 from uwlts.pages.toolkit import BLUE, figure_svg, new_figure, plain_text, png_data_uri, render_page, write_page
+from uwlts.storage.data_set import CARD, CARD_FORMAT, CARD_VERSION, SPLITS, DataCard, DataSet, Shard, Split
 
 README = "README.md"
 PAGE = "dataset.html"
 _SHOWN = 12
 """Number of frames on the page."""
-_SHOWN_WIDTH_PX = 480
+_SHOWN_WIDTH_PX = 480  # width of pictures on the page
 _GAMMA = 0.5
 """Exponent of the displayed brightness, which makes haze visible."""
 _OVERLAY = {

@@ -26,7 +26,7 @@ _LEAST_E = 1e-6
 """Electrons below which a pixel counts as dark, because some processors and threads flush tiny numbers to zero."""
 _LARGEST_HALF = 65504.0
 """Largest number of float16; brighter pixels are clipped to it. It is above the full well of usual sensors."""
-NO_OBJECT = 255
+NO_OBJECT = 255  # in a map of objects' numbers
 MEANINGS = {
     "centre_px": "(lines,) float32: true centre of the stripe on each profile line, in px across it; NaN without one",
     "centroid_px": "(lines,) float32: centroid across the stripe of its direct light, in px, without speckle and noise",

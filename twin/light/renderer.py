@@ -41,7 +41,7 @@ from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
 from twin.light.walk import Walker
 from twin.light.water import Scattering
-from twin.options import ALL, Effects
+from twin.rendering_options import ALL, Effects
 from twin.scene.description import Scene
 from twin.scene.motion import Light as LightName
 from twin.scene.objects import build_objects
@@ -119,8 +119,9 @@ class Renderer:
     """Renderer of one sensor in one medium and one scene.
 
     ``uneven_lamp`` is the relative loss of lamp light away from its spot. ``caustics`` is the contrast of daylight on
-    surfaces. ``drifting`` is the number of bodies of each kind per litre (`twin.options.Flaws`). DesignError if the
-    sensor cannot work in the medium; DescriptionError if an object cannot be built.
+    surfaces. ``drifting`` is the number of bodies of each kind per litre (`twin.rendering_options.Flaws`).
+    ``surface_seed`` is the seed of random reflectances. DesignError if the sensor cannot work in the medium;
+    DescriptionError if an object cannot be built.
     """
 
     def __init__(
@@ -133,13 +134,18 @@ class Renderer:
         uneven_lamp: float = 0.0,
         caustics: float = 0.0,
         drifting: Mapping[Body, float] | None = None,
+        surface_seed: int = 0,
     ):
         self.design, self._uneven_lamp = check_design(sensor, medium), uneven_lamp
         self.sensor, self.medium, self.effects = sensor, medium, effects
         self._caustics, self._drifting = caustics, drifting or {}
         wavelength = sensor.laser.wavelength_nm
         self.objects = build_objects(
-            scene, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength, gloss=effects.gloss
+            scene,
+            medium_index=medium.refractive_index(wavelength),
+            wavelength_nm=wavelength,
+            gloss=effects.gloss,
+            seed=surface_seed,
         )
         self.view = CameraView(sensor, medium)
         self.scattering = Scattering(medium, wavelength)

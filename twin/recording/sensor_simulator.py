@@ -8,8 +8,8 @@ import numpy as np
 
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
-from twin.options import Options
 from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth, measure_line_light
+from twin.rendering_options import Options
 from twin.scene.description import PrintedPlate, Scene, replace_values
 from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
@@ -144,6 +144,7 @@ class SensorSimulator:
             uneven_lamp=flaws.uneven_lamp,
             caustics=flaws.caustics,
             drifting={"particles": flaws.particles, "bubbles": flaws.bubbles},
+            surface_seed=options.seed,
         )
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser

@@ -17,7 +17,7 @@ from uwlts.model.sensor import Description, Medium, Sensor, Table
 from uwlts.storage.hdf5_file import DAMAGE, read_array, read_label, write_label
 
 FORMAT = "uwlts-truth"
-VERSION = 1
+VERSION = 1  # of the file format
 _DIMENSIONS = {"centre_px": 2, "point_mm": 3, "normal": 3, "status": 2, "crossings": 2, "depth_mm": 2}
 _LATER = {"pose": 3, "centroid_px": 2, "visible_fraction": 2, "mixed_fraction": 2}
 """Arrays that files of earlier versions lack, with their dimensions."""

@@ -8,8 +8,8 @@ from scipy.special import erf
 from tests.virtual_sensors import altered, block, clear, plate, scene_of, stripe_on_plate
 from twin.datasets.data_set import FAINT_BELOW, LineStatus, Mask
 from twin.datasets.labels import make_labels, noise_std_e, stripe_quality
-from twin.options import Effects, Options
 from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
+from twin.rendering_options import Effects, Options
 from twin.scene.forms.pitted_pipe import PittedPipe, pitted_radius
 from twin.scene.motion import Motion, Shot
 from uwlts.model.sensor import Sensor

@@ -12,8 +12,8 @@ from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, seen
 from twin.light.particles import Spots, _draw_out, bubble, diffuse_sphere
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
-from twin.options import NONE, Options
 from twin.recording.sensor_simulator import SensorSimulator
+from twin.rendering_options import NONE, Options
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 

@@ -26,7 +26,7 @@ from tests.virtual_sensors import (
 from twin.backend.arrays import to_jit, to_numpy
 from twin.light.renderer import Renderer
 from twin.light.sheet import PowerTable, Sheet
-from twin.options import NONE, Flaws
+from twin.rendering_options import NONE, Flaws
 from twin.sensor.flaws import as_built
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.library import validate_description

@@ -22,7 +22,6 @@ from tests.virtual_sensors import (
     stripe_on_plate,
 )
 from twin.light.renderer import Renderer
-from twin.options import NONE, Effects
 from twin.recording.frame_truth import (
     FrameTruth,
     depth_map,
@@ -33,6 +32,7 @@ from twin.recording.frame_truth import (
     measure_line_light,
     project_points,
 )
+from twin.rendering_options import NONE, Effects
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from uwlts.calibration.mount.estimate import NotSettled, settle
+from uwlts.calibration.mount.restricted_likelihood import NotSettled, settle
 
 
 @dataclass(frozen=True)
