@@ -34,9 +34,12 @@ TESTS = {
     "uwlts/stripe": ["tests/uwlts/stripe", "tests/uwlts/reconstruction"],
     "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/reconstruction"],
     "uwlts/calibration/mount": ["tests/uwlts/calibration/mount"],
-    "uwlts/calibration": ["tests/uwlts/calibration"],
+    "uwlts/calibration": [
+        f"tests/uwlts/calibration/{name}"
+        for name in ("camera", "guidance", "sequential", "polynomial", "model_comparison", "test_target_stripes.py")
+    ],
     "uwlts/reconstruction": ["tests/uwlts/reconstruction", "tests/uwlts/report", "tests/system/test_joint_command.py"],
-    "uwlts/fitting": [f"tests/uwlts/{name}" for name in ("fitting", "evaluation", "inspection")],
+    "uwlts/fitting": [f"tests/uwlts/{name}" for name in ("fitting", "evaluation", "registration", "inspection")],
     "uwlts/evaluation": ["tests/uwlts/evaluation", "tests/uwlts/acceptance"],
     "uwlts/registration": ["tests/uwlts/registration"],
     "uwlts/alignment": ["tests/uwlts/alignment"],
