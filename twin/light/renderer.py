@@ -41,7 +41,7 @@ from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
 from twin.light.walk import Walker
 from twin.light.water import Scattering
-from twin.options import ALL, Effects
+from twin.rendering_options import ALL, Effects
 from twin.scene.description import Scene
 from twin.scene.motion import Light as LightName
 from twin.scene.objects import build_objects
@@ -119,8 +119,9 @@ class Renderer:
     """Renderer of one sensor in one medium and one scene.
 
     ``uneven_lamp`` is the relative loss of lamp light away from its spot. ``caustics`` is the contrast of daylight on
-    surfaces. ``drifting`` is the number of bodies of each kind per litre (`twin.options.Flaws`). DesignError if the
-    sensor cannot work in the medium; DescriptionError if an object cannot be built.
+    surfaces. ``drifting`` is the number of bodies of each kind per litre (`twin.rendering_options.Flaws`).
+    ``surface_seed`` is the seed of random reflectances. DesignError if the sensor cannot work in the medium;
+    DescriptionError if an object cannot be built.
     """
 
     def __init__(
@@ -133,13 +134,18 @@ class Renderer:
         uneven_lamp: float = 0.0,
         caustics: float = 0.0,
         drifting: Mapping[Body, float] | None = None,
+        surface_seed: int = 0,
     ):
         self.design, self._uneven_lamp = check_design(sensor, medium), uneven_lamp
         self.sensor, self.medium, self.effects = sensor, medium, effects
         self._caustics, self._drifting = caustics, drifting or {}
         wavelength = sensor.laser.wavelength_nm
         self.objects = build_objects(
-            scene, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength, gloss=effects.gloss
+            scene,
+            medium_index=medium.refractive_index(wavelength),
+            wavelength_nm=wavelength,
+            gloss=effects.gloss,
+            seed=surface_seed,
         )
         self.view = CameraView(sensor, medium)
         self.scattering = Scattering(medium, wavelength)
@@ -152,8 +158,8 @@ class Renderer:
         self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
         self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
-        # Pose and cells of the first laser's stripe in the last frame; the ground truth needs them again.
-        self._own_stripe: tuple[SensorPose, np.ndarray] | None = None
+        # Pose, and cells of the first laser's stripe and of all lit pixels in the last frame, for the ground truth.
+        self._last_stripe: tuple[SensorPose, np.ndarray, np.ndarray] | None = None
 
     def irradiance(
         self, light: LightName, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
@@ -230,21 +236,68 @@ class Renderer:
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
-        if self._own_stripe is None or not pose.equals(self._own_stripe[0]):
-            bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
-            direct, _ = make_lights(self._sheets[:1], pose)
-            own = np.zeros((shape[0] - 1, shape[1] - 1), bool)
-            for moment, (light, *_) in self._moments(pose, direct):
-                segment = next(self._segments(moment, bundle, None))
-                own |= mark_near_sheet(_sigmas(light.evaluate(segment.end()), segment).numpy().reshape(shape))
-            self._own_stripe = pose, own
-        return find_marked(self._expand_cells(self._own_stripe[1]))
+        return find_marked(self._expand_cells(self._locate_stripe(pose)[0]))
+
+    def _locate_stripe(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
+        """Return cells that the first laser's stripe meets, and cells that light of any stripe reaches."""
+        if self._last_stripe is None or not pose.equals(self._last_stripe[0]):
+            self._laser_nodes(pose, *make_lights(self._sheets, pose, self._mirrors))
+        assert self._last_stripe is not None
+        return self._last_stripe[1:]
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
         """Return the irradiance in W/mm2 per ray of the first laser on directly visible surfaces, and the rays."""
         direct, _ = make_lights(self._sheets[:1], pose)
         segment = next(self._segments(pose, bundle, after_s))
         return segment.weight * self._radiance(pose, segment, direct, after_s), segment
+
+    def render_line_light(
+        self, pose: SensorPose, points_mm: np.ndarray, normals: np.ndarray, *, spp: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Render the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
+
+        A line's surface is what lies within one standard deviation of the sheet of the plane through its point.
+
+        Parameters
+        ----------
+        pose
+            Pose of the sensor, with its motion.
+        points_mm, normals : (L, 3)
+            Surface point of each profile line in scene coordinates, NaN for none, and the unit normal there.
+        spp
+            Number of samples per pixel.
+
+        Returns
+        -------
+        ndarray, ndarray
+            Rows and columns (P,) of pixels on lines with a point.
+        ndarray
+            Means (3, P) over each pixel: irradiance in W/mm2 from all surfaces, and from others than the line's; and
+            the density of the sheet's normalised profile on the line's surface, in 1/mm of distance from the sheet.
+        """
+        rows, columns = find_marked(self._expand_cells(self._locate_stripe(pose)[1]))
+        along_width = self.sensor.camera.stripe_along == "width"
+        known = np.isfinite(points_mm[columns if along_width else rows, 0])
+        rows, columns, found = rows[known], columns[known], [np.zeros((3, 0), np.float32)]
+        (light, *_), _ = make_lights(self._sheets[:1], pose)
+
+        def sums(pose: SensorPose, bundle: Rays, after_s: Float | None, planes: Float) -> tuple[Float, ...]:
+            segment = next(self._segments(pose, bundle, after_s))
+            here = light.evaluate(segment.end(), after_s)
+            value = segment.weight * self._radiance(pose, segment, [light], after_s)
+            pixel = dr.arange(mi.UInt32, dr.width(value)) // dr.opaque(mi.UInt32, spp)
+            plane = dr.gather(mi.Vector4f, planes, pixel)
+            away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
+            same = dr.abs(away) <= here.sigma_mm
+            profile = here.irradiance / (here.in_middle * here.sigma_mm * math.sqrt(2 * math.pi))
+            return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
+
+        for part in _split_pixels(rows, columns, spp=spp):
+            line = part[along_width]
+            offset = np.sum(normals[line] * points_mm[line], axis=1, keepdims=True)
+            planes = to_jit(mi.Float, np.concatenate([normals[line], offset], axis=1))
+            found.append(self._render_pixels(sums, pose, *part, planes, spp=spp)())
+        return rows, columns, np.concatenate(found, axis=1)
 
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
@@ -301,8 +354,9 @@ class Renderer:
                 lit |= near
             if moment is pose and dr.width(scattered) > 1:
                 image = self._expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)))
-        self._own_stripe = pose, own
-        return dilate_cells(lit, reach), image, [each.numpy().reshape(shape) for each in surfaces]
+        lit = dilate_cells(lit, reach)
+        self._last_stripe = pose, own, lit
+        return lit, image, [each.numpy().reshape(shape) for each in surfaces]
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""

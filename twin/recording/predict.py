@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from twin.options import CPU, Variant
 from twin.recording.campaigns import record_campaigns, require_at_least
 from twin.recording.command_lines import AT_ONCE, run_lines
+from twin.rendering_options import CPU, Variant
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign, replace_values
 from uwlts._version import __version__
 from uwlts.errors import CaptureError, DescriptionError

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.options import CPU, Options, Variant, use_variant
+from twin.rendering_options import CPU, Options, Variant, use_variant
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError
 from uwlts.files.inputs import protect_inputs

@@ -8,8 +8,8 @@ import numpy as np
 
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
-from twin.options import Options
-from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth
+from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth, measure_line_light
+from twin.rendering_options import Options
 from twin.scene.description import PrintedPlate, Scene, replace_values
 from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
@@ -144,6 +144,7 @@ class SensorSimulator:
             uneven_lamp=flaws.uneven_lamp,
             caustics=flaws.caustics,
             drifting={"particles": flaws.particles, "bubbles": flaws.bubbles},
+            surface_seed=options.seed,
         )
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
@@ -355,7 +356,9 @@ class SensorSimulator:
         """Return the ground truth of every profile line of a shot."""
         if not self.shows(shot, "laser"):
             return make_empty_truth(self.sensor.camera.lines())
-        return find_true_stripe(self.renderer, self.pose(shot), travel=self.travel(shot))
+        pose, travel = self.pose(shot), self.travel(shot)
+        truth = find_true_stripe(self.renderer, pose, travel=travel)
+        return measure_line_light(self.renderer, pose, truth, spp=self.options.spp, travel=travel)
 
     def _shift_points(self, shot: Shot, index: int) -> None:
         """Displace the points of a target by its detection errors in this image."""

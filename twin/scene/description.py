@@ -83,8 +83,8 @@ class PrintedPlate(SceneObject, ABC):
     """Base of calibration targets on a flat plate that faces -z; its own frame is the target's.
 
     A real target differs from its description: each point (circle or corner) has an error of ``centre_std_mm`` along x
-    and y, the print is larger along x and y by the fractions ``stretch``, and the plate's centre is ``bow_mm`` in front
-    of its corners. ``detection_std_px`` shifts each point independently in each image, in addition to the detection
+    and y. The print is larger along x and y by the fractions ``stretch``. The plate's centre is ``bow_mm`` in front of
+    its corners. ``detection_std_px`` shifts each point independently in each image, in addition to the detection
     errors that image noise causes. ``errors_seed`` is the seed of these errors.
     """
 
@@ -95,6 +95,7 @@ class PrintedPlate(SceneObject, ABC):
     errors_seed: Annotated[int, Field(ge=0)] = 0
 
     _no_texture: ClassVar[str] = "on a plate with a printed pattern: put it on an object of kind 'plate'"
+    _no_mottle: ClassVar[str] = "on a plate with a printed pattern: set mottle = 0, or use an object of kind 'plate'"
 
     @abstractmethod
     def described_target(self) -> Target:
@@ -110,8 +111,13 @@ class PrintedPlate(SceneObject, ABC):
 
     def scale_reflectance(self, scale: float) -> Self:
         """Return the plate with all reflectances multiplied by ``scale``."""
-        names = [name for name in type(self).model_fields if name.endswith("reflectance")]
-        return self.model_copy(update={name: scale * getattr(self, name) for name in names})
+        printed = [name for name in type(self).model_fields if name.endswith("_reflectance")]
+        values = {name: getattr(self, name) for name in printed} | {"reflectance": self.background_reflectance()}
+        return self.model_copy(update={name: scale * value for name, value in values.items()})
+
+    def background_reflectance(self) -> float:
+        """Return the reflectance of the plate around the print."""
+        return self.finish_properties().reflectance
 
 
 class CirclePlate(PrintedPlate):
@@ -185,7 +191,7 @@ class TargetPlate(PrintedPlate):
 
     def ink_and_gap_reflectance(self) -> tuple[float, float]:
         """Return the reflectance of the ink and of the background."""
-        return self.ink_reflectance, self.reflectance
+        return self.ink_reflectance, self.background_reflectance()
 
 
 AnyObject = Annotated[

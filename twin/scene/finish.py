@@ -1,10 +1,13 @@
 """Surface finishes under water as Mitsuba BSDFs, without specular mirror reflection.
 
-Patterns of calibration targets are textures that are evaluated exactly: the texels of a bitmap would blur their edges.
+Patterns of calibration targets and random fields are textures that are evaluated exactly at every point: the texels of
+a bitmap would blur their edges.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
@@ -14,8 +17,9 @@ import mitsuba as mi
 import numpy as np
 from pydantic import TypeAdapter
 
-from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
+from twin.backend.arrays import Bool, Float, Point3f, SurfaceInteraction3f, UInt32, opaque, to_jit
 from twin.scene.description import AnyObject, FlatObject, PrintedPlate, SceneObject
+from twin.scene.surfaces import WAVES, draw_waves, log_deviation, move_waves
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.model.media import check_range
 from uwlts.storage.image_file import read_image
@@ -62,43 +66,64 @@ def iron_index(*, wavelength_nm: float) -> complex:
     return complex(np.interp(wavelength_nm, wavelength, n), np.interp(wavelength_nm, wavelength, k))
 
 
-def finish_bsdf(thing: SceneObject, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> mi.BSDF:
+def finish_bsdf(
+    thing: SceneObject,
+    *,
+    medium_index: float,
+    wavelength_nm: float,
+    gloss: bool = True,
+    pose: np.ndarray | None = None,
+    seed: Sequence[int] = (0,),
+) -> mi.BSDF:
     """Return the BSDF of an object in a medium, without its mirror reflection.
 
     Without ``gloss`` all surfaces are diffuse: a body without its coat, and a metal with the reflectance |(m - 1) / (m
-    + 1)|^2 of its smooth surface at normal incidence (Fresnel). DescriptionError if the texture is missing, unreadable,
-    or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
+    + 1)|^2 of its smooth surface at normal incidence (Fresnel). A random reflectance is drawn from ``seed`` and fixed
+    to the object at its ``pose`` (4, 4) in the scene, by default the identity. DescriptionError if the texture is
+    missing, unreadable, or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
     """
-    if gloss and thing.finish != "diffuse":
-        return _make_glossy(thing, _reflectance(thing), medium_index=medium_index, wavelength_nm=wavelength_nm)
-    scale = 1.0
-    if thing.finish == "metal":
+    own, scale, waves = thing.finish_properties(), 1.0, None
+    if own.mottle > 0 and own.reflectance > 0:
+        waves = draw_waves(np.random.default_rng(seed), own.mottle_mm)
+        waves = move_waves(waves, np.eye(4) if pose is None else pose)
+    if gloss and own.reflection != "diffuse":
+        reflectance = _reflectance(thing, scale, waves)
+        return _make_glossy(thing, reflectance, medium_index=medium_index, wavelength_nm=wavelength_nm)
+    if own.reflection == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
         scale = abs((index - 1) / (index + 1)) ** 2
-    return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale)})
+    return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale, waves)})
 
 
 def _make_glossy(
     thing: SceneObject, reflectance: float | mi.Texture, *, medium_index: float, wavelength_nm: float
 ) -> mi.BSDF:
     """Return the BSDF of a metal or coated body; indices are relative to the surrounding medium."""
-    rough = {"distribution": "ggx", "alpha": thing.gloss_alpha()}
-    if thing.finish == "metal":
+    own = thing.finish_properties()
+    rough = {"distribution": "ggx", "alpha": own.alpha}
+    if own.reflection == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
         metal = {"type": "roughconductor", "eta": index.real, "k": index.imag, "sample_visible": True}
         return mi.load_dict(metal | rough | {"specular_reflectance": reflectance})
-    coat = {"type": "roughplastic", "int_ior": COAT_INDEX[thing.finish], "ext_ior": medium_index, "nonlinear": False}
+    coat = {"type": "roughplastic", "int_ior": COAT_INDEX[own.reflection], "ext_ior": medium_index, "nonlinear": False}
     return mi.load_dict(coat | rough | {"diffuse_reflectance": reflectance})
 
 
-def _reflectance(thing: SceneObject, scale: float = 1.0) -> float | mi.Texture:
-    """Return the reflectance of an object, a number or a texture, multiplied by ``scale``."""
+def _reflectance(thing: SceneObject, scale: float, waves: np.ndarray | None) -> float | mi.Texture:
+    """Return the reflectance of an object, a number or a texture, multiplied by ``scale``.
+
+    ``waves`` (N, 4) are those of its random variation in the scene.
+    """
     if isinstance(thing, PrintedPlate):
         return pattern_texture(thing.scale_reflectance(scale))
+    own = thing.finish_properties()
+    if waves is not None:
+        table = {"waves": waves.tolist(), "mean": own.reflectance, "mottle": own.mottle, "scale": scale}
+        return mi.load_dict({"type": "random_reflectance", "table": json.dumps(table)})
     if thing.texture is None:
-        return scale * thing.reflectance
+        return scale * own.reflectance
     # Texture coordinate v starts at the last row of the picture, but Mitsuba's rows start at the first.
-    grey = scale * thing.reflectance * read_grey(thing.texture)[::-1]
+    grey = scale * own.reflectance * read_grey(thing.texture)[::-1]
     picture = mi.Bitmap(np.ascontiguousarray(grey[..., None], dtype=np.float32))
     wrap_mode = "clamp" if isinstance(thing, FlatObject) else "repeat"
     return mi.load_dict({"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": wrap_mode})
@@ -161,12 +186,12 @@ def view_along_normal(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
 
 
 def pattern_texture(plate: PrintedPlate) -> mi.Texture:
-    """Return the texture of a printed plate; `register_pattern` must have been called for the variant."""
+    """Return the texture of a printed plate; `register_textures` must have been called for the variant."""
     return mi.load_dict({"type": "target_pattern", "plate": plate.model_dump_json()})
 
 
-def register_pattern() -> None:
-    """Register the texture ``target_pattern`` with the selected Mitsuba variant."""
+def register_textures() -> None:
+    """Register the textures ``target_pattern`` and ``random_reflectance`` with the selected Mitsuba variant."""
 
     class TargetPattern(mi.Texture):
         """Reflectance of a printed plate whose uv coordinates run from 0 to 1 over its bounds.
@@ -213,7 +238,7 @@ def register_pattern() -> None:
             column = dr.clip(dr.floor((x - self.first[0]) / self.cell_mm), 0, self.columns - 1)
             row = dr.clip(dr.floor((y - self.first[1]) / self.cell_mm), 0, self.rows - 1)
             start = 2 * mi.UInt32((row * self.columns + column) * self.depth)
-            value = mi.Float(self.plate.reflectance)
+            value = mi.Float(self.plate.background_reflectance())
             for k in range(self.depth):
                 # Adjacent values are read together, in a quarter of the time.
                 middle_x, middle_y, half_width, aspect = dr.gather(mi.Vector4f, self.patches, start + 2 * k, active)
@@ -225,7 +250,7 @@ def register_pattern() -> None:
             return value
 
         def mean(self) -> Float:
-            return mi.Float(self.plate.reflectance)
+            return mi.Float(self.plate.background_reflectance())
 
         def is_spatially_varying(self) -> bool:
             return True
@@ -233,7 +258,56 @@ def register_pattern() -> None:
         def to_string(self) -> str:
             return f"TargetPattern[{type(self.plate.described_target()).__name__}]"
 
+    class RandomReflectance(mi.Texture):
+        """Log-normal reflectance, limited to 1, from a Gaussian field of plane waves in the scene; times a scale."""
+
+        def __init__(self, props: mi.Properties):
+            mi.Texture.__init__(self, props)
+            table = json.loads(str(props["table"]))
+            self.waves = to_jit(mi.Float, np.array(table["waves"]))
+            deviation = log_deviation(table["mottle"])
+            self.gain, self.mean_value = (
+                opaque(deviation * math.sqrt(2 / WAVES)),
+                opaque(table["scale"] * table["mean"]),
+            )
+            self.middle, self.most = opaque(math.log(table["mean"]) - deviation**2 / 2), opaque(table["scale"])
+
+        def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
+            return self.eval_1(si, active)
+
+        def eval_1(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
+            return self.most * dr.minimum(dr.exp(self.middle + self.gain * _sum_waves(self.waves, si.p, active)), 1.0)
+
+        def mean(self) -> Float:
+            return self.mean_value
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+        def to_string(self) -> str:
+            return "RandomReflectance[]"
+
     mi.register_texture("target_pattern", TargetPattern)
+    mi.register_texture("random_reflectance", RandomReflectance)
+
+
+def _sum_waves(waves: Float, p: Point3f, active: Bool) -> Float:
+    """Return the sum of cos(k p + phase) of plane waves at points of the scene; ``waves`` are k and phase, flat."""
+
+    def add(number: UInt32, total: Float) -> tuple[UInt32, Float]:
+        x, y, z, phase = dr.gather(mi.Vector4f, waves, number, active)
+        return number + 1, total + dr.cos(dr.fma(x, p.x, dr.fma(y, p.y, dr.fma(z, p.z, phase))))
+
+    # Skip the search for loop invariants, as in `Walker`.
+    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+        _, total = dr.while_loop(
+            (dr.zeros(mi.UInt32, dr.width(p)), dr.zeros(mi.Float, dr.width(p))),
+            lambda number, total: number < WAVES,
+            add,
+            mode="symbolic",
+            label="waves",
+        )
+    return total
 
 
 def _patch_table(plate: PrintedPlate) -> np.ndarray:

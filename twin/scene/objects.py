@@ -13,7 +13,7 @@ import trimesh
 
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Plate, Scene, Sphere, TargetPlate
-from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, view_along_normal
+from twin.scene.finish import albedo_parts, finish_bsdf, register_textures, view_along_normal
 from twin.scene.forms.triangles import bowed_plate
 from twin.scene.scene_object import FreeForm
 from uwlts.errors import DescriptionError
@@ -25,6 +25,8 @@ _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
 _BLOCK_FACES = [np.roll(np.eye(3), shift, axis=1) @ np.diag([1, sign, sign]) for shift in range(3) for sign in (1, -1)]
 """Right-handed axes (3, 3) of a block's faces; the third one is the outward normal."""
 _CYLINDER_AXIS_TO_X = np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
+_SURFACE_STREAM = 11
+"""Random number stream of surfaces, separate from those of print errors."""
 # At a cosine of 0 no light is sampled: use the albedo at a small cosine instead.
 _ALBEDO_COSINES = np.maximum(np.linspace(0.0, 1.0, 65), 1e-3)
 
@@ -103,19 +105,24 @@ class Objects:
         return dr.gather(mi.Float, self._facts[key], _registry_number(si.shape), si.is_valid())
 
 
-def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> Objects:
+def build_objects(
+    scene: Scene, *, medium_index: float, wavelength_nm: float, gloss: bool = True, seed: int = 0
+) -> Objects:
     """Build all objects of a scene in a medium for the laser's wavelength; without ``gloss`` diffuse, without mirrors.
 
-    DescriptionError if a mesh or texture file is missing, unreadable or empty; RangeError if the wavelength is outside
-    the table of a metal.
+    Random reflectances are drawn from ``seed`` and the objects' numbers. DescriptionError if a mesh or texture file is
+    missing, unreadable or empty; RangeError if the wavelength is outside the table of a metal.
     """
-    register_pattern()
+    register_textures()
     optics = {"medium_index": medium_index, "wavelength_nm": wavelength_nm}
     things = scene.objects
     placed = list(zip(things, scene.object_poses(), strict=True))
-    shapes = [_shape(thing, pose, finish_bsdf(thing, gloss=gloss, **optics)) for thing, pose in placed]
+    shapes = [
+        _shape(thing, pose, finish_bsdf(thing, gloss=gloss, pose=pose, seed=(seed, number, _SURFACE_STREAM), **optics))
+        for number, (thing, pose) in enumerate(placed)
+    ]
     flat = np.zeros_like(_ALBEDO_COSINES), np.ones_like(_ALBEDO_COSINES)
-    glossy = [gloss and thing.finish != "diffuse" for thing in things]
+    glossy = [gloss and thing.finish_properties().reflection != "diffuse" for thing in things]
     parts = [
         albedo_parts(thing, _ALBEDO_COSINES, **optics) if shines else flat
         for thing, shines in zip(things, glossy, strict=True)
@@ -123,7 +130,7 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
     facts = {
         "mirror": [thing.mirror_share() if gloss else 0.0 for thing in things],
         "polarisation": [thing.polarisation() for thing in things],
-        "roughness_um": [thing.rms_height_um() for thing in things],
+        "roughness_um": [thing.finish_properties().roughness_um for thing in things],
         "number": list(range(len(things))),
         "two_sided": [isinstance(thing, (Mesh, FreeForm)) for thing in things],
         "albedo_black": [black for black, _ in parts],

@@ -1,4 +1,4 @@
-"""Flaws of real recordings that standard rendering does not include; see `twin.options.Flaws`.
+"""Flaws of real recordings that standard rendering does not include; see `twin.rendering_options.Flaws`.
 
 Some are properties of the sensor (`as_built`). Others change the light on the image sensor (`vignette`, `add_glare`,
 `laser_shares`) or the grey values that the camera delivers (`deliver_image`).
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.signal import fftconvolve
 
-from twin.options import Flaws
+from twin.rendering_options import Flaws
 from uwlts.errors import DescriptionError
 from uwlts.model.library import merge_tables, validate_description
 from uwlts.model.sensor import Camera, Sensor
@@ -20,7 +20,7 @@ GLARE_REACH = 0.15
 """Decay length of glare (1 / e) as a fraction of the image width (assumed from its visual appearance)."""
 _SPOT_MM = 0.2, 3.0
 """Range of the diameters of spots on the window, from silt and fouling films to drops and fingerprints."""
-_CELLS_PER_SPOT = 4
+_CELLS_PER_SPOT = 4  # so that a round spot stays round
 _DIRT_STREAM = 41
 """Random number stream of the spots, separate from others of the same seed."""
 _CELLS_PER_REACH = 16

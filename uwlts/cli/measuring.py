@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import (
+from uwlts.cli.command_options import (
     STRIPE,
     Overwrite,
     a_cloud,

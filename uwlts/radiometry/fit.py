@@ -46,13 +46,13 @@ from uwlts.stripe import StripeSettings, find_stripes
 
 _MOST_SCATTERING_PER_M = 6.0
 """Limit of the scattering coefficient, far beyond water in which a stripe is found at 0.5 m."""
-_SCATTERING_NODES = 25
+_SCATTERING_NODES = 25  # of an interpolated table; the halo is nearly linear in the coefficient
 _INSEPARABLE = 0.9
 """Absolute correlation of two estimates from which they are listed as not separable."""
 _KNOWN_ATTENUATION = 0.3
 """Standard uncertainty of the attenuation in 1/m from which the described water is kept: over 0.7 m of path, the laser
 power then changes by a fifth."""
-_ROUNDS = 3
+_ROUNDS = 3  # between tail and brightness, which depend little on each other
 _SCATTERING_STD = 0.04
 """Relative standard uncertainty of the scattering coefficient by the model of the halo, for a known phase function.
 

@@ -36,11 +36,18 @@ _CLIPPED = 0.98
 """Fraction of full scale above which a pixel may be clipped."""
 _MOST_CLIPPED = 0.02
 """Largest fraction of lines with clipped pixels in a run; their light is too low by about a tenth."""
-_LONGEST_GAP = 8
+LONGEST_GAP = 8
 """Longest gap along the stripe, lines, in which centres are interpolated."""
-_ROUNDS = 5
+_ROUNDS = 5  # of weights, which follow from the fitted variance
 _BINS = 24
 """Bins of the photon transfer."""
+_BAND_PX = 32
+"""Width of the bands across the stripe. The dimmest is taken as dark; each has thousands of pixels."""
+_HALO_STD = 0.5
+"""Relative standard uncertainty of the light of the halo, because the dimmest band can have some, too.
+
+Chosen with the width of the bands on the drawn captures 100 to 111 of docs/studies/radiometry.py, and judged on others.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +98,7 @@ def fill_gaps(stripes: CaptureStripes) -> tuple[CaptureStripes, float]:
     """
     same = np.diff(stripes.frame) == 0
     missing = np.where(same, np.diff(stripes.line) - 1, 0)
-    short = (missing > 0) & (missing <= _LONGEST_GAP)
+    short = (missing > 0) & (missing <= LONGEST_GAP)
     before = np.repeat(np.flatnonzero(short), missing[short])
     step = np.concatenate([np.arange(1, count + 1) for count in missing[short].tolist()] or [np.empty(0, int)])
     share = step / (missing[before] + 1)
@@ -292,8 +299,12 @@ def measure_noise(capture: Capture, stripes: CaptureStripes, *, repeats: Capture
         if whole is not None:
             left = np.array([_fit_transfer(counted.sum(axis=0) - part, background_dn) or whole for part in counted])
             std = np.sqrt(np.diag(jackknife(left - left.mean(axis=0))))
-            dark = math.sqrt(max(whole[1], 0.0))
-            return CameraNoise(whole[0], float(std[0]), dark, float(std[1]) / max(2 * dark, 1e-3))
+            # The intercept is the variance of the pixels beside the stripe, which includes the shot noise of its halo.
+            lines_last = mean if across == 2 else mean.transpose(0, 2, 1)
+            halo = whole[0] * max(background_dn - _dimmest(lines_last, background_dn + dark_dn), 0.0)
+            dark = math.sqrt(max(whole[1] - halo, 0.0))
+            variance_std = math.hypot(float(std[1]), _HALO_STD * halo)
+            return CameraNoise(whole[0], float(std[0]), dark, variance_std / max(2 * dark, 1e-3))
     return _dark_noise(capture, stripes)
 
 
@@ -310,6 +321,14 @@ def _bin_variance(mean: np.ndarray, variance: np.ndarray, edges: np.ndarray) -> 
     held = (cell >= 0) & (cell < len(edges) - 1)
     sums = [np.bincount(cell[held], weight, len(edges) - 1) for weight in (None, mean[held], variance[held])]
     return np.array(sums, dtype=float)
+
+
+def _dimmest(mean: np.ndarray, most: float) -> float:
+    """Return the least mean grey value of bands across the stripe, from pixels of images (G, N, L) below ``most``."""
+    dark = np.where(mean < most, mean, np.nan)
+    bands = [dark[:, at : at + _BAND_PX] for at in range(0, dark.shape[1] - _BAND_PX + 1, _BAND_PX)]
+    held = [band for band in bands if np.count_nonzero(np.isfinite(band)) > band.size / 2]
+    return min((float(np.nanmean(band)) for band in held), default=float(np.nanmean(dark)))
 
 
 def _fit_transfer(counted: np.ndarray, background_dn: float) -> tuple[float, float] | None:

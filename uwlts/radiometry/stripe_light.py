@@ -32,7 +32,7 @@ _FEWEST_POSITIONS = 5
 """Least number of stage positions of a scan: those of one plane for a normal."""
 _STEPS = 2.5
 """Radius of the planes that give the normals, in steps of the stage: five images, also on inclined surfaces."""
-_NEWTON_STEPS = 8
+_NEWTON_STEPS = 8  # of the ray through the window; converges quadratically
 _JOULE_NM = 6.62607015e-34 * 299792458.0 * 1e9
 """Energy of a photon times its wavelength in nm, J nm (SI)."""
 

@@ -17,12 +17,13 @@ import webdataset
 
 import twin
 from tests.virtual_sensors import altered
-from twin.datasets.data_set import SPLITS, DataSetDescription
+from twin.datasets.data_set import DataSetDescription
 from twin.datasets.draws import draw_scene
 from uwlts.errors import ArgumentError, CaptureError, DescriptionError, DesignError, OutputError
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import hash_file
 from uwlts.model.library import load_sensor
+from uwlts.storage.data_set import SPLITS
 
 SMALL = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}}
 LABELS = ("centre", "quality", "points", "masks", "light", "depth", "sensor")

@@ -29,7 +29,7 @@ from twin.backend.arrays import to_jit
 from twin.light.camera import WindowFaces
 from twin.light.renderer import Renderer
 from twin.light.sheet import Sheet
-from twin.options import NONE
+from twin.rendering_options import NONE
 from uwlts.model.sensor import Medium, Sensor, Window
 
 ROUNDING = 2e-6

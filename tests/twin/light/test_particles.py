@@ -9,7 +9,7 @@ import pytest
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
 from twin.light.particles import Spots, bubble, diffuse_sphere
 from twin.light.renderer import Renderer
-from twin.options import NONE
+from twin.rendering_options import NONE
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 

@@ -7,9 +7,9 @@ import pytest
 
 from tests.virtual_sensors import altered, camera_axes, clear, cropped, oracle_paths, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.options import NONE, Flaws, Options
 from twin.recording.record_scene import record_scene
 from twin.recording.sensor_simulator import SensorSimulator
+from twin.rendering_options import NONE, Flaws, Options
 from twin.sensor.flaws import dirt
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Sensor

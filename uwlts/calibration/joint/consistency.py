@@ -102,7 +102,7 @@ _FOCAL_DOUBTFUL = 0.08
 _FOCAL_WRONG = 0.2  # the same for a contradiction
 _POSITIONS_WRONG = 3.0
 """Rms position error of the stage divided by its stated uncertainty: four positions exceed it once in a million."""
-_FEWEST_POSITIONS = 4
+_FEWEST_POSITIONS = 4  # for which the limit above holds
 _MOST_NAMED = 4  # findings of a kind that a message lists
 _MOST_SAID = 6  # findings in a readable message
 

@@ -45,7 +45,7 @@ from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
 
-_ROUNDS_LEFT_OUT = 3
+_ROUNDS_LEFT_OUT = 3  # what remains after three rounds has another cause than single images
 _LEAST_GAIN = 0.0
 """Relative gain of a coefficient in predicted mean squares: any that is significant, since the uncertainties of other
 coefficients do not contain what a missing one does to them."""

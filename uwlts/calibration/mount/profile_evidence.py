@@ -8,14 +8,14 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import Shape
-from uwlts.calibration.mount.estimate import GroupedEvidence, solve_step
+from uwlts.calibration.mount.artefact_shapes import Shape
 from uwlts.calibration.mount.profiles import LEAST_POINTS, Detection
+from uwlts.calibration.mount.restricted_likelihood import GroupedEvidence, solve_step
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""
 
-_TIME_STEP_S = 1e-4
+_TIME_STEP_S = 1e-4  # for derivatives: short beside any acceleration of a platform
 _POINT_MM = (1e-5, 1e2)
 """Bounds of scatter in mm: far below any profiler's resolution, and far above any platform's error."""
 _TURN_RAD = (1e-8, 1.0)  # the same for rotations

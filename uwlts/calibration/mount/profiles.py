@@ -32,7 +32,7 @@ LEAST_WALL = 6
 """Points on a ring's wall that are used: twice the three parameters of their curve."""
 _LARGEST_GAP = 5
 """Largest gap within one wall, relative to the usual distance between neighbours, in number and in space."""
-_LARGEST_ROUNDS = 20
+_LARGEST_ROUNDS = 20  # a set of inliers that still changes then alternates between two
 _LINES = 4
 """Lines sought in a profile of a step or ring: its faces, and background beside them."""
 _PARALLEL = 2e-3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from uwlts.calibration.mount.estimate import NotSettled, settle
+from uwlts.calibration.mount.restricted_likelihood import NotSettled, settle
 
 
 @dataclass(frozen=True)

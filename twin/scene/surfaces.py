@@ -1,0 +1,111 @@
+"""Surface finishes by name, and random fields that vary their reflectance over an object.
+
+A field is a sum of plane waves fixed to the object. It is defined in space, so that every shape has it, with or without
+texture coordinates, and the texture of neighbouring profiles and of several scans fits together.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.special import ndtr
+
+Reflection = Literal["diffuse", "painted", "pvc", "metal"]
+Finish = Literal[
+    "diffuse",
+    "painted",
+    "pvc",
+    "metal",
+    "rusted-steel",
+    "weathered-paint",
+    "machined-steel",
+    "pvc-pipe",
+    "concrete",
+    "marine-growth",
+]
+Lengths = tuple[float, float, float]
+
+WAVES = 64
+"""Number of plane waves of a field: its autocorrelation over one object deviates from the mean by about 0.1."""
+_FINEST = 10 * math.pi
+"""Largest wave number times the correlation length: a wavelength of a fifth of that length. The omitted tail of the
+spectrum has 4 % of the variance; pixels that are to resolve less would show it as noise of their samples."""
+LARGEST_CLIPPED = 0.01
+"""Largest relative loss of mean reflectance by the limit of 1."""
+
+
+@dataclass(frozen=True)
+class FinishProperties:
+    """Properties of a finish that an object may replace; see `twin.scene.scene_object.SceneObject`."""
+
+    reflection: Reflection
+    reflectance: float = 0.8
+    alpha: float = 1.0
+    roughness_um: float = 5.0
+    mottle: float = 0.0
+    mottle_mm: float | Lengths = 1.0
+
+
+# Roughness of coats and metal (alpha): a satin paint, an extruded pipe, ground steel; assumed. Light from a diffuse
+# body has travelled some um inside it, whatever its surface roughness.
+FINISHES: dict[Finish, FinishProperties] = {
+    "diffuse": FinishProperties("diffuse"),
+    "painted": FinishProperties("painted", alpha=0.3),
+    "pvc": FinishProperties("pvc", alpha=0.15),
+    "metal": FinishProperties("metal", alpha=0.3, roughness_um=1.0),
+    "rusted-steel": FinishProperties("diffuse", reflectance=0.25, roughness_um=20.0, mottle=0.35, mottle_mm=0.8),
+    "weathered-paint": FinishProperties("painted", reflectance=0.5, alpha=0.4, mottle=0.15, mottle_mm=1.5),
+    "machined-steel": FinishProperties(
+        "metal", reflectance=0.6, alpha=0.2, roughness_um=1.6, mottle=0.25, mottle_mm=(10.0, 0.15, 0.15)
+    ),
+    "pvc-pipe": FinishProperties("pvc", reflectance=0.7, alpha=0.15, mottle=0.05, mottle_mm=2.0),
+    "concrete": FinishProperties("diffuse", reflectance=0.35, roughness_um=50.0, mottle=0.25, mottle_mm=0.5),
+    "marine-growth": FinishProperties("diffuse", reflectance=0.12, roughness_um=50.0, mottle=0.5, mottle_mm=1.0),
+}
+
+
+def draw_waves(rng: np.random.Generator, correlation_mm: float | Lengths) -> np.ndarray:
+    """Draw the plane waves (N, 4) of a Gaussian field of mean 0 and variance 1: wave vectors in 1/mm, and phases.
+
+    The field is the sum of sqrt(2 / N) cos(k r + phase) (spectral representation, Shinozuka 1971, J. Acoust. Soc. Am.
+    49:357). Its autocorrelation is exp(-d) at the distance d = sqrt(sum (r_j / l_j)^2), with the correlation length l_j
+    along each of the object's axes. The density of exp(-d) in space is proportional to 1 / (1 + q^2)^2 with q_j = k_j
+    l_j (Abramowitz and Stegun 1964, section 29.3; Matern's class with exponent 1/2), a power law above 1 / l. Wave
+    numbers are drawn one from each of N intervals of equal power, up to `_FINEST`.
+    """
+    numbers = np.geomspace(1e-3, _FINEST, 4096)
+    below = np.arctan(numbers) - numbers / (1 + numbers**2)
+    share = (np.arange(WAVES) + rng.random(WAVES)) / WAVES
+    number = np.interp(share * below[-1], below, numbers)
+    direction = rng.standard_normal((WAVES, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    lengths = np.broadcast_to(correlation_mm, 3)
+    phase = rng.uniform(0, 2 * math.pi, WAVES)
+    return np.column_stack([number[:, None] * direction / lengths, phase])
+
+
+def move_waves(waves: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return waves (N, 4) of an object's own frame in the frame that ``pose`` (4, 4) transforms to."""
+    towards = waves[:, :3] @ pose[:3, :3].T
+    return np.column_stack([towards, waves[:, 3] - towards @ pose[:3, 3]])
+
+
+def log_deviation(mottle: float) -> float:
+    """Return the standard deviation of the logarithm of log-normal numbers with a relative standard deviation."""
+    return math.sqrt(math.log1p(mottle**2))
+
+
+def clipped_share(reflectance: float, mottle: float) -> float:
+    """Return the relative loss of the mean of log-normal reflectances that are limited to 1.
+
+    The mean of max(x - 1, 0) of a log-normal x with mean m and log deviation s is m N(d + s) - N(d) with d = ln(m) / s
+    - s / 2 and the normal distribution function N.
+    """
+    if mottle == 0 or reflectance == 0:
+        return 0.0
+    s = log_deviation(mottle)
+    d = math.log(reflectance) / s - s / 2
+    return float(ndtr(d + s) - ndtr(d) / reflectance)
