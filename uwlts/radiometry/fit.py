@@ -41,7 +41,7 @@ from uwlts.radiometry.stripe_light import StripeLight, stripe_light, working_f_n
 from uwlts.radiometry.water_outlook import outlook
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import resolve_calibration
-from uwlts.storage.capture import Capture, describe_source, open_capture
+from uwlts.storage.capture import NO_STAGE, Capture, describe_source, open_capture
 from uwlts.stripe import StripeSettings, find_stripes
 
 _MOST_SCATTERING_PER_M = 6.0
@@ -135,8 +135,11 @@ def fit_radiometry(
     earlier = None if compared_with is None else read_estimates(compared_with)
     with open_capture(capture) as scan:
         check_fits(scan.header, known, source=scan.path.name)
-        if np.isfinite(scan.pose).any():
-            raise CaptureError(f"{scan.path.name} has poses of a platform: give a scan by a stage")
+        if np.isfinite(scan.pose).any() or scan.header.provenance.get("stage") == NO_STAGE:
+            raise CaptureError(
+                f"{scan.path.name} has poses of a platform or of a target; the slope of the surface is found from the "
+                "steps of a stage: give a scan by a stage"
+            )
         stripes, gaps = fill_gaps(find_stripes(scan, options=stripe, progress=progress))
         light = stripe_light(scan.header, known, stripes, scan.stage_mm)
         images = measure_stripes(scan, stripes, light.usable, progress)

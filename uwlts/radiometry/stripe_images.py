@@ -129,7 +129,7 @@ def measure_stripes(
     of_group, light, exposure = np.full(len(stripes.line), -1), [], []
     parts: list[_Part] = []
     frames = np.unique(stripes.frame).tolist()
-    peaks = []
+    peaks, clipped = [], 0
     for number, frame in enumerate(frames):
         own = np.flatnonzero(stripes.frame == frame)
         line = stripes.line[own]
@@ -140,6 +140,7 @@ def measure_stripes(
             part = _measure_run(profiles, stripes.line[chosen], stripes.centre_px[chosen], core, _CLIPPED * full_dn)
             peaks.append(part.values[:, part.middle])
             if np.mean(part.clipped) > _MOST_CLIPPED:
+                clipped += len(run)
                 continue
             for some in np.array_split(np.arange(len(chosen)), max(1, len(chosen) // GROUP_LINES)):
                 kept = some[np.isfinite(part.light[some])]
@@ -151,9 +152,14 @@ def measure_stripes(
                 parts.append(part.select(kept))
         progress(number + 1, len(frames), "brightness of the stripe")
     if len(light) < BLOCKS:
+        share = clipped / max(len(stripes.line), 1)
+        advice = (
+            "record them with a shorter exposure" if share > 0.5 else "record more images of a smooth, matt surface"
+        )
         raise CaptureError(
             f"{capture.path.name} has {len(light)} groups of {GROUP_LINES} neighbouring stripe centres on a smooth "
-            f"surface that are not saturated; {BLOCKS} are needed: record more images, or with a shorter exposure"
+            f"surface that are not saturated, and {BLOCKS} are needed; {100 * share:.0f} % of the centres are in "
+            f"saturated pieces of the stripe: {advice}"
         )
     block = np.arange(len(light)) * BLOCKS // len(light)
     of_block = [_Part.join([part for part, at in zip(parts, block, strict=True) if at == j]) for j in range(BLOCKS)]
