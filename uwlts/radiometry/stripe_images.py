@@ -91,8 +91,8 @@ class StripeImages:
     peak_dn: float
 
 
-def fill_gaps(stripes: CaptureStripes) -> tuple[CaptureStripes, float]:
-    """Interpolate centres in short gaps, and return the fraction of lines in gaps of any length.
+def fill_gaps(stripes: CaptureStripes) -> CaptureStripes:
+    """Interpolate centres in short gaps.
 
     Lines without a centre are dim by chance; without them, a faint stripe would seem brighter than it is.
     """
@@ -107,8 +107,7 @@ def fill_gaps(stripes: CaptureStripes) -> tuple[CaptureStripes, float]:
     filled = stripes[source[order]]
     line = np.concatenate([stripes.line, stripes.line[before] + step])[order]
     centre = np.interp(place[order], np.arange(len(stripes.line)), stripes.centre_px)
-    whole = replace(filled, line=line, centre_px=centre)
-    return whole, float(missing.sum() / (missing.sum() + len(stripes.line)))
+    return replace(filled, line=line, centre_px=centre)
 
 
 def measure_stripes(
