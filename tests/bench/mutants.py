@@ -32,11 +32,20 @@ TESTS = {
     "uwlts/optics": [f"tests/uwlts/{name}" for name in ("optics", "reconstruction", "calibration", "thesis")],
     "uwlts/stripe": ["tests/uwlts/stripe", "tests/uwlts/reconstruction"],
     "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/reconstruction"],
+    "uwlts/calibration/mount": ["tests/uwlts/calibration/mount"],
+    "uwlts/calibration": ["tests/uwlts/calibration"],
     "uwlts/reconstruction": ["tests/uwlts/reconstruction", "tests/uwlts/report", "tests/system/test_joint_command.py"],
+    "uwlts/fitting": [f"tests/uwlts/{name}" for name in ("fitting", "evaluation", "inspection")],
+    "uwlts/evaluation": ["tests/uwlts/evaluation", "tests/uwlts/acceptance"],
+    "uwlts/registration": ["tests/uwlts/registration"],
+    "uwlts/alignment": ["tests/uwlts/alignment"],
+    "uwlts/inspection": ["tests/uwlts/inspection"],
+    "uwlts/comparison": ["tests/uwlts/comparison"],
     "twin/light": ["tests/twin/light", "tests/twin/recording"],
     "twin/sensor": ["tests/twin/sensor", "tests/twin/light"],
+    "twin/scene": ["tests/twin/scene"],
 }
-"""Packages, and folders of the tests that run them."""
+"""Packages, without packages within them that are listed too, and folders of the tests that run them."""
 # These change no result, or make every test fail, such as bitwise operators between floating-point numbers.
 _LEFT_OUT = {"NoOp", "RemoveDecorator", "ExceptionReplacer", "VariableReplacer", "VariableInserter"}
 _BITWISE = {"BitAnd", "BitOr", "BitXor", "LShift", "RShift"}
@@ -88,7 +97,10 @@ def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
     from cosmic_ray.plugins import get_operator, operator_names
 
     places: dict[tuple[str, int, int], list[Mutant]] = {}
+    within = [ROOT / other for other in TESTS if other.startswith(f"{package}/")]
     for path in sorted((ROOT / package).rglob("*.py")):
+        if any(path.is_relative_to(other) for other in within):
+            continue
         source, file = path.read_text(), str(path.relative_to(ROOT))
         annotated, tree = annotated_lines(source), get_ast(source)
         for name in operator_names():
@@ -100,15 +112,15 @@ def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
             operator = get_operator(name)()
             positions = [at for node in ast_nodes(tree) for at in operator.mutation_positions(node)]
             for occurrence, ((line, column), _) in enumerate(positions):
-                within = any(at[0] == line and abs(at[1] - column) <= 40 for at in annotated)
-                if not (within and "BitOr" in short):
+                in_annotation = any(at[0] == line and abs(at[1] - column) <= 40 for at in annotated)
+                if not (in_annotation and "BitOr" in short):
                     places.setdefault((file, line, column), []).append(Mutant(package, file, line, short, occurrence))
     chosen = rng.sample(sorted(places), min(number, len(places)))
     return [rng.choice(places[place]) for place in chosen]
 
 
 def copied(folder: Path) -> Path:
-    """Copy the current files of the checkout, without those ignored by Git."""
+    """Copy the current files of the checkout, without those ignored by Git, except for Numba's compiled functions."""
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -116,7 +128,8 @@ def copied(folder: Path) -> Path:
         capture_output=True,
         text=True,
     )
-    for name in listed.stdout.splitlines():
+    compiled = (path for top in ("uwlts", "twin") for path in (ROOT / top).rglob("__pycache__/*.nb[ci]"))
+    for name in (*listed.stdout.splitlines(), *(str(path.relative_to(ROOT)) for path in compiled)):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
@@ -132,7 +145,7 @@ class Tests:
     seconds: dict[str, float]
 
     @classmethod
-    def observed(cls, folder: Path, package: str, *, slow: bool) -> "Tests":
+    def observed(cls, folder: Path, package: str, *, slow: bool, workers: int) -> "Tests":
         """Run a package's tests once."""
         from coverage import CoverageData
 
@@ -140,7 +153,17 @@ class Tests:
         options = [f"--cov={package}", "--cov-context=test", "--cov-report=", f"--junitxml={report}"]
         options += [] if slow else ["-m", "not slow"]
         subprocess.run(
-            [*_pytest(), *options, "-o", "junit_family=xunit1", "-n", "2", "--dist", "loadfile", *TESTS[package]],
+            [
+                *_pytest(),
+                *options,
+                "-o",
+                "junit_family=xunit1",
+                "-n",
+                str(workers),
+                "--dist",
+                "loadfile",
+                *TESTS[package],
+            ],
             cwd=folder,
             check=True,
             stdout=subprocess.DEVNULL,
@@ -223,7 +246,7 @@ def of_package(package: str, mutants: list[Mutant], *, slow: bool, workers: int,
         folders: SimpleQueue[Path] = SimpleQueue()
         for worker in range(workers):
             folders.put(copied(Path(temporary) / str(worker)))
-        tests = Tests.observed(copied(Path(temporary) / "observed"), package, slow=slow)
+        tests = Tests.observed(copied(Path(temporary) / "observed"), package, slow=slow, workers=workers)
 
         def one(mutant: Mutant) -> Result:
             folder = folders.get()

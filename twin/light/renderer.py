@@ -39,6 +39,7 @@ from twin.light.multiple_scattering import IndirectLight, LightSources, decay_wi
 from twin.light.particles import Body, sample_spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
+from twin.light.translucency import lit_sigma_mm, spread_irradiance
 from twin.light.walk import Walker
 from twin.light.water import Scattering
 from twin.rendering_options import ALL, Effects
@@ -310,9 +311,18 @@ class Renderer:
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
             here = light.evaluate(end, after_s)
-            lit = light.reaches(self.objects.scene, end, here, after_s, segment.valid & (here.irradiance > 0))
+            # The light of a coat or metal leaves where it arrives, that of a body is spread.
+            parts = [(mi.BSDFContext(), here.irradiance)]
+            if self.objects.translucent:
+                body, coat = mi.BSDFContext(), mi.BSDFContext()
+                body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
+                normal = pose.object_direction(segment.si.n, after_s)
+                parts = [(coat, here.irradiance), (body, spread_irradiance(self.objects, segment.si, normal, here))]
+            bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
+            lit = light.reaches(self.objects.scene, end, here, after_s, bright)
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
-            radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
+            for context, value in parts:
+                radiance += dr.select(lit, bsdf.eval(context, segment.si, towards, lit)[0] * value, 0.0)
         return radiance * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
 
     # --- nodes: where the stripe is, and the haze ---------------------------------------------------------------------
@@ -330,7 +340,7 @@ class Renderer:
             scattered = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
                 ends = [light.evaluate(segment.end()) for light in sources]
-                across = [_sigmas(here, segment) for here in ends]
+                across = [self._sigmas(here, segment, moment) for here in ends]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
                 if index == 0 and moment is pose and self._scatters:
@@ -568,14 +578,16 @@ class Renderer:
         blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
         return blur
 
+    def _sigmas(self, here: SheetLight, segment: RaySegment, pose: SensorPose) -> Float:
+        """Return the distance of segment ends from a sheet in standard deviations; infinite without a surface."""
+        sigma = here.sigma_mm
+        if self.objects.translucent:
+            sigma = lit_sigma_mm(self.objects, segment.si, pose.object_direction(segment.si.n), here)
+        return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
+
     def _expand_cells(self, cells: np.ndarray) -> np.ndarray:
         """Expand values of grid cells to pixels (H, W)."""
         return expand_cells(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
-
-
-def _sigmas(here: SheetLight, segment: RaySegment) -> Float:
-    """Return the distance of segment ends from a sheet in standard deviations; infinite without a surface."""
-    return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
 
 def _split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -83,12 +83,13 @@ class PrintedPlate(SceneObject, ABC):
     """Base of calibration targets on a flat plate that faces -z; its own frame is the target's.
 
     A real target differs from its description: each point (circle or corner) has an error of ``centre_std_mm`` along x
-    and y, and the plate's centre is ``bow_mm`` in front of its corners. ``detection_std_px`` shifts each point
-    independently in each image, in addition to the detection errors that image noise causes. ``errors_seed`` is the
-    seed of these errors.
+    and y. The print is larger along x and y by the fractions ``stretch``. The plate's centre is ``bow_mm`` in front of
+    its corners. ``detection_std_px`` shifts each point independently in each image, in addition to the detection
+    errors that image noise causes. ``errors_seed`` is the seed of these errors.
     """
 
     centre_std_mm: NotNegative = 0.0
+    stretch: tuple[Annotated[float, Field(gt=-0.1, lt=0.1)], Annotated[float, Field(gt=-0.1, lt=0.1)]] = (0.0, 0.0)
     bow_mm: Annotated[float, Field(gt=-10, lt=10)] = 0.0
     detection_std_px: NotNegative = 0.0
     errors_seed: Annotated[int, Field(ge=0)] = 0

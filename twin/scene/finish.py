@@ -19,6 +19,7 @@ from pydantic import TypeAdapter
 
 from twin.backend.arrays import Bool, Float, Point3f, SurfaceInteraction3f, UInt32, opaque, to_jit
 from twin.scene.description import AnyObject, FlatObject, PrintedPlate, SceneObject
+from twin.scene.subsurface import LateralSpread, lateral_spread
 from twin.scene.surfaces import WAVES, draw_waves, log_deviation, move_waves
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.model.media import check_range
@@ -176,6 +177,16 @@ def albedo_parts(
     unit = float(cast(Float, white.eval_diffuse_reflectance(square))[0][0])
     without = directional_albedo(black, cosines)
     return without, (directional_albedo(white, cosines) - without) / unit
+
+
+def body_spread(thing: SceneObject, *, medium_index: float) -> LateralSpread:
+    """Return the lateral spread of light in an object's body in a medium."""
+    own = thing.finish_properties()
+    return lateral_spread(
+        mean_free_path_mm=own.mean_free_path_mm,
+        reflectance=own.reflectance,
+        index=COAT_INDEX.get(own.reflection, medium_index) / medium_index,
+    )
 
 
 def view_along_normal(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
@@ -351,7 +362,10 @@ def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -
 
 def draw_print_errors(plate: PrintedPlate) -> np.ndarray:
     """Return the print errors (rows, columns, 2) in mm of a target's points along x and y."""
-    return plate.centre_std_mm * _standard_normal(plate, 0)
+    drawn, target = _standard_normal(plate, 0), plate.described_target()
+    rows, columns = np.indices(drawn.shape[:2])
+    places = target.points_at(np.column_stack([columns.ravel(), rows.ravel()]))[:, :2].reshape(drawn.shape)
+    return plate.centre_std_mm * drawn + np.array(plate.stretch) * places
 
 
 def shift_points(scene: mi.Scene, plate: PrintedPlate, *, mm_per_px: float, image: int) -> None:

@@ -44,6 +44,9 @@ class SceneObject(Pose):
     The random field is log-normal with mean 1 and the standard deviation ``mottle``; products are limited to 1. Its
     autocorrelation falls to 1 / e at the distance ``mottle_mm``, one length or one along each of the object's axes
     (`twin.scene.surfaces.draw_waves`). It is fixed to the object, and drawn from the seed of the recording.
+
+    ``mean_free_path_mm`` is the transport mean free path of light in a translucent body, which widens the stripe and
+    shifts it ahead along the laser's direction (`twin.scene.subsurface`); 0 for an opaque one.
     """
 
     reflectance: Reflectance | None = None
@@ -53,6 +56,7 @@ class SceneObject(Pose):
     texture: str | None = None
     mottle: Annotated[float, Field(ge=0, le=1)] | None = None
     mottle_mm: Positive | tuple[Positive, Positive, Positive] | None = None
+    mean_free_path_mm: Annotated[float, Field(ge=0, le=10)] | None = None
 
     _no_texture: ClassVar[str] = ""
     """Reason why objects of a class have no picture as texture."""
@@ -70,6 +74,8 @@ class SceneObject(Pose):
             raise ValueError(f"mottle {own.mottle:g} of the finish '{self.finish}' {self._no_mottle}")
         if own.mottle > 0 and self.texture is not None:
             raise ValueError(f"texture {self.texture} and mottle {own.mottle:g}: use one of them, or mottle = 0")
+        if own.mean_free_path_mm > 0 and own.reflection == "metal":
+            raise ValueError(f"mean_free_path_mm {own.mean_free_path_mm:g} in a metal: light does not enter it")
         if (lost := clipped_share(own.reflectance, own.mottle)) > LARGEST_CLIPPED:
             raise ValueError(
                 f"reflectance {own.reflectance:g} with mottle {own.mottle:g} would often exceed 1, and lose "
@@ -80,7 +86,7 @@ class SceneObject(Pose):
     def finish_properties(self) -> FinishProperties:
         """Return the properties of the object's finish, with the given ones in place of those of its row."""
         row = FINISHES[self.finish]
-        names = ("reflectance", "alpha", "roughness_um", "mottle", "mottle_mm")
+        names = ("reflectance", "alpha", "roughness_um", "mottle", "mottle_mm", "mean_free_path_mm")
         given = {name: getattr(self, name) for name in names}
         return replace(row, **{name: value for name, value in given.items() if value is not None})
 

@@ -47,6 +47,7 @@ class FinishProperties:
     roughness_um: float = 5.0
     mottle: float = 0.0
     mottle_mm: float | Lengths = 1.0
+    mean_free_path_mm: float = 0.0
 
 
 # Roughness of coats and metal (alpha): a satin paint, an extruded pipe, ground steel; assumed. Light from a diffuse

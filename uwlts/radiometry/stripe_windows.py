@@ -27,7 +27,7 @@ _LEAST_LIGHT = 0.2
 _CROP_PX = 60
 """Half the height of the pictures of windows, px: the stripe and its halo."""
 _PICTURES = 8
-"""Largest number of pictures of an image: a page shows so many of a set."""
+"""Largest number of pictures of an image: a page shows all of them."""
 
 
 @dataclass(frozen=True)

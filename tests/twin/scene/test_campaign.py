@@ -1,5 +1,6 @@
 """Campaigns: values drawn for each seed, deviations of real hardware from descriptions, and rejected plans."""
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,11 @@ from twin.scene.campaign import Campaign, Imperfections, Take, _SampledImperfect
 from twin.scene.description import load_scene
 from uwlts.errors import DescriptionError
 from uwlts.model.library import list_names, load_sensor
+from uwlts.model.sensor import Sensor
 
 SIZES = {
     "circle_centre_std_mm": 0.002,
+    "target_stretch_std": 1e-4,
     "target_bow_std_mm": 0.02,
     "circle_detection_std_px": 0.03,
     "target_tilt_std_deg": 0.1,
@@ -23,7 +26,12 @@ SIZES = {
     "stage_misalignment_std_deg": 0.2,
     "temperature_half_width_c": 5.0,
     "window_tilt_std_deg": 0.3,
+    "glass_thickness_std_mm": 0.05,
+    "glass_index_std": 1e-3,
+    "focus_std_mm": 10.0,
     "sheet_bow_std_deg": 0.15,
+    "waist_std": 0.1,
+    "waist_distance_std_mm": 20.0,
     "step_height_half_width_mm": 0.02,
 }
 RECORDINGS = [
@@ -135,6 +143,7 @@ def test_recordings_do_not_depend_on_which_others_there_are():
 
 CHANGED = {
     "circle_centre_std_mm": {"scene.objects.centre_std_mm": TARGETS},
+    "target_stretch_std": {"scene.objects.stretch": TARGETS},
     "target_bow_std_mm": {"scene.objects.bow_mm": TARGETS},
     "circle_detection_std_px": {"scene.objects.detection_std_px": TARGETS},
     "target_tilt_std_deg": {"scene.objects.rotation_deg": TARGETS},
@@ -143,7 +152,12 @@ CHANGED = {
     "stage_misalignment_std_deg": {"scene.motion.direction": NAMES[:-1]},
     "temperature_half_width_c": {"built.media.water.temperature_c": NAMES[:-1]},
     "window_tilt_std_deg": {f"built.camera.window.tilt_{axis}_deg": NAMES[:-1] for axis in "xy"},
+    "glass_thickness_std_mm": {"built.camera.window.thickness_mm": NAMES[:-1]},
+    "glass_index_std": {f"built.camera.window.{key}": NAMES[:-1] for key in ("glass", "absorption_per_m")},
+    "focus_std_mm": {"built.camera.focus_distance_mm": NAMES[:-1]},
     "sheet_bow_std_deg": {"built.laser.bow_deg": NAMES[:-1]},
+    "waist_std": {"built.laser.waist_radius_mm": NAMES[:-1]},
+    "waist_distance_std_mm": {"built.laser.waist_distance_mm": NAMES[:-1]},
     "step_height_half_width_mm": {"scene.objects.position_mm": [STEP]},
 }
 
@@ -259,6 +273,26 @@ def test_size_of_the_targets_errors():
     assert [each.detection_std_px for each in plates] == [0.03] * 2
     assert plates[0].bow_mm == plates[1].bow_mm != 0, "the same plate"
     assert plates[0].errors_seed == plates[1].errors_seed != plate(drawn(8, **SIZES)["target"]).errors_seed
+
+
+@pytest.mark.slow
+def test_size_of_window_focus_waist_and_print():
+    names = ["glass_thickness_std_mm", "glass_index_std", "focus_std_mm", "waist_std", "waist_distance_std_mm"]
+    chosen = campaign([RECORDINGS[0]], **{name: SIZES[name] for name in [*names, "target_stretch_std"]})
+    drawings = [list_takes(chosen, seed=seed)[0] for seed in range(SEEDS)]
+    as_built = load_sensor("thesis-as-built")
+
+    def values(sensor: Sensor) -> list[float]:
+        window, laser = sensor.camera.window, sensor.laser
+        focus, waist = sensor.camera.focus_distance_mm, math.log(laser.waist_radius_mm)
+        return [window.thickness_mm, window.index(laser.wavelength_nm), focus, waist, laser.waist_distance_mm]
+
+    found = np.array([[*values(take.built), *plate(take).stretch] for take in drawings])
+    errors = found - [*values(as_built), 0.0, 0.0]
+    for column, name in zip(errors.T, [*names, *["target_stretch_std"] * 2], strict=True):
+        assert_spread(column, SIZES[name])
+    for one, other in itertools.combinations(errors.T, 2):
+        assert_independent(one, other)
 
 
 @pytest.mark.slow

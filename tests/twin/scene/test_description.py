@@ -192,6 +192,7 @@ BAD_SCENES = {
         PLATE + "finish = 'concrete'\ntexture = 'wall.png'",
         r"texture .*wall\.png and mottle 0\.25: use one of them, or mottle = 0",
     ),
+    "translucent steel": (PLATE + "finish = 'metal'\nmean_free_path_mm = 0.1", r"mean_free_path_mm 0\.1 in a metal"),
     "no length": (PLATE + "reflectance = 0.2\nmottle = 0.3\nmottle_mm = 0.0", r"mottle_mm.*found 0"),
     "rusted print": (
         "base = 'target'\n[[objects]]\nkind = 'target_plate'\nfinish = 'rusted-steel'",

@@ -131,6 +131,13 @@ def test_the_print_about_each_point_is_off_by_its_error(target):
     assert np.count_nonzero(expected != np.where(covered(target, points), INK, GROUND)) > 0.01 * len(points)
 
 
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.kind)
+def test_a_stretched_print_moves_each_point_by_its_place(target):
+    thing = TargetPlate(kind="target_plate", target=target, stretch=(1e-3, -2e-3))
+    columns, rows = target.indices.T
+    np.testing.assert_allclose(draw_print_errors(thing)[rows, columns], target.points_mm[:, :2] * [1e-3, -2e-3])
+
+
 def test_descriptions_need_no_detector():
     loaded = "any(name.startswith('uwlts.targets.detection') for name in sys.modules)"
     code = f"import sys, twin.scene.description; sys.exit({loaded})"

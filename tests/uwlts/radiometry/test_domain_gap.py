@@ -20,7 +20,7 @@ NAMES = [each.name for each in STATISTICS]
 def draw(
     rng: np.random.Generator, *, sigma_px: float = 3.0, scatter: float = 0.0, halo: float = 0.0, noise: float = 1.0
 ) -> np.ndarray:
-    """Draw a stripe along the height, with light that scatters alike on two neighbouring lines each."""
+    """Draw a stripe along the height, with the same scatter of light on each pair of lines."""
     lines, place = 320, np.arange(240)
     grains = np.repeat(1 + scatter * rng.standard_normal(lines // 2), 2)[:, None]
     away = place - (120 + 5 * np.sin(np.arange(lines) / 60))[:, None]
