@@ -188,9 +188,18 @@ class Renderer:
         return self._render_lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
 
     def laser_frame(
-        self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
+        self,
+        scene_from_object: np.ndarray,
+        *,
+        spp: int,
+        seed: int = 0,
+        travel: Travel | None = None,
+        through_water: Travel | None = None,
     ) -> LaserFrame:
-        """Return the light of the laser on the image sensor; see `irradiance`."""
+        """Return the light of the laser on the image sensor; see `irradiance`.
+
+        ``through_water`` is the motion of the sensor relative to the water and its particles; None: at rest.
+        """
         begin_kernels()
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
@@ -209,10 +218,15 @@ class Renderer:
             longer = partial(walked.image, LightSources(image, haze, surfaces))
         haze = haze if self.effects.haze else np.zeros_like(haze)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
-        particles, polarisation = self._render_particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
+        particles, polarisation = (
+            self._render_particles(direct, pose, through_water, seed=seed),
+            np.clip(polarised / bright, 0, 1),
+        )
         return LaserFrame(longer, haze, particles, rows, columns, stripe, polarisation, rough / bright)
 
-    def _render_particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
+    def _render_particles(
+        self, direct: list[Light], pose: SensorPose, through_water: Travel | None, *, seed: int
+    ) -> np.ndarray:
         """Return the irradiance (H, W) in W/mm2 of particles and bubbles in the sheets."""
         camera = self.sensor.camera
         image = np.zeros((camera.height_px, camera.width_px), np.float32)
@@ -224,6 +238,7 @@ class Renderer:
                     light,
                     self.objects,
                     pose,
+                    travel=through_water,
                     body=body,
                     per_litre=per_litre,
                     extinction=self.scattering.c,
