@@ -305,7 +305,8 @@ class Renderer:
             plane = dr.gather(mi.Vector4f, planes, pixel)
             away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
             same = dr.abs(away) <= here.sigma_mm
-            profile = here.irradiance / (here.in_middle * here.sigma_mm * math.sqrt(2 * math.pi))
+            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm)) / here.sigma_mm
+            profile /= math.sqrt(2 * math.pi)
             return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
 
         for part in _split_pixels(rows, columns, spp=spp):
@@ -355,7 +356,10 @@ class Renderer:
             scattered = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
                 ends = [light.evaluate(segment.end()) for light in sources]
-                across = [self._sigmas(here, segment, moment) for here in ends]
+                across = [
+                    self._sigmas(here, segment, moment, light.sheet.reach)
+                    for light, here in zip(sources, ends, strict=True)
+                ]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
                 if index == 0 and moment is pose and self._scatters:
@@ -593,11 +597,13 @@ class Renderer:
         blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
         return blur
 
-    def _sigmas(self, here: SheetLight, segment: RaySegment, pose: SensorPose) -> Float:
-        """Return the distance of segment ends from a sheet in standard deviations; infinite without a surface."""
+    def _sigmas(self, here: SheetLight, segment: RaySegment, pose: SensorPose, reach: float) -> Float:
+        """Return distances of segment ends from a sheet in ``reach`` standard deviations; infinite without a surface."""
         sigma = here.sigma_mm
         if self.objects.translucent:
             sigma = lit_sigma_mm(self.objects, segment.si, pose.object_direction(segment.si.n), here)
+        if reach != 1:
+            sigma *= opaque(reach)
         return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
 
     def _expand_cells(self, cells: np.ndarray) -> np.ndarray:
