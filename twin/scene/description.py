@@ -95,7 +95,7 @@ class PrintedPlate(SceneObject, ABC):
     errors_seed: Annotated[int, Field(ge=0)] = 0
 
     _no_texture: ClassVar[str] = "on a plate with a printed pattern: put it on an object of kind 'plate'"
-    _no_mottle: ClassVar[str] = "on a plate with a printed pattern: set mottle = 0, or use an object of kind 'plate'"
+    _no_mottle: ClassVar[str] = "on a plate with a printed pattern: use an object of kind 'plate', or"
 
     @abstractmethod
     def described_target(self) -> Target:

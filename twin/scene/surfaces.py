@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 Reflection = Literal["diffuse", "painted", "pvc", "metal"]
 Finish = Literal[
@@ -48,6 +48,9 @@ class FinishProperties:
     mottle: float = 0.0
     mottle_mm: float | Lengths = 1.0
     mean_free_path_mm: float = 0.0
+    patch_share: float = 0.0
+    patch_length_mm: float = 5.0
+    patch_reflectance: float = 0.03
 
 
 # Roughness of coats and metal (alpha): a satin paint, an extruded pipe, ground steel; assumed. Light from a diffuse
@@ -68,17 +71,20 @@ FINISHES: dict[Finish, FinishProperties] = {
 }
 
 
-def draw_waves(rng: np.random.Generator, correlation_mm: float | Lengths) -> np.ndarray:
+def draw_waves(rng: np.random.Generator, correlation_mm: float | Lengths, *, smooth: bool = False) -> np.ndarray:
     """Draw the plane waves (N, 4) of a Gaussian field of mean 0 and variance 1: wave vectors in 1/mm, and phases.
 
     The field is the sum of sqrt(2 / N) cos(k r + phase) (spectral representation, Shinozuka 1971, J. Acoust. Soc. Am.
     49:357). Its autocorrelation is exp(-d) at the distance d = sqrt(sum (r_j / l_j)^2), with the correlation length l_j
     along each of the object's axes. The density of exp(-d) in space is proportional to 1 / (1 + q^2)^2 with q_j = k_j
-    l_j (Abramowitz and Stegun 1964, section 29.3; Matern's class with exponent 1/2), a power law above 1 / l. Wave
-    numbers are drawn one from each of N intervals of equal power, up to `_FINEST`.
+    l_j (Matern's class with exponent 1/2), a power law above 1 / l. Wave numbers are drawn one from each of N intervals
+    of equal power, up to `_FINEST`. A ``smooth`` field has the autocorrelation exp(-d^2 / 2) and the density exp(-q^2 /
+    2).
     """
     numbers = np.geomspace(1e-3, _FINEST, 4096)
-    below = np.arctan(numbers) - numbers / (1 + numbers**2)
+    density = numbers**2 * (np.exp(-0.5 * numbers**2) if smooth else 1 / (1 + numbers**2) ** 2)
+    # Per logarithm of the wave number.
+    below = np.cumsum(density * numbers)
     share = (np.arange(WAVES) + rng.random(WAVES)) / WAVES
     number = np.interp(share * below[-1], below, numbers)
     direction = rng.standard_normal((WAVES, 3))
@@ -86,6 +92,18 @@ def draw_waves(rng: np.random.Generator, correlation_mm: float | Lengths) -> np.
     lengths = np.broadcast_to(correlation_mm, 3)
     phase = rng.uniform(0, 2 * math.pi, WAVES)
     return np.column_stack([number[:, None] * direction / lengths, phase])
+
+
+def draw_patches(rng: np.random.Generator, *, share: float, length_mm: float) -> tuple[np.ndarray, float]:
+    """Draw the waves (N, 4) of a smooth field, and the level above which a ``share`` of the surface lies.
+
+    A line crosses the level u upwards exp(-u^2 / 2) / (2 pi s) times per length if the autocorrelation is exp(-d^2 / (2
+    s^2)) (Rice 1945, Bell Syst. Tech. J. 24:46, Eq. 3.3-14). The share divided by this rate is ``length_mm``, the mean
+    length of the line in a patch.
+    """
+    level = float(ndtri(1 - share))
+    correlation_mm = length_mm * math.exp(-(level**2) / 2) / (2 * math.pi * share)
+    return draw_waves(rng, correlation_mm, smooth=True), level
 
 
 def move_waves(waves: np.ndarray, pose: np.ndarray) -> np.ndarray:
