@@ -601,7 +601,7 @@ class Renderer:
         return blur
 
     def _sigmas(self, here: SheetLight, segment: RaySegment, pose: SensorPose, reach: float) -> Float:
-        """Return distances of segment ends from a sheet in ``reach`` standard deviations; infinite without a surface."""
+        """Return distances of segment ends from a sheet in ``reach`` standard deviations; infinite off surfaces."""
         sigma = here.sigma_mm
         if self.objects.translucent:
             sigma = lit_sigma_mm(self.objects, segment.si, pose.object_direction(segment.si.n), here)
