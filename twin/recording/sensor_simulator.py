@@ -1,6 +1,6 @@
 """Simulation of a sensor in a scene: poses, exposures, noisy images, and the ground truth of each shot."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal, TypeAlias
 
@@ -200,6 +200,15 @@ class SensorSimulator:
         velocity, turn = motion.course().twist(shot, exposure_s=1e-3 * exposure_ms)
         return self._travel(velocity, turn, exposure_ms)
 
+    def through_water(self, shot: Shot) -> Travel | None:
+        """Return the motion of the sensor relative to the water during an exposure; None if it does not move."""
+        travel, current = self.travel(shot), np.array(self.scene.current_mm_per_s)
+        if not (self.options.effects.motion and current.any()):
+            return travel
+        if travel is None:
+            return self._travel(-current, None, self.exposure_ms.get(shot.light, 0.0) * shot.exposure)
+        return replace(travel, velocity_mm_s=travel.velocity_mm_s - current)
+
     def travel_at(self, speed: float, *, exposure_ms: float) -> Travel | None:
         """Return the motion of the sensor during an exposure at a stage speed in mm/s; None if it does not move."""
         motion = self.scene.motion
@@ -221,12 +230,14 @@ class SensorSimulator:
         """Return the mean photo-electrons per ms (H, W) of a shot."""
         return self._electrons_per_ms(*self._light(shot, spp=spp, seed=seed, travel=travel), shot)
 
-    def _light(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None) -> ShotLight:
+    def _light(
+        self, shot: Shot, *, spp: int, seed: int, travel: Travel | None, through_water: Travel | None = None
+    ) -> ShotLight:
         others, pose = "lamp" if self.shows(shot, "lamp") else "day", self.pose(shot)
         even = self.renderer.irradiance(others, pose, spp=spp, travel=travel)
         if not self.shows(shot, "laser"):
             return even, None
-        return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel)
+        return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel, through_water=through_water)
 
     def _electrons_per_ms(
         self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
@@ -271,7 +282,8 @@ class SensorSimulator:
         """Return the light of image number ``index`` before the lens."""
         self._shift_points(shot, index)
         seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
-        return self._light(shot, spp=self.options.spp, seed=seed, travel=self.travel(shot))
+        motion = {"travel": self.travel(shot), "through_water": self.through_water(shot)}
+        return self._light(shot, spp=self.options.spp, seed=seed, **motion)
 
     def frame(self, shot: Shot, index: int) -> Frame:
         """Return image number ``index`` of the scan with its metadata in the capture."""
