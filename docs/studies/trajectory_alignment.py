@@ -210,7 +210,7 @@ def bounds(*, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave
     with a random walk) and ``walk`` (random walk). ``wave`` is the amplitude of the wave of `ride`. The known
     displacement is that within each crossing, or at two positions of it, which also determines the rates. The linear
     Gaussian estimate with the true covariance has the smallest possible error. `align_trajectory` knows only the size
-    of the drift: it uses its own model with the most likely walk.
+    of the drift: it uses its own model with the most likely random walk and correlation time.
     """
     found = []
     for apart in (0.0, SWATH_MM / LENGTH_MM):
@@ -226,7 +226,7 @@ def bounds(*, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave
         _, std, _ = _estimated(true, seen)
         found.append(float(np.sqrt(np.mean(np.diag(true)[: len(GRID)]) / np.mean(std**2))))
     models = [
-        _estimated(model.covariance(t[:, None], t, 1.0)[0], seen) for model in DriftModel.of_size(1.0, 1.0).with_walks()
+        _estimated(model.covariance(t[:, None], t, 1.0)[0], seen) for model in DriftModel.of_size(1.0, 1.0).candidates()
     ]
     rng, root = np.random.default_rng(0), np.linalg.cholesky(true + EXACT * np.eye(len(t)))
     before, after, inside, sizes = [], [], [], []
