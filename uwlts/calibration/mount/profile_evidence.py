@@ -302,7 +302,11 @@ class Problem(GroupedEvidence[MountState]):
         """
         if self._last_basis and self._last_basis[0][0] is state:
             return self._last_basis[0][1]
-        means = self.bin_means(np.hstack([self.pose_error_derivatives(state), self.derivatives(state)]))
+        changes = self.pose_error_derivatives(state)
+        if self.shape.flat:
+            # Shifts change the profile of a sphere as all parameters do. Noise would make the columns differ.
+            changes = np.hstack([changes, self.derivatives(state)])
+        means = self.bin_means(changes)
         sizes = np.linalg.norm(means, axis=1, keepdims=True).clip(1e-30)
         basis, spans, _ = np.linalg.svd(means / sizes, full_matrices=False)
         used = spans > _LEAST_SPAN * spans[:, :1]
