@@ -212,10 +212,11 @@ def bounds(
     """Return, as text, the factors that three exact crossings can reduce the rms error of a path by.
 
     The drift is a Gaussian process. Its variance at the end is the sum of ``rate`` (steady rate), ``wandering`` (rate
-    with a random walk, or Gauss-Markov rate with a ``correlation`` time) and ``walk`` (random walk). ``wave`` is the amplitude of the wave of `ride`. The known
-    displacement is that within each crossing, or at two positions of it, which also determines the rates. The linear
-    Gaussian estimate with the true covariance has the smallest possible error. `align_trajectory` knows only the size
-    of the drift: it uses its own model with the most likely random walk and correlation time.
+    with a random walk, or Gauss-Markov rate with a ``correlation`` time) and ``walk`` (random walk). ``wave`` is the
+    amplitude of the wave of `ride`. The known displacement is that within each crossing, or at two positions of it,
+    which also determines the rates. The linear Gaussian estimate with the true covariance has the smallest possible
+    error. `align_trajectory` knows only the size of the drift: it uses its own model with the most likely random walk
+    and correlation time.
     """
     found = []
     for apart in (0.0, SWATH_MM / LENGTH_MM):

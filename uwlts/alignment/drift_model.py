@@ -26,7 +26,7 @@ _AS_DEAD_RECKONED = 0.5
 """Least ratio of the position-heading covariance to that of dead reckoning, for positions to count as dead-reckoned."""
 _WALKS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 """Candidate fractions of a random walk in the variance at the end, if none is stated."""
-CORRELATION_TIMES = (0.1, 0.3, 1.0, 3.0)
+CORRELATION_TIMES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Candidate correlation times of the rates, relative to the path, if none is stated.
 
 Faster rates are like a random walk, slower ones like a constant rate with a random walk of its own.

@@ -1,6 +1,7 @@
 """Mounts from sets that share nothing with the product: arcs among scattered points, and plain least squares."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,6 +50,21 @@ def test_scattered_points_alone_are_rarely_an_arc(rng):
         found += find_arc(points, None, rng) is not None
     # One in ten, measured on 120 others; more than 13 of 40 once in 10,000 runs.
     assert found <= 13
+
+
+def test_scattered_points_on_the_continuation_of_an_arc_are_left_out(rng):
+    """Points on the rear of the circle, or 90 deg beyond the arc, fit it; they would shift it most."""
+    angle = np.radians(np.linspace(60, 120, 200))
+    points = 20 * np.column_stack([np.cos(angle), np.sin(angle)]) + 0.01 * rng.standard_normal((200, 2))
+    rear, beside = [0.3, -20.0], [-20.0, 0.2]
+    points = np.vstack([points[:90], rear, points[90:], beside])
+    points[40:55] = np.nan
+    points = points[np.isfinite(points).all(axis=1)]
+    arc = find_arc(points, 20.0, rng)
+    assert arc is not None
+    left = replace(arc, members=np.ones(len(points), dtype=bool)).without_isolated(points)
+    foreign = np.linalg.norm(points - [0, 20], axis=1) > 15
+    assert foreign.sum() == 2 and not left.members[foreign].any() and left.members[~foreign].all()
 
 
 @pytest.fixture
