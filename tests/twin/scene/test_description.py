@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.virtual_sensors import altered, plate, scene_of
 from twin.light.renderer import Renderer
-from twin.recording.sensor_simulator import check_scene, medium_of
+from twin.recording.sensor_simulator import check_scene
 from twin.rendering_options import Options
-from twin.scene.description import Scene, load_scene
+from twin.scene.description import Scene, load_scene, medium_of
 from twin.scene.motion import Motion
 from twin.scene.objects import Objects, build_objects
 from twin.scene.scene_object import Pose
