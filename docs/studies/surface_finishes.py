@@ -62,7 +62,9 @@ def main(*, real: tuple[str, ...] = (), write: bool = False) -> None:
             path = twin.simulate(scene, out=Path(folder) / "stripe.h5", sensor="thesis")[0]
             cells = cells_of(path)
         recording = twin.render(scene, sensor="thesis", frames=[FRAMES // 2])
-        shift = (recording.truth.centroid_px - recording.truth.centre_px)[np.isfinite(recording.truth.centroid_px)]
+        centroid = recording.truth.centroid_px
+        assert centroid is not None  # by rendering
+        shift = (centroid - recording.truth.centre_px)[np.isfinite(centroid)]
         rows.append([finish, *cells, f"{shift.mean():+.3f}", f"{shift.std():.3f}"])
         strips.append((finish, straighten(recording.images[0], recording.truth.centre_px[0])))
         print(rows[-1], flush=True)
