@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 PATCH_MM = 512.0
-"""Period of the surface; longer waves hardly focus light at depths of some metres."""
+"""Period of the surface; the focus of longer waves is at depths of many metres."""
 CELLS = 1024
 """Number of cells of the pattern along each axis: 0.5 mm each, narrower than the sun's blur 0.2 m below the surface."""
 _SHORTEST_MM = 17.0
