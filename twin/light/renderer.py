@@ -283,7 +283,7 @@ class Renderer:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Render the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
 
-        A line's surface is what lies within one standard deviation of the sheet of the plane through its point.
+        Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet of the plane through its point.
 
         Parameters
         ----------
@@ -316,8 +316,10 @@ class Renderer:
             plane = dr.gather(mi.Vector4f, planes, pixel)
             away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
             same = dr.abs(away) <= here.sigma_mm
-            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm)) / here.sigma_mm
-            profile /= math.sqrt(2 * math.pi)
+            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm))
+            if light.sheet.side_lobes:
+                value *= dr.select(value > 0, here.in_middle * profile / here.irradiance, 0.0)
+            profile /= here.sigma_mm * math.sqrt(2 * math.pi)
             return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
 
         for part in _split_pixels(rows, columns, spp=spp):
