@@ -23,8 +23,8 @@ def reflect_ring(
 ) -> np.ndarray:
     """Return the irradiance (H, W) in W/mm2 on the image sensor by a lamp ring that the window reflects.
 
-    A diffuse ring of radius R and area A with the radiance L illuminates a surface on the axis, at the distance d, with
-    E = L A d^2 / (d^2 + R^2)^2. The camera sees the ring mirrored by the window's inner face.
+    A diffuse ring of radius R and area A has the radiance L. It illuminates a surface on the axis at the distance d
+    with E = L A d^2 / (d^2 + R^2)^2. The camera sees the ring mirrored by the window's inner face.
 
     Parameters
     ----------

@@ -283,7 +283,8 @@ class Renderer:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Render the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
 
-        Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet of the plane through its point.
+        Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet
+        of the plane through its point.
 
         Parameters
         ----------

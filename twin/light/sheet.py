@@ -105,11 +105,10 @@ class Sheet:
         index = medium.refractive_index(laser.wavelength_nm)
         rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
         self._waist, self._rayleigh, self._waist_at = map(opaque, (waist, rayleigh, laser.waist_distance_mm))
-        self.side_lobes = [
-            tuple(map(opaque, (2 * offset, radius, share))) for offset, radius, share in laser.side_lobes
-        ]
-        self._main_share = opaque(1 - math.fsum(share for _, _, share in laser.side_lobes))
-        reaches = [(2 * abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS for offset, radius, _ in laser.side_lobes]
+        lobes = [(2 * offset, radius, share) for offset, radius, share in laser.side_lobes]
+        self.side_lobes = [tuple(map(opaque, lobe)) for lobe in lobes]
+        self._main_share = opaque(1 - math.fsum(share for _, _, share in lobes))
+        reaches = [(abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS for offset, radius, _ in lobes]
         self.reach = max([1.0, *reaches])
         self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))
 
