@@ -39,6 +39,7 @@ from twin.light.multiple_scattering import IndirectLight, LightSources, decay_wi
 from twin.light.particles import Body, sample_spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
+from twin.light.translucency import lit_sigma_mm, spread_irradiance
 from twin.light.walk import Walker
 from twin.light.water import Scattering
 from twin.rendering_options import ALL, Effects
@@ -187,9 +188,18 @@ class Renderer:
         return self._render_lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
 
     def laser_frame(
-        self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
+        self,
+        scene_from_object: np.ndarray,
+        *,
+        spp: int,
+        seed: int = 0,
+        travel: Travel | None = None,
+        through_water: Travel | None = None,
     ) -> LaserFrame:
-        """Return the light of the laser on the image sensor; see `irradiance`."""
+        """Return the light of the laser on the image sensor; see `irradiance`.
+
+        ``through_water`` is the motion of the sensor relative to the water and its particles; None: at rest.
+        """
         begin_kernels()
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
@@ -208,10 +218,15 @@ class Renderer:
             longer = partial(walked.image, LightSources(image, haze, surfaces))
         haze = haze if self.effects.haze else np.zeros_like(haze)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
-        particles, polarisation = self._render_particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
+        particles, polarisation = (
+            self._render_particles(direct, pose, through_water, seed=seed),
+            np.clip(polarised / bright, 0, 1),
+        )
         return LaserFrame(longer, haze, particles, rows, columns, stripe, polarisation, rough / bright)
 
-    def _render_particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
+    def _render_particles(
+        self, direct: list[Light], pose: SensorPose, through_water: Travel | None, *, seed: int
+    ) -> np.ndarray:
         """Return the irradiance (H, W) in W/mm2 of particles and bubbles in the sheets."""
         camera = self.sensor.camera
         image = np.zeros((camera.height_px, camera.width_px), np.float32)
@@ -223,6 +238,7 @@ class Renderer:
                     light,
                     self.objects,
                     pose,
+                    travel=through_water,
                     body=body,
                     per_litre=per_litre,
                     extinction=self.scattering.c,
@@ -289,7 +305,8 @@ class Renderer:
             plane = dr.gather(mi.Vector4f, planes, pixel)
             away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
             same = dr.abs(away) <= here.sigma_mm
-            profile = here.irradiance / (here.in_middle * here.sigma_mm * math.sqrt(2 * math.pi))
+            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm)) / here.sigma_mm
+            profile /= math.sqrt(2 * math.pi)
             return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
 
         for part in _split_pixels(rows, columns, spp=spp):
@@ -310,9 +327,21 @@ class Renderer:
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
             here = light.evaluate(end, after_s)
-            lit = light.reaches(self.objects.scene, end, here, after_s, segment.valid & (here.irradiance > 0))
+            # The light of a coat or metal leaves where it arrives, that of a body is spread.
+            parts = [(mi.BSDFContext(), here.irradiance)]
+            if self.objects.translucent:
+                body, coat = mi.BSDFContext(), mi.BSDFContext()
+                body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
+                normal = pose.object_direction(segment.si.n, after_s)
+                parts = [
+                    (coat, here.irradiance),
+                    (body, spread_irradiance(self.objects, segment.si, normal, here, light.sheet)),
+                ]
+            bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
+            lit = light.reaches(self.objects.scene, end, here, after_s, bright)
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
-            radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
+            for context, value in parts:
+                radiance += dr.select(lit, bsdf.eval(context, segment.si, towards, lit)[0] * value, 0.0)
         return radiance * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
 
     # --- nodes: where the stripe is, and the haze ---------------------------------------------------------------------
@@ -330,7 +359,10 @@ class Renderer:
             scattered = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
                 ends = [light.evaluate(segment.end()) for light in sources]
-                across = [_sigmas(here, segment) for here in ends]
+                across = [
+                    self._sigmas(here, segment, moment, light.sheet.reach)
+                    for light, here in zip(sources, ends, strict=True)
+                ]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
                 if index == 0 and moment is pose and self._scatters:
@@ -568,14 +600,18 @@ class Renderer:
         blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
         return blur
 
+    def _sigmas(self, here: SheetLight, segment: RaySegment, pose: SensorPose, reach: float) -> Float:
+        """Return distances of segment ends from a sheet in ``reach`` standard deviations; infinite off surfaces."""
+        sigma = here.sigma_mm
+        if self.objects.translucent:
+            sigma = lit_sigma_mm(self.objects, segment.si, pose.object_direction(segment.si.n), here)
+        if reach != 1:
+            sigma = sigma * opaque(reach)
+        return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
+
     def _expand_cells(self, cells: np.ndarray) -> np.ndarray:
         """Expand values of grid cells to pixels (H, W)."""
         return expand_cells(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
-
-
-def _sigmas(here: SheetLight, segment: RaySegment) -> Float:
-    """Return the distance of segment ends from a sheet in standard deviations; infinite without a surface."""
-    return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
 
 def _split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

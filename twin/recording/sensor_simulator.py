@@ -1,6 +1,6 @@
 """Simulation of a sensor in a scene: poses, exposures, noisy images, and the ground truth of each shot."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal, TypeAlias
 
@@ -10,7 +10,7 @@ from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth, measure_line_light
 from twin.rendering_options import Options
-from twin.scene.description import PrintedPlate, Scene, replace_values
+from twin.scene.description import PrintedPlate, Scene, medium_of, replace_values
 from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
 from twin.scene.platforms import Platform
@@ -19,9 +19,8 @@ from twin.sensor.flaws import add_glare, as_built, deliver_image, dirt, laser_sh
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
-from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import Coordinates
 from uwlts.storage.capture import Frame, Seen
 
@@ -35,16 +34,6 @@ STRAY_LINES = 4
 """Number of brightest lines that may be due to single bright pixels."""
 LIT_SHARE = 0.05
 """A line is lit if it exceeds this fraction of the brightest line that is not one of `STRAY_LINES`."""
-
-
-def medium_of(sensor: Sensor, scene: Scene) -> Medium:
-    """Return the sensor's medium that the scene names, with the scene's water if it defines one."""
-    medium = sensor.medium(scene.medium)
-    if scene.water is None:
-        return medium
-    kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}
-    kept = medium.model_dump(include={"kind", "temperature_c", "salinity_g_kg", "index"})
-    return validate_description(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
 
 
 def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
@@ -211,6 +200,15 @@ class SensorSimulator:
         velocity, turn = motion.course().twist(shot, exposure_s=1e-3 * exposure_ms)
         return self._travel(velocity, turn, exposure_ms)
 
+    def through_water(self, shot: Shot) -> Travel | None:
+        """Return the motion of the sensor relative to the water during an exposure; None if it does not move."""
+        travel, current = self.travel(shot), np.array(self.scene.current_mm_per_s)
+        if not (self.options.effects.motion and current.any()):
+            return travel
+        if travel is None:
+            return self._travel(-current, None, self.exposure_ms.get(shot.light, 0.0) * shot.exposure)
+        return replace(travel, velocity_mm_s=travel.velocity_mm_s - current)
+
     def travel_at(self, speed: float, *, exposure_ms: float) -> Travel | None:
         """Return the motion of the sensor during an exposure at a stage speed in mm/s; None if it does not move."""
         motion = self.scene.motion
@@ -232,12 +230,14 @@ class SensorSimulator:
         """Return the mean photo-electrons per ms (H, W) of a shot."""
         return self._electrons_per_ms(*self._light(shot, spp=spp, seed=seed, travel=travel), shot)
 
-    def _light(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None) -> ShotLight:
+    def _light(
+        self, shot: Shot, *, spp: int, seed: int, travel: Travel | None, through_water: Travel | None = None
+    ) -> ShotLight:
         others, pose = "lamp" if self.shows(shot, "lamp") else "day", self.pose(shot)
         even = self.renderer.irradiance(others, pose, spp=spp, travel=travel)
         if not self.shows(shot, "laser"):
             return even, None
-        return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel)
+        return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel, through_water=through_water)
 
     def _electrons_per_ms(
         self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
@@ -282,7 +282,8 @@ class SensorSimulator:
         """Return the light of image number ``index`` before the lens."""
         self._shift_points(shot, index)
         seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
-        return self._light(shot, spp=self.options.spp, seed=seed, travel=self.travel(shot))
+        motion = {"travel": self.travel(shot), "through_water": self.through_water(shot)}
+        return self._light(shot, spp=self.options.spp, seed=seed, **motion)
 
     def frame(self, shot: Shot, index: int) -> Frame:
         """Return image number ``index`` of the scan with its metadata in the capture."""

@@ -23,6 +23,8 @@ TYPICAL = [
     "particles=1000",
     "bubbles=200",
     "caustics=0.3",
+    "stray-light=0.02",
+    "side-lobes=0.01",
     "dirt=0.1",
     "lamp-and-laser",
     "pixel-aspect=1.002",

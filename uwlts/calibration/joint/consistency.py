@@ -404,14 +404,20 @@ def _check_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor)
 def _check_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
     """Find images that fit worse than similar ones: contradictions by source, and doubts for noisy images."""
     unfit: dict[str, str] = {}
-    noisy = []
+    noisy: list[str] = []
+    scatters: dict[object, list[float]] = {}
     for image in images:
-        others = [other.scatter_px for other in images if other.peers == image.peers and other is not image]
-        usual = float(np.median(others)) if others else image.noise_px
+        scatters.setdefault(image.peers, []).append(image.scatter_px)
+    ordered = {peers: np.sort(values) for peers, values in scatters.items()}
+    for image in images:
+        # Of all images with the same peers, without this one.
+        others = ordered[image.peers]
+        others = np.delete(others, np.searchsorted(others, image.scatter_px))
+        usual = float(np.median(others)) if len(others) else image.noise_px
         if image.scatter_px <= max(_OVER_OTHERS * usual, usual + _OVER_OTHERS_PX):
             continue
         shaped = image.scatter_px > _OVER_NOISE * image.noise_px
-        than = f"in the other images {usual:.2f} px" if others else f"its noise being {usual:.2f} px"
+        than = f"in the other images {usual:.2f} px" if len(others) else f"its noise being {usual:.2f} px"
         words = f"{image.source}: the {image.kind} is {image.scatter_px:.2f} px off (rms), {than}"
         if shaped or image.scatter_px > image.largest_px():
             unfit.setdefault(image.source, words)
