@@ -87,7 +87,9 @@ def open_image_set(source: str | Path, *, stripe: StripeSettings = None) -> Imag
 
 def _open_data_set(folder: Path, stripe: StripeSettings) -> ImageSet:
     samples = load_dataset(folder, names=("image", "info"))
-    sensor = validate_description(Sensor, samples.card.description["sensor"], folder / CARD)
+    sensor = validate_description(Sensor, samples.card.description.get("sensor"), folder / CARD)
+    if "bits" not in samples.card.image:
+        raise CaptureError(f"{folder / CARD} is damaged: it does not state the number of bits of the images")
 
     def read(number: int) -> np.ndarray | None:
         sample = samples[number]
@@ -142,6 +144,11 @@ def _open_files(path: Path, stripe: StripeSettings) -> ImageSet:
 
     def read(number: int) -> np.ndarray:
         image = read_image(files[number])
+        if image.dtype != first.dtype or image.max() > full:
+            raise ImageError(
+                f"{files[number]} is {image.dtype} with grey values up to {image.max()}, {files[0]} is of {bits} bits: "
+                "give images of one camera in a folder"
+            )
         return np.ascontiguousarray(image if image.ndim == 2 else image[:, :, channel])
 
     name = path.name if path.is_dir() else f"{path.parent.name}/{path.name}"
