@@ -333,7 +333,10 @@ class Renderer:
                 body, coat = mi.BSDFContext(), mi.BSDFContext()
                 body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
                 normal = pose.object_direction(segment.si.n, after_s)
-                parts = [(coat, here.irradiance), (body, spread_irradiance(self.objects, segment.si, normal, here))]
+                parts = [
+                    (coat, here.irradiance),
+                    (body, spread_irradiance(self.objects, segment.si, normal, here, light.sheet)),
+                ]
             bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
             lit = light.reaches(self.objects.scene, end, here, after_s, bright)
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
@@ -603,7 +606,7 @@ class Renderer:
         if self.objects.translucent:
             sigma = lit_sigma_mm(self.objects, segment.si, pose.object_direction(segment.si.n), here)
         if reach != 1:
-            sigma *= opaque(reach)
+            sigma = sigma * opaque(reach)
         return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
 
     def _expand_cells(self, cells: np.ndarray) -> np.ndarray:

@@ -10,11 +10,13 @@ import drjit as dr
 import mitsuba as mi
 
 from twin.backend.arrays import Float, SurfaceInteraction3f, Vector3f
-from twin.light.sheet import SheetLight
+from twin.light.sheet import Sheet, SheetLight
 from twin.scene.objects import Objects
 
 
-def spread_irradiance(objects: Objects, si: SurfaceInteraction3f, normal: Vector3f, here: SheetLight) -> Float:
+def spread_irradiance(
+    objects: Objects, si: SurfaceInteraction3f, normal: Vector3f, here: SheetLight, sheet: Sheet
+) -> Float:
     """Return the irradiance in W/mm2 that light leaving the bodies at surface points stands for.
 
     Along the surface, the distance from the sheet changes by the sine of the angle between surface and sheet normal.
@@ -31,16 +33,20 @@ def spread_irradiance(objects: Objects, si: SurfaceInteraction3f, normal: Vector
         Unit normals there in the OCS.
     here
         Light of the sheet there.
+    sheet
+        The sheet, whose profile is a sum of Gaussians.
     """
     across = dr.dot(normal, here.normal)
     tilted, variance = 1 - dr.square(across), dr.square(here.sigma_mm)
     cosine = dr.dot(here.direction, normal)
     ahead = dr.dot(here.direction, here.normal) - cosine * across
-    squared = dr.square(here.distance_mm - objects.spread_ahead_mm(si, cosine) * ahead)
+    distance = here.distance_mm - objects.spread_ahead_mm(si, cosine) * ahead
     total = mi.Float(0.0)
-    for weight, added in objects.spread_parts(si):
-        wide = variance + added * tilted
-        total += weight * dr.sqrt(variance / wide) * dr.exp(-0.5 * squared / wide)
+    for share, offset, radius in sheet.parts:
+        squared, narrow = dr.square(distance - offset * here.sigma_mm), variance * dr.square(radius)
+        for weight, added in objects.spread_parts(si):
+            wide = narrow + added * tilted
+            total += share * weight * dr.sqrt(variance / wide) * dr.exp(-0.5 * squared / wide)
     return here.in_middle * total
 
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Annotated, ClassVar, Self, cast
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from twin.scene.surfaces import FINISHES, LARGEST_CLIPPED, Finish, FinishProperties, clipped_share
@@ -124,6 +124,16 @@ class FlatObject(SceneObject):
         if self.mirror > 0 and own.reflection in ("painted", "pvc"):
             raise ValueError(f"mirror {self.mirror:g} under a coat: use the finish 'diffuse' or 'metal' for a mirror")
         return self
+
+
+def _check_range(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"the range [{ends[0]:g}, {ends[1]:g}] must begin with its smaller end")
+    return ends
+
+
+Range = Annotated[tuple[Positive, Positive], AfterValidator(_check_range)]
+"""Least and largest value of a size that is drawn."""
 
 
 class FreeForm(SceneObject, ABC):

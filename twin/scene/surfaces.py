@@ -19,11 +19,12 @@ Finish = Literal[
     "painted",
     "pvc",
     "metal",
-    "rusted-steel",
-    "weathered-paint",
     "machined-steel",
-    "pvc-pipe",
+    "painted-steel",
+    "rusted-steel",
+    "fouled-steel",
     "concrete",
+    "pvc-pipe",
     "marine-growth",
 ]
 Lengths = tuple[float, float, float]
@@ -53,21 +54,36 @@ class FinishProperties:
     patch_reflectance: float = 0.03
 
 
-# Roughness of coats and metal (alpha): a satin paint, an extruded pipe, ground steel; assumed. Light from a diffuse
-# body has travelled some um inside it, whatever its surface roughness.
+# Sources. Roughness of coats and metal (alpha): a satin paint, an extruded pipe, ground steel; assumed. Light from a
+# diffuse body has travelled some um inside it, whatever its surface roughness. White, diffuse materials scatter 3 to 8
+# times per mm (reduced; Sensors 23:6853, 2023), coral tissue once at 636 nm (Wangpraseurt et al. 2016, Front. Plant
+# Sci. 7:1404), which is an albedo of 0.5 per mean free path of 0.5 mm. Brown algae reflect 0.02 to 0.04 below 520 nm
+# (Maritorena, Morel and Gentili 1994, Limnol. Oceanogr. 39:1689). Other reflectances, mottle and lengths are assumed;
+# docs/results/surfaces.md compares the stripes with real ones.
 FINISHES: dict[Finish, FinishProperties] = {
     "diffuse": FinishProperties("diffuse"),
     "painted": FinishProperties("painted", alpha=0.3),
     "pvc": FinishProperties("pvc", alpha=0.15),
     "metal": FinishProperties("metal", alpha=0.3, roughness_um=1.0),
-    "rusted-steel": FinishProperties("diffuse", reflectance=0.25, roughness_um=20.0, mottle=0.35, mottle_mm=0.8),
-    "weathered-paint": FinishProperties("painted", reflectance=0.5, alpha=0.4, mottle=0.15, mottle_mm=1.5),
     "machined-steel": FinishProperties(
-        "metal", reflectance=0.6, alpha=0.2, roughness_um=1.6, mottle=0.25, mottle_mm=(10.0, 0.15, 0.15)
+        "metal", reflectance=0.6, alpha=0.2, roughness_um=1.6, mottle=0.2, mottle_mm=(10.0, 0.2, 0.2)
     ),
-    "pvc-pipe": FinishProperties("pvc", reflectance=0.7, alpha=0.15, mottle=0.05, mottle_mm=2.0),
-    "concrete": FinishProperties("diffuse", reflectance=0.35, roughness_um=50.0, mottle=0.25, mottle_mm=0.5),
-    "marine-growth": FinishProperties("diffuse", reflectance=0.12, roughness_um=50.0, mottle=0.5, mottle_mm=1.0),
+    "painted-steel": FinishProperties("painted", reflectance=0.5, alpha=0.4, mottle=0.12, mottle_mm=1.5),
+    "rusted-steel": FinishProperties("diffuse", reflectance=0.25, roughness_um=20.0, mottle=0.3, mottle_mm=0.8),
+    "fouled-steel": FinishProperties(
+        "diffuse",
+        reflectance=0.25,
+        roughness_um=20.0,
+        mottle=0.3,
+        mottle_mm=0.8,
+        patch_share=0.25,
+        patch_length_mm=10.0,
+    ),
+    "concrete": FinishProperties("diffuse", reflectance=0.35, roughness_um=50.0, mottle=0.2, mottle_mm=0.6),
+    "pvc-pipe": FinishProperties("pvc", reflectance=0.7, alpha=0.15, mottle=0.05, mottle_mm=2.0, mean_free_path_mm=0.2),
+    "marine-growth": FinishProperties(
+        "diffuse", reflectance=0.12, roughness_um=50.0, mottle=0.4, mottle_mm=1.5, mean_free_path_mm=0.5
+    ),
 }
 
 

@@ -1,6 +1,7 @@
 """Random reflectance of surfaces against its stated distribution and spectrum, in numbers and in rendered stripes."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -22,6 +23,7 @@ from uwlts.model.sensor import Sensor
 
 FINEST = 10 * math.pi
 """Cut-off of the spectrum times the correlation length, as stated: a wavelength of a fifth of that length."""
+ROOT = Path(__file__).resolve().parents[3]
 SEEDS = 200
 SHAPES: list[dict[str, Any]] = [
     plate(side=60.0),
@@ -174,6 +176,22 @@ def test_every_finish_is_physical(finish):
     own = thing.finish_properties()
     assert own == FINISHES[finish]
     assert clipped_share(own.reflectance, own.mottle) < 0.01
+
+
+def test_the_documented_table_of_finishes_is_the_one_that_is_rendered():
+    page = (ROOT / "docs" / "explanation" / "light.md").read_text(encoding="utf-8")
+    documented = {}
+    for line in page[page.index("| `finish` | reflection") :].split("\n\n")[0].splitlines()[2:]:
+        name, reflection, *numbers = (cell.strip() for cell in line.strip("|").split(" | "))
+        documented[name.strip("`")] = reflection, *(numbers[k] for k in (0, 2, 3)), numbers[5].strip("| ")
+    for name, row in FINISHES.items():
+        reflection, reflectance, roughness, mottle, others = documented.pop(name)
+        found = reflection, float(reflectance), float(roughness), float(mottle or 0)
+        assert found == (row.reflection, row.reflectance, row.roughness_um, row.mottle)
+        for key in ("mean_free_path_mm", "patch_share"):
+            value = getattr(row, key)
+            assert (f"`{key}` {value:g}" in others) == (value > 0)
+    assert not documented
 
 
 def filtered_covariance(lag_mm: float, *, sigma_mm: float, pixel_mm: float, length_mm: float, mottle: float) -> float:
