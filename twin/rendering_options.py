@@ -75,8 +75,8 @@ class Flaws:
     """Number of grains of marine snow above 0.1 mm per litre, rendered individually in the laser's sheet."""
     bubbles: float = _flaw(off=0.0, typical=200.0, least=0.0, most=1e5)
     """Number of air bubbles above 0.1 mm in diameter per litre, which glint in the sheet."""
-    caustics: float = _flaw(off=0.0, typical=0.3, least=0.0, most=1.0)
-    """Strength of the daylight's pattern on surfaces under a wavy water surface."""
+    caustics: float = _flaw(off=0.0, typical=2.0, least=0.0, most=15.0)
+    """Wind speed in m/s over the water, whose waves focus daylight to moving filaments on surfaces."""
     stray_light: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.3)
     """Fraction of the laser's power in a wide pedestal of the sheet, which its optics scatter."""
     side_lobes: float = _flaw(off=0.0, typical=0.01, least=0.0, most=0.1)
