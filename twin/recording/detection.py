@@ -38,7 +38,7 @@ _SLOPES = (-1.0, 5.0)
 _SIGNAL_VALUES = ("undercut left", "undercut right")
 
 
-class Detection(BaseModel, frozen=True):
+class ProbabilityOfDetection(BaseModel, frozen=True):
     """Probability of detection of one kind of flaw against its depth.
 
     Attributes
@@ -58,7 +58,7 @@ class Detection(BaseModel, frozen=True):
     signals_mm : tuple of N float or None
         Measured depths of a signal response, 0 where nothing was measured; None for hits and misses.
     false_calls : int
-        Findings that are no flaw.
+        FlawFindings that are no flaw.
     a90_mm : float or None
         Depth found with a probability of 90 %; None if the flaws do not determine it.
     a90_95_mm : float or None
@@ -104,7 +104,7 @@ class Detection(BaseModel, frozen=True):
 
 @dataclass(frozen=True)
 class Fitted:
-    """Fitted probability of detection; see `Detection`."""
+    """Fitted probability of detection; see `ProbabilityOfDetection`."""
 
     a90_mm: float | None = None
     a90_95_mm: float | None = None
@@ -213,7 +213,7 @@ def _second_differences(of: Callable[[np.ndarray], float], at: np.ndarray, steps
 
 
 @dataclass
-class Findings:
+class FlawFindings:
     """Flaws of one kind, collected over scans and campaigns.
 
     ``thresholds_mm`` are the least significant signals of undercuts, ``values`` the measured value, its standard
@@ -230,7 +230,7 @@ class Findings:
     values: list[tuple[float, float, float]] = field(default_factory=list)
     false_calls: int = 0
 
-    def detection(self) -> Detection:
+    def detection(self) -> ProbabilityOfDetection:
         """Return the probability of detection."""
         depth, found = np.array(self.depths_mm), np.array(self.found)
         if self.flaw == "undercut":
@@ -239,7 +239,7 @@ class Findings:
             fitted = fit_signal_response(depth, np.array(self.signals_mm), threshold_mm=level)
         else:
             method, fitted = "hit/miss", fit_hit_miss(depth, found)
-        return Detection(
+        return ProbabilityOfDetection(
             flaw=self.flaw,
             width_mm=self.width_mm,
             method=method,
@@ -269,7 +269,7 @@ def flaws_of(scene: Scene) -> tuple[Flaw, float] | None:
     return None
 
 
-def collect_findings(into: Findings, take: Take, inspection: dict[str, Any]) -> None:
+def collect_findings(into: FlawFindings, take: Take, inspection: dict[str, Any]) -> None:
     """Add the flaws of a recording and the findings of its inspection (the content of its file).
 
     CaptureError if the inspection is incomplete.
@@ -283,7 +283,7 @@ def collect_findings(into: Findings, take: Take, inspection: dict[str, Any]) -> 
         raise CaptureError(f"the inspection of {take.name} is incomplete: {error}") from error
 
 
-def _collect_pits(into: Findings, scene: Scene, inspection: dict[str, Any]) -> None:
+def _collect_pits(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) -> None:
     """Add the pits within the scanned part of a pipe."""
     number = next(n for n, thing in enumerate(scene.objects) if isinstance(thing, PittedPipe))
     pipe, place = scene.objects[number], scene.object_poses()[number]
@@ -319,7 +319,7 @@ def _collect_pits(into: Findings, scene: Scene, inspection: dict[str, Any]) -> N
             into.values.append((*_value(feature["values"]["depth"]), depth))
 
 
-def _collect_undercuts(into: Findings, scene: Scene, inspection: dict[str, Any]) -> None:
+def _collect_undercuts(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) -> None:
     """Add the undercuts on both sides of a weld."""
     weld = next(thing for thing in scene.objects if isinstance(thing, Weld))
     found = next(each for each in inspection["features"] if each["kind"] == "weld")
@@ -349,7 +349,7 @@ def _scanned_mm(scene: Scene) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def deep_values(found: Findings, detection: Detection) -> Iterator[tuple[float, float, float]]:
+def deep_values(found: FlawFindings, detection: ProbabilityOfDetection) -> Iterator[tuple[float, float, float]]:
     """Yield the values of flaws at least as deep as a90/95; shallower ones are found by the noise that deepens them."""
     least = detection.a90_95_mm if detection.a90_95_mm is not None else math.inf
     return (each for each in found.values if found.flaw == "undercut" or each[2] >= least)

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from twin.recording.campaigns import record_campaigns, require_at_least
 from twin.recording.command_lines import AT_ONCE, run_lines
-from twin.recording.detection import Detection, Findings, collect_findings, deep_values, flaws_of
+from twin.recording.detection import Flaw, FlawFindings, ProbabilityOfDetection, collect_findings, deep_values, flaws_of
 from twin.rendering_options import CPU, Variant
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign, replace_values
 from twin.scene.description import Scene, medium_of
@@ -97,7 +97,7 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
         Seeds of the campaigns.
     figures : tuple of PredictedFigure
         All figures with a known true value, by scan.
-    detections : tuple of Detection
+    detections : tuple of ProbabilityOfDetection
         Probabilities of detection, by kind and width of the flaws.
     """
 
@@ -107,7 +107,7 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
     water: str | float | None = None
     seeds: tuple[int, ...]
     figures: tuple[PredictedFigure, ...]
-    detections: tuple[Detection, ...] = ()
+    detections: tuple[ProbabilityOfDetection, ...] = ()
 
     def covered_share(self) -> float:
         """Return the fraction of all errors within their expanded uncertainty."""
@@ -151,7 +151,7 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
 _DETECTION_HEAD = "flaw", "method", "width / mm", "found", "false", "a90 / mm", "a90/95", "limits"
 
 
-def _detection_row(each: Detection) -> tuple[str, ...]:
+def _detection_row(each: ProbabilityOfDetection) -> tuple[str, ...]:
     """Return the cells of a probability of detection."""
     depths = ("-" if depth is None else f"{depth:.3f}" for depth in (each.a90_mm, each.a90_95_mm))
     found = f"{sum(each.found)} of {len(each.found)}"
@@ -242,7 +242,7 @@ def predict(
     if water is not None:
         described = validate_description(Campaign, described.model_dump() | {"water": water}, str(campaign))
     folder = Path(out or Path("runs") / f"predict-{Path(described.sensor).stem}")
-    evidence, scans = _sort_recordings(described)
+    evidence, scans = _sort_recordings(described, every)
     seeds = range(first, first + campaigns)
     folders = record_campaigns(
         described,
@@ -280,11 +280,11 @@ def predict(
     return result
 
 
-def _sort_recordings(campaign: Campaign) -> tuple[dict[str, list[str]], dict[str, Take]]:
+def _sort_recordings(campaign: Campaign, every: int) -> tuple[dict[str, list[str]], dict[str, Take]]:
     """Return the names of the recordings for each option of the calibration, and the scans by name."""
     evidence: dict[str, list[str]] = {"air": [], "water": [], "step": []}
     scans: dict[str, Take] = {}
-    for take in list_takes(campaign, seed=0):
+    for take in list_takes(campaign, seed=0, every=every):
         if (option := _evidence_of(take)) is not None:
             evidence[option].append(take.name)
         elif take.scene.artefact is not None or _inspected_as(take.scene) is not None:
@@ -398,25 +398,23 @@ def _read_values(take: Take, folders: list[Path]) -> Iterator[PredictedFigure]:
 
 def _read_flaws(
     scans: dict[str, Take], takes: list[dict[str, Take]], folders: list[Path]
-) -> tuple[tuple[Detection, ...], list[PredictedFigure]]:
+) -> tuple[tuple[ProbabilityOfDetection, ...], list[PredictedFigure]]:
     """Return the probabilities of detection, and the errors of the depths of all flaws."""
-    groups: dict[tuple[str, float, str], Findings] = {}
-    names: dict[tuple[str, float, str], list[str]] = {}
+    groups: dict[tuple[Flaw, float, str], FlawFindings] = {}
     for scan, take in scans.items():
         if (kind := flaws_of(take.scene)) is None:
             continue
         group = *kind, _conditions(take)
-        found = groups.setdefault(group, Findings(*group))
-        names.setdefault(group, []).append(scan)
+        found = groups.setdefault(group, FlawFindings(*group))
         for drawn, folder in zip(takes, folders, strict=True):
             collect_findings(found, drawn[scan], _read_inspection(take, folder))
     detections, figures = [], []
-    for group, found in groups.items():
+    for found in groups.values():
         detections.append(found.detection())
         if values := list(deep_values(found, detections[-1])):
             figure = PredictedFigure(
-                scan=names[group][0] if len(names[group]) == 1 else f"{len(names[group])} scans",
-                name=f"{found.flaw} depth error, {found.width_mm:g} mm wide",
+                scan=f"{found.flaw}s",
+                name=f"depth error, {found.width_mm:g} mm wide",
                 checked=found.checked,
                 expanded_mm=tuple(2 * std for _, std, _ in values),
                 errors_mm=tuple(value - true for value, _, true in values),
@@ -476,20 +474,23 @@ def _page(result: PredictedUncertainty) -> str:
         figure=figure_svg(figure),
         rows=[
             (
-                *(each.scan, each.name, each.checked, f"{each.predicted_mm:.4f}", f"{each.found_mm:.4f}"),
+                *(each.scan, each.name, f"{each.predicted_mm:.4f}", f"{each.found_mm:.4f}"),
                 f"{each.covered} of {len(each.errors_mm)}",
             )
             for each in result.figures
         ],
         curves=_draw_curves(result.detections) if result.detections else None,
-        detection_head=[*_DETECTION_HEAD, "checked with"],
-        detections=[(*_detection_row(each), each.checked) for each in result.detections],
+        detection_head=_DETECTION_HEAD,
+        detections=[*map(_detection_row, result.detections)],
+        validity=[line.split(": ", 1) for line in result.validity()],
         version=__version__,
     )
 
 
-def _draw_curves(detections: Sequence[Detection]) -> Markup:
+def _draw_curves(detections: Sequence[ProbabilityOfDetection]) -> Markup:
     """Draw the probability of detection against the depth, with all hits and misses, and a90/95 as dots."""
+    from matplotlib.ticker import LogLocator
+
     figure, panels = new_figure(8.0, 2.6 * len(detections), rows=len(detections))
     for axes, each in zip(panels, detections, strict=True):
         depth = np.array(each.depths_mm)
@@ -499,6 +500,10 @@ def _draw_curves(detections: Sequence[Detection]) -> Markup:
         if each.a90_95_mm is not None:
             axes.plot([each.a90_95_mm], [0.9], "o", color=BLUE)
         axes.axhline(0.9, color="black", linewidth=0.5)
+        axes.set_ylim(-0.05, 1.05)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("")
         axes.set_title(f"{each.flaw}s, {each.width_mm:g} mm wide")
         axes.set_ylabel("probability of detection")
     panels[-1].set_xlabel("depth, mm")

@@ -7,8 +7,8 @@ import pytest
 
 from tests.virtual_sensors import scene_of
 from twin.recording.detection import (
-    Detection,
-    Findings,
+    FlawFindings,
+    ProbabilityOfDetection,
     collect_findings,
     deep_values,
     fit_hit_miss,
@@ -115,9 +115,8 @@ def test_pits_are_matched_with_findings(thesis):
         pit_feature(places[second], 0.2, hollows=[places[third]]),
         pit_feature((0.0, 2.0), 0.05),
     ]
-    kind = flaws_of(take.scene)
-    assert kind == ("pit", 6.0)
-    found = Findings(*kind, "here")
+    assert flaws_of(take.scene) == ("pit", 6.0)
+    found = FlawFindings("pit", 6.0, "here")
     collect_findings(found, take, {"features": features})
     assert found.depths_mm == pytest.approx(depths[seen])
     assert [n for n, hit in zip(seen, found.found, strict=True) if hit] == [first, second, third]
@@ -137,7 +136,8 @@ def test_undercuts_belong_to_their_side(thesis, sign: float):
     left, right = (negative, positive) if sign > 0 else (positive, negative)
     axes = [[sign, 0.0, 0.0], [0.0, sign, 0.0], [0.0, 0.0, -1.0]]
     values = {"undercut left": value(0.3), "undercut right": value(0.005)}
-    found = Findings(*(flaws_of(take.scene) or ("pit", 0.0)), "here")
+    assert flaws_of(take.scene) == ("undercut", 1.5)
+    found = FlawFindings("undercut", 1.5, "here")
     collect_findings(found, take, {"features": [{"kind": "weld", "axes": axes, "values": values}]})
     assert found.depths_mm == [left, right]
     assert found.found == [True, False]
@@ -152,10 +152,10 @@ def test_wide_hollows_are_dents_and_plain_objects_have_no_flaws():
 
 def test_few_flaws_and_missing_bounds_are_stated():
     some = {"flaw": "pit", "width_mm": 3.0, "method": "hit/miss", "checked": "here"}
-    few = Detection(**some, depths_mm=(0.1, 0.2), found=(True, False))
+    few = ProbabilityOfDetection(**some, depths_mm=(0.1, 0.2), found=(True, False))
     assert few.limits() == "2 flaws, fewer than 60; hits and misses do not determine a90"
     assert np.isnan(few.probability(np.array([0.1]))).all()
-    curve = Detection(
+    curve = ProbabilityOfDetection(
         **some, depths_mm=(0.1,) * 60, found=(True,) * 60, a90_mm=0.2, location=math.log(0.1), scale=0.5 / math.log(9)
     )
     assert curve.limits() == "a90 is not bounded"
@@ -165,8 +165,8 @@ def test_few_flaws_and_missing_bounds_are_stated():
 
 
 def test_only_depths_that_are_surely_found_are_judged():
-    found = Findings("pit", 3.0, "here", values=[(0.1, 0.01, 0.09), (0.3, 0.01, 0.31)])
-    detection = Detection(
+    found = FlawFindings("pit", 3.0, "here", values=[(0.1, 0.01, 0.09), (0.3, 0.01, 0.31)])
+    detection = ProbabilityOfDetection(
         flaw="pit", width_mm=3.0, method="hit/miss", checked="here", depths_mm=(), found=(), a90_mm=0.1, a90_95_mm=0.2
     )
     assert list(deep_values(found, detection)) == [(0.3, 0.01, 0.31)]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import twin
-from twin.recording.detection import Detection
+from twin.recording.detection import ProbabilityOfDetection
 from twin.recording.predict import PredictedFigure, PredictedUncertainty
 from uwlts.errors import CommandFailed, DescriptionError
 
@@ -48,7 +48,7 @@ def test_figures_compare_uncertainty_and_errors():
 
 
 def test_detections_have_their_own_table():
-    pits = Detection(
+    pits = ProbabilityOfDetection(
         flaw="pit",
         width_mm=5.0,
         method="hit/miss",
@@ -101,13 +101,14 @@ def test_errors_of_a_rendered_campaign_are_within_the_prediction(tmp_path: Path)
     out, options = tmp_path / "out", {"campaign": "prediction", "water": "clear", "campaigns": 1, "every": 5, "spp": 8}
     result = twin.predict("thesis-small", out=out, **options)
     assert {each.scan for each in result.figures} >= {
-        *("spheres-near", "spheres-standoff", "spheres-far", "step-scan", "pipe", "plane", "pipe-around", "4 scans")
+        *("spheres-near", "spheres-standoff", "spheres-far", "step-scan", "pipe", "plane", "pipe-around", "undercuts")
     }
     # Twice the expanded uncertainty is exceeded once in 15,000 figures.
     for each in result.figures:
         assert abs(each.errors_mm[0]) < 2 * each.expanded_mm[0], each
         assert 0.001 < each.predicted_mm < 1.0, each
         assert "a = 0." in each.checked, "the water is stated"
+    assert any("20 profiles 2.5 mm apart" in each.checked for each in result.detections), "thinned by `every`"
     assert {each.flaw for each in result.detections} == {"pit", "dent", "undercut"}
     written = json.loads((out / "prediction.json").read_text(encoding="utf-8"))
     assert written["format"] == "twin-prediction"
