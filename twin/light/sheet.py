@@ -47,7 +47,7 @@ _SMALLEST_SPREAD_MM = 1e-3
 
 
 Part = tuple[Float, Float, Float]
-"""A Gaussian across a sheet: share of the power, place and standard deviation, in standard deviations of the main one."""
+"""Gaussian across a sheet: share of the power; place and standard deviation in standard deviations of the main one."""
 
 
 @dataclass(frozen=True)
