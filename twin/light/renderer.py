@@ -461,7 +461,8 @@ class Renderer:
         lamp = self.sensor.lamp
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
-        radiance = dr.select(segment.valid, self.objects.albedo(segment.si) * left, 0.0)
+        albedo = self.objects.albedo(segment.si) if ambient else self.objects.lamp_albedo(segment.si)
+        radiance = dr.select(segment.valid, albedo * left, 0.0)
         if self._caustics and ambient:
             radiance *= self._caustic(segment.si.p)
         if self.effects.haze and self.scattering.coefficient > 0:
