@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.browser import find_chromium, open_chromium
-from twin.options import CPU, use_variant
+from twin.rendering_options import CPU, use_variant
 from uwlts.errors import SetupError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor

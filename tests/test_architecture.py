@@ -119,3 +119,43 @@ def test_folders_of_tests_are_packages():
     mirrored = {folder for folder in folders if folder.parts[:1] in (("uwlts",), ("twin",))}
     assert len(mirrored) > 20
     assert {str(folder) for folder in mirrored if not (ROOT / folder / "__init__.py").exists()} == set()
+
+
+def silent_numbers(source: str) -> list[str]:
+    """Named numbers of a module without words: a comment in the line or above the group, or a text below the group."""
+    lines, silent, group, commented = source.splitlines(), [], [], False
+    for node in ast.parse(source).body:
+        match node:
+            case ast.Expr(value=ast.Constant()):
+                group = []
+                continue
+            case ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)):
+                pass
+            case _:
+                name = ""
+        above = lines[node.lineno - 2] if node.lineno > 1 else ""
+        if above.startswith("#"):
+            commented = True
+        elif not above or above.endswith('"""') or not name:
+            commented = False
+        if not above or not name:
+            silent, group = [*silent, *group], []
+        value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
+        is_number = isinstance(value, ast.Constant | ast.BinOp | ast.UnaryOp | ast.Tuple) and any(
+            isinstance(each, ast.Constant) and type(each.value) in (int, float) for each in ast.walk(value)
+        )
+        if name.isupper() and is_number and not commented and "#" not in lines[(node.end_lineno or node.lineno) - 1]:
+            group.append(name)
+    return [*silent, *group]
+
+
+def test_named_numbers_have_a_reason():
+    assert silent_numbers("A = 1\n\n# Why.\nB = 2\nC = 3\nD = 4  # why\n\nE = 5\n") == ["A", "E"]
+    assert silent_numbers('F = 1\nG = 2\n"""Why both."""\nH = 3\n') == ["H"]
+    silent = {
+        str(path.relative_to(ROOT)): names
+        for package in ("twin", "uwlts")
+        for path in (ROOT / package).rglob("*.py")
+        if (names := silent_numbers(path.read_text(encoding="utf-8")))
+    }
+    assert not silent

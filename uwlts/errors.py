@@ -17,8 +17,8 @@ _MOST_PROBLEMS = 5
 _MOST_LISTED = 1000
 """Largest number of problems that are examined: a list of a million would take a gigabyte."""
 
-_LONGEST_PROBLEM = 300
-_LONGEST = 5000
+_LONGEST_PROBLEM = 300  # characters; foreign files are quoted in messages
+_LONGEST = 5000  # characters of a message
 
 
 _UNPRINTABLE = re.compile(r"[^\n\t\x20-\x7e\xa0-\u200d\u2010-\u2029\u202f-\u2065\u206a-\ud7ff\ue000-\U0010ffff]")

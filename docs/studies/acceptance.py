@@ -19,7 +19,7 @@ from result_tables import publish, table
 import twin
 import uwlts
 from uwlts.acceptance.accept import Acceptance
-from uwlts.acceptance.plan import load_plan
+from uwlts.acceptance.acceptance_plan import load_plan
 
 PLAN = Path(__file__).with_name("acceptance.toml")
 AS_BUILT = "thesis-as-built"

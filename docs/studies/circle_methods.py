@@ -7,7 +7,7 @@ import numpy as np
 from result_tables import table
 from scipy.spatial import cKDTree
 
-from twin.options import Options
+from twin.rendering_options import Options
 from twin.scene.description import CirclePlate, load_scene
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor

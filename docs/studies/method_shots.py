@@ -9,7 +9,7 @@ import numpy as np
 from stripe_cases import FACING, PLATE, Case, step_per_px
 
 from twin.light.renderer import LaserFrame
-from twin.options import ALL, Options
+from twin.rendering_options import ALL, Options
 from twin.scene.description import Scene, load_scene
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.speckle import Speckle, coherence

@@ -29,7 +29,7 @@ from tests.uwlts.mount_views import (
     step_campaign,
 )
 from tests.uwlts.sensor_profiles import captured_by, joint_estimate
-from uwlts.calibration.mount.calibrate import calibrate_mount
+from uwlts.calibration.mount.calibrate_mount import calibrate_mount
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import Mount, SphereFound
 

@@ -15,8 +15,8 @@ import numpy as np
 
 import twin
 import uwlts
-from twin.options import CPU, Options, use_variant
 from twin.recording.record_scene import record_scene
+from twin.rendering_options import CPU, Options, use_variant
 from twin.scene.campaign import list_takes, load_campaign
 from twin.scene.description import load_scene
 

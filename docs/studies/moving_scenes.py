@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 import uwlts
 from twin.scene.description import Scene
 from twin.scene.platforms import Platform
-from uwlts.calibration.mount.sensor import CapturedProfiles, reconstruct_profiles
+from uwlts.calibration.mount.captured_profiles import CapturedProfiles, reconstruct_profiles
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount
 from uwlts.storage.truth import Truth, read_truth, truth_path

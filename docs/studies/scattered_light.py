@@ -34,7 +34,7 @@ def render(kind: str, water: str, out: Path, *, seed: int) -> None:
     """Write the scattered light of frames (N, H, W) and the stripe, or the cells of a reference and their error."""
     from tests.bench.light import in_named_water
     from twin.light.renderer import Renderer
-    from twin.options import use_variant
+    from twin.rendering_options import use_variant
     from twin.scene.description import load_scene
 
     use_variant()

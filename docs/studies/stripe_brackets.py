@@ -9,7 +9,7 @@ import numpy as np
 from cyclopts import App
 from result_tables import publish, table
 
-from twin.options import Options, use_variant
+from twin.rendering_options import Options, use_variant
 from twin.scene.description import Scene
 from uwlts.model.library import load_sensor
 from uwlts.stripe import extract_stripe

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.polynomial import polynomial
 
-from twin.options import ALL, NONE, Effects, Options
+from twin.rendering_options import ALL, NONE, Effects, Options
 from twin.scene.description import Scene, load_scene
 from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.model.library import load_sensor

@@ -13,7 +13,7 @@ from result_tables import publish, table
 from stripe_cases import CROSSING, FILTERED, MASS, VERTEX, Frames, measure
 from stripe_plan import NAME_CORE, PLACES, Plan
 
-from twin.options import use_variant
+from twin.rendering_options import use_variant
 from uwlts.pages.numbers import format_fixed
 from uwlts.runtime.console import progress_bar
 

@@ -18,7 +18,7 @@ from method_shots import LEVELS, Place, Spread, places, render, round_to_zero, s
 from result_tables import publish, table
 from stripe_cases import FILTERED, MASS, METHODS
 
-from twin.options import use_variant
+from twin.rendering_options import use_variant
 from uwlts.runtime.console import progress_bar
 from uwlts.stripe import StripeOptions, extract_stripe
 

@@ -2,7 +2,7 @@
 
 from stripe_cases import Case
 
-from twin.options import ALL, NONE, Effects
+from twin.rendering_options import ALL, NONE, Effects
 from uwlts.model.library import load_sensor
 
 PLACES = {

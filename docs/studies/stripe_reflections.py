@@ -20,7 +20,7 @@ from cyclopts import App
 from result_tables import publish, table
 from scipy.spatial import cKDTree
 
-from twin.options import ALL, Options, use_variant
+from twin.rendering_options import ALL, Options, use_variant
 from twin.scene.description import Scene, load_scene
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor

@@ -12,10 +12,10 @@ from cyclopts import App
 from result_tables import publish, table
 
 from twin.design.designs import EvaluatedDesign, HighlightedDesign
-from twin.design.parameters import adjust_to_standoff, extract_parameters
+from twin.design.sensor_arrays import adjust_to_standoff, extract_parameters
 from twin.design.study import Study
 from twin.design.verification import verify_candidate
-from twin.options import CPU
+from twin.rendering_options import CPU
 from uwlts.model.library import load_sensor, merge_tables, validate_description
 from uwlts.model.sensor import Sensor
 

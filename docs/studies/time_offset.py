@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.uwlts.mount_views import MOUNT, RADIUS_MM, SPHERE_MM, profile_of
-from uwlts.calibration.mount.calibrate import calibrate_mount
+from uwlts.calibration.mount.calibrate_mount import calibrate_mount
 
 SPEED_MM_S = 100.0
 SWEEPS = 16

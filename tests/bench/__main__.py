@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.bench.rows import Floor, Row, at_least, at_most, median_seconds
-from twin.options import use_variant
+from twin.rendering_options import use_variant
 
 RESULT = Path("runs/bench.json")
 CORES = 2
@@ -40,7 +40,7 @@ def rendering() -> list[Row]:
     """Time of sharp full-size laser frames of the thesis's sensor."""
     from tests.bench.floors import stock_frame_seconds
     from twin.light.renderer import Renderer
-    from twin.options import NONE
+    from twin.rendering_options import NONE
     from twin.scene.description import load_scene
     from uwlts.model.library import load_sensor
 
@@ -136,8 +136,8 @@ def campaign() -> list[Row]:
 def pipeline() -> list[Row]:
     """Time of stripe extraction and reconstruction on one core: the default method, and the fastest one."""
     from tests.bench.floors import connected_parts_seconds, line_maxima_seconds, plain_centroid_seconds
-    from twin.options import Options
     from twin.recording.sensor_simulator import SensorSimulator
+    from twin.rendering_options import Options
     from twin.scene.description import load_scene
     from uwlts.model.library import load_sensor
     from uwlts.optics.nominal import nominal_calibration

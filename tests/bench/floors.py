@@ -18,7 +18,7 @@ from numba import njit
 from tests.bench.rows import median_seconds
 from tests.stock_mitsuba import fog, stock_scene
 from tests.virtual_sensors import altered
-from twin.options import Options
+from twin.rendering_options import Options
 from twin.scene.description import load_scene
 from uwlts.model.library import load_sensor
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from cyclopts import App
 
-from twin.options import GPU, use_variant
+from twin.rendering_options import GPU, use_variant
 from uwlts.errors import SetupError
 
 FRAMES = 40
@@ -36,7 +36,7 @@ def frame_seconds(water: str, samples_at_once: int) -> float:
     use_variant(GPU)
     from tests.bench.light import in_named_water
     from twin.light import renderer as module
-    from twin.options import Options
+    from twin.rendering_options import Options
     from twin.scene.description import load_scene
 
     module.SAMPLES_AT_ONCE = samples_at_once
@@ -64,7 +64,7 @@ def light_span(water: str) -> tuple[float, float]:
     use_variant(GPU)
     from tests.bench.light import in_named_water
     from twin.light.renderer import Renderer
-    from twin.options import Options
+    from twin.rendering_options import Options
     from twin.scene.description import load_scene
 
     sensor = in_named_water(water)

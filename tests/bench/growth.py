@@ -16,7 +16,7 @@ from cyclopts import App
 import uwlts
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
-from twin.options import Options, use_variant
+from twin.rendering_options import Options, use_variant
 from twin.scene.description import load_scene
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions

@@ -14,8 +14,8 @@ import numpy as np
 from tests.stock_mitsuba import fog, stock_scene
 from tests.virtual_sensors import altered
 from twin.light.renderer import Renderer
-from twin.options import NONE, Options
 from twin.recording.record_scene import record_scene
+from twin.rendering_options import NONE, Options
 from twin.scene.description import load_scene
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium, Sensor

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
-from uwlts.desk.board import Board
 from uwlts.desk.recording_view import LOOK_S, RecordingView, follow_frames
+from uwlts.desk.shown_state import Board
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.replay import ReplayCamera

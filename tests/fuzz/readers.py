@@ -26,8 +26,6 @@ from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
 from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, BLOCK, COLUMNS, INFO, POINTS, PROGRAMS, pcd
 from tests.uwlts.stripe.test_learned import centroid_model
 from twin.datasets.data_set import load_description as load_data_set
-from twin.datasets.loading import load_dataset
-from twin.datasets.shards import Sample, ShardReader, open_shard
 from twin.design.screening import encode_part, read_parts
 from twin.design.study import load_study
 from twin.scene.campaign import load_campaign
@@ -36,13 +34,13 @@ from twin.scene.finish import read_grey
 from twin.scene.objects import _surface_from_file
 from uwlts.acceptance.accept import read_acceptance
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.mount.calibrate import calibrate_mount
+from uwlts.calibration.mount.calibrate_mount import calibrate_mount
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.comparison.change_reference import read_datums, read_reference
 from uwlts.comparison.ideal_shapes import read_shape
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.evaluation.gauge import gauge_study
-from uwlts.hardware.guided.plan import load_guided_plan
+from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
 from uwlts.model.artefacts import read_artefact
 from uwlts.model.library import library_folder, load_sensor, read_table, validate_description
@@ -54,6 +52,8 @@ from uwlts.report.inventory import describe
 from uwlts.storage.calibration_file import load_calibration, read_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
+from uwlts.storage.data_set import load_dataset
+from uwlts.storage.data_set_shards import Sample, ShardReader, open_shard
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.centre_lines import read_profiles as read_centre_lines

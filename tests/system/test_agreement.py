@@ -8,7 +8,7 @@ import pytest
 from tests.virtual_sensors import altered
 from twin.design.designs import Design, EvaluatedDesign, HighlightedDesign, build_sensor
 from twin.design.figures_of_merit import predict_scatter
-from twin.design.parameters import extract_parameters
+from twin.design.sensor_arrays import extract_parameters
 from twin.design.study import Study
 from twin.design.verification import (
     Agreement,
@@ -17,7 +17,7 @@ from twin.design.verification import (
     verify_candidate,
     verify_candidates,
 )
-from twin.options import CPU
+from twin.rendering_options import CPU
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.workers import open_workers
 

@@ -21,7 +21,7 @@ from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import load_scene
 from uwlts.calibration.sequential.sequential_calibration import calibrate_sequentially
 from uwlts.errors import DescriptionError
-from uwlts.hardware.guided.plan import load_guided_plan
+from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.model.library import load_sensor
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import uwlts
-from twin.options import Flaws, Options
 from twin.recording.record_scene import record_scene
+from twin.rendering_options import Flaws, Options
 from twin.scene.description import load_scene, replace_values
 from uwlts.model.library import load_sensor
 from uwlts.storage.capture import Capture

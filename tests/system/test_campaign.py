@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.options import ALL, NONE, Options
 from twin.recording.record_scene import record_scene
+from twin.rendering_options import ALL, NONE, Options
 from twin.scene.description import load_scene
 from uwlts.calibration.sequential.sequential_calibration import (
     CalibrationOptions,

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 import twin
 import uwlts
 from tests.virtual_sensors import altered, cropped, plate, scene_of
-from twin.options import Flaws, Options
 from twin.recording.sensor_simulator import SensorSimulator
+from twin.rendering_options import Flaws, Options
 from twin.scene.motion import Shot
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor

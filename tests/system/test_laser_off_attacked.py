@@ -37,7 +37,7 @@ USUAL_FILES = 1024
 
 PROGRAM = f"""
 import resource, sys
-from uwlts.desk.board import Board
+from uwlts.desk.shown_state import Board
 from uwlts.desk.guided import BoardScreen
 from uwlts.desk.server import DeskServer
 from uwlts.hardware.grbl import GrblStage

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.desk.board import Board
 from uwlts.desk.recording_view import RecordingView, follow_frames
+from uwlts.desk.shown_state import Board
 from uwlts.errors import CaptureError
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor

@@ -25,10 +25,10 @@ from websockets.sync.client import ClientConnection, connect
 
 from tests.waiting import within
 from uwlts.desk.access import PageAccess
-from uwlts.desk.board import Board, Picture
 from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.guided import BoardScreen, answer_buttons
 from uwlts.desk.server import DeskServer
+from uwlts.desk.shown_state import Board, Picture
 from uwlts.errors import SetupError
 
 SOCKET = "/_nicegui_ws/socket.io/"
@@ -391,7 +391,7 @@ def test_a_server_that_cannot_start_says_why():
     """Here semaphores are forbidden, as in a container whose /dev/shm belongs to somebody else."""
     code = """
 import multiprocessing.synchronize as m
-from uwlts.desk.board import Board
+from uwlts.desk.shown_state import Board
 from uwlts.desk.server import DeskServer
 
 def refuse(*_, **__):

@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from twin import cli
-from twin.options import Options
 from twin.recording.campaigns import record as record_one, record_campaigns
 from twin.recording.record_scene import record_scene
+from twin.rendering_options import Options
 from twin.scene.campaign import list_takes, load_campaign
 from uwlts.errors import DescriptionError
 from uwlts.storage.capture import Capture, part_path

@@ -11,8 +11,8 @@ import uwlts
 from tests.system.small_board import small_sensor, turned_board
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.serve import ServedTwin, serve
-from twin.options import Flaws, Options
 from twin.recording.record_scene import record_scene
+from twin.rendering_options import Flaws, Options
 from twin.scene.description import Scene
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from uwlts.errors import DescriptionError, HardwareError

@@ -15,8 +15,8 @@ import uwlts
 from tests.system.small_board import small_sensor, turned_board
 from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
-from twin.options import Options
 from twin.recording.record_scene import record_scene
+from twin.rendering_options import Options
 from twin.scene.description import Scene
 from uwlts.errors import CaptureError
 from uwlts.model.sensor import Sensor

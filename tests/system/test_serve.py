@@ -14,8 +14,8 @@ import pytest
 
 from tests.system.small_board import small_sensor, turned_board
 from twin.devices.serve import NAMES, Fault, ServedTwin, Track, parse_fault, serve
-from twin.options import Options
 from twin.recording.record_scene import record_scene
+from twin.rendering_options import Options
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError, DesignError, HardwareError, ImageError
 from uwlts.hardware.camera_addresses import open_camera

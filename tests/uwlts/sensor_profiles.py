@@ -12,7 +12,7 @@ from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
 from tests.uwlts.mount_views import MOUNT, SPHERE_MM
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, read_stored_estimate
-from uwlts.calibration.mount.sensor import CapturedProfiles
+from uwlts.calibration.mount.captured_profiles import CapturedProfiles
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.model.sensor import Sensor

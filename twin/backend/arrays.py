@@ -26,7 +26,7 @@ SurfaceInteraction3f: TypeAlias = Any
 PCG32: TypeAlias = Any
 BSDFPtr: TypeAlias = Any
 
-_ALIGNMENT_BYTES = 64
+_ALIGNMENT_BYTES = 64  # a cache line, and the widest vector register
 
 
 def to_jit(kind: type, values: np.ndarray) -> Float:

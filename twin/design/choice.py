@@ -32,7 +32,7 @@ from twin.design.figures_of_merit import (
     find_depths_in_view,
 )
 from twin.design.geometry import Array, standoff_mm
-from twin.design.parameters import (
+from twin.design.sensor_arrays import (
     PARAMETER_OF,
     SensorArrays,
     adjust_to_standoff,
@@ -40,7 +40,7 @@ from twin.design.parameters import (
     list_independent_paths,
 )
 from twin.design.study import Study
-from twin.options import use_variant
+from twin.rendering_options import use_variant
 from uwlts.errors import DesignError, Error, EvaluationError, RangeError
 
 
@@ -262,7 +262,7 @@ def _coverage(xp: ModuleType, p: SensorArrays, f: Field, mean: Mean) -> Array:
     return (far - near) / (p.far_mm - p.near_mm)
 
 
-MIDDLE = DEPTHS // 2
+MIDDLE = DEPTHS // 2  # index of the middle depth
 SMOOTH: dict[str, Smooth] = {
     "sigma_z_rms_mm": _rms("sigma_z_mm"),
     "sigma_z_mm": lambda xp, p, f, mean: _largest(xp, f.sigma_z_mm),

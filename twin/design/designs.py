@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from twin.design.figures_of_merit import FIGURES, Figures, compute_figures
-from twin.design.parameters import (
+from twin.design.sensor_arrays import (
     PARAMETER_OF,
     SensorArrays,
     adjust_to_standoff,

@@ -32,7 +32,7 @@ from twin.design.geometry import (
     standoff_mm,
     trace_to_points,
 )
-from twin.design.parameters import Follow, SensorArrays, compute_adjustments
+from twin.design.sensor_arrays import Follow, SensorArrays, compute_adjustments
 from twin.sensor.detector import PLANCK_TIMES_LIGHT
 from uwlts.errors import RangeError
 
@@ -40,7 +40,7 @@ DEPTHS = 5
 """Number of evaluated depths, evenly spaced over the part of the measuring volume in the camera's view."""
 PLACES = 7
 """Number of evaluated points along the stripe at each depth."""
-_EDGE_STEPS = 5
+_EDGE_STEPS = 5  # Newton steps to an edge of the image; converges quadratically from a close start
 _MANY = 200
 """Least number of designs that is worth the time to compile the formulas."""
 _BLOCK = 1000
@@ -443,6 +443,7 @@ def compute_figures(
 
 
 _SHARES = np.linspace(0, 1, DEPTHS).reshape(1, -1, 1)
+# Along the stripe, relative to its half length, just within its ends.
 _PLACES = np.linspace(-1, 1, PLACES).reshape(1, 1, -1) * (1 - 1e-9)
 
 
@@ -610,7 +611,7 @@ _CLASS_2_W = 1e-3
 _CLASS_3R_W = 5e-3
 _CLASS_3B_W = 0.5
 
-_GRAVITY = 9.81
+_GRAVITY = 9.81  # m/s2
 _WATER_KG_PER_M3 = 1030.0
 """Density of sea water."""
 # As in thesis Eq. 3.2.

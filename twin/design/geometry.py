@@ -19,7 +19,7 @@ Array = Any
 """NumPy array, Dr.Jit array, or number."""
 Vector = tuple[Array, Array, Array]
 
-_NEWTON_STEPS = 4
+_NEWTON_STEPS = 4  # of the ray through the window; converges quadratically
 _UNDISTORTING_STEPS = 100
 """Largest number of iterations; strong distortion converges slowly."""
 _UNDISTORTED_PX = 1e-3

@@ -33,7 +33,7 @@ from uwlts.files.writing import write_atomically
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import Lost, Workers
 
-_MOST_PART_BYTES = 2**28
+_MOST_PART_BYTES = 2**28  # thousands of times a usual part, far below the memory
 
 
 def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
@@ -112,7 +112,7 @@ def write_csv(path: Path, columns: Columns) -> None:
 
 JOURNAL = "optimiser.log"
 _NAME = "sweep"
-_POPULATION = 64
+_POPULATION = 64  # designs of a generation of NSGA-II
 
 
 def _open_search(study: Study, folder: Path) -> optuna.Study:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from twin.design.figures_of_merit import FIGURES
-from twin.design.parameters import Follow
+from twin.design.sensor_arrays import Follow
 from twin.scene.paths import Value, value_at
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import is_regular_file
@@ -22,7 +22,7 @@ OTHER_COLUMNS = ("design", "violation", "failure")
 """Columns of results in addition to values and figures."""
 FOLLOWING: dict[Follow, str] = {"focus": "camera.focus_distance_mm", "waist": "laser.waist_distance_mm"}
 """Paths that `Study.follow` sets; they must not be free at the same time."""
-MOST_DESIGNS = 10**8
+MOST_DESIGNS = 10**8  # hours of screening
 
 
 class Variable(Description):
@@ -131,7 +131,7 @@ class Study(Description):
     ``sensor`` is the base sensor, given by name, path or table. It is stored completely, because remote workers may not
     have its file. ``variables`` are free values of the sensor's description by path (``camera.focal_length_mm``).
     ``choices`` are named alternatives that set several paths at once, such as commercial cameras. ``follow`` lists the
-    adjustments to each design's stand-off, see `twin.design.parameters.compute_adjustments`. ``refine`` enables the
+    adjustments to each design's stand-off, see `twin.design.sensor_arrays.compute_adjustments`. ``refine`` enables the
     refinement of the best design along the gradient. ``verify`` is the number of designs to render, in addition to the
     base sensor.
     """

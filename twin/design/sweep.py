@@ -22,8 +22,8 @@ from twin.design.report.study_tables import failure_counts
 from twin.design.screening import JOURNAL, PARTS, evaluate_study, read_parts, write_csv
 from twin.design.study import Study, load_study
 from twin.design.verification import Agreement, verify_candidates
-from twin.options import CPU, Variant
 from twin.recording.campaigns import PLAN, require_at_least
+from twin.rendering_options import CPU, Variant
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief

@@ -25,11 +25,11 @@ import pyarrow.parquet as pq
 from twin.backend.llvm import preserve_threads
 from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import compute_figures, predict_scatter
-from twin.design.parameters import extract_parameters
+from twin.design.sensor_arrays import extract_parameters
 from twin.design.study import Study
 from twin.design.verification_scenes import PlannedRecording, plan_recordings
-from twin.options import CPU, Options, use_variant
 from twin.recording.campaigns import make_folder, require_at_least
+from twin.rendering_options import CPU, Options, use_variant
 from uwlts import errors
 from uwlts.errors import Error
 from uwlts.files.writing import write_atomically
@@ -40,11 +40,11 @@ from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.truth import truth_path
 
-_USER_ERROR = 2
-_FEWEST_POINTS = 20
+_USER_ERROR = 2  # exit code of the commands for a mistake of the user
+_FEWEST_POINTS = 20  # of a profile, for its scatter to be known within a sixth
 _LARGEST_RESIDUAL = 5.0
 """Limit of residuals from the profile's trend in robust standard deviations; larger ones are outliers."""
-_MAD_TO_STD = 1.4826
+_MAD_TO_STD = 1.4826  # of normally distributed values
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,14 +107,14 @@ def find_longest_run(flags: np.ndarray | list[bool]) -> slice:
     return slice(start, end)
 
 
-STANDARD_DEPTHS = 9
-STEP_DEPTHS = 7
-TARGET_POSES = 9
+STANDARD_DEPTHS = 9  # positions of the plane standard in the volume
+STEP_DEPTHS = 7  # positions of the step in the volume
+TARGET_POSES = 9  # positions of the target in the volume
 
-_DEPTHS_TRIED = 250
+_DEPTHS_TRIED = 250  # finer than any limit of the volume needs to be known
 _MARGIN = 0.03
 """Margin at either end of the depth range, relative to the range: there the stripe reaches the image's edge."""
-_OVERSIZE = 1.2
+_OVERSIZE = 1.2  # of a plane relative to the stripe, which must not end on it
 _STEP_HEIGHT = 0.2
 """Height of the step relative to the depth range. A high step determines the window's distance more accurately."""
 _EDGE = 0.02
@@ -133,7 +133,7 @@ _DOT = 0.4
 """Diameter of a marking dot relative to its circle."""
 _LARGEST_BLUR_PX = 12.0
 """Largest diameter of the blur for circle detection, which searches edges within about 6 px on either side."""
-_BORDER_PX = 4.0
+_BORDER_PX = 4.0  # least distance of the target from the image's border
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from twin.light.illumination import Light, Passage, SheetLobe
 from twin.light.pose import CLEAR_MM, Rays, SensorPose
 from twin.light.sheet import SheetLight
 from twin.light.water import Scattering, one_minus_cosine, rotate_about
-from twin.options import Effects
+from twin.rendering_options import Effects
 from twin.scene.objects import Objects
 
 _STEPS = 64

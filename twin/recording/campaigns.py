@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from twin.options import CPU, Flaws, Options, Variant, use_variant
+from twin.rendering_options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign
 from uwlts.errors import CaptureError, DescriptionError, Error, OutputError
 from uwlts.files.inputs import record_made, refuse_input

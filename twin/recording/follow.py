@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from twin.options import CPU, Variant
 from twin.recording.render import simulate
+from twin.rendering_options import CPU, Variant
 from twin.scene.description import load_scene
 from uwlts.errors import CaptureError, CommandFailed, OutputError
 from uwlts.files.writing import write_atomically

@@ -4,8 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from twin.options import CPU, Variant
 from twin.recording.campaigns import record_campaigns, require_at_least
+from twin.rendering_options import CPU, Variant
 from twin.scene.campaign import load_campaign
 from uwlts.errors import CommandFailed, DescriptionError
 from uwlts.runtime.progress import ProgressListener, ignore_progress

@@ -14,8 +14,8 @@ from pydantic import model_validator
 from twin.scene.platforms import LEAD_S, PlatformMotion, Route, displace_poses, interpolate_values
 from uwlts.model.sensor import Description, NotNegative, Positive
 
-_GRAVITY = 9.81
-_COMPONENTS = 24
+_GRAVITY = 9.81  # m/s2
+_COMPONENTS = 24  # sines of a sea state; it does not repeat during a scan
 _STEP_S = 0.05
 """Time step of the navigation errors, far below all their time constants."""
 

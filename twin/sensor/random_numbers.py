@@ -25,7 +25,7 @@ _COUNTS = 120
 _SEVERAL = 255
 """Marks a cell that belongs to several counts."""
 
-_LAYERS = 256
+_LAYERS = 256  # of the ziggurat, with the edge and area below (Marsaglia and Tsang 2000)
 _LAST_EDGE = 3.6541528853610088
 """Start of the tail, the outer edge of the last layer under exp(-x^2 / 2) (Marsaglia and Tsang 2000)."""
 _LAYER_AREA = 4.92867323399e-3

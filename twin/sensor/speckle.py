@@ -50,7 +50,7 @@ _BORDER_PX = 0.3
 _RENEWAL_CELLS = 0.9
 _RENEWAL_GROUPS = 8
 
-_LEAST_CONTRAST = 1e-4
+_LEAST_CONTRAST = 1e-4  # less is invisible, and would divide by zero
 
 # Nodes of the table of distributions, along half the skewness and along the cube root of an exponential variable.
 _SKEWS = 65

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from uwlts._version import __version__
+from uwlts.acceptance.acceptance_plan import SYMBOLS, AcceptancePlan, PlannedPosition, Symbol, load_plan
 from uwlts.acceptance.characteristics import (
     NAMES,
     Characteristic,
@@ -20,7 +21,6 @@ from uwlts.acceptance.characteristics import (
     measure_position,
 )
 from uwlts.acceptance.directional_scale import DirectionalScale, ScaleComponent, fit_directional_scale
-from uwlts.acceptance.plan import SYMBOLS, AcceptancePlan, PlannedPosition, Symbol, load_plan
 from uwlts.argument_types import check_arguments
 from uwlts.errors import DescriptionError, Error
 from uwlts.files.json_files import EDITED, read_model, to_canonical_json, trusting, write_model

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from uwlts.acceptance.plan import REFERENCE_C, CertifiedArtefact, Length, Size, Spread, Symbol, Temperature
+from uwlts.acceptance.acceptance_plan import REFERENCE_C, CertifiedArtefact, Length, Size, Spread, Symbol, Temperature
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import PlaneEvaluation, StepEvaluation, evaluate_cloud
 from uwlts.evaluation.decision import Verdict, judge_interval
@@ -38,7 +38,7 @@ NAMES: dict[Symbol, tuple[str, str]] = {
 WANTED: dict[Symbol, int] = {"PF": 10, "PF95": 10, "PS": 10, "SD": 7, "F": 6, "F95": 6, "E": 1}
 """Least number of measured spheres, spacings and planes (VDI/VDE 2634 part 2); a step has no guideline."""
 
-COVERAGE_FACTOR = 2.0
+COVERAGE_FACTOR = 2.0  # k = 2, about 95 % (ISO 14253-1)
 
 _DECISIONS: dict[Verdict, Decision] = {
     "within the limit": "conformity proven",

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
+from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.crossing_search import Search, accept_crossings
 from uwlts.alignment.drift_model import choose_drift_model
-from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.path_solution import initial_estimate, settle

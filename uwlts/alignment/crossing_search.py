@@ -17,7 +17,7 @@ from scipy.fft import next_fast_len
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.spatial.transform import Rotation
 
-from uwlts.alignment.options import AlignmentOptions
+from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nodes, refit, solve
 from uwlts.fitting.least_squares import rms_distance

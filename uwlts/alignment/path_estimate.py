@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from uwlts.alignment.options import AlignmentOptions
+from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.pieces import Piece, Survey
 from uwlts.fitting.patches import PatchDistances, Patches, distances_between, rigid_derivatives

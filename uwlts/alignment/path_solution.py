@@ -9,10 +9,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import cho_solve, eigh, solve_triangular
 from scipy.sparse import csr_array
 
-from uwlts.alignment.options import AlignmentOptions
+from uwlts.alignment.alignment_options import AlignmentOptions
+from uwlts.alignment.drift_model import CORRELATION_TIMES, DriftModel
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.pieces import Survey, fit_piece
@@ -24,6 +25,9 @@ from uwlts.fitting.patches import (
     rigid_derivatives,
     slope_information,
 )
+
+_NEGLIGIBLE = 1e-3
+"""Information of all nodes together in units of the drift's variance, below which an observation shows nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,35 +104,55 @@ def refit(estimate: PathEstimate, numbers: Iterable[int]) -> PathEstimate:
 def settle(estimate: PathEstimate) -> PathEstimate:
     """Estimate path and patches alternately; drop pairs that then disagree.
 
-    If no random walk is stated, the most likely one is used.
+    If no drift model is stated, the most likely random walk and correlation time of the rates are used.
     """
     estimate = solve(refine_nodes(estimate))
     crossing = {number for pair in estimate.pairs for number in pair}
     for _ in range(estimate.options.refits):
-        before, estimate = estimate.numbers, solve(refit(_select_walk(estimate), crossing))
+        before, estimate = estimate.numbers, solve(refit(_select_drift(estimate), crossing))
         if _step_size(estimate, before) < estimate.options.settled:
             break
     agreeing = tuple(pair for pair in estimate.pairs if estimate.agrees(pair))
     return estimate if len(agreeing) == len(estimate.pairs) else settle(replace(estimate, pairs=agreeing))
 
 
-def _select_walk(estimate: PathEstimate) -> PathEstimate:
-    """Select the random walk of maximum marginal likelihood, unless one is stated.
+def _select_drift(estimate: PathEstimate) -> PathEstimate:
+    """Select the random walk and the correlation time of maximum marginal likelihood, unless they are stated.
 
-    The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992).
+    The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992). A normal matrix V L V^T corresponds
+    to observations L^(1/2) V^T x of the path x with unit noise. Their covariance is I + L^(1/2) V^T P V L^(1/2) for a
+    prior covariance P.
     """
-    if estimate.prior.drift.stated:
+    prior, drift = estimate.prior, estimate.prior.drift
+    if drift.stated:
         return estimate
     normal, right = _normal_equations(estimate)
+    size = np.repeat(drift.std, prior.count)
+    near = np.flatnonzero(normal.any(axis=0))
+    values, vectors = eigh(size[near, None] * normal[np.ix_(near, near)] * size[near])
+    used = values > _NEGLIGIBLE / len(near)
+    root = np.sqrt(values[used])
+    by = np.zeros((len(size), len(root)))
+    by[near] = vectors[:, used] * root / size[near, None]
+    seen = (vectors[:, used].T @ (size[near] * right[near, 0])) / root
+    parts, at = by.reshape(6, prior.count, -1), prior.nodes_s - prior.nodes_s[0]
 
-    def twice_log_likelihood(prior: PathPrior) -> float:
-        factor = np.linalg.cholesky(prior.with_evidence(normal))
-        off = solve_triangular(factor, prior.times_transposed_root(right), lower=True)
-        return float(np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor))))
+    def observed(model: DriftModel) -> np.ndarray:
+        return np.einsum("ckr,cks->rs", parts, model.covariance(at[:, None], at, at[-1]) @ parts, optimize=True)
 
-    priors = [replace(estimate.prior, drift=drift) for drift in estimate.prior.drift.with_walks()]
-    best = max(priors, key=twice_log_likelihood)
-    return estimate if (best.drift.walk == estimate.prior.drift.walk).all() else _change_prior(estimate, best)
+    walk = observed(replace(drift, walk=np.ones(6)))
+    rates = {each: observed(replace(drift, walk=np.zeros(6), correlation=each)) for each in CORRELATION_TIMES}
+
+    def twice_log_likelihood(model: DriftModel) -> float:
+        share = model.walk[0]
+        covariance = (1 - share) * rates[model.correlation] + share * walk
+        factor = np.linalg.cholesky(np.eye(len(root)) + covariance)
+        off = solve_triangular(factor, seen, lower=True)
+        return float(-np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor))))
+
+    best = max(drift.candidates(), key=twice_log_likelihood)
+    same = best.correlation == drift.correlation and (best.walk == drift.walk).all()
+    return estimate if same else _change_prior(estimate, replace(prior, drift=best))
 
 
 def _change_prior(estimate: PathEstimate, prior: PathPrior) -> PathEstimate:

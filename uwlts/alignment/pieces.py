@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from uwlts.alignment.options import AlignmentOptions
+from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import Patches, find_disc_radius, surface_patches
 from uwlts.model.trajectory import Trajectory

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import uwlts
-from uwlts.cli.options import CalibrationOut, Overwrite, app, cloud_written, wrote_files
+from uwlts.cli.command_options import CalibrationOut, Overwrite, app, cloud_written, wrote_files
 from uwlts.runtime.command_line import Call, command_from, say, show, warn
 
 

@@ -3,7 +3,7 @@
 import sys
 
 import uwlts
-from uwlts.cli.options import app
+from uwlts.cli.command_options import app
 from uwlts.runtime.command_line import Call, command_from, say, warn
 
 

@@ -20,9 +20,9 @@ from uwlts.comparison.change_reference import (
     require_enough,
     require_same_unit,
 )
+from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.comparison.ideal_shapes import IdealShape, place_shape
 from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, average_locally
-from uwlts.comparison.options import OPTIONS
 from uwlts.errors import EvaluationError
 from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.model.brief import Brief

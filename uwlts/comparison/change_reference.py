@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial import KDTree
 
+from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.comparison.ideal_shapes import KINDS, IdealShape, read_shape
-from uwlts.comparison.options import OPTIONS
 from uwlts.errors import DescriptionError, EvaluationError, describe_problems
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
@@ -26,7 +26,7 @@ _SAMPLES_PER_DISC = 60
 """Samples of a mesh in a disc: twice the points of a cloud, so that the cloud's noise dominates."""
 _MOST_SAMPLES = 3_000_000
 """Limit of memory for samples of a mesh."""
-_AT_A_TIME = 20_000
+_AT_A_TIME = 20_000  # places, to limit memory
 _IN_METRES = (".glb", ".gltf")
 
 Reference = PointCloud | IdealShape | str | os.PathLike[str]

@@ -10,14 +10,14 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import t as t_distribution
 
-from uwlts.comparison.options import OPTIONS
+from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.storage.cloud import PointUncertainty, project_variance
 
 TWO_SIDED = 1.96
 """Standard normal quantile of 97.5 %."""
 _NEARLY_NORMAL = 200
 """Least number of points with Student's quantile within 1 % of the normal one."""
-_PAIRS_AT_A_TIME = 2_000_000
+_PAIRS_AT_A_TIME = 2_000_000  # to limit memory
 
 
 class LocalMeans(NamedTuple):

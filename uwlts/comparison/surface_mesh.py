@@ -28,7 +28,7 @@ from uwlts.storage.number_tables import Unit
 
 _BLOCK = 48
 """Cubes along the edge of a block that marching cubes processes at once."""
-_PLACES_AT_A_TIME = 500_000
+_PLACES_AT_A_TIME = 500_000  # to limit memory
 _FEWEST = 50
 """Least number of points of a scan."""
 _CUBES_OF_RADIUS = 3.0

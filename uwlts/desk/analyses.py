@@ -17,8 +17,8 @@ from types import MappingProxyType, ModuleType
 from typing import Any, get_type_hints
 
 import uwlts
-from uwlts.desk.board import Board
 from uwlts.desk.desk_files import find_file, new_path
+from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error, OutputError
 from uwlts.files.inputs import protect_inputs, record_input, record_made
 from uwlts.files.writing import refuse_unsuitable

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from nicegui import ui
 
-from uwlts.desk.board import KEPT_LINES, Board, LaserState, Line, Picture
 from uwlts.desk.cloud_view import CloudView
+from uwlts.desk.shown_state import KEPT_LINES, Board, LaserState, Line, Picture
 from uwlts.desk.thinned_cloud import FIELDS
 
-_REFRESH_S = 0.2
+_REFRESH_S = 0.2  # five times a second looks immediate
 _LASER: dict[LaserState, tuple[str, str]] = {
     "none": ("no laser", "bg-slate-600"),
     "off": ("laser off", "bg-green-700"),

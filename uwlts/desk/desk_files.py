@@ -17,8 +17,8 @@ from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT, POLYNOM
 from uwlts.storage.capture import part_path
 from uwlts.storage.cloud_files import is_cloud
 
-_SHOWN = 500
-_REMEMBERED = 4 * _SHOWN
+_SHOWN = 500  # the latest files; a longer list is not read
+_REMEMBERED = 4 * _SHOWN  # files whose description is kept
 _FORMATS = {CALIBRATION_FORMAT: "calibration", POLYNOMIAL_FORMAT: "calibration", EVALUATION_FORMAT: "evaluation"}
 _LONGEST_NAME = 200
 """Longest name of a new file in bytes: file systems allow 255, including appended endings."""

@@ -10,19 +10,19 @@ import numpy as np
 from nicegui import ui
 
 from uwlts.calibration.guidance.pose_advice import Coverage
-from uwlts.desk.board import Board, Picture, encode_png
 from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.server import DeskServer
+from uwlts.desk.shown_state import Board, Picture, encode_png
 from uwlts.errors import HardwareError
 from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.guided.guided_plan import GuidedPlan, load_guided_plan
 from uwlts.hardware.guided.operator import ANSWERS
-from uwlts.hardware.guided.plan import GuidedPlan, load_guided_plan
 from uwlts.hardware.guided.record import GuidedRecording, guide
 from uwlts.hardware.rig import LaserStage
 
 _COVERED, _EMPTY, _DOT = (70, 140, 70), (120, 60, 60), (230, 230, 230)
-_MAP_CELL_PX = 48
+_MAP_CELL_PX = 48  # size of a cell of the map on the screen
 
 
 class Ended(Exception):

@@ -19,18 +19,18 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.calibration.calibrate import calibrate
-from uwlts.desk.board import Board, Picture
 from uwlts.desk.frame_profile import FrameProfile
 from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import BackgroundView, RecordingView
+from uwlts.desk.shown_state import Board, Picture
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.guided.plan import GuidedPlan
+from uwlts.hardware.guided.guided_plan import GuidedPlan
 from uwlts.hardware.guided.record import guide
 from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan

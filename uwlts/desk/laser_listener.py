@@ -31,7 +31,7 @@ _AGAIN_S = 0.2
 """Interval between repetitions of Ctrl-X: a command in progress may have switched the laser on again."""
 _GIVE_UP_S = 2.0
 """A press has failed if no port is lent and the program does not answer in this time."""
-_WATCH_S = 0.2
+_WATCH_S = 0.2  # period in which its state is looked at
 
 
 class LaserListener:

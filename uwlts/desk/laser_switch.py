@@ -18,8 +18,8 @@ from pathlib import Path
 from nicegui import ui
 
 from uwlts.desk.access import PageAccess
-from uwlts.desk.board import Board
 from uwlts.desk.laser_listener import MESSAGE_BYTES, PRESS
+from uwlts.desk.shown_state import Board
 from uwlts.errors import HardwareError, SetupError
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.rig import LaserStage

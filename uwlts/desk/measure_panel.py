@@ -10,10 +10,10 @@ from typing import Literal, get_args
 import numpy as np
 from nicegui import ui
 
-from uwlts.desk.board import Board
 from uwlts.desk.desk_files import find_file, new_path
 from uwlts.desk.number_field import NumberField
 from uwlts.desk.plot_view import Plot, PlotView
+from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error
 from uwlts.files.inputs import protect_inputs
 from uwlts.inspection.picking import PickedMeasurement, Shape, find_nearest_point, fit_shape_near, measure_length
@@ -22,7 +22,7 @@ from uwlts.report.measured_values import MEASURED_ENDINGS, MeasuredValue, Measur
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import name_cloud
 
-_BINS = 60
+_BINS = 60  # of the displayed histogram
 _DEFAULT_RADIUS_MM, _DEFAULT_WIDTH_MM = 15.0, 2.0
 _GROWING = "points of a running scan have no uncertainty: reconstruct it"
 _WITHOUT = "the cloud has no uncertainty"

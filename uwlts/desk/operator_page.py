@@ -16,7 +16,6 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from uwlts.desk.analyses import Analyses
 from uwlts.desk.analysis_panel import AnalysisPanel
-from uwlts.desk.board import Board
 from uwlts.desk.board_page import BoardView, build_board, update_regularly
 from uwlts.desk.desk_files import find_file, guess_kind, is_interrupted, list_files, new_path
 from uwlts.desk.guided import answer_buttons
@@ -24,9 +23,10 @@ from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.measure_panel import MeasurePanel, Measuring
 from uwlts.desk.number_field import NumberField
 from uwlts.desk.server import DeskServer
+from uwlts.desk.shown_state import Board
 from uwlts.desk.thinned_cloud import FIELDS, point_table
 from uwlts.errors import DescriptionError, Error
-from uwlts.hardware.guided.plan import load_guided_plan
+from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
 from uwlts.model.library import validate_description
 from uwlts.report.inventory import describe
@@ -35,11 +35,11 @@ from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_region, read_thinned_cloud
 from uwlts.storage.copc_file import is_copc
 
-_LIST_S = 2.0
-_MOST_SHOWN = 300_000
+_LIST_S = 2.0  # period in which the list of files is read again
+_MOST_SHOWN = 300_000  # points, fluent on a tablet
 _MOST_OPENED = 5_000_000
 """Points of a file that are kept in memory for measurements."""
-_JOGS_MM = (-10.0, -1.0, -0.1, 0.1, 1.0, 10.0)
+_JOGS_MM = (-10.0, -1.0, -0.1, 0.1, 1.0, 10.0)  # steps of the buttons that move the stage
 _FREE = (InstrumentState.READY, InstrumentState.LOCKED)
 _RUNNING = (InstrumentState.SCANNING, InstrumentState.PAUSED)
 

@@ -24,7 +24,7 @@ from uwlts.storage.capture import CAPTURES
 
 _POLITE = 10
 """Reduction of the page's priority in favour of the recording, as by ``nice``."""
-_PATIENCE_S = 5.0
+_PATIENCE_S = 5.0  # for a process to end
 _SIGNAL_WHEN_PARENT_ENDS = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""
 

@@ -19,10 +19,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from uwlts.desk.access import GuardedApp, PageAccess, is_local
-from uwlts.desk.board import Board
 from uwlts.desk.board_page import build_board
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.request_limits import BACKLOG, HEAD_BYTES, LimitedHttp, PendingHeads
+from uwlts.desk.shown_state import Board
 from uwlts.desk.thinned_cloud import pack
 from uwlts.errors import Error, SetupError
 

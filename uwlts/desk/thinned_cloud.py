@@ -8,7 +8,7 @@ from uwlts.pages.cloud_figure import CloudField
 
 FIELDS: tuple[CloudField, ...] = ("intensity", "deviation", "uncertainty")
 """Fields for colouring points besides depth: in grey values, mm and mm."""
-_COLUMNS = 3 + len(FIELDS)
+_COLUMNS = 3 + len(FIELDS)  # coordinates first
 
 
 def point_table(points_mm: np.ndarray, **fields: np.ndarray | None) -> np.ndarray:

@@ -13,7 +13,7 @@ from uwlts.doctor.machine import Finding
 from uwlts.runtime.optional_library import EXTRAS, pip_install, read_requirements
 
 _ABSENT = "not installed"
-_LOAD_S = 120
+_LOAD_S = 120  # for all libraries, from a slow disk
 # The last printed name is that of the module that did not load, by an error or by ending the process.
 _LOAD = "import importlib, sys\nfor name in sys.argv[1:]: print(name, flush=True); importlib.import_module(name)"
 

@@ -22,7 +22,7 @@ from rich.text import Text
 Status = Literal["ok", "optional", "warning", "missing"]
 
 _STYLES = {"ok": "green", "optional": "dim", "warning": "yellow", "missing": "bold red"}
-_WIDTH = 110
+_WIDTH = 110  # of a table that is not shown in a terminal, characters
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ FRAME_BYTES = 1280 * 1024
 """Size of an 8-bit frame of the thesis's camera, bytes."""
 FRAMES_PER_S = 60
 """Frame rate that the disk has to sustain, 1/s."""
-_TRIAL_BYTES = 64_000_000
+_TRIAL_BYTES = 64_000_000  # a second of frames, beyond the cache of a disk's controller
 # 7500 profiles: the bench's travel of 750 mm in steps of 0.1 mm, uncompressed.
 _SCAN_BYTES = 7500 * FRAME_BYTES
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
@@ -150,7 +150,7 @@ def _date(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M")
 
 
-_RENDERER_S = 330
+_RENDERER_S = 330  # above the time that the program itself gives its trial
 
 
 def examine_renderer() -> list[Finding]:

@@ -26,7 +26,7 @@ from uwlts.storage.truth import Truth, TruthHeader, read_truth, scene_digest, tr
 TOLERANCE_MM = 0.010
 """Tolerance for points from perfect images and true parameters (tests/system/test_campaign.py)."""
 FORMAT = "uwlts-evaluation"
-VERSION = 1
+VERSION = 1  # of the file format
 Count = Annotated[int, Field(ge=0)]
 
 

@@ -17,7 +17,7 @@ from uwlts.files.reading import read_bytes
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 
-_MOST_BYTES = 64 * 2**20
+_MOST_BYTES = 64 * 2**20  # a million measured values
 _POOLED_ABOVE = 0.25
 """p-value of the interaction above which it is pooled with the repeatability (AIAG)."""
 _DRAWS = 20_000

@@ -31,12 +31,12 @@ _LOG = logging.getLogger("uwlts")
 MiB = 2**20
 MOST_TOML_BYTES = MiB
 """The parser takes about a second for it; the longest descriptions, with lists of positions, have a tenth of it."""
-MOST_JSON_BYTES = 32 * MiB
+MOST_JSON_BYTES = 32 * MiB  # several times the largest calibration
 MOST_VALUES = 500_000
 """Values in a JSON file, enough for a covariance of 700 parameters. As Python objects they take less than 100 MB."""
 MOST_DEPTH = 64
 """Nesting of tables and lists; the program's own files have fewer than ten levels."""
-_LARGEST_INT = 2**63
+_LARGEST_INT = 2**63  # 64 bits, what NumPy and HDF5 hold
 _LONGEST_KEY = 32  # parts of a dotted key; the parser takes time by the square of their number
 
 _WORD = r"(?<![\w-])[\w-]++"

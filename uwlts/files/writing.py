@@ -29,7 +29,7 @@ except ImportError:
 _PATIENCE_S = 10.0
 """Longest wait at the end of the work for a file that another process writes. Results are written faster, and several
 machines may write those of one sweep."""
-_AGAIN_S = 0.05
+_AGAIN_S = 0.05  # until a lock is tried again
 
 
 class OtherWriterError(OutputError):

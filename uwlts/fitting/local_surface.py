@@ -19,7 +19,7 @@ _FEWEST = 8
 """Least number of points of a patch, which has six coefficients."""
 _MOST_IMAGES = 256
 """Largest number of images of a patch that are distinguished; further ones are combined."""
-_TERMS = 6
+_TERMS = 6  # of a polynomial of second order in two variables
 _AT_A_TIME = 500_000
 """Number of points whose normals are computed together; their matrices take 100 MB."""
 

@@ -22,7 +22,7 @@ from uwlts.storage.cloud import PointUncertainty, project_image_errors, project_
 
 _CELLS_PER_RADIUS = 3.0
 """Averaging cubes per disc radius: a disc contains 28 averages for 6 coefficients."""
-_NEIGHBOURS = 40
+_NEIGHBOURS = 40  # most averages in a disc; 28 are usual
 _FEWEST = 10
 """Least number of averages in a disc; a second-order surface has 6 coefficients."""
 _ROUND = 0.3

@@ -34,7 +34,7 @@ from uwlts.hardware.camera_interface import (
 )
 from uwlts.runtime.shared_library import load_aravis
 
-BUFFER_COMPLETE = 0
+BUFFER_COMPLETE = 0  # ARV_BUFFER_STATUS_SUCCESS
 
 
 class _GError(ctypes.Structure):

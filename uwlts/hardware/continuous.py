@@ -41,8 +41,8 @@ _GAP_S = 0.8
 """Longest gap between frames while the laser is on, including the braking time. Its detection takes 0.1 s more."""
 _SLOW_REPORT = 2.0
 """Reports that took this many times as long as the fastest are ignored: their time is less certain."""
-_FEWEST_REPORTS = 4
-_OUTLIER = 5.0
+_FEWEST_REPORTS = 4  # of the stage's position: two determine the motion, the others check it
+_OUTLIER = 5.0  # robust standard deviations
 _BUSY = 0.9
 """Largest fraction of the frame period that the exposure may take."""
 

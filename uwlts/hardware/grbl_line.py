@@ -220,7 +220,7 @@ _ERRORS = {
 }
 
 SOFT_RESET, STATUS_QUERY, FEED_HOLD = b"\x18", b"?", b"!"
-ANSWER_S = 2.0
+ANSWER_S = 2.0  # of the controller; it answers within milliseconds
 # Grbl's documentation recommends at most 5 to 10 status queries a second during a movement.
 POLL_S = 0.1
 # Grbl's own lines are shorter than 130 characters.

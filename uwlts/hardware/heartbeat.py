@@ -22,7 +22,7 @@ BEAT_S = 0.1
 """Longest time between two beats in a waiting loop."""
 _ANSWER_S = 0.5
 """Time limit of the guard's answer, which takes less than 1 ms unless the guard is suspended."""
-_END_S = 3.0
+_END_S = 3.0  # for the guarding process to end
 
 GuardState = Literal["watching", "switched off", "gone"]
 """Answer to a beat. "switched off": a beat was late and the guard has switched the laser off; "gone": the guard does

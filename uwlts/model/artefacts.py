@@ -10,7 +10,7 @@ from uwlts.errors import DescriptionError, EvaluationError, describe_problems
 from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
 from uwlts.model.sensor import Description, NotNegative, Positive
 
-_MOST_SPHERES = 6
+_MOST_SPHERES = 6  # of a sphere standard; ball plates with more are not evaluated
 
 
 class SphereStandard(Description):

@@ -21,7 +21,7 @@ from uwlts.model.sensor import Description, Sensor, Table
 AnyDescription = TypeVar("AnyDescription", bound=Description)
 
 
-_MOST_PROBLEMS = 30
+_MOST_PROBLEMS = 30  # of a description that a message lists
 _NO_TOML = "is not valid TOML"
 _MOST_BASES = 16
 """Largest length of a chain of bases; the shipped descriptions have two."""

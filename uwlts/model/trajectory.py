@@ -15,7 +15,7 @@ from uwlts.files.writing import require_ending, write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 
-_ROUNDED = 1e-6
+_ROUNDED = 1e-6  # deviation of poses and correlations that files with six digits have
 _LARGEST_DRIFT_PPM = 10_000.0
 """A hundred times the drift of the worst quartz; larger values indicate a wrong unit."""
 _UNIX_S = 946_684_800.0, 4_102_444_800.0

@@ -25,6 +25,7 @@ import numpy as np
 from uwlts.errors import DescriptionError
 from uwlts.model.media import check_range, read_table, water_absorption_per_m, water_scattering_per_m
 
+# Sources: see above.
 _STATION_NM = 530.0
 _ABSORPTION_SLOPE_PER_NM = 0.014
 _SCATTERING_EXPONENT = 1.0

@@ -49,7 +49,7 @@ _LEAST_ACROSS = 0.3
 _TABLE_TOLERANCE = np.array([1e-7] * 3 + [1e-6] * 5)
 """Tolerances of a table: points (mm), shift per slope (mm^2), sheet thickness (mm) and its image (px)."""
 
-_MOST_FOR_FOOTPRINT = 1000
+_MOST_FOR_FOOTPRINT = 1000  # lines, to limit time: a median needs no more
 _FOOTPRINT_PER_SHEET = math.sqrt(3.0)
 """Standard deviation of a point's footprint across the sheet, divided by that of the sheet: see `footprint_mm`."""
 _METHOD_STD = 0.15

@@ -27,7 +27,7 @@ THREE = _NICEGUI / "elements" / "scene" / "dist" / "index.js"
 _VUE = _NICEGUI / "static" / "vue.esm-browser.prod.js"
 _LARGEST = 2**13 - 1
 """Number of steps on either side of the middle: steps of 8 µm for 130 mm, finer than a pixel."""
-_UNKNOWN = -(2**15)
+_UNKNOWN = -(2**15)  # the one 16-bit number that stands for no value
 
 
 STOPS = (

@@ -21,7 +21,7 @@ import numpy as np
 _LEAST_MM = 1e-3
 """Least distance from the sheet, far below a pixel; light scattered by less stays in the stripe."""
 _DISTANCES, _ALONG, _ACROSS = 32, 96, 72
-STEP_PX = 0.5
+STEP_PX = 0.5  # below the width of any stripe
 _CELLS = 4096
 """Step and number of cells of line spreads: some 2,000 px, beyond which little light is scattered."""
 

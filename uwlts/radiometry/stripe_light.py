@@ -32,7 +32,7 @@ _FEWEST_POSITIONS = 5
 """Least number of stage positions of a scan: those of one plane for a normal."""
 _STEPS = 2.5
 """Radius of the planes that give the normals, in steps of the stage: five images, also on inclined surfaces."""
-_NEWTON_STEPS = 8
+_NEWTON_STEPS = 8  # of the ray through the window; converges quadratically
 _JOULE_NM = 6.62607015e-34 * 299792458.0 * 1e9
 """Energy of a photon times its wavelength in nm, J nm (SI)."""
 
@@ -216,11 +216,11 @@ def _fan_light(laser: Laser, pose: LaserPose, point: np.ndarray, *, medium_index
 def _power_per_rad(laser: Laser, angle: np.ndarray) -> np.ndarray:
     """Return the described fraction of the power per rad at angles (N,) in air; 0 outside the fan."""
     half = math.radians(laser.fan_angle_deg / 2)
-    if isinstance(laser.fan_profile, str):
+    if not (table := laser.fan_table()):
         nodes = np.linspace(-half, half, 1001)
         power = np.exp(-2 * (nodes / half) ** 2) if laser.fan_profile == "gaussian" else np.ones_like(nodes)
     else:
-        degrees, power = np.array(laser.fan_profile).T
+        degrees, power = np.array(table).T
         nodes = np.radians(degrees)
     return np.interp(angle, nodes, power / np.trapezoid(power, nodes), left=0.0, right=0.0)
 

@@ -14,7 +14,7 @@ _LEFT = 0.01
 """Largest fraction of the variance in this remainder."""
 _SAMPLE = 1500
 """Number of points used to choose the modes."""
-_BLOCK = 50_000
+_BLOCK = 50_000  # points, to limit memory
 
 
 def propagate_pose_errors(

@@ -37,7 +37,7 @@ from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import PoseFormat, read_poses, write_poses
 
-_ROUNDS = 60
+_ROUNDS = 60  # largest number; 20 rounds narrow the search radius a hundredfold
 _REFITS = 12
 """Largest number of further rounds, with surfaces fitted again at each distance."""
 _SETTLED = 0.1

@@ -7,9 +7,9 @@ import numpy as np
 from markupsafe import Markup
 
 from uwlts.acceptance.accept import FORMAT, VERSION, Acceptance, JudgedPosition
+from uwlts.acceptance.acceptance_plan import SYMBOLS, CertifiedArtefact, Symbol
 from uwlts.acceptance.characteristics import NAMES, Characteristic, CharacteristicValue
 from uwlts.acceptance.directional_scale import DirectionalScale, ScaleComponent
-from uwlts.acceptance.plan import SYMBOLS, CertifiedArtefact, Symbol
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.artefacts import SphereStandard, StepStandard

@@ -23,8 +23,8 @@ from uwlts.pages.toolkit import (
 )
 from uwlts.storage.image_file import read_image
 
-_THUMBNAIL_PX = 420
-_MOST_PICTURES = 12
+_THUMBNAIL_PX = 420  # width of pictures on the page
+_MOST_PICTURES = 12  # those left out come first
 _ARROWS_PX = 0.02  # length of the rms arrow, relative to the image width
 
 

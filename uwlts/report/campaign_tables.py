@@ -22,7 +22,7 @@ from uwlts.report.plot import SHORT_LIST
 
 _QUANTITIES = {"PE": "probing error PE", "RE": "range error RE", "STD": "deviations STD", "range": "deviations range"}
 _ORDER = ("sphere spacing", "step height", "pipe diameter", "diameter", "probing", "range", "deviations", "ovality")
-_WIDTH = 110
+_WIDTH = 110  # of a table that is not shown in a terminal, characters
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from uwlts.report.certificate_volume import (
 )
 
 FORMAT = "uwlts-certificate"
-VERSION = 1
+VERSION = 1  # of the file format
 # Number of best shots listed, in addition to the best one of each kind.
 _BEST_SHOTS = 3
 NOT_JOINT = "the calibration was not estimated jointly: the uncertainty of lengths measured by it is not known"

@@ -43,7 +43,7 @@ from uwlts.report.digital_certificate import digital_certificate, load_administr
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import read_calibration
 
-_WORST_IMAGES = 5
+_WORST_IMAGES = 5  # listed
 
 
 @protect_inputs()

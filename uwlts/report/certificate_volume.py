@@ -21,6 +21,7 @@ from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.triangulation import points_on_sheet
 
+# Rows of the certificate's table, up to beyond the volume of usual sensors.
 LENGTHS_MM = (10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0, 500.0)
 # Number of positions along each axis searched for the largest uncertainty, which varies slowly over the volume.
 _PLACES = 9

@@ -60,10 +60,10 @@ _SMALLEST = 1e-6
 """Smaller uncertainties are shown as 0."""
 _SMALLEST_MM = 0.002
 """Precision that determines the decimals of figures without uncertainty."""
-_MOST_PICTURES = 40
+_MOST_PICTURES = 40  # the largest findings come first
 FINDINGS = "findings"
 """Kind of the page, in the name of its JSON file."""
-_MOST_DRAWN = 60_000
+_MOST_DRAWN = 60_000  # points of a picture; more look the same
 _AROUND = 1.2
 """Size of the area shown around a finding, relative to the finding."""
 

@@ -22,7 +22,7 @@ from uwlts.pages.numbers import format_to_scale
 from uwlts.pages.toolkit import MISSING, render_page, write_page
 
 FORMAT = "uwlts-measured-values"
-VERSION = 1
+VERSION = 1  # of the file format
 MEASURED = "measured"
 """Kind of the files, in their names."""
 MEASURED_ENDINGS = tuple(f".{MEASURED}{ending}" for ending in (".html", ".json", ".csv"))

@@ -15,7 +15,7 @@ from uwlts.report.plot import surface_limit_mm
 
 _SHOWN = 30_000
 """Number of points shown per picture for all scans together; more would overlap."""
-_VIEWS = ((0, 1), (0, 2), (1, 2))
+_VIEWS = ((0, 1), (0, 2), (1, 2))  # axes of plan, front and side view
 
 
 REGISTRATION = "registration"

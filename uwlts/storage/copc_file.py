@@ -38,8 +38,8 @@ SUFFIX = ".copc.laz"
 
 _POINTS_OF_NODE = 60_000
 """Points of the root, and of a typical node: compressed about 500 kB, one request of a viewer."""
-_DEEPEST = 7
-_MOST_LEVELS = 16
+_DEEPEST = 7  # levels written: 4**7 nodes on a surface
+_MOST_LEVELS = 16  # read; more only occur in damaged files
 _INFO, _INFO_BYTES, _ENTRY, _EXTENDED = 429, 160, 32, 60
 """Place and size of the description of the octree, and sizes of its entries and of an extended record's header."""
 _ITEMS = 32  # place of the number of items in the record of LASzip

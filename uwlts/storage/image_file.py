@@ -17,7 +17,7 @@ import numpy as np
 from uwlts.errors import ImageError
 from uwlts.storage.image_header import ImageHeader, png_damage, read_header, read_image_file
 
-_STANDARD_ERROR = 2
+_STANDARD_ERROR = 2  # its file descriptor
 _DAMAGE = re.compile(rb"libpng error|Corrupt JPEG data|Premature end of JPEG|\[ERROR:")
 # For example about unknown tags.
 _WARNING = b"[ WARN:"

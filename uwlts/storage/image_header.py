@@ -18,7 +18,7 @@ _MOST_BYTES = 2**27
 """Largest image file: 60 million uncompressed pixels of 16 bit."""
 _MOST_SHRINKING = {"PNG": 1100}
 """Largest compression ratio by format: deflate reaches 1032 (zlib.net/zlib_tech.html), others are unlimited."""
-_MOST_TAGS = 4096
+_MOST_TAGS = 4096  # of a TIFF directory; more only occur in damaged files
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"BM": "BMP", b"\xff\xd8\xff": "JPEG"}
 _SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")

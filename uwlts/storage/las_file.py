@@ -19,8 +19,8 @@ from uwlts.storage.cloud import PointCloud, make_foreign_cloud
 LAZ_STEP_M = 1e-7
 """Resolution of coordinates in LAZ, integers relative to the middle of the cloud: up to 214 m to either side."""
 
-_REACH_M = LAZ_STEP_M * (2**31 - 1)
-INTENSITY_LIMITS = 0, 2**16 - 1
+_REACH_M = LAZ_STEP_M * (2**31 - 1)  # of 32-bit coordinates
+INTENSITY_LIMITS = 0, 2**16 - 1  # 16 bits
 _NOISE_CLASSES = 7, 18
 """Low and high noise."""
 _BOX_MARGIN = 1e-3

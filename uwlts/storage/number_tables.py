@@ -22,7 +22,7 @@ MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
 ROTATION_NAMES = ("qw", "qx", "qy", "qz", "rx", "ry", "rz", "roll", "pitch", "yaw", "angle")
 """Names of columns with rotations, as `read_number_table` returns them; it returns positions as x, y, z."""
 
-_MOST_BYTES = 512 * 2**20
+_MOST_BYTES = 512 * 2**20  # ten million rows
 _LENGTHS = {"nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1e3, "km": 1e6}
 _LENGTHS |= {"in": 25.4, "ft": 304.8, "yd": 914.4}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "gon": np.pi / 200}

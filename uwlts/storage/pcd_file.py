@@ -10,12 +10,12 @@ from uwlts.errors import CaptureError
 from uwlts.files.reading import read_bytes
 from uwlts.runtime.compiled import compiled
 
-_MOST_BYTES = 2**31
+_MOST_BYTES = 2**31  # held in memory as a whole
 _KINDS = {"F": "f", "I": "i", "U": "u"}
-_LONGEST_HEADER = 2**16
+_LONGEST_HEADER = 2**16  # bytes; usual headers have 200
 _LARGEST_RATIO = 132
 """Bytes that two or three bytes of LZF can stand for, divided by two: larger contents are damaged."""
-_REST = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+_REST = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # position and quaternion of no motion
 
 
 def read_pcd(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:

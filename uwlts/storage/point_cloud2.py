@@ -14,7 +14,7 @@ from uwlts.storage.cloud import PAIRS, PointCloud
 
 FRAME_ID = "base"
 """Frame of the points, if no other is given."""
-NANOSECONDS = 10**9
+NANOSECONDS = 10**9  # of a second
 _DATATYPES = {"<i4": 5, "<f4": 7, "<f8": 8}
 """Constants INT32, FLOAT32 and FLOAT64 of sensor_msgs/PointField."""
 

@@ -60,7 +60,7 @@ _ROBOTS = {
         "p[x, y, z, rx, ry, rz]", re.compile(rf"\bp\s*+\[\s*+{_NEXT.join([_N] * 6)}\s*+\]"), "rotvec-rad", "m", "#"
     ),
 }
-_MOST_PROGRAM_BYTES = 64 * 2**20
+_MOST_PROGRAM_BYTES = 64 * 2**20  # hours of a robot's path
 _EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
 _FORMATS = (
     "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg, "
@@ -70,7 +70,7 @@ _COLMAP = "colmap"
 _IMAGE_ROW = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
-_MOST_POSES = 1_000_000
+_MOST_POSES = 1_000_000  # more than an hour at 200 poses a second
 _LATEST_S = 1e11
 """Unix times in s reach it in the year 5138; larger numbers are in ms, us or ns."""
 

@@ -36,7 +36,7 @@ _ABSENT = 0.05
 """Largest probability of a line without a stripe; from here to `LEAST_VISIBLE` it is ambiguous."""
 
 _CALLED = "model of the learned method"
-_MOST_BYTES = 256 * 2**20
+_MOST_BYTES = 256 * 2**20  # a hundred times the usual model
 _OPERATORS = (
     "Abs Add And ArgMax ArgMin AveragePool BatchNormalization Cast Ceil Clip Concat Constant Conv ConvTranspose Cos "
     "DepthToSpace Div Dropout Einsum Elu Equal Erf Exp Expand Flatten Floor Gather GatherElements Gelu Gemm "

@@ -35,7 +35,7 @@ from uwlts.thesis.results import (
 from uwlts.thesis.sphere_spacing import SphereScan, spacing_budget, sphere_scan, window_choices, window_of
 
 RESULTS = "results.json"
-TRIALS = 100
+TRIALS = 100  # an interval of 95 % then leaves out five
 
 
 class _Known(BaseModel):

@@ -89,7 +89,7 @@ def _calibrate_polynomials(target: Path) -> PolynomialCalibration:
         return calibrate_polynomials([capture]).calibration
 
 
-_SIZE_PX = 5
+_SIZE_PX = 5  # of the window of the thesis's filter
 _SEARCHED_PX = 8
 """Half width of the window around the stripe in which its peak is searched."""
 

@@ -22,8 +22,8 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import run_jobs
 from uwlts.thesis.sphere_spacing import SphereScan, spacing_error
 
-COVERAGE = 0.95
-LEAST_TRIALS = 20
+COVERAGE = 0.95  # of the stated intervals
+LEAST_TRIALS = 20  # of 20, a 95 % interval leaves one out
 
 
 @dataclass(frozen=True, eq=False)

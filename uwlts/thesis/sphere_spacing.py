@@ -148,7 +148,7 @@ def window_choices(
     return choices, profiles
 
 
-TEMPERATURE_HALF_WIDTH_C = 5.0
+TEMPERATURE_HALF_WIDTH_C = 5.0  # the thesis's 5 K
 _EXPANSION_PER_K = 22.2e-6
 """Thermal expansion of the standard: the thesis's 0.011 mm for 5 K and 99.18 mm, as for aluminium."""
 _STANDARD_EXPANDED_MM = 0.004

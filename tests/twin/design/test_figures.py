@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 
 from tests.virtual_sensors import altered
 from twin.design.figures_of_merit import CLASS_NAMES, Figures, compute_figures
-from twin.design.parameters import adjust_to_standoff, extract_parameters
+from twin.design.sensor_arrays import adjust_to_standoff, extract_parameters
 from uwlts.model.media import water_absorption_per_m, water_scattering_per_m
 from uwlts.model.placement import view_of_sheet
 from uwlts.model.sensor import Sensor

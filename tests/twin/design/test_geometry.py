@@ -10,7 +10,7 @@ from tests.oracles import fermat
 from tests.virtual_sensors import altered
 from twin.design import geometry as g
 from twin.design.figures_of_merit import FIGURES, compute_figures, predict_scatter
-from twin.design.parameters import adjust_to_standoff, extract_parameters
+from twin.design.sensor_arrays import adjust_to_standoff, extract_parameters
 from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Sensor
 from uwlts.optics.design import depth_per_pixel_mm, line_length_mm, nominal_setup, pixel_of_depth

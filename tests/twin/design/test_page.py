@@ -22,7 +22,6 @@ from twin.design.designs import (
     select_design,
 )
 from twin.design.figures_of_merit import FIGURES, compute_figures
-from twin.design.parameters import extract_parameters
 from twin.design.report.charts import (
     bars,
     choose_pareto_axes,
@@ -46,6 +45,7 @@ from twin.design.report.study_tables import (
     without_numbers,
     words_of,
 )
+from twin.design.sensor_arrays import extract_parameters
 from twin.design.study import Study, load_study
 from twin.design.verification import Agreement
 from uwlts.errors import DesignError, EvaluationError, RangeError

@@ -5,7 +5,7 @@ import pytest
 
 from twin.design.choice import SMOOTH, DerivedFigures, refine_design
 from twin.design.designs import Design, evaluate_designs
-from twin.design.parameters import PARAMETER_OF
+from twin.design.sensor_arrays import PARAMETER_OF
 from twin.design.study import Study
 
 VALUES = {

@@ -19,7 +19,7 @@ from tests.stock_mitsuba import blocks, fog, opened_from_its_origin, per_radianc
 from tests.virtual_sensors import altered, camera_axes, laser_origin, plate, scene_of, sensor_at
 from twin.light.multiple_scattering import WALK_CELL_PX
 from twin.light.renderer import Renderer
-from twin.options import ALL
+from twin.rendering_options import ALL
 from twin.scene.description import Scene
 from uwlts.model.sensor import Medium, Sensor
 

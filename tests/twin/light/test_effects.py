@@ -7,8 +7,8 @@ import pytest
 
 from tests.virtual_sensors import altered, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.options import ALL, NONE, Effects, Options
 from twin.recording.sensor_simulator import SensorSimulator
+from twin.rendering_options import ALL, NONE, Effects, Options
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Sensor
 

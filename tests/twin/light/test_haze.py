@@ -28,7 +28,7 @@ from twin.backend.arrays import to_jit
 from twin.light.image_sampling import NODE_SPACING_PX
 from twin.light.renderer import Renderer
 from twin.light.water import Scattering
-from twin.options import NONE
+from twin.rendering_options import NONE
 from uwlts.model.sensor import Medium, Sensor
 
 import mitsuba as mi  # isort: skip

@@ -8,8 +8,8 @@ import pytest
 
 from tests.virtual_sensors import altered, camera_axes, clear, cropped, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.options import NONE
 from twin.recording.frame_truth import find_true_stripe
+from twin.rendering_options import NONE
 from uwlts.model.sensor import Medium, Sensor
 
 SPP = 1024

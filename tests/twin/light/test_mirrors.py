@@ -9,8 +9,8 @@ import pytest
 from tests.virtual_sensors import block, clear, image_of, plate, scene_of, sensor_at
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
-from twin.options import NONE
 from twin.recording.frame_truth import find_true_stripe
+from twin.rendering_options import NONE
 from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus

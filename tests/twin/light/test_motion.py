@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sensor_at
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
-from twin.options import NONE, Options
 from twin.recording.frame_truth import find_true_stripe
 from twin.recording.sensor_simulator import SensorSimulator
+from twin.rendering_options import NONE, Options
 from uwlts.errors import DesignError
 
 ALONG_X = np.array([1.0, 0.0, 0.0])

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
 from twin.light.image_sampling import make_lattice, pupil_shifts
 from twin.light.renderer import Renderer
-from twin.options import NONE
+from twin.rendering_options import NONE
 
 BLURRED = replace(NONE, defocus=True)
 

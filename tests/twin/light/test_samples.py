@@ -10,7 +10,7 @@ import pytest
 from tests.virtual_sensors import altered, block, clear, cropped, plate, scene_of, sensor_at
 from twin.light.image_sampling import golden_step
 from twin.light.renderer import Renderer
-from twin.options import NONE
+from twin.rendering_options import NONE
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from scipy import stats
 from tests.bench.light import in_named_water
 from twin.light.renderer import Renderer
 from twin.light.smoothing import FoundLight, blur_cells, estimate_light, interpolate_cells
-from twin.options import Options
+from twin.rendering_options import Options
 from twin.scene.description import load_scene
 
 ROOT = Path(__file__).parents[3]

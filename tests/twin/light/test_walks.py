@@ -27,7 +27,7 @@ from twin.light.illumination import make_lights
 from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer
 from twin.light.walk import Walker
-from twin.options import NONE
+from twin.rendering_options import NONE
 from twin.scene.description import Scene
 from uwlts.model.sensor import Medium, Sensor
 

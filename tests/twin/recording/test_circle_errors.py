@@ -9,10 +9,10 @@ import pytest
 
 from tests.virtual_sensors import altered, camera_axes, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.options import NONE, Options
 from twin.recording.frame_truth import depth_map
 from twin.recording.record_scene import record_scene
 from twin.recording.sensor_simulator import SensorSimulator, with_window
+from twin.rendering_options import NONE, Options
 from twin.scene.description import CirclePlate, Scene
 from twin.scene.finish import draw_print_errors
 from twin.scene.motion import Motion, Shot

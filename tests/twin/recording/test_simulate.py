@@ -8,9 +8,9 @@ import pytest
 
 import twin
 from tests.virtual_sensors import altered, plate, scene_of
-from twin.options import NONE, Options
 from twin.recording.record_scene import record_scene
 from twin.recording.render import choose_scene
+from twin.rendering_options import NONE, Options
 from twin.scene.description import Scene
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.model.sensor import Sensor

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.virtual_sensors import altered
-from twin.options import Flaws
+from twin.rendering_options import Flaws
 from twin.sensor.flaws import GLARE_REACH, add_glare, as_built, deliver_image, laser_shares, vignette
 from uwlts.errors import DescriptionError
 

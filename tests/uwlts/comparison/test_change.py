@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import uwlts
 from uwlts.cli import app
-from uwlts.comparison.options import ComparisonOptions
+from uwlts.comparison.comparison_options import ComparisonOptions
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
 from uwlts.registration.surface_registration import SampledSurface, register_to_surface
 from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.comparison.local_means import TWO_SIDED, average_locally
+from uwlts.comparison.local_means import TWO_SIDED, _student_ratio, average_locally
 from uwlts.storage.cloud import PointUncertainty
 
 
@@ -37,3 +37,9 @@ def test_means_do_not_depend_on_how_many_pairs_are_averaged_at_once(monkeypatch:
     monkeypatch.setattr("uwlts.comparison.local_means._PAIRS_AT_A_TIME", 70)
     for one, other in zip(whole, average_locally(places, normals, points, **options), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_the_factor_of_few_points_is_students() -> None:
+    """Quantiles of 97.5 % for 1, 4, 10 and 30 degrees of freedom, from tables."""
+    tabulated = np.array([12.706, 2.776, 2.228, 2.042])
+    np.testing.assert_allclose(_student_ratio(np.array([2, 5, 11, 31])), tabulated / TWO_SIDED, rtol=2e-4)

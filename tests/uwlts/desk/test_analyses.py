@@ -11,7 +11,7 @@ import pytest
 import uwlts
 from tests.waiting import within
 from uwlts.desk.analyses import ANALYSES, Analyses, list_fields, name_results
-from uwlts.desk.board import Board
+from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, OutputError
 from uwlts.storage.cloud import PointCloud
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from uwlts.cli.options import MethodName
+from uwlts.cli.command_options import MethodName
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe, method_names
 
 LENGTH = 120

@@ -54,10 +54,10 @@ _SHOWN = (
     "speckle_limit_mm",
 )
 """Figures shown in addition to objectives and constraints, the most informative first."""
-_MOST_PANELS = 9
-_PANEL_COLUMNS = 3
-_PANEL_INCHES = (4.0, 3.1)
-_BAR_INCHES = 0.17
+_MOST_PANELS = 9  # of a figure, so that it fits on a page
+_PANEL_COLUMNS = 3  # of a page's width
+_PANEL_INCHES = (4.0, 3.1)  # width and height
+_BAR_INCHES = 0.17  # height of a bar with its label
 # Limits: more points and lines make a page slow; more dots, curve points, bars and axes would overlap.
 MOST_POINTS = 20_000
 MOST_LINES = 5_000
@@ -79,7 +79,7 @@ _CELLS = 40
 """Cells along each side of a map with one best design each, if further variables are free."""
 _FLAT = 1e-6
 """Tolerance, relative to the ranges, for designs on a line, which do not span a map."""
-_LEVELS = 12
+_LEVELS = 12  # contour levels that the eye still separates
 _WIDE = 15.0
 """Ratio of a figure's values above which a map has logarithmic colours."""
 _MARGIN = 0.02

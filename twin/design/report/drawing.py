@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from twin.design.figures_of_merit import evaluate_field, find_depths_in_view
 from twin.design.geometry import Lens, WindowGeometry, trace_rays, undistort_pixels
-from twin.design.parameters import SensorArrays, extract_parameters
 from twin.design.report.study_tables import number_text
+from twin.design.sensor_arrays import SensorArrays, extract_parameters
 from uwlts.errors import DesignError
 from uwlts.model.placement import LaserPose, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
@@ -131,7 +131,7 @@ def make_views(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     DesignError
         The sheet does not cross the camera's axis in front of the window, or the laser points back to the camera.
     Error
-        As for `twin.design.parameters.extract_numbers`.
+        As for `twin.design.sensor_arrays.extract_numbers`.
     """
     pose, p, camera = laser_pose(sensor), extract_parameters([sensor], [medium]), sensor.camera
     outer = float(p.outer_mm(np).item())
@@ -323,7 +323,7 @@ _THIN = "#b9c2cc"
 _HOUSING = "#aab4c0"
 _VOLUME = "#f1ecd9"
 _VOLUME_END = "#bda96b"
-_INCHES = (11.5, 7.0)
+_INCHES = (11.5, 7.0)  # width and height
 _MARGIN = 0.1
 """Margin around a view for dimensions, relative to its larger side."""
 _LABELS = 0.35

@@ -6,7 +6,7 @@ import numpy as np
 
 from uwlts.errors import DescriptionError
 
-_MOST_VERTICES = 4_000_000
+_MOST_VERTICES = 4_000_000  # some 300 MB in the renderer
 
 
 def require_few_vertices(vertices: int, *, step_mm: float, advice: str) -> None:

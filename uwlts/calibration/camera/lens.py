@@ -32,7 +32,7 @@ RATIONAL = tuple((*_USUAL, *names) for names in (("k4", "k5"), ("p1", "p2", "k4"
 _WIDE_USUAL = RATIONAL[0]
 WIDE_DEG = 45.0
 """Angle to the axis beyond which lenses are wide: tan > 1, so that the powers of k1 to k3 grow instead of fading."""
-_FOLDS = 5
+_FOLDS = 5  # parts of the images for cross-validation; 5 to 10 are usual
 _WORSE = 1.0  # standard errors of the mean difference of squares within which a model is as good as the best
 _LEAST_GAIN = 0.01  # relative to the mean square; a smaller gain is useless even if significant
 _SOFT = 2.0  # robust standard deviations from which a point has less weight

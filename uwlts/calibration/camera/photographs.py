@@ -29,7 +29,7 @@ from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import DESCRIPTION_NAME, check_channel, extract_channel, image_files
 from uwlts.targets import Target, parse_target
 
-_FEWEST_IMAGES = 4
+_FEWEST_IMAGES = 4  # three determine a lens, the fourth checks it
 
 
 @dataclass(frozen=True, eq=False)

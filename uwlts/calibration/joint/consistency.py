@@ -102,7 +102,7 @@ _FOCAL_DOUBTFUL = 0.08
 _FOCAL_WRONG = 0.2  # the same for a contradiction
 _POSITIONS_WRONG = 3.0
 """Rms position error of the stage divided by its stated uncertainty: four positions exceed it once in a million."""
-_FEWEST_POSITIONS = 4
+_FEWEST_POSITIONS = 4  # for which the limit above holds
 _MOST_NAMED = 4  # findings of a kind that a message lists
 _MOST_SAID = 6  # findings in a readable message
 
@@ -243,18 +243,21 @@ def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
     The stripe's shift on the target is excluded: images have little information on it, so that small model errors
     dominate.
     """
-    parameters = result.parameters
-    for key, value, known, std, after in zip(
+    parameters, covariance = result.parameters, result.covariance
+    formal = covariance if result.formal_covariance is None else result.formal_covariance
+    for key, value, known, std, after, exact in zip(
         parameters.keys,
         result.values,
         parameters.prior_mean(),
         parameters.prior_std(),
-        result.std().values(),
+        np.diag(covariance),
+        np.diag(formal),
         strict=True,
     ):
         if np.isfinite(std) and key is not SHIFT:
-            # The estimate includes the prior: this is the variance of their difference if both are right.
-            gain = float(np.sqrt(max(1.0 - (after / std) ** 2, _LEAST_GAIN**2)))
+            # The estimate includes the prior, with the weight of the formal variance, in which tied parameters are
+            # exact: this is the variance of their difference if both are right (for none tied, 1 - after / std^2).
+            gain = float(np.sqrt(max(1.0 + (after - 2 * exact) / std**2, _LEAST_GAIN**2)))
             alone = known + (value - known) / gain**2
             yield Deviation(abs(value - known) / (gain * std), key, alone, known, std), gain
 

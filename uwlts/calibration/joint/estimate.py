@@ -62,7 +62,8 @@ class Estimate:
 
     ``local`` (b,) with ``local_covariances`` (b, b) and ``residuals`` (with outliers) are those of every piece of
     evidence. ``noise`` is that of every kind of residual, ``outliers`` the number of rejected residuals. ``rounds``
-    counts all least-squares iterations.
+    counts all least-squares iterations. ``formal_covariance`` (P, P) takes tied parameters as exactly known; None if
+    none are tied.
     """
 
     parameters: Parameters
@@ -75,6 +76,7 @@ class Estimate:
     outliers: int
     rounds: int
     stopped: str
+    formal_covariance: np.ndarray | None = None
 
     def std(self) -> dict[ParameterKey, float]:
         """Return the standard uncertainty of every parameter."""

@@ -33,7 +33,7 @@ STEP_MM = 20.0
 """Height of the step standard, as in the thesis."""
 _STEP_HALF_MM = 30.0  # half the length of its upper face along the stripe
 _STEP_REACH_MM = 70.0  # extent of its lower faces from the middle
-SPHERES = 2
+SPHERES = 2  # of the standard that an image of a sphere pair shows
 SPHERE_MM = 30.0
 """Diameter of the spheres, as in the thesis."""
 _SPHERES_APART_MM = 60.0  # spacing of their centres, twice the diameter

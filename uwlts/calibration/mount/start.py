@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, SphereShape, StepShape, perpendicular_to
-from uwlts.calibration.mount.estimate import RestrictedEstimate
+from uwlts.calibration.mount.artefact_shapes import PlaneShape, RingShape, SphereShape, StepShape, perpendicular_to
 from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet, point_by_mount, to_sheet
 from uwlts.calibration.mount.profiles import Detection, ProfileArc, ProfileLine, circles_through
+from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError
 
 _SUBSET = 8  # poses of a random subset: 24 linear equations for 12 unknowns
@@ -21,7 +21,7 @@ _TURNS = 5000  # rotations tried for a plane, some 12 deg apart
 _TURNS_TRIED = 10  # best rotations, which are refined
 _RADII = (1.02, 1.15, 1.5)
 """Trial radii of an unknown sphere, relative to its largest section."""
-_REWEIGHTED = 10
+_REWEIGHTED = 10  # rounds of Cauchy weights; a start needs no more digits
 _FAR = 4.0
 """Standard uncertainties within which points of a ring's wall are sought; poses beyond as many misfits are rejected."""
 _CLEAR = 6.0

@@ -12,7 +12,7 @@ import numpy as np
 from uwlts.calibration.guidance.pose_advice import Coverage
 from uwlts.hardware.rig import LaserStage
 
-_LOOK_S = 0.1
+_LOOK_S = 0.1  # between looks at what is waited for
 ANSWERS = ("take", "skip", "done")
 """Take the target as it is now; ask for another pose; end this phase with what is recorded."""
 

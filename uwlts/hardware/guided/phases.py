@@ -47,8 +47,8 @@ from uwlts.calibration.guidance.step import (
     next_depth_mm,
 )
 from uwlts.errors import CalibrationError, TargetError
+from uwlts.hardware.guided.guided_plan import GuidedPlan, GuidedStep
 from uwlts.hardware.guided.operator import Operator, Screen
-from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
 from uwlts.hardware.rig import START_MS, Rig
 from uwlts.hardware.scan_plan import Light, RigPlan
 from uwlts.model.calibration import Calibration, WindowModel
@@ -57,7 +57,7 @@ from uwlts.storage.capture import Capture, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.targets import TargetView
 
-_TRIES = 3
+_TRIES = 3  # images of a position, until the target is found in one
 # Largest motion of the points of a hand-held target that counts as standing still.
 _STILL_PX = 0.5
 # Free poses have no stage position; they are numbered in this unit, which does not look like a motion of the stage.

@@ -51,7 +51,7 @@ _OF_COLMAP = {
 }
 """Parameters of COLMAP's camera models that this program's camera can have (colmap.github.io/cameras.html)."""
 
-_MOST_BYTES = 2**20
+_MOST_BYTES = 2**20  # hundreds of times a usual file
 _LARGEST = 1e9
 """Focal lengths in px and coefficients are far below this value; their products do not overflow."""
 _SQUARE = 0.005  # calibrations of square pixels find focal lengths that differ by less

@@ -16,7 +16,7 @@ from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.folder_description import CentreLines
 from uwlts.storage.import_.matching import ImageRow
 
-_MOST_BYTES = 2**28
+_MOST_BYTES = 2**28  # ten thousand profiles and more
 _OF_PROFILES = ("stage_mm", "exposure_ms", "time_s", "encoder")
 
 

@@ -24,7 +24,7 @@ POSE_COLUMNS = tuple(f"pose_{row}{column}" for row in range(4) for column in ran
 
 _NUMBERS = ("stage_mm", "exposure_ms", "time_s", "encoder")
 _COLUMNS = ("file", "light", "background", *_NUMBERS, *POSE_COLUMNS)
-_MOST_TABLE_BYTES = 8 * 2**20
+_MOST_TABLE_BYTES = 8 * 2**20  # a hundred thousand images
 _LONGEST_LINE = 10_000
 """Longest line in characters; 23 columns take a few hundred."""
 _LIGHTS = ("laser", "lamp", "both", "ignore")

@@ -22,7 +22,7 @@ _LEAST_SHARE = 0.1
 """Least alternation of a mosaic relative to the mean signal: 0.8 for laser light, below 0.01 in images of grey cameras
 and colour channels."""
 _LEAST_SIGNIFICANCE = 6  # alternation over its standard error
-_BORDER = 2
+_BORDER = 2  # pixels that the interpolation of a mosaic does not fill
 
 
 def demosaic(image: np.ndarray, pattern: BayerPattern, *, name: str) -> np.ndarray:

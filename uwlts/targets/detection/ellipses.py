@@ -90,7 +90,7 @@ class EllipseRule(NamedTuple):
 
 RULE = EllipseRule()
 
-_ANGLES = np.arange(PROFILES) * (2 * np.pi / PROFILES)
+_ANGLES = np.arange(PROFILES) * (2 * np.pi / PROFILES)  # of the profiles across an outline
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1)
 """Unit vectors (PROFILES, 2) that an ellipse's shape matrix maps to points of its rim."""
 

@@ -19,7 +19,7 @@ from uwlts.calibration.polynomial.polynomial_calibration_fit import (
     line_domains,
 )
 from uwlts.calibration.polynomial.polynomial_evidence import fit_plate_map
-from uwlts.cli.options import app
+from uwlts.cli.command_options import app
 from uwlts.errors import CalibrationError, CaptureError, RangeError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Distortion, Medium

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.desk.board import KEPT_LINES, Board, Picture, encode_png
+from uwlts.desk.shown_state import KEPT_LINES, Board, Picture, encode_png
 
 FULL = 255
 

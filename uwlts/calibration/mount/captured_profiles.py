@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
-from uwlts.calibration.mount.estimate import RestrictedEstimate
+from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration

@@ -17,9 +17,9 @@ from uwlts.desk.thinned_cloud import ThinnedCloud
 Kind = Literal["note", "warning", "error"]
 LaserState = Literal["none", "off", "flashing", "on", "unknown"]
 """No laser connected; off; on while images are exposed; on; controller unreachable."""
-_LONGEST_SIDE_PX = 1000
-_BINS = 64
-KEPT_LINES = 1000
+_LONGEST_SIDE_PX = 1000  # of displayed images: a screen shows no more
+_BINS = 64  # of the displayed histogram
+KEPT_LINES = 1000  # of messages
 _FOUND, _STRIPE = (0, 140, 0), (40, 60, 255)
 
 

@@ -18,7 +18,7 @@ from uwlts.model.sensor import Description, NotNegative, Positive
 from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
 
-_SAME_POSITION_MM = 0.02
+_SAME_POSITION_MM = 0.02  # above the stage's repeatability, below any step of a plan
 
 
 class GuidedStage(StageSettings):

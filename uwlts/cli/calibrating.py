@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import STRIPE, CalibrationOut, Overwrite, a_file, a_page, app, wrote, wrote_page
+from uwlts.cli.command_options import STRIPE, CalibrationOut, Overwrite, a_file, a_page, app, wrote, wrote_page
 from uwlts.errors import DescriptionError, OutputError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.command_line import Call, command_from, say, show, warn
@@ -230,7 +230,7 @@ def accept(
     Example: uwlts accept acceptance.toml --pdf
     """
     from uwlts.acceptance.accept import Acceptance
-    from uwlts.acceptance.plan import load_plan
+    from uwlts.acceptance.acceptance_plan import load_plan
     from uwlts.files.inputs import record_made
     from uwlts.pages.toolkit import json_beside, refuse_unsuitable_page
     from uwlts.report.acceptance_page import KIND

@@ -8,13 +8,19 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import SHAPES
-from uwlts.calibration.mount.board import mount_by_board
-from uwlts.calibration.mount.estimate import LARGEST_ROUGH, NotSettled, RestrictedEstimate, settle, settle_agreeing
+from uwlts.calibration.mount.artefact_shapes import SHAPES
+from uwlts.calibration.mount.captured_profiles import CapturedProfiles, mount_covariance, reconstruct_profiles
+from uwlts.calibration.mount.hand_eye import mount_by_board
 from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, from_sheet, to_sheet
 from uwlts.calibration.mount.profiles import LEAST_POINTS
-from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, reconstruct_profiles
+from uwlts.calibration.mount.restricted_likelihood import (
+    LARGEST_ROUGH,
+    NotSettled,
+    RestrictedEstimate,
+    settle,
+    settle_agreeing,
+)
 from uwlts.calibration.mount.start import NoFit, require_surfaces, start
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.files.json_files import trusting
@@ -367,13 +373,13 @@ class _Calibration:
         )
 
     def _calibration_derivatives(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
-        """Return derivatives (P, K, Q) of the residuals by the parameters of the sensor's calibration."""
+        """Return derivatives (P, q, Q) of the residuals by the parameters of the sensor's calibration."""
         assert self.captured is not None
         numbers = [n for n in range(len(members)) if n not in self.reasons]
         by = np.vstack(
             [self.captured.point_derivatives(number, self.rows[number][members[number]]) for number in numbers]
         )
-        return used.bin_means(used.project_on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
+        return used.project(state, used.project_on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
 
 
 def _thin(points: np.ndarray, most: int) -> np.ndarray:

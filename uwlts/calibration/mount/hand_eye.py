@@ -15,15 +15,15 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
-from uwlts.calibration.mount.estimate import (
+from uwlts.calibration.mount.captured_profiles import mount_covariance
+from uwlts.calibration.mount.next_pose import OPEN_RAD, describe_missing_turns, require_determined, weaknesses
+from uwlts.calibration.mount.restricted_likelihood import (
     LARGEST_ROUGH,
     GroupedEvidence,
     RestrictedEstimate,
     settle_agreeing,
     solve_step,
 )
-from uwlts.calibration.mount.next_pose import OPEN_RAD, describe_missing_turns, require_determined, weaknesses
-from uwlts.calibration.mount.sensor import mount_covariance
 from uwlts.errors import CalibrationError, DescriptionError, TargetError
 from uwlts.files.writing import hash_file
 from uwlts.model.calibration import Calibration, WindowModel, rigid_transform

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import uwlts
-from tests.uwlts.calibration.mount.test_board import CAMERA, MIDDLE, simulated
+from tests.uwlts.calibration.mount.test_hand_eye import CAMERA, MIDDLE, simulated
 from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.mount_views import errors_of
 from tests.uwlts.sensor_profiles import RADIUS_MM, captured_by, half_way, joint_estimate, largest_parts
 from uwlts.calibration.joint.stored_estimate import covariance_root
-from uwlts.calibration.mount.board import BoardEvidence
-from uwlts.calibration.mount.estimate import RestrictedEstimate, solve_step
+from uwlts.calibration.mount.hand_eye import BoardEvidence
+from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate, solve_step
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.reconstruction.moving import PlatformPoses, add_platform_uncertainty
 from uwlts.reconstruction.point_uncertainty import point_uncertainty

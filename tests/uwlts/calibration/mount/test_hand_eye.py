@@ -9,7 +9,7 @@ from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.sensor_profiles import half_way, joint_estimate, largest_parts
 from tests.virtual_sensors import scene_of
 from twin import render
-from uwlts.calibration.mount.board import BoardEvidence, BoardImage, estimate_board_pose, select_agreeing_images
+from uwlts.calibration.mount.hand_eye import BoardEvidence, BoardImage, estimate_board_pose, select_agreeing_images
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import KnownMedium
 from uwlts.model.mount import BoardFound
