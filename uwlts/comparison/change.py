@@ -428,7 +428,9 @@ def _thin_points(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
     """
     while True:
         cells = np.floor((points - points.min(axis=0)) / apart).astype(np.int64)
-        first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+        size = cells.max(axis=0) + 1
+        keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+        first = np.sort(np.unique(keys, return_index=True)[1])
         if len(first) <= OPTIONS.most_places:
             return first, apart
         # The number of cubes on a surface is inversely proportional to the square of their side.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -64,28 +65,28 @@ def average_locally(
     together, alone = np.zeros(len(places)), np.zeros(len(places))
     patterns = np.zeros((len(places), 0 if uncertainty is None else len(uncertainty.patterns_mm)))
     radius = float(np.hypot(disc_mm / 2, deep_mm))
-    for place, point in _nearby_pairs(KDTree(points), places, radius):
-        away = points[point] - places[place]
-        along = np.einsum("ni,ni->n", away, normals[place])
+    for block, place, point in _nearby_pairs(KDTree(points), places, radius):
+        # The numbers of places count within the block: no array of a block has the size of all places.
+        size, own_normals = block.stop - block.start, normals[block]
+        away = points[point] - places[block][place]
+        along = np.einsum("ni,ni->n", away, own_normals[place])
         across = np.einsum("ni,ni->n", away, away) - along**2
         inside = (across <= (disc_mm / 2) ** 2) & (np.abs(along) <= deep_mm)
         if distance_mm is not None:
             along = distance_mm[point]
             inside &= np.isfinite(along)
         place, point, along = place[inside], point[inside], along[inside]
-        here = np.unique(place)
-        number = np.bincount(place, minlength=len(places))
-        centre = np.bincount(place, along, minlength=len(places)) / np.maximum(number, 1)
+        number = np.bincount(place, minlength=size)
+        centre = np.bincount(place, along, minlength=size) / np.maximum(number, 1)
         off = along - centre[place]
-        scatter = np.bincount(place, off**2, minlength=len(places)) / np.maximum(number - 1, 1)
-        count[here], mean[here] = number[here], centre[here]
-        rough[here] = (scatter / np.maximum(number, 1) * _student_ratio(number) ** 2)[here]
+        scatter = np.bincount(place, off**2, minlength=size) / np.maximum(number - 1, 1)
+        count[block], mean[block] = number, centre
+        rough[block] = scatter / np.maximum(number, 1) * _student_ratio(number) ** 2
         if frame is not None:
-            sums, expected = _image_sums(place, frame[point], off, scatter, number)
-            together[here], alone[here] = sums[here], expected[here]
+            together[block], alone[block] = _image_sums(place, frame[point], off, scatter, number)
         if uncertainty is not None:
-            single, images, shared = _propagated_variance(place, point, normals, uncertainty, frame, number)
-            stated[here], other[here], patterns[here] = single[here], images[here], shared[here]
+            found = _propagated_variance(place, point, own_normals, uncertainty, frame, number)
+            stated[block], other[block], patterns[block] = found
     # The empirical scatter includes that between images.
     variance = np.maximum(_correlation_factor(together, alone, count) * rough, stated + other)
     mean[count < OPTIONS.fewest_points] = np.nan
@@ -99,16 +100,17 @@ def _student_ratio(number: np.ndarray) -> np.ndarray:
     return table[np.minimum(number, _NEARLY_NORMAL)]
 
 
-def _nearby_pairs(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the indices of nearby pairs of places and points, in blocks."""
+def _nearby_pairs(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Yield blocks of places, with the numbers of places within the block and of points of nearby pairs."""
     counts = tree.query_ball_point(places, radius, return_length=True, workers=-1)
     part = np.cumsum(counts) // _PAIRS_AT_A_TIME
-    for number in np.unique(part):
-        chosen = np.flatnonzero(part == number)
-        found = tree.query_ball_point(places[chosen], radius, workers=-1)
-        lengths = np.array([len(each) for each in found])
+    starts = np.flatnonzero(np.diff(part, prepend=-1)).tolist()
+    for start, end in pairwise([*starts, len(places)]):
+        found = tree.query_ball_point(places[start:end], radius, workers=-1)
+        lengths = counts[start:end]
         if lengths.sum():
-            yield np.repeat(chosen, lengths), np.concatenate([np.asarray(each, np.intp) for each in found])
+            point = np.fromiter(chain.from_iterable(found), np.intp, int(lengths.sum()))
+            yield slice(start, end), np.repeat(np.arange(end - start), lengths), point
 
 
 def _propagated_variance(
@@ -124,12 +126,12 @@ def _propagated_variance(
     single = np.bincount(place, project_variance(known.random_mm2[point], normal), minlength=size) / many**2
     image = np.arange(len(point)) if frame is None else frame[point].astype(np.int64)
     # Position errors are fully correlated within an image and independent between images.
-    group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
+    group, owner = _place_images(place, image)
     result = np.zeros(size)
     for part in known.image_errors_mm():
         moved = np.einsum("ni,ni->n", part[point], normal)
-        together = np.bincount(owner.ravel(), moved / many[place])
-        result += np.bincount(group[:, 0], together**2, minlength=size)
+        together = np.bincount(owner, moved / many[place])
+        result += np.bincount(group, together**2, minlength=size)
     moves = np.zeros((size, len(known.patterns_mm)))
     for number_of, pattern in enumerate(known.patterns_mm):
         along = np.einsum("ni,ni->n", pattern[point], normal)
@@ -144,12 +146,20 @@ def _image_sums(
 
     The residuals of a place sum to zero, which reduces the expectation by the squared fraction of each image.
     """
-    group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
-    sums, counts = np.bincount(owner.ravel(), off), np.bincount(owner.ravel())
+    group, owner = _place_images(place, image)
+    sums, counts = np.bincount(owner, off), np.bincount(owner)
     size = len(number)
-    squares = np.bincount(group[:, 0], sums**2, minlength=size)
-    shares = np.bincount(group[:, 0], counts.astype(float) ** 2, minlength=size) / np.maximum(number, 1)
+    squares = np.bincount(group, sums**2, minlength=size)
+    shares = np.bincount(group, counts.astype(float) ** 2, minlength=size) / np.maximum(number, 1)
     return squares, scatter * np.maximum(number - shares, 0)
+
+
+def _place_images(place: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the place (G,) of each group of pairs of one place and one image, and the group (N,) of each pair."""
+    least = int(image.min(initial=0))
+    many = int(image.max(initial=0)) - least + 1
+    keys, owner = np.unique(place * many + (image - least), return_inverse=True)
+    return keys // many, owner
 
 
 def _correlation_factor(together: np.ndarray, alone: np.ndarray, count: np.ndarray) -> float:

@@ -210,13 +210,18 @@ def _thinnest_wall(points: SurfacePoints, radius: float) -> float:
 
 def _corners_near(cells: np.ndarray) -> np.ndarray:
     """Return the corners (C, 3) of cubes that hold points, and of cubes up to two away."""
-    corners = np.unique(cells, axis=0)
-    shape = corners.max(axis=0) + 8
-    keys = np.asarray(np.ravel_multi_index(tuple(corners.T + 3), tuple(shape)))
+    shape = cells.max(axis=0) + 8
+    keys = _sort_unique(np.asarray(np.ravel_multi_index(tuple(cells.T + 3), tuple(shape))))
     for axis in range(3):
         step = int(np.prod(shape[axis + 1 :]))
-        keys = np.unique((keys[:, None] + step * np.arange(-2, 4)).ravel())
+        keys = _sort_unique((keys + step * np.arange(-2, 4)[:, None]).ravel())
     return np.stack(np.unravel_index(keys, tuple(shape)), axis=1) - 3
+
+
+def _sort_unique(keys: np.ndarray) -> np.ndarray:
+    """Return the sorted different keys: `numpy.unique`, which takes ten times as long, may use a hash table."""
+    keys.sort()
+    return keys[np.append(True, keys[1:] != keys[:-1])] if len(keys) else keys
 
 
 def _signed_distances(
@@ -239,10 +244,12 @@ def _march_cubes(corners: np.ndarray, distance: np.ndarray, known: np.ndarray) -
     corners, distance = corners[known], distance[known]
     # A block has one more corner than cubes along each edge. Adjacent blocks share corners.
     block = np.floor_divide(corners, _BLOCK)
-    blocks, owner = np.unique(block, axis=0, return_inverse=True)
-    order = np.argsort(owner.ravel(), kind="stable")
-    bounds = np.searchsorted(owner.ravel()[order], np.arange(len(blocks) + 1))
-    members = {tuple(each): order[a:b] for each, a, b in zip(blocks.tolist(), bounds[:-1], bounds[1:], strict=True)}
+    low = block.min(axis=0, initial=0)
+    size = block.max(axis=0, initial=0) - low + 1
+    keys = np.asarray(np.ravel_multi_index(tuple((block - low).T), tuple(size)))
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    members = {tuple(block[each[0]].tolist()): each for each in np.split(order, starts[1:])} if len(order) else {}
     vertices, faces, first = [], [], 0
     for each in members:
         volume = np.zeros((_BLOCK + 1,) * 3, np.float32)

@@ -20,6 +20,8 @@ _FEWEST = 8
 _MOST_IMAGES = 256
 """Largest number of images of a patch that are distinguished; further ones are combined."""
 _TERMS = 6  # of a polynomial of second order in two variables
+_AT_A_TIME = 500_000
+"""Number of points whose normals are computed together; their matrices take 100 MB."""
 
 
 class PointGrid:
@@ -94,12 +96,15 @@ class LocalPatches:
 
 def surface_normals(points_mm: np.ndarray, *, radius_mm: float, towards: np.ndarray) -> np.ndarray:
     """Return unit normals (N, 3) of planes through the points within a radius of each, oriented ``towards`` (3,)."""
-    grid = PointGrid(points_mm, radius_mm)
-    moments = np.empty((len(points_mm), 6))
-    _fill_moments(points_mm.astype(np.float64), grid.points_mm, grid.keys, grid.low, grid.shape, radius_mm, moments)
-    matrices = moments[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    normals = np.linalg.eigh(matrices)[1][:, :, 0]
-    return np.where((normals @ towards)[:, None] < 0, -normals, normals)
+    grid, normals = PointGrid(points_mm, radius_mm), np.empty((len(points_mm), 3))
+    for start in range(0, len(points_mm), _AT_A_TIME):
+        places = points_mm[start : start + _AT_A_TIME].astype(np.float64)
+        moments = np.empty((len(places), 6))
+        _fill_moments(places, grid.points_mm, grid.keys, grid.low, grid.shape, radius_mm, moments)
+        matrices = moments[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        found = np.linalg.eigh(matrices)[1][:, :, 0]
+        normals[start : start + _AT_A_TIME] = np.where((found @ towards)[:, None] < 0, -found, found)
+    return normals
 
 
 class LocalSurface:
@@ -154,25 +159,26 @@ def _row_range(keys, low, shape, cell, place, row):
     return start, np.searchsorted(keys, first + min(z + 1, shape[2] - 1), side="right")
 
 
-@compiled_with_arrays
+@compiled
 def _fill_moments(places, points, keys, low, shape, radius, moments):
     """Fill the second central moments (P, 6) xx, xy, xz, yy, yz, zz of the points within the radius of each place."""
     for number in range(len(places)):
         place, count = places[number], 0
-        sums, products = np.zeros(3), np.zeros(6)
+        x = y = z = xx = xy = xz = yy = yz = zz = 0.0
         for row in range(9):
             start, end = _row_range(keys, low, shape, radius, place, row)
             for k in range(start, end):
                 a, b, c = points[k, 0] - place[0], points[k, 1] - place[1], points[k, 2] - place[2]
                 if a * a + b * b + c * c <= radius * radius:
                     count += 1
-                    sums += np.array((a, b, c))
-                    products += np.array((a * a, a * b, a * c, b * b, b * c, c * c))
-        mean, column = sums / max(count, 1), 0
-        for i in range(3):
-            for j in range(i, 3):
-                moments[number, column] = products[column] / max(count, 1) - mean[i] * mean[j]
-                column += 1
+                    x, y, z = x + a, y + b, z + c
+                    xx, xy, xz = xx + a * a, xy + a * b, xz + a * c
+                    yy, yz, zz = yy + b * b, yz + b * c, zz + c * c
+        share = 1 / max(count, 1)
+        x, y, z = share * x, share * y, share * z
+        moments[number, 0], moments[number, 1] = share * xx - x * x, share * xy - x * y
+        moments[number, 2], moments[number, 3] = share * xz - x * z, share * yy - y * y
+        moments[number, 4], moments[number, 5] = share * yz - y * z, share * zz - z * z
 
 
 @compiled_with_arrays

@@ -1,8 +1,10 @@
-"""Local means of few points: their intervals hold as often as stated."""
+"""Local means of few points: their intervals hold as often as stated, and blocks of pairs change nothing."""
 
 import numpy as np
+import pytest
 
 from uwlts.comparison.local_means import TWO_SIDED, _student_ratio, average_locally
+from uwlts.storage.cloud import PointUncertainty
 
 
 def test_intervals_of_few_points_hold_as_often_as_stated() -> None:
@@ -15,6 +17,26 @@ def test_intervals_of_few_points_hold_as_often_as_stated() -> None:
     found = average_locally(places, normals, points, uncertainty=None, frame=None, disc_mm=2.0, deep_mm=8.0)
     inside = np.abs(found.mean_mm) < TWO_SIDED * np.sqrt(found.variance_mm2)
     assert abs(inside.mean() - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 3000)
+
+
+def test_means_do_not_depend_on_how_many_pairs_are_averaged_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points of eight images and of none, with uncertainty; some places have no points."""
+    rng, count = np.random.default_rng(5), 4000
+    points = rng.uniform(0, 30, (count, 3)) * [1, 1, 0.02]
+    places = np.column_stack([rng.uniform(-20, 30, (60, 2)), np.zeros(60)])
+    known = PointUncertainty(
+        np.full((count, 6), [1, 0, 0, 1, 0, 1], np.float32),
+        rng.normal(0, 0.1, (count, 3)).astype(np.float32),
+        rng.normal(0, 0.1, (2, count, 3)).astype(np.float32),
+    )
+    frame = rng.integers(-1, 8, count)
+    normals = np.broadcast_to([0.0, 0.0, 1.0], places.shape)
+    options = {"uncertainty": known, "frame": frame, "disc_mm": 3.0, "deep_mm": 2.0}
+    whole = average_locally(places, normals, points, **options)
+    assert 10 < np.isnan(whole.mean_mm).sum() < 50
+    monkeypatch.setattr("uwlts.comparison.local_means._PAIRS_AT_A_TIME", 70)
+    for one, other in zip(whole, average_locally(places, normals, points, **options), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
 def test_the_factor_of_few_points_is_students() -> None:
