@@ -1,6 +1,6 @@
 from . import datasets as datasets
+from .datasets import DataSet as DataSet, load_dataset as load_dataset
 from .datasets.generation import dataset as dataset
-from .datasets.loading import DataSet as DataSet, load_dataset as load_dataset
 from .design.sweep import SweepResult as SweepResult, sweep as sweep
 from .devices.serve import ServedTwin as ServedTwin, serve as serve
 from .recording.campaigns import record as record

@@ -172,7 +172,7 @@ def given_crossings(
     for pair in _true_pairs(
         [correct_places(correction(p.times_s), p.platform_mm, p.places_mm) for p in estimate.pieces]
     ):
-        own = estimate.surfaces[pair[1]].places_mm
+        own = estimate.surface(pair[1]).places_mm
         middle = own.mean(axis=0)
         relative = estimate.relative_movement(pair, middle) @ correction(estimate.prior.nodes_s).T.ravel()
         std = survey.radius_mm * np.repeat([1.0, 1 / float(np.sqrt(np.mean(np.sum((own - middle) ** 2, axis=1))))], 3)

@@ -3,7 +3,8 @@
 Mutants of each package are drawn at random with Cosmic Ray's operators: another arithmetic operator, comparison, sign,
 number or truth value, or a loop left out. Annotations are not changed. Each mutant is tested in a copy of the checkout:
 first with the tests that run the changed line, shortest first, then with the other tests of their files. Slow tests
-are left out. ``--again FILE`` runs all tests on the survivors of earlier results. A mutant survives if no test fails;
+are left out. ``--whole`` runs all fast tests of the package instead, which takes less time for few mutants.
+``--again FILE`` runs all tests on the survivors of earlier results. A mutant survives if no test fails;
 the reader decides if it changes a result at all. Needs ``pip install -e '.[mutants]'``.
 """
 
@@ -32,11 +33,23 @@ TESTS = {
     "uwlts/optics": [f"tests/uwlts/{name}" for name in ("optics", "reconstruction", "calibration", "thesis")],
     "uwlts/stripe": ["tests/uwlts/stripe", "tests/uwlts/reconstruction"],
     "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/reconstruction"],
+    "uwlts/calibration/mount": ["tests/uwlts/calibration/mount"],
+    "uwlts/calibration": [
+        f"tests/uwlts/calibration/{name}"
+        for name in ("camera", "guidance", "sequential", "polynomial", "model_comparison", "test_target_stripes.py")
+    ],
     "uwlts/reconstruction": ["tests/uwlts/reconstruction", "tests/uwlts/report", "tests/system/test_joint_command.py"],
+    "uwlts/fitting": [f"tests/uwlts/{name}" for name in ("fitting", "evaluation", "registration", "inspection")],
+    "uwlts/evaluation": ["tests/uwlts/evaluation", "tests/uwlts/acceptance"],
+    "uwlts/registration": ["tests/uwlts/registration"],
+    "uwlts/alignment": ["tests/uwlts/alignment"],
+    "uwlts/inspection": ["tests/uwlts/inspection"],
+    "uwlts/comparison": ["tests/uwlts/comparison"],
     "twin/light": ["tests/twin/light", "tests/twin/recording"],
     "twin/sensor": ["tests/twin/sensor", "tests/twin/light"],
+    "twin/scene": ["tests/twin/scene"],
 }
-"""Packages, and folders of the tests that run them."""
+"""Packages, without packages within them that are listed too, and folders of the tests that run them."""
 # These change no result, or make every test fail, such as bitwise operators between floating-point numbers.
 _LEFT_OUT = {"NoOp", "RemoveDecorator", "ExceptionReplacer", "VariableReplacer", "VariableInserter"}
 _BITWISE = {"BitAnd", "BitOr", "BitXor", "LShift", "RShift"}
@@ -88,7 +101,10 @@ def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
     from cosmic_ray.plugins import get_operator, operator_names
 
     places: dict[tuple[str, int, int], list[Mutant]] = {}
+    within = [ROOT / other for other in TESTS if other.startswith(f"{package}/")]
     for path in sorted((ROOT / package).rglob("*.py")):
+        if any(path.is_relative_to(other) for other in within):
+            continue
         source, file = path.read_text(), str(path.relative_to(ROOT))
         annotated, tree = annotated_lines(source), get_ast(source)
         for name in operator_names():
@@ -100,15 +116,15 @@ def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
             operator = get_operator(name)()
             positions = [at for node in ast_nodes(tree) for at in operator.mutation_positions(node)]
             for occurrence, ((line, column), _) in enumerate(positions):
-                within = any(at[0] == line and abs(at[1] - column) <= 40 for at in annotated)
-                if not (within and "BitOr" in short):
+                in_annotation = any(at[0] == line and abs(at[1] - column) <= 40 for at in annotated)
+                if not (in_annotation and "BitOr" in short):
                     places.setdefault((file, line, column), []).append(Mutant(package, file, line, short, occurrence))
     chosen = rng.sample(sorted(places), min(number, len(places)))
     return [rng.choice(places[place]) for place in chosen]
 
 
 def copied(folder: Path) -> Path:
-    """Copy the current files of the checkout, without those ignored by Git."""
+    """Copy the current files of the checkout, without those ignored by Git, except for Numba's compiled functions."""
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -116,7 +132,8 @@ def copied(folder: Path) -> Path:
         capture_output=True,
         text=True,
     )
-    for name in listed.stdout.splitlines():
+    compiled = (path for top in ("uwlts", "twin") for path in (ROOT / top).rglob("__pycache__/*.nb[ci]"))
+    for name in (*listed.stdout.splitlines(), *(str(path.relative_to(ROOT)) for path in compiled)):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
@@ -132,7 +149,7 @@ class Tests:
     seconds: dict[str, float]
 
     @classmethod
-    def observed(cls, folder: Path, package: str, *, slow: bool) -> "Tests":
+    def observed(cls, folder: Path, package: str, *, slow: bool, workers: int) -> "Tests":
         """Run a package's tests once."""
         from coverage import CoverageData
 
@@ -140,7 +157,17 @@ class Tests:
         options = [f"--cov={package}", "--cov-context=test", "--cov-report=", f"--junitxml={report}"]
         options += [] if slow else ["-m", "not slow"]
         subprocess.run(
-            [*_pytest(), *options, "-o", "junit_family=xunit1", "-n", "2", "--dist", "loadfile", *TESTS[package]],
+            [
+                *_pytest(),
+                *options,
+                "-o",
+                "junit_family=xunit1",
+                "-n",
+                str(workers),
+                "--dist",
+                "loadfile",
+                *TESTS[package],
+            ],
             cwd=folder,
             check=True,
             stdout=subprocess.DEVNULL,
@@ -190,17 +217,20 @@ def statement_lines(source: str, line: int) -> range:
     return best
 
 
-def tried(mutant: Mutant, folder: Path, tests: Tests) -> Result:
-    """Change the file in a copy of the checkout, run the tests, and put it back."""
+def tried(mutant: Mutant, folder: Path, tests: Tests | None) -> Result:
+    """Change the file in a copy of the checkout, run the tests (default: the package's fast ones), and put it back."""
     path = folder / mutant.file
     source = path.read_text()
     changed = mutant.code(source)
     before, after = (text.splitlines()[mutant.line - 1].strip() for text in (source, changed))
-    chosen = list(tests.chosen(mutant, statement_lines(source, mutant.line)))
+    if tests is None:
+        chosen, limit = ["-m", "not slow", *TESTS[mutant.package]], 4 * _LONGEST_S
+    else:
+        chosen = list(tests.chosen(mutant, statement_lines(source, mutant.line)))
+        limit = 60 + 5 * sum(tests.seconds[test] for test in chosen)
     if not chosen:
         return Result(mutant, "not run", before, after)
     path.write_text(changed)
-    limit = 60 + 5 * sum(tests.seconds[test] for test in chosen)
     try:
         done = subprocess.run(
             [*_pytest(), "-x", *chosen], cwd=folder, timeout=limit, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -217,13 +247,18 @@ def _pytest() -> list[str]:
     return [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
 
 
-def of_package(package: str, mutants: list[Mutant], *, slow: bool, workers: int, console: Console) -> Iterator[Result]:
+def of_package(
+    package: str, mutants: list[Mutant], *, slow: bool, whole: bool, workers: int, console: Console
+) -> Iterator[Result]:
     """Try mutants of a package, one result after the other."""
     with tempfile.TemporaryDirectory() as temporary:
         folders: SimpleQueue[Path] = SimpleQueue()
         for worker in range(workers):
             folders.put(copied(Path(temporary) / str(worker)))
-        tests = Tests.observed(copied(Path(temporary) / "observed"), package, slow=slow)
+        if whole:
+            tests = None
+        else:
+            tests = Tests.observed(copied(Path(temporary) / "observed"), package, slow=slow, workers=workers)
 
         def one(mutant: Mutant) -> Result:
             folder = folders.get()
@@ -246,6 +281,7 @@ def main() -> None:
     parser.add_argument("packages", nargs="*", metavar="package", help=", ".join(TESTS))
     parser.add_argument("--sample", type=int, default=60, help="mutants of each package (default: 60)")
     parser.add_argument("--seed", type=int, default=0, help="draw others by another number")
+    parser.add_argument("--whole", action="store_true", help="run all fast tests of the package for each mutant")
     parser.add_argument("--again", type=Path, help="try the survivors of these results on all tests")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("mutants.json"), help="results, written after each mutant")
@@ -259,7 +295,9 @@ def main() -> None:
         else:
             mutants = drawn(package, options.sample, random.Random(f"{options.seed} {package}"))
         slow = options.again is not None
-        for result in of_package(package, mutants, slow=slow, workers=options.workers, console=console):
+        for result in of_package(
+            package, mutants, slow=slow, whole=options.whole, workers=options.workers, console=console
+        ):
             results = [each for each in results if each.mutant != result.mutant] + [result]
             options.out.write_text(json.dumps([asdict(each) for each in results], indent=1))
     table = Table("package", "mutants", "killed", "survived", "not run", "score")

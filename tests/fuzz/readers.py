@@ -26,8 +26,6 @@ from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
 from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, BLOCK, COLUMNS, INFO, POINTS, PROGRAMS, pcd
 from tests.uwlts.stripe.test_learned import centroid_model
 from twin.datasets.data_set import load_description as load_data_set
-from twin.datasets.loading import load_dataset
-from twin.datasets.shards import Sample, ShardReader, open_shard
 from twin.design.screening import encode_part, read_parts
 from twin.design.study import load_study
 from twin.scene.campaign import load_campaign
@@ -54,6 +52,8 @@ from uwlts.report.inventory import describe
 from uwlts.storage.calibration_file import load_calibration, read_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
+from uwlts.storage.data_set import load_dataset
+from uwlts.storage.data_set_shards import Sample, ShardReader, open_shard
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.centre_lines import read_profiles as read_centre_lines

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -35,7 +36,7 @@ class ModelErrors:
     ``distortion`` contains coefficients added to those of the lens. The target is a saddle, ``saddle_mm`` high at the
     middles of its edges, or twisted by ``twist_mm`` at its corners, and stretched along x by the fraction ``stretch``.
     Its gloss moves the stripe by ``gloss_px``. In the focus, the noise of circles and stripe is ``noise`` times the
-    usual one. At 100 mm from the focus, it is larger by the fraction ``blur``.
+    drawn one. At 100 mm from the focus, it is larger by a drawn fraction and ``blur``.
     """
 
     distortion: tuple[tuple[str, float], ...] = ()
@@ -55,7 +56,8 @@ class Reality:
     thermometer: true minus measured temperature of the water. ``target_saddle_mm`` is twice the height of the middles
     of the target's sides across x, ``target_twist_mm`` the height of its corners by a twist. ``stretch`` (2,) is the
     relative stretch of its columns and rows. The target's gloss moves the stripe by ``gloss_px``. ``circles_px`` and
-    ``stripe_px`` are the noise in the focus, which grows by the fraction ``blur`` within 100 mm.
+    ``stripe_px`` are the noise in the focus, which is at the depth ``focus_mm`` of the OCS; the noise grows by the
+    fraction ``blur`` within 100 mm.
     """
 
     sensor: Sensor
@@ -75,10 +77,11 @@ class Reality:
     stretch: np.ndarray
     gloss_px: float
     blur: float
+    focus_mm: float
 
     def noisier(self, z_mm: float) -> float:
         """Return the noise at a depth of the OCS, divided by that in the focus."""
-        return 1 + self.blur * abs(z_mm) / 100
+        return 1 + self.blur * abs(z_mm - self.focus_mm) / 100
 
     def index(self, medium: Medium, drift_k: float = 0.0) -> float:
         """Return the index of a medium; for water, quadratic in the temperature, also beyond 30 degC."""
@@ -102,7 +105,8 @@ def drawn_reality(
     """Draw a sensor built from drawings.
 
     Quantities with a stated uncertainty are drawn with ``spread`` times this uncertainty, those in ``apart`` with the
-    given factor times it. All others differ as in the sensor as built.
+    given factor times it. All others differ as in the sensor as built. The waist of the sheet scales the noise of the
+    stripe, the focus moves the depth with the least noise, and the aperture sets how fast the noise grows from there.
     """
     stated = described.uncertainty
     known = stated.scaled(spread)
@@ -117,6 +121,9 @@ def drawn_reality(
         distortion[name] += value
     as_drawn = window.normal()[:2] / window.normal()[2]
     slope_x, slope_y = as_drawn + np.tan(np.radians(known.window_tilt_deg)) * rng.standard_normal(2)
+    # Of their own, so that the other draws of a seed do not depend on them.
+    noise_rng = rng.spawn(1)[0]
+    waist, blur, focus_mm = noise_rng.lognormal(0, 0.2), noise_rng.uniform(0, 0.5), noise_rng.normal(0, 20.0)
     bow, facing = np.radians([known.bow_deg, known.laser_window_tilt_deg]) * rng.standard_normal(2)
     window = window.model_copy(
         update={
@@ -154,14 +161,15 @@ def drawn_reality(
         target_bow_mm=rng.normal(0, known.target_bow_mm),
         step_mm=STEP_MM + rng.normal(0, known.step_height_mm),
         circles_px=errors.noise * rng.uniform(0.03, 0.05),
-        stripe_px=errors.noise * rng.uniform(0.1, 0.15),
+        stripe_px=errors.noise * waist * rng.uniform(0.1, 0.15),
         stage_mm=known.stage_position_mm,
         rng=rng,
         target_saddle_mm=rng.normal(0, known.target_bow_mm) + 2 * errors.saddle_mm,
         target_twist_mm=rng.normal(0, known.target_bow_mm) + errors.twist_mm,
         stretch=rng.normal(0, known.stretch_by_axis()) + [errors.stretch, 0.0],
         gloss_px=rng.normal(0, known.target_stripe_px) + errors.gloss_px,
-        blur=errors.blur,
+        blur=errors.blur + blur,
+        focus_mm=focus_mm,
     )
 
 
@@ -173,6 +181,7 @@ class FanRays:
     steps: np.ndarray
 
     @classmethod
+    @lru_cache(maxsize=4)
     def of(cls, real: Reality, index: float, count: int) -> "FanRays":
         """Construct rays from the points lit on two planes; behind the window, light runs straight.
 

@@ -3,6 +3,8 @@
 `load` is a short name of `twin.load_dataset`.
 """
 
-from twin.datasets.loading import load_dataset as load
+from uwlts.storage.data_set import DataSet as DataSet, load_dataset as load_dataset
 
-__all__ = ["load"]
+load = load_dataset
+
+__all__ = ["DataSet", "load", "load_dataset"]

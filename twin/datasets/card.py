@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,25 +14,14 @@ from markupsafe import Markup
 from pydantic import JsonValue
 
 from twin.datasets.coco import write_coco
-from twin.datasets.data_set import (
-    SPLITS,
-    Constant,
-    DataSetDescription,
-    LineStatus,
-    LogUniform,
-    Mask,
-    Normal,
-    OneOf,
-    Split,
-    Uniform,
-)
+from twin.datasets.data_set import Constant, DataSetDescription, LineStatus, LogUniform, Mask, Normal, OneOf, Uniform
 from twin.datasets.labels import MEANINGS
-from twin.datasets.loading import CARD, CARD_FORMAT, CARD_VERSION, DataCard, DataSet, Shard
 from twin.scene.paths import Value
 from uwlts._version import __version__
 from uwlts.files.json_files import write_model
 from uwlts.files.writing import hash_file, write_atomically
 from uwlts.pages.toolkit import BLUE, figure_svg, new_figure, plain_text, png_data_uri, render_page, write_page
+from uwlts.storage.data_set import CARD, CARD_FORMAT, CARD_VERSION, SPLITS, DataCard, DataSet, Shard, Split
 
 README = "README.md"
 PAGE = "dataset.html"
@@ -51,13 +40,24 @@ _OVERLAY = {
 """Colours (red, green, blue) of the masks on the page; later ones cover earlier ones."""
 
 
+_QUALITY: dict[str, tuple[tuple[str, ...], Callable[..., np.floating]]] = {
+    "width_px": (("width_px",), np.median),
+    "snr": (("snr",), np.median),
+    "bound_px": (("bound_px",), np.median),
+    "rms of centroid_px - centre_px": (("centroid_px", "centre_px"), lambda a, b: np.sqrt(np.mean((a - b) ** 2))),
+    "lines with visible_fraction < 0.99": (("visible_fraction",), lambda seen: np.mean(seen < 0.99)),
+    "lines with mixed_fraction > 0.01": (("mixed_fraction",), lambda mixed: np.mean(mixed > 0.01)),
+}
+"""Statistics of a frame: the labels (lines,) that they need, and their function of the finite values."""
+
+
 @dataclass
 class _Collected:
     """Statistics of all frames; their memory does not grow with the size of the images."""
 
     drawn: dict[str, list[Value]] = field(default_factory=dict)
     status: Counter[int] = field(default_factory=Counter)
-    quality: dict[str, list[float]] = field(default_factory=lambda: {"width_px": [], "snr": [], "bound_px": []})
+    quality: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in _QUALITY})
     redrawn: set[int] = field(default_factory=set)
     labels: list[str] = field(default_factory=list)
 
@@ -92,7 +92,8 @@ def write_card(
         description=description.model_dump(mode="json"),
         shards=tuple(Shard(name=path.name, split=own, frames=n, sha256=hash_file(path)) for path, own, n in shards),
     )
-    found = _collect_statistics(DataSet(folder, card, None, ("info", "status", *_Collected().quality)))
+    needed = dict.fromkeys(name for names, _ in _QUALITY.values() for name in names)
+    found = _collect_statistics(DataSet(folder, card, None, ("info", "status", *needed)))
     names = _describe_storage(DataSet(folder, card, None, None))
     card = card.model_copy(
         update={
@@ -130,9 +131,12 @@ def _collect_statistics(samples: DataSet) -> _Collected:
         if "status" in sample:
             numbers, counts = np.unique(sample["status"], return_counts=True)
             found.status.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
-        for name, values in found.quality.items():
-            if name in sample and np.isfinite(sample[name]).any():
-                values.append(float(np.nanmedian(sample[name])))
+        for title, (names, statistic) in _QUALITY.items():
+            if all(name in sample for name in names):
+                values = np.stack([sample[name] for name in names])
+                values = values[:, np.isfinite(values).all(axis=0)]
+                if values.size:
+                    found.quality[title].append(float(statistic(*values)))
     return found
 
 

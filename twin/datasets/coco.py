@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from twin.datasets.data_set import SPLITS, Mask
-from twin.datasets.loading import DataCard, DataSet
+from twin.datasets.data_set import Mask
 from uwlts.files.writing import write_atomically
+from uwlts.storage.data_set import SPLITS, DataCard, DataSet
 
 
 def coco_path(folder: Path, split: str) -> Path:

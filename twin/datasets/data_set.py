@@ -6,8 +6,9 @@ import math
 from abc import ABC, abstractmethod
 from enum import IntEnum, IntFlag
 from pathlib import Path
-from typing import Annotated, Literal, Self, get_args
+from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_validator
 from scipy.special import ndtr, ndtri
 
@@ -24,9 +25,7 @@ ROOTS = ("sensor", "as_built", "scene", "effects")
 """First keys of paths that vary between scenes; only `EXPOSURE` varies between frames."""
 EXPOSURE = "frame.exposure"
 _ONE_FOR_ALL = ("camera.width_px", "camera.height_px", "camera.stripe_along", "detector.bits", "motion.count")
-_PRINT_ERRORS = ("centre_std_mm", "bow_mm", "detection_std_px")
-Split = Literal["train", "validation", "test"]
-SPLITS: tuple[Split, ...] = get_args(Split)
+_PRINT_ERRORS = ("centre_std_mm", "stretch", "bow_mm", "detection_std_px")
 Label = Literal["centre", "quality", "points", "masks", "light", "depth", "target", "sensor"]
 
 
@@ -274,7 +273,9 @@ class DataSetDescription(Description):
             if not printed:
                 raise ValueError("the label 'target' is for scenes with a calibration target: leave it out")
             varied = {path.rpartition(".")[2] for path in self.vary}
-            if any(getattr(one, error) for one in printed for error in _PRINT_ERRORS) or varied & set(_PRINT_ERRORS):
+            if any(np.any(getattr(one, error)) for one in printed for error in _PRINT_ERRORS) or varied & set(
+                _PRINT_ERRORS
+            ):
                 raise ValueError(
                     "the label 'target' does not include errors of print, plate and detection: remove them"
                 )

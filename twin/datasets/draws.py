@@ -8,13 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.datasets.data_set import EXPOSURE, SPLITS, DataSetDescription, Split
+from twin.datasets.data_set import EXPOSURE, DataSetDescription
 from twin.rendering_options import Options
 from twin.scene.description import Scene
 from twin.scene.paths import Value, with_values
 from uwlts.errors import Error
 from uwlts.model.library import validate_description
 from uwlts.model.sensor import Sensor
+from uwlts.storage.data_set import SPLITS, Split
 
 _GOLDEN = (5**0.5 - 1) / 2
 """Golden ratio conjugate: the fractional parts of its first n multiples are evenly spread for every n."""

@@ -19,11 +19,9 @@ from typing import TYPE_CHECKING, Any
 from pydantic import JsonValue
 
 from twin.datasets.card import PAGE, README, write_card
-from twin.datasets.data_set import SPLITS, DataSetDescription, Split, load_description
+from twin.datasets.data_set import DataSetDescription, load_description
 from twin.datasets.draws import DrawnScene, choose_split, draw_scene
 from twin.datasets.labels import make_labels
-from twin.datasets.loading import CARD
-from twin.datasets.shards import SUFFIXES, Sample, open_shard
 from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
 from twin.rendering_options import CPU, Variant, use_variant
 from uwlts.errors import DesignError
@@ -32,6 +30,8 @@ from uwlts.files.writing import OtherWriterError, lock_output, refuse_other_writ
 from uwlts.model.placement import camera_from_object
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import run_jobs
+from uwlts.storage.data_set import CARD, SPLITS, Split
+from uwlts.storage.data_set_shards import SUFFIXES, Sample, open_shard
 
 if TYPE_CHECKING:
     from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage

@@ -29,10 +29,15 @@ _LARGEST_HALF = 65504.0
 NO_OBJECT = 255  # in a map of objects' numbers
 MEANINGS = {
     "centre_px": "(lines,) float32: true centre of the stripe on each profile line, in px across it; NaN without one",
+    "centroid_px": "(lines,) float32: centroid across the stripe of its direct light, in px, without speckle and noise",
     "status": "(lines,) uint8: " + ", ".join(f"{one.value} {one.name.lower()}" for one in LineStatus),
     "width_px": "(lines,) float32: full width at half maximum of the stripe across it, in px",
     "snr": "(lines,) float32: signal-to-noise ratio of the stripe's brightest pixel, without speckle",
     "bound_px": "(lines,) float32: Cramér-Rao bound of the centre's standard deviation, in px, without speckle",
+    "visible_fraction": "(lines,) float32: fraction of the sheet's profile that is lit and seen on the surface at the "
+    "centre: 1 for a whole stripe, less at edges, in shadows and at the image's border",
+    "mixed_fraction": "(lines,) float32: fraction of the stripe's direct light from other surfaces than that at the "
+    "centre",
     "point_mm": "(lines, 3) float32: surface point at the centre, in scene coordinates",
     "normal": "(lines, 3) float32: unit normal of the surface at the point",
     "object": "(lines,) int16: number of the object at the point, -1 for none",
@@ -56,8 +61,9 @@ def make_labels(
     noise = noise_std_e(taken, studio.sensor.detector)
     if {"centre", "quality", "points"} & set(wanted):
         lines = _line_labels(studio, shot, taken, noise)
-        names = {"centre": ("centre_px", "status"), "quality": ("width_px", "snr", "bound_px")}
-        names["points"] = ("point_mm", "normal", "object")
+        names: dict[str, tuple[str, ...]] = {"centre": ("centre_px", "centroid_px", "status")}
+        names["quality"] = "width_px", "snr", "bound_px", "visible_fraction", "mixed_fraction"
+        names["points"] = "point_mm", "normal", "object"
         arrays |= {name: lines[name] for label, group in names.items() if label in wanted for name in group}
     if "masks" in wanted:
         arrays["mask"] = make_mask(
@@ -81,14 +87,22 @@ def _line_labels(
     studio: SensorSimulator, shot: Shot, taken: SimulatedImage, noise: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return all labels of the profile lines of a shot."""
-    from twin.recording.frame_truth import find_crossings, make_empty_truth, select_brightest, sort_lit_crossings
+    from twin.recording.frame_truth import (
+        find_crossings,
+        make_empty_truth,
+        measure_line_light,
+        select_brightest,
+        sort_lit_crossings,
+    )
 
     camera, detector = studio.sensor.camera, studio.sensor.detector
     count, truth, number = camera.lines(), make_empty_truth(camera.lines()), np.full(camera.lines(), -1, np.int16)
     status = np.full(count, LineStatus.LASER_OFF, np.uint8)
     if studio.shows(shot, "laser"):
-        found = find_crossings(studio.renderer, studio.pose(shot), travel=studio.travel(shot))
+        pose, travel = studio.pose(shot), studio.travel(shot)
+        found = find_crossings(studio.renderer, pose, travel=travel)
         truth, order = select_brightest(found, count), sort_lit_crossings(found)
+        truth = measure_line_light(studio.renderer, pose, truth, spp=studio.options.spp, travel=travel)
         number[found.line[order]] = found.thing[order]
         status[:] = LineStatus.NOT_CROSSED
         status[found.line] = LineStatus.SHADOWED
@@ -100,6 +114,7 @@ def _line_labels(
     status[quality.clipped] = LineStatus.SATURATED
     floats = {"centre_px": truth.centre_px, "point_mm": truth.point_mm, "normal": truth.normal}
     floats |= {"width_px": quality.width_px, "snr": quality.snr, "bound_px": quality.bound_px}
+    floats |= {name: getattr(truth, name) for name in ("centroid_px", "visible_fraction", "mixed_fraction")}
     return {name: values.astype(np.float32) for name, values in floats.items()} | {"status": status, "object": number}
 
 

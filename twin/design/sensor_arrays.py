@@ -284,7 +284,7 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
     if by_axis:
         pose = laser_pose(sensor)
         placed = tuple(tuple(v.tolist()) for v in (pose.origin_mm, pose.axis, pose.fan, pose.normal))
-    table = () if isinstance(laser.fan_profile, str) else laser.fan_profile
+    table = laser.fan_table()
     half = math.radians(laser.fan_angle_deg / 2)
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
     angle, speckle = laser.triangulation_angle_deg, 1.0

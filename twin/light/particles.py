@@ -4,6 +4,9 @@ Their positions are sampled in the image: each image area sees an area of the sh
 A body at the irradiance E that sends the radiant intensity I (W/sr) to the camera adds light to the image. The amount
 is that of one pixel that sees a surface of radiance I / F. F is the area perpendicular to the ray that a pixel covers
 there. Defocus and the size of the body spread the light over a disc.
+
+While the sensor moves through the water, bodies cross the sheet. Each is lit while it is in the sheet, and its spot is
+drawn out to a track.
 """
 
 from __future__ import annotations
@@ -16,10 +19,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, to_jit
+from twin.backend.arrays import Float, Vector3f, to_jit
 from twin.light.camera import CameraView
 from twin.light.illumination import Light
-from twin.light.pose import SensorPose
+from twin.light.pose import SensorPose, Travel
 from twin.scene.objects import Objects
 
 Body = Literal["particles", "bubbles"]
@@ -39,6 +42,10 @@ _SIGMAS = 3.0
 """Bodies farther from the sheet's centre than this many standard deviations are treated as dark."""
 _MOST_BODIES = 50_000
 """Largest number of bodies in one image; more of them would look like haze."""
+_STEP_PX = 0.5
+"""Largest distance of the discs that form a track; a disc is at least a pixel wide."""
+_MOST_STEPS = 400
+"""Largest number of discs of a track."""
 _MARGIN_PX = 20.0
 """Width of the border around the image whose bodies are included, because their discs may reach into it."""
 
@@ -74,6 +81,7 @@ def sample_spots(
     objects: Objects,
     pose: SensorPose,
     *,
+    travel: Travel | None,
     body: Body,
     per_litre: float,
     extinction: Float,
@@ -94,6 +102,8 @@ def sample_spots(
         Objects of the scene; bodies behind, inside or shadowed by them are omitted.
     pose
         Pose of the sensor.
+    travel
+        Motion of the sensor through the water during the exposure; None: at rest in it.
     body
         Kind of the bodies.
     per_litre
@@ -120,19 +130,32 @@ def sample_spots(
         crossed = [light.intersect(*light.to_sheet_frame(each.origin, each.direction)) for each in bundles]
         t, bundle = crossed[0][0], bundles[0]
         points = [each.origin + each.direction * where for each, (where, _) in zip(bundles, crossed, strict=True)]
-        area = dr.norm(dr.cross(points[1] - points[0], points[2] - points[0]))
+        right, down = mi.Vector3f(points[1] - points[0]), mi.Vector3f(points[2] - points[0])
+        area = dr.norm(dr.cross(right, down))
         middle = light.evaluate(mi.Point3f(points[0]))
-        place = mi.Point3f(points[0] + middle.normal * (middle.sigma_mm * to_jit(mi.Float, aside)))
+        reach, tracks = middle.sigma_mm, {}
+        if travel is not None:
+            moved = pose.drift(mi.Point3f(points[0]), travel)
+            through = dr.dot(moved, middle.normal)
+            # Bodies that are in the sheet at any time of the exposure.
+            reach = reach + dr.abs(through) / (2 * _SIGMAS)
+            start = middle.normal * (reach * to_jit(mi.Float, aside))
+            tracks = {"start": _image_shift(start, right, down, bundle.direction)}
+            tracks["moved"] = _image_shift(moved, right, down, bundle.direction)
+            tracks = {f"{name}_{axis}": values[k] for name, values in tracks.items() for k, axis in enumerate("xy")}
+            tracks |= {"through": through, "reach": reach, "sigma": middle.sigma_mm}
+        place = mi.Point3f(points[0] + middle.normal * (reach * to_jit(mi.Float, aside)))
         lit = light.evaluate(place)
+        brightness = lit.irradiance if travel is None else lit.in_middle
         hit = objects.scene.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
-        free = (bundle.weight > 0) & (t > 0) & (~hit.is_valid() | (t < hit.t)) & (lit.irradiance > 0)
+        free = (bundle.weight > 0) & (t > 0) & (~hit.is_valid() | (t < hit.t)) & (brightness > 0)
         free &= light.reaches(objects.scene, place, lit, None, free)
-        volume = dr.select(free, area * 2 * _SIGMAS * middle.sigma_mm, 0.0)
+        volume = dr.select(free, area * 2 * _SIGMAS * reach, 0.0)
         across = area * dr.abs(dr.dot(bundle.direction, middle.normal))
         cosine = dr.dot(lit.direction, -bundle.direction)
-        gathered = bundle.weight * lit.irradiance * dr.exp(-extinction * t)
+        gathered = bundle.weight * brightness * dr.exp(-extinction * t)
         depth = view.depth_mm(mi.Point3f(points[0]))
-        values = {"volume": volume, "light": gathered, "across": across, "cosine": cosine, "depth": depth}
+        values = {"volume": volume, "light": gathered, "across": across, "cosine": cosine, "depth": depth} | tracks
         dr.eval(*values.values())
         return {name: value.numpy().astype(float) for name, value in values.items()}
 
@@ -145,9 +168,10 @@ def sample_spots(
     tried = min(rng.poisson(1e-6 * per_litre * largest * width * height), _MOST_BODIES)
     # At least two: empty arrays would compile separate kernels.
     x, y = (rng.uniform(-_MARGIN_PX, side - _MARGIN_PX, max(tried, 2)) for side in (width, height))
-    found = seen(x, y, rng.uniform(-_SIGMAS, _SIGMAS, len(x)))
+    aside = rng.uniform(-_SIGMAS, _SIGMAS, len(x))
+    found = seen(x, y, aside)
     kept = (rng.uniform(0, largest, len(x)) < found["volume"]) & (np.arange(len(x)) < tried)
-    x, y, found = x[kept], y[kept], {name: values[kept] for name, values in found.items()}
+    x, y, aside, found = x[kept], y[kept], aside[kept], {name: values[kept] for name, values in found.items()}
     below = 1 - (_LEAST_MM / _MOST_MM) ** _SLOPE
     diameter = _LEAST_MM * (1 - below * rng.random(len(x))) ** (-1 / _SLOPE)
     match body:
@@ -167,7 +191,40 @@ def sample_spots(
         grain_px = 1e-3 * wavelength_nm * working / camera.pixel_size_um
         grains = np.maximum(1.0, math.pi * np.square(radius / grain_px))
         light_seen = light_seen * rng.gamma(grains) / grains
-    return Spots(x, y, light_seen, radius)
+    spots = Spots(x, y, light_seen, radius)
+    return spots if travel is None else _draw_out(spots, aside, found)
+
+
+def _image_shift(way: Vector3f, right: Vector3f, down: Vector3f, ray: Vector3f) -> tuple[Float, Float]:
+    """Return the shift in px, along x and y, of the image of points that move by ``way``, to first order.
+
+    ``right`` and ``down`` are the ways in the sheet that shift the image by a pixel; ``ray`` is the camera ray.
+    """
+    volume = dr.dot(dr.cross(right, down), ray)
+    return dr.dot(dr.cross(way, down), ray) / volume, dr.dot(dr.cross(right, way), ray) / volume
+
+
+def _draw_out(spots: Spots, aside: np.ndarray, found: dict[str, np.ndarray]) -> Spots:
+    """Return the tracks of bodies, as discs along the parts of their ways where they are in the sheet.
+
+    A body's distance from the sheet's centre at the time t, from -1/2 to 1/2 of the exposure, is ``aside * reach +
+    through * t``. A disc's light is in proportion to its duration and to the sheet's Gaussian.
+    """
+    sigma, through = found["sigma"], np.where(found["through"] == 0, 1e-12, found["through"])
+    ends = np.sort((np.array([[-1.0], [1.0]]) * _SIGMAS * sigma - aside * found["reach"]) / through, axis=0)
+    first, last = np.clip(ends, -0.5, 0.5)
+    length = (last - first) * np.hypot(found["moved_x"], found["moved_y"])
+    steps = np.clip(np.ceil(length / np.maximum(_STEP_PX, 0.5 * spots.radius_px)), 1, _MOST_STEPS).astype(int)
+    body = np.repeat(np.arange(len(steps)), steps)
+    step = np.arange(len(body)) - np.repeat(np.cumsum(steps) - steps, steps)
+    duration = (last - first)[body] / steps[body]
+    t = first[body] + duration * (step + 0.5)
+    away = (aside * found["reach"])[body] + through[body] * t
+    share = duration * np.exp(-0.5 * np.square(away / sigma[body]))
+    x, y = (
+        getattr(spots, axis)[body] + found[f"start_{axis}"][body] + found[f"moved_{axis}"][body] * t for axis in "xy"
+    )
+    return Spots(x, y, spots.light[body] * share, spots.radius_px[body])
 
 
 def diffuse_sphere(cosine: np.ndarray) -> np.ndarray:

@@ -115,6 +115,17 @@ class SensorPose:
         """Transform directions from the OCS of the sensor at rest to the moving OCS at a time."""
         return self._rotate(direction, after_s, sign=-1.0)
 
+    def drift(self, point: Point3f, travel: Travel) -> Vector3f:
+        """Return the displacement in mm of resting points, seen from the moving OCS, during the exposure of a motion.
+
+        It applies in the middle of the exposure, in the OCS.
+        """
+        into = self.scene_from_object[:3, :3].T
+        way = mi.Vector3f(opaque_point(into @ travel.velocity_mm_s * travel.exposure_s))
+        if travel.turn_rad_s is not None:
+            way += dr.cross(mi.Vector3f(opaque_point(into @ travel.turn_rad_s * travel.exposure_s)), mi.Vector3f(point))
+        return -way
+
     def _rotate(self, vector: Vector3f, after_s: Float | None, *, sign: float) -> Vector3f:
         """Rotate vectors by the sensor's rotation within a time (Rodrigues' formula)."""
         if after_s is None or self._axis is None:

@@ -23,6 +23,7 @@ import numpy as np
 
 from twin.backend.arrays import Float, Point3f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
+from twin.light.caustics import CELLS, PATCH_MM, Caustics
 from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
 from twin.light.illumination import Light, make_lights
 from twin.light.image_sampling import (
@@ -39,6 +40,7 @@ from twin.light.multiple_scattering import IndirectLight, LightSources, decay_wi
 from twin.light.particles import Body, sample_spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
+from twin.light.translucency import lit_sigma_mm, spread_irradiance
 from twin.light.walk import Walker
 from twin.light.water import Scattering
 from twin.rendering_options import ALL, Effects
@@ -68,10 +70,6 @@ _SPOT_ASIDE = 0.25
 """Offset of an uneven lamp's axis from the camera's axis, as a fraction of the view's corner slope."""
 _DRIFTING_STREAM = 7
 """Random number stream of particles and bubbles, separate from those of walks and noise."""
-_CAUSTIC_WAVES = 10
-"""Number of surface waves that form caustics."""
-_CAUSTIC_MM = (20.0, 120.0)
-"""Range of their wavelengths on the lit surfaces, for a rippled tank or harbour."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor moves, lit pixels are located at positions of this spacing."""
 _REACH_SHARE = 1.5
@@ -118,9 +116,10 @@ class LaserFrame:
 class Renderer:
     """Renderer of one sensor in one medium and one scene.
 
-    ``uneven_lamp`` is the relative loss of lamp light away from its spot. ``caustics`` is the contrast of daylight on
-    surfaces. ``drifting`` is the number of bodies of each kind per litre (`twin.rendering_options.Flaws`). DesignError
-    if the sensor cannot work in the medium; DescriptionError if an object cannot be built.
+    ``uneven_lamp`` is the relative loss of lamp light away from its spot. ``caustics`` is the water surface that
+    focuses daylight. ``drifting`` is the number of bodies of each kind per litre (`twin.rendering_options.Flaws`).
+    ``surface_seed`` is the seed of random reflectances. DesignError if the sensor cannot work in the medium;
+    DescriptionError if an object cannot be built.
     """
 
     def __init__(
@@ -131,15 +130,20 @@ class Renderer:
         *,
         effects: Effects = ALL,
         uneven_lamp: float = 0.0,
-        caustics: float = 0.0,
+        caustics: Caustics | None = None,
         drifting: Mapping[Body, float] | None = None,
+        surface_seed: int = 0,
     ):
         self.design, self._uneven_lamp = check_design(sensor, medium), uneven_lamp
         self.sensor, self.medium, self.effects = sensor, medium, effects
         self._caustics, self._drifting = caustics, drifting or {}
         wavelength = sensor.laser.wavelength_nm
         self.objects = build_objects(
-            scene, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength, gloss=effects.gloss
+            scene,
+            medium_index=medium.refractive_index(wavelength),
+            wavelength_nm=wavelength,
+            gloss=effects.gloss,
+            seed=surface_seed,
         )
         self.view = CameraView(sensor, medium)
         self.scattering = Scattering(medium, wavelength)
@@ -152,11 +156,19 @@ class Renderer:
         self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
         self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
-        # Pose and cells of the first laser's stripe in the last frame; the ground truth needs them again.
-        self._own_stripe: tuple[SensorPose, np.ndarray] | None = None
+        # Pose, and cells of the first laser's stripe and of all lit pixels in the last frame, for the ground truth.
+        self._last_stripe: tuple[SensorPose, np.ndarray, np.ndarray] | None = None
 
     def irradiance(
-        self, light: LightName, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
+        self,
+        light: LightName,
+        scene_from_object: np.ndarray,
+        *,
+        spp: int,
+        seed: int = 0,
+        travel: Travel | None = None,
+        time_s: float = 0.0,
+        exposure_s: float = 0.0,
     ) -> np.ndarray:
         """Return the irradiance (H, W) on the image sensor in W/mm2, float32.
 
@@ -172,18 +184,34 @@ class Renderer:
             Seed of the random walks. Equal arguments give equal images.
         travel
             Motion of the sensor during the exposure; None: at rest.
+        time_s, exposure_s
+            Time and duration of the exposure, for the waves of the water surface.
         """
         if light == "laser":
-            day = self.irradiance("day", scene_from_object, spp=spp, travel=travel)
+            day = self.irradiance(
+                "day", scene_from_object, spp=spp, travel=travel, time_s=time_s, exposure_s=exposure_s
+            )
             return day + self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
         if light == "day" and not (self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
             return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
-        return self._render_lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
+        pose, pattern = SensorPose(scene_from_object, travel), None
+        if self._caustics is not None and light == "day":
+            pattern = to_jit(mi.Float, self._caustics.pattern(time_s, exposure_s))
+        return self._render_lamp_frame(pose, spp=spp, ambient=light == "day", pattern=pattern)
 
     def laser_frame(
-        self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
+        self,
+        scene_from_object: np.ndarray,
+        *,
+        spp: int,
+        seed: int = 0,
+        travel: Travel | None = None,
+        through_water: Travel | None = None,
     ) -> LaserFrame:
-        """Return the light of the laser on the image sensor; see `irradiance`."""
+        """Return the light of the laser on the image sensor; see `irradiance`.
+
+        ``through_water`` is the motion of the sensor relative to the water and its particles; None: at rest.
+        """
         begin_kernels()
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
@@ -202,10 +230,15 @@ class Renderer:
             longer = partial(walked.image, LightSources(image, haze, surfaces))
         haze = haze if self.effects.haze else np.zeros_like(haze)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
-        particles, polarisation = self._render_particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
+        particles, polarisation = (
+            self._render_particles(direct, pose, through_water, seed=seed),
+            np.clip(polarised / bright, 0, 1),
+        )
         return LaserFrame(longer, haze, particles, rows, columns, stripe, polarisation, rough / bright)
 
-    def _render_particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
+    def _render_particles(
+        self, direct: list[Light], pose: SensorPose, through_water: Travel | None, *, seed: int
+    ) -> np.ndarray:
         """Return the irradiance (H, W) in W/mm2 of particles and bubbles in the sheets."""
         camera = self.sensor.camera
         image = np.zeros((camera.height_px, camera.width_px), np.float32)
@@ -217,6 +250,7 @@ class Renderer:
                     light,
                     self.objects,
                     pose,
+                    travel=through_water,
                     body=body,
                     per_litre=per_litre,
                     extinction=self.scattering.c,
@@ -230,15 +264,14 @@ class Renderer:
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
-        if self._own_stripe is None or not pose.equals(self._own_stripe[0]):
-            bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
-            direct, _ = make_lights(self._sheets[:1], pose)
-            own = np.zeros((shape[0] - 1, shape[1] - 1), bool)
-            for moment, (light, *_) in self._moments(pose, direct):
-                segment = next(self._segments(moment, bundle, None))
-                own |= mark_near_sheet(_sigmas(light.evaluate(segment.end()), segment).numpy().reshape(shape))
-            self._own_stripe = pose, own
-        return find_marked(self._expand_cells(self._own_stripe[1]))
+        return find_marked(self._expand_cells(self._locate_stripe(pose)[0]))
+
+    def _locate_stripe(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
+        """Return cells that the first laser's stripe meets, and cells that light of any stripe reaches."""
+        if self._last_stripe is None or not pose.equals(self._last_stripe[0]):
+            self._laser_nodes(pose, *make_lights(self._sheets, pose, self._mirrors))
+        assert self._last_stripe is not None
+        return self._last_stripe[1:]
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
         """Return the irradiance in W/mm2 per ray of the first laser on directly visible surfaces, and the rays."""
@@ -246,20 +279,87 @@ class Renderer:
         segment = next(self._segments(pose, bundle, after_s))
         return segment.weight * self._radiance(pose, segment, direct, after_s), segment
 
+    def render_line_light(
+        self, pose: SensorPose, points_mm: np.ndarray, normals: np.ndarray, *, spp: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Render the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
+
+        Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet
+        of the plane through its point.
+
+        Parameters
+        ----------
+        pose
+            Pose of the sensor, with its motion.
+        points_mm, normals : (L, 3)
+            Surface point of each profile line in scene coordinates, NaN for none, and the unit normal there.
+        spp
+            Number of samples per pixel.
+
+        Returns
+        -------
+        ndarray, ndarray
+            Rows and columns (P,) of pixels on lines with a point.
+        ndarray
+            Means (3, P) over each pixel: irradiance in W/mm2 from all surfaces, and from others than the line's; and
+            the density of the sheet's normalised profile on the line's surface, in 1/mm of distance from the sheet.
+        """
+        rows, columns = find_marked(self._expand_cells(self._locate_stripe(pose)[1]))
+        along_width = self.sensor.camera.stripe_along == "width"
+        known = np.isfinite(points_mm[columns if along_width else rows, 0])
+        rows, columns, found = rows[known], columns[known], [np.zeros((3, 0), np.float32)]
+        (light, *_), _ = make_lights(self._sheets[:1], pose)
+
+        def sums(pose: SensorPose, bundle: Rays, after_s: Float | None, planes: Float) -> tuple[Float, ...]:
+            segment = next(self._segments(pose, bundle, after_s))
+            here = light.evaluate(segment.end(), after_s)
+            value = segment.weight * self._radiance(pose, segment, [light], after_s, lobes=False)
+            pixel = dr.arange(mi.UInt32, dr.width(value)) // dr.opaque(mi.UInt32, spp)
+            plane = dr.gather(mi.Vector4f, planes, pixel)
+            away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
+            same = dr.abs(away) <= here.sigma_mm
+            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm))
+            profile /= here.sigma_mm * math.sqrt(2 * math.pi)
+            return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
+
+        for part in _split_pixels(rows, columns, spp=spp):
+            line = part[along_width]
+            offset = np.sum(normals[line] * points_mm[line], axis=1, keepdims=True)
+            planes = to_jit(mi.Float, np.concatenate([normals[line], offset], axis=1))
+            found.append(self._render_pixels(sums, pose, *part, planes, spp=spp)())
+        return rows, columns, np.concatenate(found, axis=1)
+
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
     def _segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
         return trace_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
 
-    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None) -> Float:
-        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start."""
+    def _radiance(
+        self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None, *, lobes: bool = True
+    ) -> Float:
+        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start.
+
+        It is that of the main parts of the sheets alone without ``lobes``.
+        """
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
             here = light.evaluate(end, after_s)
-            lit = light.reaches(self.objects.scene, end, here, after_s, segment.valid & (here.irradiance > 0))
+            across = light.sheet.parts if lobes else light.sheet.parts[:1]
+            arriving = here.irradiance if lobes else across[0][0] * here.main_irradiance()
+            # The light of a coat or metal leaves where it arrives, that of a body is spread.
+            parts = [(mi.BSDFContext(), arriving)]
+            if self.objects.translucent:
+                body, coat = mi.BSDFContext(), mi.BSDFContext()
+                body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
+                normal = pose.object_direction(segment.si.n, after_s)
+                spread = spread_irradiance(self.objects, segment.si, normal, here, across)
+                parts = [(coat, arriving), (body, spread)]
+            bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
+            lit = light.reaches(self.objects.scene, end, here, after_s, bright)
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
-            radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
+            for context, value in parts:
+                radiance += dr.select(lit, bsdf.eval(context, segment.si, towards, lit)[0] * value, 0.0)
         return radiance * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
 
     # --- nodes: where the stripe is, and the haze ---------------------------------------------------------------------
@@ -277,7 +377,10 @@ class Renderer:
             scattered = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
                 ends = [light.evaluate(segment.end()) for light in sources]
-                across = [_sigmas(here, segment) for here in ends]
+                across = [
+                    self._sigmas(here, segment, moment, light.sheet.reach)
+                    for light, here in zip(sources, ends, strict=True)
+                ]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
                 if index == 0 and moment is pose and self._scatters:
@@ -301,8 +404,9 @@ class Renderer:
                 lit |= near
             if moment is pose and dr.width(scattered) > 1:
                 image = self._expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)))
-        self._own_stripe = pose, own
-        return dilate_cells(lit, reach), image, [each.numpy().reshape(shape) for each in surfaces]
+        lit = dilate_cells(lit, reach)
+        self._last_stripe = pose, own, lit
+        return lit, image, [each.numpy().reshape(shape) for each in surfaces]
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
@@ -340,12 +444,14 @@ class Renderer:
 
     # --- lamp ---------------------------------------------------------------------------------------------------------
 
-    def _render_lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
+    def _render_lamp_frame(
+        self, pose: SensorPose, *, spp: int, ambient: bool = False, pattern: Float | None = None
+    ) -> np.ndarray:
         """Return the light (H, W) of lamp or daylight in W/mm2; only pixels with changes are sampled finely."""
         begin_kernels()
         bundle, shape = self.view.trace_grid(1)
         segment = next(self._segments(pose, bundle, None))
-        value = self._compute_even_light(segment, ambient)
+        value = self._compute_even_light(segment, ambient, pattern)
         depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
         nodes = value.numpy().reshape(shape)
@@ -358,26 +464,27 @@ class Renderer:
         image = 0.25 * combine_corners(np.add, nodes)
 
         def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None) -> tuple[Float]:
-            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient),)
+            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
 
         for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
             image[rows, columns] = self._render_pixels(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
         return image
 
-    def _compute_even_light(self, segment: RaySegment, ambient: bool) -> Float:
+    def _compute_even_light(self, segment: RaySegment, ambient: bool, pattern: Float | None) -> Float:
         """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
 
         A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight is isotropic, so the water
         scatters the radiance E / pi into every ray. The lamp is beside the camera, so only backscattered light returns.
         Up to the distance t, the veiling light is E / pi (1 - exp(-c t)) times the scattered fraction of the extinction
-        c (Duntley 1963, Eq. 4, for an even light field).
+        c (Duntley 1963, Eq. 4, for an even light field). ``pattern`` is that of focused daylight on surfaces.
         """
         lamp = self.sensor.lamp
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
-        radiance = dr.select(segment.valid, self.objects.albedo(segment.si) * left, 0.0)
-        if self._caustics and ambient:
-            radiance *= self._caustic(segment.si.p)
+        albedo = self.objects.albedo(segment.si) if ambient else self.objects.lamp_albedo(segment.si)
+        radiance = dr.select(segment.valid, albedo * left, 0.0)
+        if pattern is not None:
+            radiance *= self._caustic(segment.si.p, pattern)
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
@@ -385,26 +492,18 @@ class Renderer:
             radiance *= self._lamp_share(segment)
         return segment.weight * level * radiance
 
-    def _caustic(self, p: Point3f) -> Float:
-        """Return the daylight factor of focusing waves on surfaces at points of the scene; its mean is about 1.
+    def _caustic(self, p: Point3f, pattern: Float) -> Float:
+        """Return the relative daylight at points of the scene: the pattern at X and Y, interpolated linearly."""
+        x, y = p.x * (CELLS / PATCH_MM), p.y * (CELLS / PATCH_MM)
+        left, top = dr.floor(x), dr.floor(y)
 
-        A wavy surface of height h displaces rays by the length L times its slopes. The irradiance is proportional to 1
-        / |det(1 - L H)| with the second derivatives H of h (Lock and Andrews, Am. J. Phys. 60, 397, 1992). Waves of all
-        directions give the trace of L H the standard deviation ``caustics``; singularities at folds are clipped.
-        """
-        rng = np.random.default_rng(_DRIFTING_STREAM)
-        angle, phase = rng.uniform(0, 2 * math.pi, (2, _CAUSTIC_WAVES))
-        number = 2 * math.pi / np.geomspace(*_CAUSTIC_MM, _CAUSTIC_WAVES)
-        xx, xy, yy = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
-        for k, a, start in zip(number.tolist(), angle.tolist(), phase.tolist(), strict=True):
-            x, y = math.cos(a), math.sin(a)
-            bend = math.sqrt(2 / _CAUSTIC_WAVES) * dr.cos(k * (x * p.x + y * p.y) + start)
-            xx, xy, yy = xx + x * x * bend, xy + x * y * bend, yy + y * y * bend
-        size = opaque(self._caustics)
-        determinant = (1 - size * xx) * (1 - size * yy) - dr.square(size * xy)
-        # For a normally distributed trace t, the mean of 1 / (1 - t) is 1 + std^2 + 3 std^4 + ...
-        mean = 1 + dr.square(size) + 3 * dr.square(dr.square(size))
-        return 1 / (dr.clip(dr.abs(determinant), 0.15, 10.0) * mean)
+        def read(beside: int, below: int) -> Float:
+            column, row = mi.Int32(left) + beside, mi.Int32(top) + below
+            # The number of cells is a power of two, so that the bits below it count periodically.
+            return dr.gather(mi.Float, pattern, mi.UInt32((row & (CELLS - 1)) * CELLS + (column & (CELLS - 1))))
+
+        above, below = (dr.lerp(read(0, row), read(1, row), x - left) for row in (0, 1))
+        return dr.lerp(above, below, y - top)
 
     def _lamp_share(self, segment: RaySegment) -> Float:
         """Return the fraction of lamp light at the end of camera rays: a round Gaussian spot about the lamp's axis.
@@ -514,14 +613,18 @@ class Renderer:
         blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
         return blur
 
+    def _sigmas(self, here: SheetLight, segment: RaySegment, pose: SensorPose, reach: float) -> Float:
+        """Return distances of segment ends from a sheet in ``reach`` standard deviations; infinite off surfaces."""
+        sigma = here.sigma_mm
+        if self.objects.translucent:
+            sigma = lit_sigma_mm(self.objects, segment.si, pose.object_direction(segment.si.n), here)
+        if reach != 1:
+            sigma = sigma * opaque(reach)
+        return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
+
     def _expand_cells(self, cells: np.ndarray) -> np.ndarray:
         """Expand values of grid cells to pixels (H, W)."""
         return expand_cells(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
-
-
-def _sigmas(here: SheetLight, segment: RaySegment) -> Float:
-    """Return the distance of segment ends from a sheet in standard deviations; infinite without a surface."""
-    return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
 
 def _split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -3,7 +3,7 @@
 All coordinates are in the sensor's object coordinate system (OCS). The nominal sheet is X = 0, Y is along the stripe
 and Z along the laser's axis. A fan ray is the straight line Y = y0(m) + m Z, X = x0(m) + k(m) Z; its slope m = dY/dZ is
 the parameter of the surface. A tilted window or a bow curve the surface. Across it, along its normal, the irradiance is
-Gaussian.
+Gaussian, with side lobes if they are described.
 
 The fan's own frame has x along the sheet's normal, y along the fan and z along the laser's axis. A fan ray is
 identified by the angle in rad between the axis and its projection along x.
@@ -22,6 +22,7 @@ from numpy.polynomial import Chebyshev
 
 from twin.backend.arrays import Float, Point3f, UInt32, Vector3f, opaque, opaque_point, to_jit
 from twin.light.camera import WindowFaces, build_frame
+from twin.light.image_sampling import LIT_SIGMAS
 from twin.light.pose import Rays
 from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object, laser_pose
@@ -45,13 +46,17 @@ _SMALLEST_SPREAD_MM = 1e-3
 """Smallest distance from the fan's vertex; rays closer to it are treated as at this distance."""
 
 
+Part = tuple[Float, Float, Float]
+"""Gaussian across a sheet: share of the power; place and standard deviation in standard deviations of the main one."""
+
+
 @dataclass(frozen=True)
 class SheetLight:
     """Light of the sheet at points: distance, width, irradiance in W/mm2 perpendicular to the ray, direction.
 
     The signed ``distance_mm`` and ``sigma_mm`` are measured along ``normal``, the unit normal of the lit surface
-    towards positive X. ``in_middle`` is the irradiance at the nearest point of the sheet's centre. ``exit_mm`` is the
-    path length from the laser's window.
+    towards positive X. ``in_middle`` is the irradiance at the nearest point of the sheet's centre if all power were in
+    the main Gaussian; scattered light is computed with it. ``exit_mm`` is the path length from the laser's window.
     """
 
     distance_mm: Float
@@ -62,12 +67,17 @@ class SheetLight:
     normal: Vector3f
     exit_mm: Float
 
+    def main_irradiance(self) -> Float:
+        """Return the irradiance in W/mm2 if all power were in the main part of the sheet."""
+        return self.in_middle * dr.exp(-0.5 * dr.square(self.distance_mm / self.sigma_mm))
+
 
 class Sheet:
     """The lit surface of a laser in a medium: of the sensor's main laser, or of ``laser``, another laser of the sensor.
 
     ``power_w`` is the power behind the window, before absorption. ``begins_at_z_mm`` is the smallest Z of the window's
-    outer face in the OCS, before which there is no light. The sheet of another laser has its own OCS;
+    outer face in the OCS, before which there is no light. ``parts`` are the Gaussians across the sheet, the main one
+    first. Side lobes make the lit surface ``reach`` times as wide. The sheet of another laser has its own OCS;
     ``own_from_object`` (4, 4) transforms from the sensor's OCS to it. DesignError if part of the fan does not pass the
     window, or the window bends the fan too unevenly.
     """
@@ -104,6 +114,11 @@ class Sheet:
         index = medium.refractive_index(laser.wavelength_nm)
         rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
         self._waist, self._rayleigh, self._waist_at = map(opaque, (waist, rayleigh, laser.waist_distance_mm))
+        lobes = [(share, 2 * offset, radius) for offset, radius, share in laser.side_lobes]
+        main = (1 - math.fsum(share for share, _, _ in lobes), 0.0, 1.0)
+        self.parts: list[Part] = [(opaque(share), opaque(at), opaque(radius)) for share, at, radius in (main, *lobes)]
+        reaches = [(abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS for _, offset, radius in lobes]
+        self.reach = max([1.0, *reaches])
         self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))
 
     def evaluate(self, p: Point3f) -> SheetLight:
@@ -131,6 +146,11 @@ class Sheet:
         in_middle = density / (sigma * math.sqrt(2 * math.pi)) * stretch * dr.exp(-self._extinction * exit_mm)
         in_middle = dr.select(exit_mm > 0, in_middle, 0.0)
         irradiance = in_middle * dr.exp(-0.5 * dr.square(distance / sigma))
+        if len(self.parts) > 1:
+            irradiance *= self.parts[0][0]
+            for share, offset, radius in self.parts[1:]:
+                away = (distance / sigma - offset) / radius
+                irradiance += in_middle * (share / radius) * dr.exp(-0.5 * dr.square(away))
         direction = mi.Vector3f(tilt, m, 1.0) / stretch
         return SheetLight(distance, sigma, irradiance, in_middle, direction, normal, exit_mm)
 
@@ -231,8 +251,8 @@ def _standard_normal(u: Float) -> Float:
 def _fan_lit_angles(laser: Laser) -> np.ndarray:
     """Return the angles (K,) in rad that bound the smooth parts of the power per angle, which is 0 outside them."""
     half = laser.fan_angle_deg / 2
-    nodes = (-half, half) if isinstance(laser.fan_profile, str) else [angle for angle, _ in laser.fan_profile]
-    return np.radians(nodes)
+    table = laser.fan_table()
+    return np.radians([angle for angle, _ in table] if table else (-half, half))
 
 
 def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
@@ -254,8 +274,8 @@ def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
             relative, total = np.ones_like(angle), 2 * half
         case "gaussian":
             relative, total = np.exp(-2 * (angle / half) ** 2), half * math.sqrt(math.pi / 2) * math.erf(math.sqrt(2))
-        case tuple() as profile:
-            nodes, powers = _fan_lit_angles(laser), [power for _, power in profile]
+        case "powell" | tuple():
+            nodes, powers = _fan_lit_angles(laser), [power for _, power in laser.fan_table()]
             relative, total = np.interp(angle, nodes, powers), np.trapezoid(powers, nodes)
         case _:
             assert_never(laser.fan_profile)

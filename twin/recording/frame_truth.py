@@ -1,6 +1,6 @@
 """Ground truth of a frame: stripe centres, surface points, depths, and image positions of scene points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +26,10 @@ _TOLERANCE_MM = 5e-4
 """
 
 
+_FAINTEST = 1e-3
+"""Fraction of the light at a stripe's centre at which the stripe ends: 3.7 standard deviations of a Gaussian."""
+
+
 @dataclass(frozen=True)
 class FrameTruth:
     """Truth of one frame, as `uwlts.storage.truth.Truth` without the frame axis."""
@@ -35,15 +39,16 @@ class FrameTruth:
     normal: np.ndarray
     status: np.ndarray
     crossings: np.ndarray
+    centroid_px: np.ndarray
+    visible_fraction: np.ndarray
+    mixed_fraction: np.ndarray
 
 
 def make_empty_truth(lines: int) -> FrameTruth:
     """Return the truth of a frame without laser light."""
-    nothing = np.full(lines, np.nan)
-    empty = np.zeros(lines, np.uint8)
-    return FrameTruth(
-        nothing, np.full((lines, 3), np.nan), np.full((lines, 3), np.nan), empty + TruthStatus.NO_STRIPE, empty
-    )
+    number, vector, empty = np.full(lines, np.nan), np.full((lines, 3), np.nan), np.zeros(lines, np.uint8)
+    status = empty + TruthStatus.NO_STRIPE
+    return FrameTruth(number, vector, vector.copy(), status, empty, *(number.copy() for _ in range(3)))
 
 
 @dataclass(frozen=True)
@@ -64,11 +69,89 @@ class Crossings:
 
 
 def find_true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> FrameTruth:
-    """Return the true stripe of a frame: the brightest lit crossing of every profile line.
+    """Return the true stripe of a frame without its light: the brightest lit crossing of every profile line.
 
     It applies to chief rays in the middle of the exposure.
     """
     return select_brightest(find_crossings(renderer, scene_from_object, travel=travel), renderer.sensor.camera.lines())
+
+
+def measure_line_light(
+    renderer: Renderer, scene_from_object: np.ndarray, truth: FrameTruth, *, spp: int, travel: Travel | None = None
+) -> FrameTruth:
+    """Return the truth of a frame with centroid, visible and mixed fraction of each line's stripe.
+
+    Light comes directly from lit surfaces, over pixel, pupil and exposure. A line's stripe is the run of pixels about
+    its centre that exceed 1e-3 of the light there. Speckle, haze, other indirect light, side lobes
+    of the sheet, losses of the lens and noise are excluded.
+    """
+    lines = np.flatnonzero(truth.status == TruthStatus.VISIBLE)
+    if len(lines) == 0:
+        return truth
+    pose, centre = SensorPose(scene_from_object, travel), truth.centre_px[lines]
+    *pixels, values = renderer.render_line_light(pose, truth.point_mm, truth.normal, spp=spp)
+    line, across = pixels[::-1] if renderer.sensor.camera.stripe_along == "width" else pixels
+    # Pixels across the stripe from its centre, of the visible lines only.
+    offset, column = across - np.rint(truth.centre_px[line]).astype(int), np.searchsorted(lines, line)
+    reach = int(np.abs(offset[values[0] > 0]).max(initial=0)) + 1
+    near = np.abs(offset) <= reach
+    windows = np.zeros((3, 2 * reach + 1, len(lines)))
+    windows[:, offset[near] + reach, column[near]] = values[:, near]
+    place = np.arange(-reach, reach + 1)[:, None] + np.rint(centre) - centre
+    total, other, profile = np.where(mark_run(windows[0], np.full(len(lines), reach), _FAINTEST), windows, 0.0)
+    light = total.sum(axis=0)
+    slope = np.abs(_distance_slopes(renderer, pose, truth, lines))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        measured = {
+            "centroid_px": centre + (place * total).sum(axis=0) / light,
+            "visible_fraction": np.where(light > 0, np.minimum(slope * profile.sum(axis=0), 1.0), np.nan),
+            "mixed_fraction": other.sum(axis=0) / light,
+        }
+    filled = {name: getattr(truth, name).copy() for name in measured}
+    for name, values in measured.items():
+        filled[name][lines] = values
+    return replace(truth, **filled)
+
+
+def mark_run(light: np.ndarray, centre: np.ndarray, share: float) -> np.ndarray:
+    """Return the mask (A, L) of each line's run of pixels about its centre that exceed ``share`` of the light there.
+
+    Parameters
+    ----------
+    light : (A, L)
+        Light of A pixels across the stripe on L lines.
+    centre : (L,)
+        Centres in px across the stripe.
+    share
+        Fraction of the light of the three pixels at the centre.
+    """
+    across, place = len(light), np.arange(len(light))[:, None]
+    middle = np.clip(np.rint(centre).astype(int), 0, across - 1)
+    around = np.clip(middle + np.array([-1, 0, 1])[:, None], 0, across - 1)
+    dark = light <= share * light[around, np.arange(len(centre))].max(axis=0)
+    before = np.where(dark & (place <= middle), place, -1).max(axis=0)
+    behind = np.where(dark & (place >= middle), place, across).min(axis=0)
+    return (place > before) & (place < behind)
+
+
+def _distance_slopes(renderer: Renderer, pose: SensorPose, truth: FrameTruth, lines: np.ndarray) -> np.ndarray:
+    """Return the derivative of the sheet's distance on the lines' tangent planes across the stripe, in mm/px."""
+    camera, distance = renderer.sensor.camera, []
+    point, normal = (
+        mi.Vector3f(*(to_jit(mi.Float, axis) for axis in v[lines].T)) for v in (truth.point_mm, truth.normal)
+    )
+    at = to_jit(mi.Float, lines)
+    for aside in (-0.5, 0.5):
+        across = to_jit(mi.Float, truth.centre_px[lines] + aside)
+        x, y = (at, across) if camera.stripe_along == "width" else (across, at)
+        bundle = renderer.view.trace_bundle(x, y)
+        ray = pose.ray(
+            bundle.origin, bundle.direction, None if pose.travel is None else pose.travel.compute_times(y, 0.5)
+        )
+        t = dr.dot(normal, point - mi.Vector3f(ray.o)) / dr.dot(normal, ray.d)
+        place = mi.Point3f(bundle.origin + bundle.direction * t)
+        distance.append(renderer.sheet.evaluate(place).distance_mm.numpy().astype(float))
+    return distance[1] - distance[0]
 
 
 def select_brightest(found: Crossings, lines: int) -> FrameTruth:

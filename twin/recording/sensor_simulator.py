@@ -1,16 +1,18 @@
 """Simulation of a sensor in a scene: poses, exposures, noisy images, and the ground truth of each shot."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from twin.light.caustics import Caustics
+from twin.light.lamp_ring import reflect_ring
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
-from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth
+from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth, measure_line_light
 from twin.rendering_options import Options
-from twin.scene.description import PrintedPlate, Scene, replace_values
+from twin.scene.description import PrintedPlate, Scene, medium_of, replace_values
 from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
 from twin.scene.platforms import Platform
@@ -19,9 +21,8 @@ from twin.sensor.flaws import add_glare, as_built, deliver_image, dirt, laser_sh
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
-from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import Coordinates
 from uwlts.storage.capture import Frame, Seen
 
@@ -35,16 +36,6 @@ STRAY_LINES = 4
 """Number of brightest lines that may be due to single bright pixels."""
 LIT_SHARE = 0.05
 """A line is lit if it exceeds this fraction of the brightest line that is not one of `STRAY_LINES`."""
-
-
-def medium_of(sensor: Sensor, scene: Scene) -> Medium:
-    """Return the sensor's medium that the scene names, with the scene's water if it defines one."""
-    medium = sensor.medium(scene.medium)
-    if scene.water is None:
-        return medium
-    kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}
-    kept = medium.model_dump(include={"kind", "temperature_c", "salinity_g_kg", "index"})
-    return validate_description(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
 
 
 def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
@@ -142,8 +133,9 @@ class SensorSimulator:
             scene,
             effects=options.effects,
             uneven_lamp=flaws.uneven_lamp,
-            caustics=flaws.caustics,
+            caustics=self._water_surface(),
             drifting={"particles": flaws.particles, "bubbles": flaws.bubbles},
+            surface_seed=options.seed,
         )
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
@@ -153,6 +145,7 @@ class SensorSimulator:
         if flaws.dirt and mounted:
             clean = dirt(camera, flaws.dirt, seed=options.seed)
             self._passed = clean if self._passed is None else self._passed * clean
+        self._lamp_ring = self._reflect_lamp() if flaws.lamp_reflection and mounted else None
         self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else None
         self.peak_finder = None
         if flaws.camera_3d:
@@ -163,6 +156,29 @@ class SensorSimulator:
         self.exposure_ms = {light: self._exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
         longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
         self.period_s = self._period_s(max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz))
+
+    def _reflect_lamp(self) -> np.ndarray:
+        """Return the irradiance (H, W) by the lamp ring that the camera's window reflects."""
+        return reflect_ring(
+            self.renderer.view,
+            self.sensor,
+            irradiance_w_per_m2=self.sensor.lamp.irradiance_w_per_m2,
+            distance_mm=float(camera_from_object(self.sensor)[2, 3]),
+            reflectance=self.options.flaws.lamp_reflection,
+        )
+
+    def _water_surface(self) -> Caustics | None:
+        """Return the waves above the scene; None without daylight or wind."""
+        wind, wavelength = self.options.flaws.caustics, self.sensor.laser.wavelength_nm
+        if wind == 0 or self.medium.kind == "air":
+            return None
+        return Caustics(
+            wind_m_s=wind,
+            depth_mm=1e3 * self.scene.depth_m,
+            index=self.medium.refractive_index(wavelength),
+            scattering_per_mm=self.medium.scattering_per_mm(wavelength),
+            seed=self.options.seed,
+        )
 
     def _period_s(self, shortest_s: float) -> float:
         """Return the time between shots: motion or settling of the platform, exposure and read-out of the camera.
@@ -210,6 +226,15 @@ class SensorSimulator:
         velocity, turn = motion.course().twist(shot, exposure_s=1e-3 * exposure_ms)
         return self._travel(velocity, turn, exposure_ms)
 
+    def through_water(self, shot: Shot) -> Travel | None:
+        """Return the motion of the sensor relative to the water during an exposure; None if it does not move."""
+        travel, current = self.travel(shot), np.array(self.scene.current_mm_per_s)
+        if not (self.options.effects.motion and current.any()):
+            return travel
+        if travel is None:
+            return self._travel(-current, None, self.exposure_ms.get(shot.light, 0.0) * shot.exposure)
+        return replace(travel, velocity_mm_s=travel.velocity_mm_s - current)
+
     def travel_at(self, speed: float, *, exposure_ms: float) -> Travel | None:
         """Return the motion of the sensor during an exposure at a stage speed in mm/s; None if it does not move."""
         motion = self.scene.motion
@@ -231,12 +256,24 @@ class SensorSimulator:
         """Return the mean photo-electrons per ms (H, W) of a shot."""
         return self._electrons_per_ms(*self._light(shot, spp=spp, seed=seed, travel=travel), shot)
 
-    def _light(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None) -> ShotLight:
+    def _light(
+        self,
+        shot: Shot,
+        *,
+        spp: int,
+        seed: int,
+        travel: Travel | None,
+        through_water: Travel | None = None,
+        time_s: float = 0.0,
+        exposure_s: float = 0.0,
+    ) -> ShotLight:
         others, pose = "lamp" if self.shows(shot, "lamp") else "day", self.pose(shot)
-        even = self.renderer.irradiance(others, pose, spp=spp, travel=travel)
+        even = self.renderer.irradiance(others, pose, spp=spp, travel=travel, time_s=time_s, exposure_s=exposure_s)
+        if others == "lamp" and self._lamp_ring is not None:
+            even = even + self._lamp_ring
         if not self.shows(shot, "laser"):
             return even, None
-        return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel)
+        return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel, through_water=through_water)
 
     def _electrons_per_ms(
         self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
@@ -281,7 +318,19 @@ class SensorSimulator:
         """Return the light of image number ``index`` before the lens."""
         self._shift_points(shot, index)
         seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
-        return self._light(shot, spp=self.options.spp, seed=seed, travel=self.travel(shot))
+        return self._light(
+            shot,
+            spp=self.options.spp,
+            seed=seed,
+            travel=self.travel(shot),
+            through_water=self.through_water(shot),
+            time_s=self._time_s(shot, index),
+            exposure_s=1e-3 * self.exposure_ms[shot.light] * shot.exposure,
+        )
+
+    def _time_s(self, shot: Shot, index: int) -> float:
+        """Return the time of an image since the first of the scan."""
+        return index * self.period_s if shot.time_s is None else shot.time_s
 
     def frame(self, shot: Shot, index: int) -> Frame:
         """Return image number ``index`` of the scan with its metadata in the capture."""
@@ -303,7 +352,7 @@ class SensorSimulator:
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
-            time_s=index * self.period_s if shot.time_s is None else shot.time_s,
+            time_s=self._time_s(shot, index),
             pose=pose,
             pose_covariance=covariance,
             speed_mm_per_s=self.speed_mm_per_s(),
@@ -355,7 +404,9 @@ class SensorSimulator:
         """Return the ground truth of every profile line of a shot."""
         if not self.shows(shot, "laser"):
             return make_empty_truth(self.sensor.camera.lines())
-        return find_true_stripe(self.renderer, self.pose(shot), travel=self.travel(shot))
+        pose, travel = self.pose(shot), self.travel(shot)
+        truth = find_true_stripe(self.renderer, pose, travel=travel)
+        return measure_line_light(self.renderer, pose, truth, spp=self.options.spp, travel=travel)
 
     def _shift_points(self, shot: Shot, index: int) -> None:
         """Displace the points of a target by its detection errors in this image."""

@@ -9,8 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from twin.scene.description import Block, PrintedPlate, Scene, load_scene, replace_values
+from twin.scene.forms import PittedPipe, Weld
 from twin.scene.motion import Motion
 from twin.scene.platforms import Platform
+from twin.scene.scene_object import SceneObject
 from uwlts.errors import DescriptionError
 from uwlts.model.library import find_description, load_sensor, read_table, validate_description
 from uwlts.model.sensor import Description, NotNegative, Sensor
@@ -21,22 +23,26 @@ FOLDER = "campaigns"
 class Imperfections(Description):
     """Deviations of the real hardware: standard deviations of normal, half widths of uniform distributions.
 
-    Target: ``circle_centre_std_mm`` of each printed circle or corner along x and y; ``target_bow_std_mm`` of the
-    centre's height over the corners; ``circle_detection_std_px`` of each circle or corner in each image, in addition to
-    image noise; ``target_tilt_std_deg`` about X and Y, relative to the stage.
+    Target: ``circle_centre_std_mm`` of each printed circle or corner along x and y; ``target_stretch_std`` of the
+    print's size along x and along y, relative; ``target_bow_std_mm`` of the centre's height over the corners;
+    ``circle_detection_std_px`` of each circle or corner in each image, in addition to image noise;
+    ``target_tilt_std_deg`` about X and Y, relative to the stage.
 
     Stage: ``stage_position_std_mm`` of each position; ``stage_lead_std`` relative to the travel;
     ``stage_misalignment_std_deg`` of the travel about two axes, relative to the sheet's normal in scans and to the
     laser's axis for targets.
 
-    Sensor: ``window_tilt_std_deg`` of the camera's window about x and y; ``sheet_bow_std_deg`` of the beam's tilt at
-    the line optics, which bends the sheet.
+    Sensor: ``window_tilt_std_deg`` of the camera's window about x and y; ``glass_thickness_std_mm`` and
+    ``glass_index_std`` of this window; ``focus_std_mm`` of the camera's focus distance; ``sheet_bow_std_deg`` of the
+    beam's tilt at the line optics, which bends the sheet; ``waist_std`` of the logarithm of the sheet's waist radius,
+    and ``waist_distance_std_mm`` of the waist's distance.
 
     Others: ``temperature_half_width_c`` of the water, drawn once for calibrations and once for measurements;
-    ``step_height_half_width_mm`` of the step standard.
+    ``step_height_half_width_mm`` of the step standard. Depths of pits and undercuts given as a range are drawn again.
     """
 
     circle_centre_std_mm: NotNegative = 0.0
+    target_stretch_std: NotNegative = 0.0
     target_bow_std_mm: NotNegative = 0.0
     circle_detection_std_px: NotNegative = 0.0
     target_tilt_std_deg: NotNegative = 0.0
@@ -45,7 +51,12 @@ class Imperfections(Description):
     stage_misalignment_std_deg: NotNegative = 0.0
     temperature_half_width_c: NotNegative = 0.0
     window_tilt_std_deg: NotNegative = 0.0
+    glass_thickness_std_mm: NotNegative = 0.0
+    glass_index_std: NotNegative = 0.0
+    focus_std_mm: NotNegative = 0.0
     sheet_bow_std_deg: NotNegative = 0.0
+    waist_std: NotNegative = 0.0
+    waist_distance_std_mm: NotNegative = 0.0
     step_height_half_width_mm: NotNegative = 0.0
 
 
@@ -69,12 +80,14 @@ class CampaignRecording(Description):
 class Campaign(Description):
     """Recordings with one sensor. The imperfections are added to the sensor ``as_built``.
 
-    Sensors are names or paths; relative paths start at the campaign's folder.
+    Sensors are names or paths; relative paths start at the campaign's folder. ``water`` replaces that of all scenes in
+    water, by the name of a water or a turbidity from 0 (pure) to 3 (harbour).
     """
 
     title: str
     sensor: str
     as_built: str
+    water: str | Annotated[float, Field(ge=0, le=3)] | None = None
     imperfections: Imperfections = Imperfections()
     recordings: Annotated[tuple[CampaignRecording, ...], Field(min_length=1)]
 
@@ -110,7 +123,7 @@ def list_takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
     """
     drawn = _SampledImperfections(campaign, seed)
     found = [
-        _take(recording, place, medium, drawn, every=every)
+        _take(recording, place, medium, drawn, water=campaign.water, every=every)
         for recording in campaign.recordings
         for place in recording.placements or (None,)
         for medium in recording.media or (None,)
@@ -122,10 +135,23 @@ def list_takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
 
 
 def _take(
-    recording: CampaignRecording, place: str | None, medium: str | None, drawn: "_SampledImperfections", *, every: int
+    recording: CampaignRecording,
+    place: str | None,
+    medium: str | None,
+    drawn: "_SampledImperfections",
+    *,
+    water: str | float | None,
+    every: int,
 ) -> Take:
-    motion = load_scene(recording.scene, placement=place, medium=medium).motion.model_dump() | recording.motion
-    scene = load_scene(recording.scene, placement=place, medium=medium, motion=motion)
+    plain = load_scene(recording.scene, placement=place, medium=medium)
+    in_water = water is not None and drawn.described.medium(plain.medium).kind != "air"
+    scene = load_scene(
+        recording.scene,
+        placement=place,
+        medium=medium,
+        water=water if in_water else None,
+        motion=plain.motion.model_dump() | recording.motion,
+    )
     name = recording.name or f"{Path(recording.scene).stem}-{scene.placement}-{scene.medium}"
     sensor = drawn.described
     built = sensor if recording.as_described else drawn.sensor
@@ -158,13 +184,26 @@ class _SampledImperfections:
         window = built.camera.window
         tilt_x, tilt_y = (size.window_tilt_std_deg * rng.standard_normal(2)).tolist()
         bow = size.sheet_bow_std_deg * rng.standard_normal()
-        tilts = {"tilt_x_deg": window.tilt_x_deg + tilt_x, "tilt_y_deg": window.tilt_y_deg + tilt_y}
-        self.sensor = replace_values(built, camera={"window": tilts}, laser={"bow_deg": built.laser.bow_deg + bow})
+        changed = {"tilt_x_deg": window.tilt_x_deg + tilt_x, "tilt_y_deg": window.tilt_y_deg + tilt_y}
+        # Drawn apart, so that other imperfections of a seed remain as they were.
+        thicker, denser, farther, wider, later, *stretch = np.random.default_rng([seed, 1]).standard_normal(7).tolist()
+        changed["thickness_mm"] = window.thickness_mm + size.glass_thickness_std_mm * thicker
+        if size.glass_index_std > 0:
+            changed["glass"] = window.index(built.laser.wavelength_nm) + size.glass_index_std * denser
+            changed["absorption_per_m"] = 1e3 * window.absorption_per_mm()
+        focus = built.camera.focus_distance_mm + size.focus_std_mm * farther
+        laser = {
+            "bow_deg": built.laser.bow_deg + bow,
+            "waist_radius_mm": built.laser.waist_radius_mm * float(np.exp(size.waist_std * wider)),
+            "waist_distance_mm": built.laser.waist_distance_mm + size.waist_distance_std_mm * later,
+        }
+        self.sensor = replace_values(built, camera={"window": changed, "focus_distance_mm": focus}, laser=laser)
         self._lead = size.stage_lead_std * rng.standard_normal()
         self._scan_angles = size.stage_misalignment_std_deg * rng.standard_normal(2)
         self._warmer_calibrating, self._warmer_measuring = size.temperature_half_width_c * rng.uniform(-1, 1, 2)
         self._target = {
             "centre_std_mm": size.circle_centre_std_mm,
+            "stretch": tuple(size.target_stretch_std * each for each in stretch),
             "bow_mm": size.target_bow_std_mm * rng.standard_normal(),
             "detection_std_px": size.circle_detection_std_px,
             "errors_seed": seed,
@@ -185,6 +224,8 @@ class _SampledImperfections:
                 tilt = size.target_tilt_std_deg * rng.standard_normal(2)
                 turned = np.array(thing.rotation_deg) + (*tilt, 0.0)
                 objects[number] = replace_values(thing, **self._target, rotation_deg=tuple(turned.tolist()))
+            elif draws_depths(thing):
+                objects[number] = replace_values(thing, seed=int(rng.integers(2**31)))
         if self._lower_step != 0 and _shows_step(scene):
             number = _find_lower_block(scene)
             x, y, z = objects[number].position_mm
@@ -205,6 +246,17 @@ class _SampledImperfections:
             nominal_direction=motion.recorded_direction(),
             position_errors_mm=tuple(errors.tolist()),
         )
+
+
+def draws_depths(thing: SceneObject) -> bool:
+    """Return whether an object has pits or undercuts of drawn depths; each campaign draws them again."""
+    match thing:
+        case PittedPipe():
+            return isinstance(thing.pit_depth_mm, tuple)
+        case Weld():
+            return isinstance(thing.undercut_depth_mm, tuple)
+        case _:
+            return False
 
 
 def _shows_step(scene: Scene) -> bool:

@@ -22,7 +22,7 @@ from twin.scene.scene_object import FlatObject, Pose, Reflectance, SceneObject
 from twin.scene.vehicle import Vehicle
 from uwlts.errors import DescriptionError
 from uwlts.model.library import find_description, read_table, validate_description
-from uwlts.model.sensor import Description, NotNegative, Positive, Table
+from uwlts.model.sensor import Description, Medium, NotNegative, Positive, Sensor, Table, Vector
 from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
@@ -83,17 +83,19 @@ class PrintedPlate(SceneObject, ABC):
     """Base of calibration targets on a flat plate that faces -z; its own frame is the target's.
 
     A real target differs from its description: each point (circle or corner) has an error of ``centre_std_mm`` along x
-    and y, and the plate's centre is ``bow_mm`` in front of its corners. ``detection_std_px`` shifts each point
-    independently in each image, in addition to the detection errors that image noise causes. ``errors_seed`` is the
-    seed of these errors.
+    and y. The print is larger along x and y by the fractions ``stretch``. The plate's centre is ``bow_mm`` in front of
+    its corners. ``detection_std_px`` shifts each point independently in each image, in addition to the detection
+    errors that image noise causes. ``errors_seed`` is the seed of these errors.
     """
 
     centre_std_mm: NotNegative = 0.0
+    stretch: tuple[Annotated[float, Field(gt=-0.1, lt=0.1)], Annotated[float, Field(gt=-0.1, lt=0.1)]] = (0.0, 0.0)
     bow_mm: Annotated[float, Field(gt=-10, lt=10)] = 0.0
     detection_std_px: NotNegative = 0.0
     errors_seed: Annotated[int, Field(ge=0)] = 0
 
     _no_texture: ClassVar[str] = "on a plate with a printed pattern: put it on an object of kind 'plate'"
+    _no_mottle: ClassVar[str] = "on a plate with a printed pattern: use an object of kind 'plate', or"
 
     @abstractmethod
     def described_target(self) -> Target:
@@ -109,8 +111,14 @@ class PrintedPlate(SceneObject, ABC):
 
     def scale_reflectance(self, scale: float) -> Self:
         """Return the plate with all reflectances multiplied by ``scale``."""
-        names = [name for name in type(self).model_fields if name.endswith("reflectance")]
-        return self.model_copy(update={name: scale * getattr(self, name) for name in names})
+        own = set(type(self).model_fields) - set(SceneObject.model_fields)
+        printed = {name: getattr(self, name) for name in own if name.endswith("_reflectance")}
+        values = printed | {"reflectance": self.background_reflectance()}
+        return self.model_copy(update={name: scale * value for name, value in values.items()})
+
+    def background_reflectance(self) -> float:
+        """Return the reflectance of the plate around the print."""
+        return self.finish_properties().reflectance
 
 
 class CirclePlate(PrintedPlate):
@@ -184,7 +192,7 @@ class TargetPlate(PrintedPlate):
 
     def ink_and_gap_reflectance(self) -> tuple[float, float]:
         """Return the reflectance of the ink and of the background."""
-        return self.ink_reflectance, self.reflectance
+        return self.ink_reflectance, self.background_reflectance()
 
 
 AnyObject = Annotated[
@@ -215,11 +223,15 @@ class Scene(Description):
     ``medium`` is one of the sensor's media. ``water`` replaces its dissolved and suspended matter, by the name of a
     water or a turbidity from 0 (pure) to 3 (harbour). ``artefact`` and ``target`` are what an operator would record
     about the objects (calibrated values, the description of the target); they are stored in the capture.
+    ``current_mm_per_s`` is the velocity of the water and its particles in scene coordinates. ``depth_m`` is the depth
+    below the water surface, whose waves focus daylight (effect ``caustics``).
     """
 
     title: str
     medium: str = "water"
     water: str | Annotated[float, Field(ge=0, le=3)] | None = None
+    current_mm_per_s: Vector = (0.0, 0.0, 0.0)
+    depth_m: Positive = 1.0
     motion: AnyMotion = Motion()
     objects: Annotated[tuple[AnyObject, ...], Field(min_length=1)]
     placements: dict[str, Pose] = {"standoff": Pose()}
@@ -290,6 +302,16 @@ def load_scene(
         table["motion"] = {**moved, "trajectory": str(path.parent / str(moved["trajectory"]))}
     table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
     return validate_description(Scene, table, path)
+
+
+def medium_of(sensor: Sensor, scene: Scene) -> Medium:
+    """Return the sensor's medium that the scene names, with the scene's water if it defines one."""
+    medium = sensor.medium(scene.medium)
+    if scene.water is None:
+        return medium
+    kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}
+    kept = medium.model_dump(include={"kind", "temperature_c", "salinity_g_kg", "index"})
+    return validate_description(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
 
 
 def _with_paths_from(folder: Path, thing: Table) -> Table:

@@ -1,10 +1,13 @@
 """Surface finishes under water as Mitsuba BSDFs, without specular mirror reflection.
 
-Patterns of calibration targets are textures that are evaluated exactly: the texels of a bitmap would blur their edges.
+Patterns of calibration targets and random fields are textures that are evaluated exactly at every point: the texels of
+a bitmap would blur their edges.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
@@ -14,8 +17,10 @@ import mitsuba as mi
 import numpy as np
 from pydantic import TypeAdapter
 
-from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
+from twin.backend.arrays import Bool, Float, Point3f, SurfaceInteraction3f, UInt32, opaque, to_jit
 from twin.scene.description import AnyObject, FlatObject, PrintedPlate, SceneObject
+from twin.scene.subsurface import LateralSpread, lateral_spread
+from twin.scene.surfaces import WAVES, FinishProperties, draw_patches, draw_waves, log_deviation, move_waves
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.model.media import check_range
 from uwlts.storage.image_file import read_image
@@ -62,43 +67,81 @@ def iron_index(*, wavelength_nm: float) -> complex:
     return complex(np.interp(wavelength_nm, wavelength, n), np.interp(wavelength_nm, wavelength, k))
 
 
-def finish_bsdf(thing: SceneObject, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> mi.BSDF:
+def finish_bsdf(
+    thing: SceneObject,
+    *,
+    medium_index: float,
+    wavelength_nm: float,
+    gloss: bool = True,
+    pose: np.ndarray | None = None,
+    seed: Sequence[int] = (0,),
+) -> mi.BSDF:
     """Return the BSDF of an object in a medium, without its mirror reflection.
 
     Without ``gloss`` all surfaces are diffuse: a body without its coat, and a metal with the reflectance |(m - 1) / (m
-    + 1)|^2 of its smooth surface at normal incidence (Fresnel). DescriptionError if the texture is missing, unreadable,
-    or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
+    + 1)|^2 of its smooth surface at normal incidence (Fresnel). A random reflectance is drawn from ``seed`` and fixed
+    to the object at its ``pose`` (4, 4) in the scene, by default the identity. DescriptionError if the texture is
+    missing, unreadable, or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
     """
-    if gloss and thing.finish != "diffuse":
-        return _make_glossy(thing, _reflectance(thing), medium_index=medium_index, wavelength_nm=wavelength_nm)
-    scale = 1.0
-    if thing.finish == "metal":
+    own, scale = thing.finish_properties(), 1.0
+    field = _random_field(own, np.eye(4) if pose is None else pose, seed)
+    if gloss and own.reflection != "diffuse":
+        reflectance = _reflectance(thing, scale, field)
+        return _make_glossy(thing, reflectance, medium_index=medium_index, wavelength_nm=wavelength_nm)
+    if own.reflection == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
         scale = abs((index - 1) / (index + 1)) ** 2
-    return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale)})
+    return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale, field)})
 
 
 def _make_glossy(
     thing: SceneObject, reflectance: float | mi.Texture, *, medium_index: float, wavelength_nm: float
 ) -> mi.BSDF:
     """Return the BSDF of a metal or coated body; indices are relative to the surrounding medium."""
-    rough = {"distribution": "ggx", "alpha": thing.gloss_alpha()}
-    if thing.finish == "metal":
+    own = thing.finish_properties()
+    rough = {"distribution": "ggx", "alpha": own.alpha}
+    if own.reflection == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
         metal = {"type": "roughconductor", "eta": index.real, "k": index.imag, "sample_visible": True}
         return mi.load_dict(metal | rough | {"specular_reflectance": reflectance})
-    coat = {"type": "roughplastic", "int_ior": COAT_INDEX[thing.finish], "ext_ior": medium_index, "nonlinear": False}
+    coat = {"type": "roughplastic", "int_ior": COAT_INDEX[own.reflection], "ext_ior": medium_index, "nonlinear": False}
     return mi.load_dict(coat | rough | {"diffuse_reflectance": reflectance})
 
 
-def _reflectance(thing: SceneObject, scale: float = 1.0) -> float | mi.Texture:
-    """Return the reflectance of an object, a number or a texture, multiplied by ``scale``."""
+def _random_field(own: FinishProperties, pose: np.ndarray, seed: Sequence[int]) -> dict[str, object]:
+    """Return the waves of mottle and patches in the scene, and the level of the patches; empty if there are none."""
+    field: dict[str, object] = {}
+    if own.mottle > 0 and own.reflectance > 0:
+        waves = draw_waves(np.random.default_rng([*seed, 0]), own.mottle_mm)
+        field["mottle_waves"] = move_waves(waves, pose).tolist()
+    if own.patch_share > 0:
+        waves, level = draw_patches(
+            np.random.default_rng([*seed, 1]), share=own.patch_share, length_mm=own.patch_length_mm
+        )
+        field |= {"patch_waves": move_waves(waves, pose).tolist(), "level": level}
+    return field
+
+
+def _reflectance(thing: SceneObject, scale: float, field: dict[str, object]) -> float | mi.Texture:
+    """Return the reflectance of an object, a number or a texture, multiplied by ``scale``.
+
+    ``field`` describes its random variation in the scene.
+    """
     if isinstance(thing, PrintedPlate):
         return pattern_texture(thing.scale_reflectance(scale))
+    own = thing.finish_properties()
+    if field:
+        numbers = {
+            "mean": own.reflectance,
+            "mottle": own.mottle,
+            "patch": own.patch_reflectance,
+            "share": own.patch_share,
+        }
+        return mi.load_dict({"type": "random_reflectance", "table": json.dumps(field | numbers | {"scale": scale})})
     if thing.texture is None:
-        return scale * thing.reflectance
+        return scale * own.reflectance
     # Texture coordinate v starts at the last row of the picture, but Mitsuba's rows start at the first.
-    grey = scale * thing.reflectance * read_grey(thing.texture)[::-1]
+    grey = scale * own.reflectance * read_grey(thing.texture)[::-1]
     picture = mi.Bitmap(np.ascontiguousarray(grey[..., None], dtype=np.float32))
     wrap_mode = "clamp" if isinstance(thing, FlatObject) else "repeat"
     return mi.load_dict({"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": wrap_mode})
@@ -153,6 +196,16 @@ def albedo_parts(
     return without, (directional_albedo(white, cosines) - without) / unit
 
 
+def body_spread(thing: SceneObject, *, medium_index: float) -> LateralSpread:
+    """Return the lateral spread of light in an object's body in a medium."""
+    own = thing.finish_properties()
+    return lateral_spread(
+        mean_free_path_mm=own.mean_free_path_mm,
+        reflectance=own.reflectance,
+        index=COAT_INDEX.get(own.reflection, medium_index) / medium_index,
+    )
+
+
 def view_along_normal(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     """Return the same surface points viewed along their normals from outside."""
     straight = mi.SurfaceInteraction3f(si)
@@ -161,12 +214,12 @@ def view_along_normal(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
 
 
 def pattern_texture(plate: PrintedPlate) -> mi.Texture:
-    """Return the texture of a printed plate; `register_pattern` must have been called for the variant."""
+    """Return the texture of a printed plate; `register_textures` must have been called for the variant."""
     return mi.load_dict({"type": "target_pattern", "plate": plate.model_dump_json()})
 
 
-def register_pattern() -> None:
-    """Register the texture ``target_pattern`` with the selected Mitsuba variant."""
+def register_textures() -> None:
+    """Register the textures ``target_pattern`` and ``random_reflectance`` with the selected Mitsuba variant."""
 
     class TargetPattern(mi.Texture):
         """Reflectance of a printed plate whose uv coordinates run from 0 to 1 over its bounds.
@@ -213,7 +266,7 @@ def register_pattern() -> None:
             column = dr.clip(dr.floor((x - self.first[0]) / self.cell_mm), 0, self.columns - 1)
             row = dr.clip(dr.floor((y - self.first[1]) / self.cell_mm), 0, self.rows - 1)
             start = 2 * mi.UInt32((row * self.columns + column) * self.depth)
-            value = mi.Float(self.plate.reflectance)
+            value = mi.Float(self.plate.background_reflectance())
             for k in range(self.depth):
                 # Adjacent values are read together, in a quarter of the time.
                 middle_x, middle_y, half_width, aspect = dr.gather(mi.Vector4f, self.patches, start + 2 * k, active)
@@ -225,7 +278,7 @@ def register_pattern() -> None:
             return value
 
         def mean(self) -> Float:
-            return mi.Float(self.plate.reflectance)
+            return mi.Float(self.plate.background_reflectance())
 
         def is_spatially_varying(self) -> bool:
             return True
@@ -233,7 +286,71 @@ def register_pattern() -> None:
         def to_string(self) -> str:
             return f"TargetPattern[{type(self.plate.described_target()).__name__}]"
 
+    class RandomReflectance(mi.Texture):
+        """Log-normal reflectance, limited to 1, with patches of another one, both times a scale.
+
+        Both follow from Gaussian fields of plane waves in the scene.
+        """
+
+        def __init__(self, props: mi.Properties):
+            mi.Texture.__init__(self, props)
+            table = json.loads(str(props["table"]))
+            mottle, patches = table.get("mottle_waves"), table.get("patch_waves")
+            self.mottle_waves = None if mottle is None else to_jit(mi.Float, np.array(mottle))
+            self.patch_waves = None if patches is None else to_jit(mi.Float, np.array(patches))
+            mean, share, scale = table["mean"], table["share"], table["scale"]
+            deviation = log_deviation(table["mottle"])
+            self.gain, self.most = opaque(deviation * math.sqrt(2 / WAVES)), opaque(scale)
+            self.middle = opaque(mean * math.exp(-(deviation**2) / 2))
+            self.level = opaque(table.get("level", 0.0) * math.sqrt(WAVES / 2))
+            self.patch, self.average = (
+                opaque(scale * table["patch"]),
+                opaque(scale * (mean + share * (table["patch"] - mean))),
+            )
+
+        def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
+            return self.eval_1(si, active)
+
+        def eval_1(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
+            value = mi.Float(self.middle)
+            if self.mottle_waves is not None:
+                value *= dr.exp(self.gain * _sum_waves(self.mottle_waves, si.p, active))
+            value = self.most * dr.minimum(value, 1.0)
+            if self.patch_waves is not None:
+                covered = _sum_waves(self.patch_waves, si.p, active) > self.level
+                value = dr.select(covered, self.patch, value)
+            return value
+
+        def mean(self) -> Float:
+            return self.average
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+        def to_string(self) -> str:
+            return "RandomReflectance[]"
+
     mi.register_texture("target_pattern", TargetPattern)
+    mi.register_texture("random_reflectance", RandomReflectance)
+
+
+def _sum_waves(waves: Float, p: Point3f, active: Bool) -> Float:
+    """Return the sum of cos(k p + phase) of plane waves at points of the scene; ``waves`` are k and phase, flat."""
+
+    def add(number: UInt32, total: Float) -> tuple[UInt32, Float]:
+        x, y, z, phase = dr.gather(mi.Vector4f, waves, number, active)
+        return number + 1, total + dr.cos(dr.fma(x, p.x, dr.fma(y, p.y, dr.fma(z, p.z, phase))))
+
+    # Skip the search for loop invariants, as in `Walker`.
+    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+        _, total = dr.while_loop(
+            (dr.zeros(mi.UInt32, dr.width(p)), dr.zeros(mi.Float, dr.width(p))),
+            lambda number, total: number < WAVES,
+            add,
+            mode="symbolic",
+            label="waves",
+        )
+    return total
 
 
 def _patch_table(plate: PrintedPlate) -> np.ndarray:
@@ -277,7 +394,10 @@ def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -
 
 def draw_print_errors(plate: PrintedPlate) -> np.ndarray:
     """Return the print errors (rows, columns, 2) in mm of a target's points along x and y."""
-    return plate.centre_std_mm * _standard_normal(plate, 0)
+    drawn, target = _standard_normal(plate, 0), plate.described_target()
+    rows, columns = np.indices(drawn.shape[:2])
+    places = target.points_at(np.column_stack([columns.ravel(), rows.ravel()]))[:, :2].reshape(drawn.shape)
+    return plate.centre_std_mm * drawn + np.array(plate.stretch) * places
 
 
 def shift_points(scene: mi.Scene, plate: PrintedPlate, *, mm_per_px: float, image: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, assert_never, cast
@@ -13,9 +14,10 @@ import trimesh
 
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Plate, Scene, Sphere, TargetPlate
-from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, view_along_normal
+from twin.scene.finish import albedo_parts, body_spread, finish_bsdf, register_textures, view_along_normal
 from twin.scene.forms.triangles import bowed_plate
 from twin.scene.scene_object import FreeForm
+from twin.scene.subsurface import GAUSSIANS
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_regular_file
 
@@ -25,6 +27,8 @@ _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
 _BLOCK_FACES = [np.roll(np.eye(3), shift, axis=1) @ np.diag([1, sign, sign]) for shift in range(3) for sign in (1, -1)]
 """Right-handed axes (3, 3) of a block's faces; the third one is the outward normal."""
 _CYLINDER_AXIS_TO_X = np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
+_SURFACE_STREAM = 11
+"""Random number stream of surfaces, separate from those of print errors."""
 # At a cosine of 0 no light is sampled: use the albedo at a small cosine instead.
 _ALBEDO_COSINES = np.maximum(np.linspace(0.0, 1.0, 65), 1e-3)
 
@@ -49,13 +53,16 @@ class Objects:
     ``scene`` contains what scatters light and ``mirrors`` the specular faces. Tables list a property of each shape at
     its number in Dr.Jit's registry, which is common to all scenes of the process. ``coherent`` is True if adjacent rays
     are traced faster together, as for meshes but not for spheres and cylinders. ``glossy`` is True if the albedo of any
-    object depends on direction.
+    object depends on direction. ``translucent`` is True if light spreads in the body of any object,
+    and ``retroreflects`` if any returns the lamp's light.
     """
 
     scene: mi.Scene
     mirrors: tuple[MirrorFace, ...]
     coherent: Bool
     glossy: bool
+    translucent: bool
+    retroreflects: bool
     _facts: dict[str, Float]
 
     def mirror_share(self, si: SurfaceInteraction3f) -> Float:
@@ -69,6 +76,33 @@ class Objects:
     def roughness_um(self, si: SurfaceInteraction3f) -> Float:
         """Return the rms height of the objects hit; 0 without a hit."""
         return self._fact("roughness_um", si)
+
+    def lamp_albedo(self, si: SurfaceInteraction3f) -> Float:
+        """Return the radiance of surfaces lit from the camera with the radiance 1 of a uniform sky, as `albedo`.
+
+        A retroreflecting front adds pi times its coefficient of retroreflected luminance.
+        """
+        if not self.retroreflects:
+            return self.albedo(si)
+        return self.albedo(si) + math.pi * dr.select(si.wi.z > 0, self._fact("retroreflection", si), 0.0)
+
+    def spread_ahead_mm(self, si: SurfaceInteraction3f, cosine: Float) -> Float:
+        """Return the mean way of light in the bodies hit, per sine of its incidence angle of the given cosine.
+
+        See `twin.scene.subsurface.LateralSpread`; the way is along the surface.
+        """
+        index = dr.maximum(self._fact("spread_index", si), 1.0)
+        inside = dr.safe_sqrt(1 - (1 - dr.square(cosine)) / dr.square(index))
+        return self._fact("spread_path_mm", si) / (index * (1 + self._fact("spread_decay", si) * inside))
+
+    def spread_parts(self, si: SurfaceInteraction3f) -> list[tuple[Float, Float]]:
+        """Return weights and variances in mm2 of the Gaussians that spread light in the bodies hit."""
+        start, valid = GAUSSIANS * _registry_number(si.shape), si.is_valid()
+        weights, variances = self._facts["spread_weights"], self._facts["spread_variances_mm2"]
+        return [
+            (dr.gather(mi.Float, weights, start + k, valid), dr.gather(mi.Float, variances, start + k, valid))
+            for k in range(GAUSSIANS)
+        ]
 
     def number(self, shape: mi.ShapePtr, active: Bool) -> Int32:
         """Return the index of the objects that shapes belong to; -1 where not ``active``."""
@@ -103,31 +137,43 @@ class Objects:
         return dr.gather(mi.Float, self._facts[key], _registry_number(si.shape), si.is_valid())
 
 
-def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> Objects:
+def build_objects(
+    scene: Scene, *, medium_index: float, wavelength_nm: float, gloss: bool = True, seed: int = 0
+) -> Objects:
     """Build all objects of a scene in a medium for the laser's wavelength; without ``gloss`` diffuse, without mirrors.
 
-    DescriptionError if a mesh or texture file is missing, unreadable or empty; RangeError if the wavelength is outside
-    the table of a metal.
+    Random reflectances are drawn from ``seed`` and the objects' numbers. DescriptionError if a mesh or texture file is
+    missing, unreadable or empty; RangeError if the wavelength is outside the table of a metal.
     """
-    register_pattern()
+    register_textures()
     optics = {"medium_index": medium_index, "wavelength_nm": wavelength_nm}
     things = scene.objects
     placed = list(zip(things, scene.object_poses(), strict=True))
-    shapes = [_shape(thing, pose, finish_bsdf(thing, gloss=gloss, **optics)) for thing, pose in placed]
+    shapes = [
+        _shape(thing, pose, finish_bsdf(thing, gloss=gloss, pose=pose, seed=(seed, number, _SURFACE_STREAM), **optics))
+        for number, (thing, pose) in enumerate(placed)
+    ]
     flat = np.zeros_like(_ALBEDO_COSINES), np.ones_like(_ALBEDO_COSINES)
-    glossy = [gloss and thing.finish != "diffuse" for thing in things]
+    glossy = [gloss and thing.finish_properties().reflection != "diffuse" for thing in things]
     parts = [
         albedo_parts(thing, _ALBEDO_COSINES, **optics) if shines else flat
         for thing, shines in zip(things, glossy, strict=True)
     ]
+    spreads = [body_spread(thing, medium_index=medium_index) for thing in things]
     facts = {
         "mirror": [thing.mirror_share() if gloss else 0.0 for thing in things],
         "polarisation": [thing.polarisation() for thing in things],
-        "roughness_um": [thing.rms_height_um() for thing in things],
+        "roughness_um": [thing.finish_properties().roughness_um for thing in things],
         "number": list(range(len(things))),
         "two_sided": [isinstance(thing, (Mesh, FreeForm)) for thing in things],
         "albedo_black": [black for black, _ in parts],
         "albedo_per_unit": [per_unit for _, per_unit in parts],
+        "retroreflection": [thing.retroreflection for thing in things],
+        "spread_weights": [spread.weights for spread in spreads],
+        "spread_variances_mm2": [spread.variances_mm2 for spread in spreads],
+        "spread_path_mm": [spread.path_mm for spread in spreads],
+        "spread_decay": [spread.decay for spread in spreads],
+        "spread_index": [spread.index for spread in spreads],
     }
     # With optimisation, Mitsuba would merge meshes of equal BSDF into one shape. Without robust intersections, one ray
     # in about ten thousand would pass through the edge between two facets.
@@ -137,6 +183,8 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
         scene=whole,
         coherent=mi.Bool(any(shape.is_mesh() for shape in shapes)),
         glossy=any(glossy),
+        retroreflects=any(thing.retroreflection > 0 for thing in things),
+        translucent=any(spread.path_mm > 0 for spread in spreads),
         mirrors=tuple(face for thing, pose in placed if gloss for face in _mirror_faces(thing, pose)),
         _facts={key: _by_registry(shapes, np.array(values, float)) for key, values in facts.items()},
     )

@@ -2,22 +2,18 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
+from dataclasses import fields, replace
 from functools import lru_cache
-from typing import Annotated, ClassVar, Literal, Self, cast
+from typing import Annotated, ClassVar, Self, cast
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from uwlts.model.sensor import Description, NotNegative, Vector
+from twin.scene.surfaces import FINISHES, LARGEST_CLIPPED, Finish, FinishProperties, clipped_share
+from uwlts.model.sensor import Description, NotNegative, Positive, Vector
 
 Reflectance = Annotated[float, Field(ge=0, le=1)]
-Finish = Literal["diffuse", "painted", "pvc", "metal"]
-
-TYPICAL_ALPHA = {"diffuse": 1.0, "painted": 0.3, "pvc": 0.15, "metal": 0.3}
-"""GGX roughness of a satin paint, an extruded pipe, and ground steel."""
-TYPICAL_ROUGHNESS_UM = {"diffuse": 5.0, "painted": 5.0, "pvc": 5.0, "metal": 1.0}
-"""Rms heights in um; light from a diffuse body has travelled some um inside it, whatever the surface roughness."""
 
 
 class Pose(Description):
@@ -37,38 +33,73 @@ class Pose(Description):
 class SceneObject(Pose):
     """Base of all objects: a pose and a finish.
 
-    ``finish`` selects the reflection model: "diffuse" is Lambertian; "painted" and "pvc" are a diffuse body under a
-    clear, slightly rough coat; "metal" is rough steel. ``reflectance`` is the diffuse reflectance, that of the body
-    under a coat, or the scale of a metal's reflection. It is multiplied by the grey values (0 to 1) of the picture
-    ``texture``. The shape's uv coordinates map the picture, with its last row at v = 0; a relative path starts at the
-    scene's folder. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007), ``roughness_um``
-    the rms height of the surface.
+    ``finish`` names a row of `twin.scene.surfaces.FINISHES`, from which the properties are taken that are not given. It
+    selects the reflection model: "diffuse" is Lambertian; "painted" and "pvc" are a diffuse body under a clear,
+    slightly rough coat; "metal" is rough steel. ``reflectance`` is the diffuse reflectance, that of the body under a
+    coat, or the scale of a metal's reflection. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007),
+    ``roughness_um`` the rms height of the surface.
+
+    The reflectance is multiplied by the grey values (0 to 1) of the picture ``texture``, or by a random field. The
+    shape's uv coordinates map the picture, with its last row at v = 0; a relative path starts at the scene's folder.
+    The random field is log-normal with mean 1 and the standard deviation ``mottle``; products are limited to 1. Its
+    autocorrelation falls to 1 / e at the distance ``mottle_mm``, one length or one along each of the object's axes
+    (`twin.scene.surfaces.draw_waves`). It is fixed to the object, and drawn from the seed of the recording.
+
+    Random patches of the diffuse reflectance ``patch_reflectance``, such as growth or stains, cover the fraction
+    ``patch_share`` of the surface. A line on the surface is within a patch for ``patch_length_mm`` on average.
+
+    ``mean_free_path_mm`` is the transport mean free path of light in a translucent body, which widens the stripe and
+    shifts it ahead along the laser's direction (`twin.scene.subsurface`); 0 for an opaque one.
+
+    ``retroreflection`` is the coefficient of retroreflected luminance in cd/m2/lx (CIE 17-24-104), for tapes and marks
+    that return the light of the lamp beside the camera. The laser is too far beside: its stripe shows ``reflectance``.
     """
 
-    reflectance: Reflectance = 0.8
+    reflectance: Reflectance | None = None
     finish: Finish = "diffuse"
     alpha: Annotated[float, Field(ge=0.02, le=1)] | None = None
     roughness_um: NotNegative | None = None
     texture: str | None = None
+    mottle: Annotated[float, Field(ge=0, le=1)] | None = None
+    mottle_mm: Positive | tuple[Positive, Positive, Positive] | None = None
+    mean_free_path_mm: Annotated[float, Field(ge=0, le=10)] | None = None
+    patch_share: Annotated[float, Field(ge=0, le=0.8)] | None = None
+    patch_length_mm: Positive | None = None
+    patch_reflectance: Reflectance | None = None
+    retroreflection: NotNegative = 0.0
 
     _no_texture: ClassVar[str] = ""
-    """Reason why objects of a class have no texture."""
+    """Reason why objects of a class have no picture as texture."""
+    _no_mottle: ClassVar[str] = ""
+    """Reason why the reflectance of objects of a class does not vary."""
 
     @model_validator(mode="after")
     def _has_what_its_finish_and_shape_take(self) -> Self:
+        own = self.finish_properties()
         if self.texture is not None and self._no_texture:
             raise ValueError(f"texture {self.texture} {self._no_texture}")
-        if self.finish == "diffuse" and self.alpha is not None:
-            raise ValueError(f"alpha {self.alpha:g} is for glossy finishes, but finish is 'diffuse': omit alpha")
+        if own.reflection == "diffuse" and self.alpha is not None:
+            raise ValueError(f"alpha {self.alpha:g} is for glossy finishes, but finish is '{self.finish}': omit alpha")
+        for name in ("mottle", "patch_share"):
+            value = getattr(own, name)
+            if value > 0 and self._no_mottle:
+                raise ValueError(f"{name} {value:g} of the finish '{self.finish}' {self._no_mottle} {name} = 0")
+            if value > 0 and self.texture is not None:
+                raise ValueError(f"texture {self.texture} and {name} {value:g}: use one of them, or {name} = 0")
+        if own.mean_free_path_mm > 0 and own.reflection == "metal":
+            raise ValueError(f"mean_free_path_mm {own.mean_free_path_mm:g} in a metal: light does not enter it")
+        if (lost := clipped_share(own.reflectance, own.mottle)) > LARGEST_CLIPPED:
+            raise ValueError(
+                f"reflectance {own.reflectance:g} with mottle {own.mottle:g} would often exceed 1, and lose "
+                f"{100 * lost:.1f} % of its mean: reduce one of them"
+            )
         return self
 
-    def gloss_alpha(self) -> float:
-        """Return the GGX roughness; the default depends on the finish."""
-        return TYPICAL_ALPHA[self.finish] if self.alpha is None else self.alpha
-
-    def rms_height_um(self) -> float:
-        """Return the rms height of the surface in um; the default depends on the finish."""
-        return TYPICAL_ROUGHNESS_UM[self.finish] if self.roughness_um is None else self.roughness_um
+    def finish_properties(self) -> FinishProperties:
+        """Return the properties of the object's finish, with the given ones in place of those of its row."""
+        row = FINISHES[self.finish]
+        given = {each.name: getattr(self, each.name, None) for each in fields(row)}
+        return replace(row, **{name: value for name, value in given.items() if value is not None})
 
     def mirror_share(self) -> float:
         """Return the specular reflectance of a plane mirror."""
@@ -76,7 +107,7 @@ class SceneObject(Pose):
 
     def polarisation(self) -> float:
         """Return the degree of polarisation of scattered laser light: 1 for metals and mirrors, else 0."""
-        return 1.0 if self.finish == "metal" or self.mirror_share() > 0 else 0.0
+        return 1.0 if self.finish_properties().reflection == "metal" or self.mirror_share() > 0 else 0.0
 
 
 class FlatObject(SceneObject):
@@ -90,12 +121,23 @@ class FlatObject(SceneObject):
 
     @model_validator(mode="after")
     def _reflects_at_most_all(self) -> "FlatObject":
-        if self.reflectance + self.mirror > 1:
-            both = f"reflectance {self.reflectance:g} and mirror {self.mirror:g}"
+        own = self.finish_properties()
+        if own.reflectance + self.mirror > 1:
+            both = f"reflectance {own.reflectance:g} and mirror {self.mirror:g}"
             raise ValueError(f"{both} add up to more than 1: reduce one of them")
-        if self.mirror > 0 and self.finish in ("painted", "pvc"):
+        if self.mirror > 0 and own.reflection in ("painted", "pvc"):
             raise ValueError(f"mirror {self.mirror:g} under a coat: use the finish 'diffuse' or 'metal' for a mirror")
         return self
+
+
+def _check_range(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"the range [{ends[0]:g}, {ends[1]:g}] must begin with its smaller end")
+    return ends
+
+
+Range = Annotated[tuple[Positive, Positive], AfterValidator(_check_range)]
+"""Least and largest value of a size that is drawn."""
 
 
 class FreeForm(SceneObject, ABC):

@@ -31,11 +31,22 @@ LASER_SHARES = {"red": 1.0, "green": 0.083, "blue": 0.008}
 0.041 and 0.004 divided by 0.496 for the Nikon D5100 (Darrodi et al. 2015, J. Opt. Soc. Am. A 32, 381). Filters of
 machine vision cameras may separate colours less.
 """
+_PEDESTAL = 0.0, 30.0
+"""Offset and radius of stray light in radii of the sheet (the radius is assumed)."""
+_FIRST_LOBES = (-2.0, 0.4), (2.0, 0.4)
+"""Offsets and radii of the first side lobes in radii of the sheet.
+
+Fraunhofer diffraction of a Gaussian beam at a slit as wide as 0.8 to 1 of its 1/e^2 diameter: each has 0.8 to 0.3 % of
+the power, its centroid at 1.98 to 2.01 and a radius of 0.38 to 0.43.
+"""
 _RGGB = (("red", "green"), ("green", "blue"))
 
 
 def as_built(sensor: Sensor, flaws: Flaws) -> Sensor:
-    """Return the sensor with the flaws of its pixels, lens and shutter; DescriptionError if they are incompatible."""
+    """Return the sensor with the flaws of its laser, pixels, lens and shutter.
+
+    DescriptionError if they are incompatible.
+    """
     if flaws.jpeg and sensor.detector.bits != 8:
         raise DescriptionError(
             f"jpeg holds 8-bit images, the sensor '{sensor.name}' gives {sensor.detector.bits} bits: take a sensor "
@@ -45,7 +56,10 @@ def as_built(sensor: Sensor, flaws: Flaws) -> Sensor:
     built = {"pixel_aspect": camera.pixel_aspect * flaws.pixel_aspect}
     lens = {"p1": camera.distortion.p1 + flaws.tangential}
     shutter = {"shutter": "rolling", "line_time_us": flaws.rolling_shutter} if flaws.rolling_shutter else {}
-    changes = {"camera": built | {"distortion": lens}, "detector": shutter}
+    lobes = [(*_PEDESTAL, flaws.stray_light)] * (flaws.stray_light > 0)
+    lobes += [(*lobe, flaws.side_lobes / 2) for lobe in _FIRST_LOBES if flaws.side_lobes > 0]
+    laser = {"side_lobes": [*sensor.laser.side_lobes, *lobes]} if lobes else {}
+    changes = {"camera": built | {"distortion": lens}, "detector": shutter, "laser": laser}
     return validate_description(
         Sensor, merge_tables(sensor.model_dump(), changes), f"{sensor.name} with {', '.join(flaws.names())}"
     )

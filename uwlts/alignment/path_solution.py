@@ -5,11 +5,12 @@ Motions that the surface does not determine, for example along a plain pipe, kee
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_solve, eigh, solve_triangular
+from scipy.sparse import csr_array
 
 from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.drift_model import CORRELATION_TIMES, DriftModel
@@ -177,14 +178,17 @@ def _solve_step(estimate: PathEstimate, normal: np.ndarray, right: np.ndarray) -
 def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix (6 C, 6 C) and right-hand side (6 C, 1) of the values from all pairs, without prior."""
     count = len(estimate.values)
-    normal, gradient = np.zeros((count, count)), np.zeros(count)
+    total, gradient = csr_array((count, count)), np.zeros(count)
     for pair in estimate.pairs:
-        _add_pair(estimate, pair, normal, gradient)
+        for derivatives, weight, distance_mm in _linearise_pair(estimate, pair):
+            total += derivatives.T @ derivatives.multiply(weight[:, None]).tocsr()
+            gradient += derivatives.T @ (weight * distance_mm)
+    normal = total.toarray()
     return normal, (normal @ estimate.values - gradient)[:, None]
 
 
-def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: np.ndarray) -> None:
-    """Add the distances of a pair, measured in both directions, to the normal matrix and the gradient."""
+def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_array, np.ndarray, np.ndarray]]:
+    """Yield sparse derivatives (Q, 6 C), weights (Q,) and distances (Q,) of a pair, measured in both directions."""
     ways = []
     for source, target in (pair[::-1], pair):
         found, held_out = estimate.distances(source, target, reach_mm=estimate.reach_mm)
@@ -201,24 +205,25 @@ def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: 
     middle = np.vstack([used.places_mm for _, _, used, _ in ways]).mean(axis=0)
     twists = [rigid_derivatives(used.places_mm, used.normals, middle) for _, _, used, _ in ways]
     observable = _observable_projection([(*way[2:], twist) for way, twist in zip(ways, twists, strict=True)], middle)
+    component = estimate.prior.count * np.arange(6)
     for (source, target, used, weight), twist in zip(ways, twists, strict=True):
-        seen = twist @ observable
-        derivatives = np.zeros((len(weight), 6, estimate.prior.count))
+        seen, columns, values = twist @ observable, [], []
         for number, at, sign in ((source, used.source, 1.0), (target, used.target, -1.0)):
             piece, by = estimate.pieces[number], seen.copy()
             # Points off the centre of a patch were measured slightly earlier or later.
-            off = used.places_mm - estimate.surfaces[number].places_mm[at]
+            off = used.places_mm - estimate.surface(number).places_mm[at]
             later = np.einsum("qi,qi->q", piece.slopes_s_mm[at], off)
             times = piece.times_s[at] + later
             # Rotations of the path are about the platform.
             platform = piece.platform_mm[at] + later[:, None] * piece.velocity_mm_s[at]
             by[:, 3:] += np.cross(middle - platform - estimate.corrections(times)[:, :3], by[:, :3])
-            derivatives += sign * by[:, :, None] * estimate.prior.basis(times)[:, None]
-        derivatives = derivatives.reshape(len(weight), -1)
-        near = np.flatnonzero(derivatives.any(axis=0))
-        derivatives = derivatives[:, near]
-        normal[np.ix_(near, near)] += derivatives.T @ (weight[:, None] * derivatives)
-        gradient[near] += derivatives.T @ (weight * used.distance_mm)
+            before, after = estimate.prior.weights(times)
+            for node, share in ((before, 1 - after), (before + 1, after)):
+                columns.append(node[:, None] + component)
+                values.append(sign * share[:, None] * by)
+        ends = np.arange(0, 6 * len(columns) * len(weight) + 1, 6 * len(columns))
+        places = np.hstack(values).ravel(), np.hstack(columns).ravel(), ends
+        yield csr_array(places, shape=(len(weight), len(estimate.values))), weight, used.distance_mm
 
 
 def _observable_projection(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from cyclopts import Parameter
 
 import uwlts
 from uwlts.cli.command_options import (
+    STRIPE,
     ColouredOut,
     Overwrite,
     a_file,
@@ -161,3 +162,11 @@ def thesis(call: Call) -> None:
     say(written.headline.rstrip())
     page, *others = written.files
     say(f"wrote {page}, {', '.join(file.name for file in others)}")
+
+
+@command_from(app, uwlts.report, "write_domain_gap", job="Inspect", shortcuts=STRIPE)
+def domain_gap(call: Call) -> None:
+    """Example: uwlts domain-gap runs/clean runs/turbid --real photographs bust/laser.png --out gap.html"""
+    found = call()
+    show(found.lines())
+    wrote_page(Path(call.given["out"]))

@@ -192,6 +192,15 @@ class Camera(Description):
         return self.width_px if self.stripe_along == "width" else self.height_px
 
 
+_POWELL_BEAM = 1.7
+"""Squared radius of the beam at a Powell lens, relative to that of a flat line: the edges are 20 % brighter (assumed).
+"""
+_POWELL_NODES = 97
+"""Linear interpolation between them is accurate to 1 % of the power in the middle."""
+_LARGEST_LOBE = 200.0
+"""Largest offset plus radius of side lobes in radii of the sheet, beyond which they would fill the image."""
+
+
 class Laser(Description):
     """Laser that emits a sheet of light.
 
@@ -201,8 +210,13 @@ class Laser(Description):
 
     ``waist_radius_mm`` is the 1/e^2 radius across the sheet at ``waist_distance_mm`` from the origin, in the medium of
     use. ``power_mw`` is the power behind the line optics. ``fan_profile`` is its distribution over the fan: "flat", a
-    constant power per angle; "gaussian", exp(-2 (angle / half the fan)^2) up to the fan's edges; or pairs of an angle
-    in deg and a relative power per angle, interpolated linearly and zero outside. ``bow_deg`` is the tilt of the beam
+    constant power per angle; "gaussian", exp(-2 (angle / half the fan)^2) up to the fan's edges; "powell", that of a
+    Powell lens (`fan_table`); or pairs of an angle in deg and a relative power per angle, interpolated linearly and
+    zero outside.
+
+    ``side_lobes`` are weak Gaussian sheets parallel to the main one: stray light (a wide pedestal at the offset 0) and
+    side lobes. Each is an offset towards the sheet's normal and a 1/e^2 radius, both in units of the main sheet's local
+    radius, and a fraction of the power. ``bow_deg`` is the tilt of the beam
     at the line optics, which curves the line towards the sheet's normal (positive) or away from it. ``linewidth_nm`` is
     the full width at half maximum of the spectrum.
     """
@@ -211,7 +225,8 @@ class Laser(Description):
     linewidth_nm: NotNegative = 0.0
     power_mw: Positive
     fan_angle_deg: Annotated[float, Field(gt=0, lt=120)]
-    fan_profile: Literal["flat", "gaussian"] | tuple[tuple[float, float], ...] = "flat"
+    fan_profile: Literal["flat", "gaussian", "powell"] | tuple[tuple[float, float], ...] = "flat"
+    side_lobes: tuple[tuple[float, Positive, Annotated[float, Field(gt=0, lt=1)]], ...] = ()
     bow_deg: Annotated[float, Field(gt=-10, lt=10)] = 0.0
     roll_deg: Annotated[float, Field(gt=-180, le=180)] = 0.0
     waist_radius_mm: _Length
@@ -251,6 +266,32 @@ class Laser(Description):
                 f"{half:g} deg: widen fan_angle_deg or cut the profile"
             )
         return self
+
+    @model_validator(mode="after")
+    def _check_side_lobes(self) -> "Laser":
+        if (total := math.fsum(share for _, _, share in self.side_lobes)) >= 1:
+            raise ValueError(f"the fractions of side_lobes add up to {total:g}; the main sheet needs the rest of 1")
+        if reach := [lobe for lobe in self.side_lobes if abs(lobe[0]) + lobe[1] > _LARGEST_LOBE]:
+            raise ValueError(f"side_lobes {reach} reach farther than {_LARGEST_LOBE:g} radii of the sheet")
+        return self
+
+    def fan_table(self) -> tuple[tuple[float, float], ...]:
+        """Return the tabulated power per angle of the fan: pairs of an angle in deg and a relative power.
+
+        It is empty for the profiles "flat" and "gaussian". A Powell lens is a cylinder with a hyperbolic section
+        (Powell, US patent 4826299). The slope of its surface at the height x is proportional to u = q / sqrt(1 + q^2),
+        with q in proportion to x. The angle behind the lens is approximately u times half the fan. A Gaussian beam of
+        the 1/e^2 radius q0 has the power per angle (1 - u^2)^(-3/2) exp(-2 u^2 / (q0^2 (1 - u^2))). It is flat in the
+        middle for q0^2 = 4/3. A wider beam with q0^2 = 4/3 b raises it to b^(3/2) exp(3/2 (1/b - 1)) at u^2 = 1 - 1/b.
+        Beyond that angle it falls to zero.
+        """
+        if self.fan_profile != "powell":
+            return () if isinstance(self.fan_profile, str) else self.fan_profile
+        half, squared = self.fan_angle_deg / 2, 4 / 3 * _POWELL_BEAM
+        share = np.linspace(-1, 1, _POWELL_NODES)
+        left = np.maximum(1 - share**2, 1e-3)
+        power = left**-1.5 * np.exp(-2 * (1 / left - 1) / squared)
+        return tuple(zip((half * share).tolist(), power.tolist(), strict=True))
 
 
 AnyPhase = str | phase_functions.DescribedPhase | None

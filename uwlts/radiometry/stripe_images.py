@@ -36,11 +36,18 @@ _CLIPPED = 0.98
 """Fraction of full scale above which a pixel may be clipped."""
 _MOST_CLIPPED = 0.02
 """Largest fraction of lines with clipped pixels in a run; their light is too low by about a tenth."""
-_LONGEST_GAP = 8
+LONGEST_GAP = 8
 """Longest gap along the stripe, lines, in which centres are interpolated."""
 _ROUNDS = 5  # of weights, which follow from the fitted variance
 _BINS = 24
 """Bins of the photon transfer."""
+_BAND_PX = 32
+"""Width of the bands across the stripe. The dimmest is taken as dark; each has thousands of pixels."""
+_HALO_STD = 0.5
+"""Relative standard uncertainty of the light of the halo, because the dimmest band can have some, too.
+
+Chosen with the width of the bands on the drawn captures 100 to 111 of docs/studies/radiometry.py, and judged on others.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +91,14 @@ class StripeImages:
     peak_dn: float
 
 
-def fill_gaps(stripes: CaptureStripes) -> tuple[CaptureStripes, float]:
-    """Interpolate centres in short gaps, and return the fraction of lines in gaps of any length.
+def fill_gaps(stripes: CaptureStripes) -> CaptureStripes:
+    """Interpolate centres in short gaps.
 
     Lines without a centre are dim by chance; without them, a faint stripe would seem brighter than it is.
     """
     same = np.diff(stripes.frame) == 0
     missing = np.where(same, np.diff(stripes.line) - 1, 0)
-    short = (missing > 0) & (missing <= _LONGEST_GAP)
+    short = (missing > 0) & (missing <= LONGEST_GAP)
     before = np.repeat(np.flatnonzero(short), missing[short])
     step = np.concatenate([np.arange(1, count + 1) for count in missing[short].tolist()] or [np.empty(0, int)])
     share = step / (missing[before] + 1)
@@ -100,8 +107,7 @@ def fill_gaps(stripes: CaptureStripes) -> tuple[CaptureStripes, float]:
     filled = stripes[source[order]]
     line = np.concatenate([stripes.line, stripes.line[before] + step])[order]
     centre = np.interp(place[order], np.arange(len(stripes.line)), stripes.centre_px)
-    whole = replace(filled, line=line, centre_px=centre)
-    return whole, float(missing.sum() / (missing.sum() + len(stripes.line)))
+    return replace(filled, line=line, centre_px=centre)
 
 
 def measure_stripes(
@@ -122,7 +128,7 @@ def measure_stripes(
     of_group, light, exposure = np.full(len(stripes.line), -1), [], []
     parts: list[_Part] = []
     frames = np.unique(stripes.frame).tolist()
-    peaks = []
+    peaks, clipped = [], 0
     for number, frame in enumerate(frames):
         own = np.flatnonzero(stripes.frame == frame)
         line = stripes.line[own]
@@ -133,6 +139,7 @@ def measure_stripes(
             part = _measure_run(profiles, stripes.line[chosen], stripes.centre_px[chosen], core, _CLIPPED * full_dn)
             peaks.append(part.values[:, part.middle])
             if np.mean(part.clipped) > _MOST_CLIPPED:
+                clipped += len(run)
                 continue
             for some in np.array_split(np.arange(len(chosen)), max(1, len(chosen) // GROUP_LINES)):
                 kept = some[np.isfinite(part.light[some])]
@@ -144,9 +151,14 @@ def measure_stripes(
                 parts.append(part.select(kept))
         progress(number + 1, len(frames), "brightness of the stripe")
     if len(light) < BLOCKS:
+        share = clipped / max(len(stripes.line), 1)
+        advice = (
+            "record them with a shorter exposure" if share > 0.5 else "record more images of a smooth, matt surface"
+        )
         raise CaptureError(
             f"{capture.path.name} has {len(light)} groups of {GROUP_LINES} neighbouring stripe centres on a smooth "
-            f"surface that are not saturated; {BLOCKS} are needed: record more images, or with a shorter exposure"
+            f"surface that are not saturated, and {BLOCKS} are needed; {100 * share:.0f} % of the centres are in "
+            f"saturated pieces of the stripe: {advice}"
         )
     block = np.arange(len(light)) * BLOCKS // len(light)
     of_block = [_Part.join([part for part, at in zip(parts, block, strict=True) if at == j]) for j in range(BLOCKS)]
@@ -292,8 +304,12 @@ def measure_noise(capture: Capture, stripes: CaptureStripes, *, repeats: Capture
         if whole is not None:
             left = np.array([_fit_transfer(counted.sum(axis=0) - part, background_dn) or whole for part in counted])
             std = np.sqrt(np.diag(jackknife(left - left.mean(axis=0))))
-            dark = math.sqrt(max(whole[1], 0.0))
-            return CameraNoise(whole[0], float(std[0]), dark, float(std[1]) / max(2 * dark, 1e-3))
+            # The intercept is the variance of the pixels beside the stripe, which includes the shot noise of its halo.
+            lines_last = mean if across == 2 else mean.transpose(0, 2, 1)
+            halo = whole[0] * max(background_dn - _dimmest(lines_last, background_dn + dark_dn), 0.0)
+            dark = math.sqrt(max(whole[1] - halo, 0.0))
+            variance_std = math.hypot(float(std[1]), _HALO_STD * halo)
+            return CameraNoise(whole[0], float(std[0]), dark, variance_std / max(2 * dark, 1e-3))
     return _dark_noise(capture, stripes)
 
 
@@ -310,6 +326,14 @@ def _bin_variance(mean: np.ndarray, variance: np.ndarray, edges: np.ndarray) -> 
     held = (cell >= 0) & (cell < len(edges) - 1)
     sums = [np.bincount(cell[held], weight, len(edges) - 1) for weight in (None, mean[held], variance[held])]
     return np.array(sums, dtype=float)
+
+
+def _dimmest(mean: np.ndarray, most: float) -> float:
+    """Return the least mean grey value of bands across the stripe, from pixels of images (G, N, L) below ``most``."""
+    dark = np.where(mean < most, mean, np.nan)
+    bands = [dark[:, at : at + _BAND_PX] for at in range(0, dark.shape[1] - _BAND_PX + 1, _BAND_PX)]
+    held = [band for band in bands if np.count_nonzero(np.isfinite(band)) > band.size / 2]
+    return min((float(np.nanmean(band)) for band in held), default=float(np.nanmean(dark)))
 
 
 def _fit_transfer(counted: np.ndarray, background_dn: float) -> tuple[float, float] | None:

@@ -216,11 +216,11 @@ def _fan_light(laser: Laser, pose: LaserPose, point: np.ndarray, *, medium_index
 def _power_per_rad(laser: Laser, angle: np.ndarray) -> np.ndarray:
     """Return the described fraction of the power per rad at angles (N,) in air; 0 outside the fan."""
     half = math.radians(laser.fan_angle_deg / 2)
-    if isinstance(laser.fan_profile, str):
+    if not (table := laser.fan_table()):
         nodes = np.linspace(-half, half, 1001)
         power = np.exp(-2 * (nodes / half) ** 2) if laser.fan_profile == "gaussian" else np.ones_like(nodes)
     else:
-        degrees, power = np.array(laser.fan_profile).T
+        degrees, power = np.array(table).T
         nodes = np.radians(degrees)
     return np.interp(angle, nodes, power / np.trapezoid(power, nodes), left=0.0, right=0.0)
 

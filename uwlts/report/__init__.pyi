@@ -5,6 +5,7 @@ from .campaign_page import write_campaign as write_campaign
 from .certificate import check_certificate as check_certificate
 from .certificate_page import write_certificate as write_certificate
 from .change_page import write_change as write_change
+from .domain_page import write_domain_gap as write_domain_gap
 from .findings_page import write_findings as write_findings
 from .model_comparison import write_models as write_models
 from .radiometry_page import write_radiometry as write_radiometry

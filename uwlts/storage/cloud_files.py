@@ -33,14 +33,7 @@ from uwlts.storage.cloud import (
     omit_points,
 )
 from uwlts.storage.copc_file import is_copc, read_copc
-from uwlts.storage.foreign_clouds import (
-    FOREIGN_FORMATS,
-    TEXT_FORMATS,
-    WRITTEN_FORMATS,
-    read_foreign,
-    require_libraries,
-    write_foreign,
-)
+from uwlts.storage.foreign_clouds import FORMATS, find_format, read_foreign, require_libraries, write_foreign
 from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
 from uwlts.storage.normal_std import compute_normal_std
 from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
@@ -52,18 +45,15 @@ VERSION = 1  # of the file format
 POINTS_OF_PART = 1_000_000
 """Number of points in a part of a large cloud."""
 
-CLOUD_ENDINGS = (".ply", ".h5", ".copc.laz", *FOREIGN_FORMATS)
+CLOUD_ENDINGS = (".ply", ".h5", ".copc.laz", *(ending for ending, each in FORMATS.items() if each.read))
 """Endings of the clouds that can be read."""
-CLOUD_FORMATS = (".ply", ".h5", *WRITTEN_FORMATS)
+CLOUD_FORMATS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.write))
 """Endings of the clouds that can be written, including ``.copc.laz`` and ``.foxglove.mcap``."""
-COLOURED_FORMATS = (".ply", ".h5", ".laz", ".las", ".e57")
+COLOURED_FORMATS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.coloured))
 """Endings of the clouds that can be written with a colour of each point."""
 PLY_COLOURS = ("red", "green", "blue")
 FULL = ".full.ply"
 """Ending of PLY files with the whole uncertainty."""
-_IN_METRES = (".laz", ".las", ".e57", ".mcap")
-_CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57", ".pcd")
-"""Endings that only clouds have."""
 _LEAN = (
     "it holds the standard deviation of each point along the surface normal, and no errors that points share: results "
     f"have no uncertainty. Use the cloud in HDF5 (NAME.h5) or in PLY with the whole uncertainty (NAME{FULL})"
@@ -118,7 +108,7 @@ def write_cloud(
     """
     path = Path(path)
     _require_format(path, coloured=colours is not None)
-    if path.suffix.lower() in WRITTEN_FORMATS:
+    if find_format(path) is not None:
         write_foreign(path, cloud, overwrite=overwrite, colours=colours)
         return
     if _in_hdf5(path):
@@ -265,7 +255,8 @@ def read_parts(
 
 def unit_of(path: str | os.PathLike[str]) -> Unit:
     """Return the unit in which `write_cloud` writes coordinates, by the ending of the name."""
-    return "m" if Path(path).suffix.lower() in _IN_METRES else "mm"
+    form = find_format(path)
+    return "mm" if form is None or form.unit is None else form.unit
 
 
 def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -> PointCloud:
@@ -273,16 +264,16 @@ def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -
 
     Raises CaptureError if its file states another unit.
     """
-    ending = Path(path).suffix.lower()
-    # The readers of text and PCD have converted theirs.
-    if ending not in (*TEXT_FORMATS, ".pcd"):
+    form = find_format(path)
+    # Foreign formats without a prescribed unit were converted when they were read.
+    if form is None or form.unit is not None:
         own = _in_hdf5(path) or bool(cloud.metadata.keys() - {STEP}) or cloud.uncertainty is not None
-        stated = unit_of(path) if own or ending in _IN_METRES else None
+        stated = unit_of(path) if own or form is not None else None
         if unit is not None and stated not in (None, unit):
             raise CaptureError(
                 f"{path} is in {stated}, as its format prescribes, but the unit {unit} was given: omit it"
             )
-        if ending == ".ply":
+        if Path(path).suffix.lower() == ".ply":
             scale, step = MM_PER_UNIT[check_unit(unit or "mm")], find_float_step(cloud.points_mm)
             cloud = note_step(replace(cloud, points_mm=scale * cloud.points_mm), scale * step)
     log_warnings(path, cloud.warnings)
@@ -290,7 +281,8 @@ def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -
 
 
 def _is_foreign(path: str | os.PathLike[str]) -> bool:
-    return Path(path).suffix.lower() in FOREIGN_FORMATS
+    form = find_format(path)
+    return form is not None and form.read is not None
 
 
 @contextmanager
@@ -331,12 +323,15 @@ def is_cloud(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is a cloud, by its ending, or by its label if captures have the same ending."""
     if _in_hdf5(path):
         return read_format(Path(path)) == FORMAT
-    return is_copc(path) or Path(path).suffix.lower() in _CLOUDS_ALONE
+    if is_copc(path) or Path(path).suffix.lower() == ".ply":
+        return True
+    form = find_format(path)
+    return form is not None and form.read is not None and not form.ambiguous
 
 
 def is_readable_cloud(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is a cloud (`is_cloud`), or is text, which may contain one."""
-    return is_cloud(path) or Path(path).suffix.lower() in TEXT_FORMATS
+    return is_cloud(path) or _is_foreign(path)
 
 
 def _in_hdf5(path: str | os.PathLike[str]) -> bool:

@@ -1,6 +1,8 @@
 """Clouds in formats of other programs and scanners: text, PCD, LAS, E57; LAZ, COPC and MCAP are only written here."""
 
-from dataclasses import replace
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,29 +19,55 @@ from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit, read_numb
 from uwlts.storage.pcd_file import read_pcd
 from uwlts.storage.point_cloud2 import covariance_columns
 
-TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
-"""Columns x, y, z by name, or the first three, in mm or the unit of their names; and optionally intensity."""
-FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57", ".pcd")
-WRITTEN_FORMATS = (".xyz", ".laz", ".e57", ".las", ".mcap")
+Colours = np.ndarray | None
+
+
+@dataclass(frozen=True)
+class CloudFormat:
+    """Format of files with a cloud.
+
+    Attributes
+    ----------
+    read
+        Reads a file whose numbers are in a unit if it states none. None if files are only written.
+    write
+        Writes a cloud with colours (N, 3) or None to a path that is renamed to the second one afterwards. None if files
+        are only read.
+    libraries
+        Optional libraries that writing needs.
+    coloured
+        Whether points can have colours.
+    unit
+        Unit that the format prescribes, or None if files can be in any unit.
+    ambiguous
+        Whether files with this ending usually contain something else.
+    """
+
+    read: Callable[[Path, Unit | None], PointCloud] | None = None
+    write: Callable[[Path, PointCloud, Colours, Path], object] | None = None
+    libraries: tuple[Literal["laspy", "lazrs", "copclib", "pye57"], ...] = ()
+    coloured: bool = False
+    unit: Unit | None = None
+    ambiguous: bool = False
+
+
+def find_format(path: str | os.PathLike[str]) -> CloudFormat | None:
+    """Return the format of a file by its ending, the longest that fits; None if it is no foreign format."""
+    name = Path(path).name.lower()
+    return FORMATS.get(max((ending for ending in FORMATS if name.endswith(ending)), key=len, default=""))
 
 
 def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
-    """Read all points of a file in one of `FOREIGN_FORMATS`.
+    """Read all points of a file in one of `FORMATS`.
 
     Text is in the unit that the names of its columns state, else in ``unit``, by default mm; PCD is in ``unit``; LAS
     and E57 are in m, as they prescribe. The scans of an E57 file are combined, each at its pose.
 
     Raises CaptureError if the file is damaged or foreign, SetupError if the library for its format is not installed.
     """
-    match path.suffix.lower():
-        case ".las":
-            return read_las(path)
-        case ".e57":
-            return read_e57(path)
-        case ".pcd":
-            return _read_pcd(path, unit)
-        case _:
-            return _read_text(path, unit)
+    form = find_format(path)
+    assert form is not None and form.read is not None
+    return form.read(path, unit)
 
 
 def _read_pcd(path: Path, unit: Unit | None) -> PointCloud:
@@ -69,8 +97,8 @@ def _read_text(path: Path, unit: Unit | None) -> PointCloud:
     return replace(cloud, warnings=[*table.notes, *cloud.warnings])
 
 
-def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np.ndarray | None = None) -> None:
-    """Write a cloud in one of `WRITTEN_FORMATS`, by the path's suffix, completely or not at all.
+def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: Colours = None) -> None:
+    """Write a cloud in one of `FORMATS`, by the path's ending, completely or not at all.
 
     Raises OutputError if the file exists, the cloud is empty, too wide for LAS, or lacks some intensities in E57, or
     writing fails; SetupError if the format's library is not installed.
@@ -80,50 +108,44 @@ def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np
     if is_copc(path):
         write_copc(path, lambda: [cloud], overwrite=overwrite)
         return
+    form = find_format(path)
+    assert form is not None and form.write is not None
     with write_atomically(path, overwrite=overwrite) as aside:
-        match path.suffix.lower():
-            case ".xyz":
-                rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
-                with open(aside, "w", encoding="utf-8") as file:
-                    # CloudCompare reads the names from a first line that begins with two slashes.
-                    file.write("//X Y Z Intensity\n")
-                    file.writelines(f"{x!r} {y!r} {z!r} {intensity!s}\n" for x, y, z, intensity in rows)
-            case ".laz" | ".las" as suffix:
-                fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
-                if cloud.deviation_mm is not None:
-                    fields["deviation_mm"] = cloud.deviation_mm
-                fields |= covariance_columns(cloud)
-                content = encode_las(
-                    cloud.points_mm,
-                    cloud.intensity,
-                    fields,
-                    time_s=cloud.time_s,
-                    colours=colours,
-                    compressed=suffix == ".laz",
-                )
-                aside.write_bytes(content)
-            case ".mcap":
-                aside.write_bytes(mcap_content(cloud, foxglove=path.name.lower().endswith(".foxglove.mcap")))
-            case _:
-                _write_e57(cloud, aside, path, colours)
-
-
-_LIBRARIES: dict[str, tuple[Literal["laspy", "lazrs", "copclib", "pye57"], ...]] = {
-    ".copc.laz": ("copclib",),
-    ".laz": ("laspy", "lazrs"),
-    ".las": ("laspy",),
-    ".e57": ("pye57",),
-}
+        form.write(aside, cloud, colours, path)
 
 
 def require_libraries(path: Path) -> None:
     """Raise SetupError if a library for writing a file with this ending is not installed."""
-    ending = next((each for each in _LIBRARIES if path.name.lower().endswith(each)), "")
-    for name in _LIBRARIES.get(ending, ()):
-        load_library(name, ending.strip(".").upper())
+    form = find_format(path)
+    for name in () if form is None else form.libraries:
+        load_library(name, path.suffix.strip(".").upper())
 
 
-def _write_e57(cloud: PointCloud, aside: Path, path: Path, colours: np.ndarray | None) -> None:
+def _write_text(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
+    rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
+    with open(aside, "w", encoding="utf-8") as file:
+        # CloudCompare reads the names from a first line that begins with two slashes.
+        file.write("//X Y Z Intensity\n")
+        file.writelines(f"{x!r} {y!r} {z!r} {intensity!s}\n" for x, y, z, intensity in rows)
+
+
+def _write_las(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
+    fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
+    if cloud.deviation_mm is not None:
+        fields["deviation_mm"] = cloud.deviation_mm
+    fields |= covariance_columns(cloud)
+    compressed = path.suffix.lower() == ".laz"
+    content = encode_las(
+        cloud.points_mm, cloud.intensity, fields, time_s=cloud.time_s, colours=colours, compressed=compressed
+    )
+    aside.write_bytes(content)
+
+
+def _write_mcap(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
+    aside.write_bytes(mcap_content(cloud, foxglove=path.name.lower().endswith(".foxglove.mcap")))
+
+
+def _write_e57(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
     unknown = np.isnan(cloud.intensity)
     if unknown.any() and not unknown.all():
         raise OutputError(
@@ -137,3 +159,21 @@ def _write_e57(cloud: PointCloud, aside: Path, path: Path, colours: np.ndarray |
         columns |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
     further = covariance_columns(cloud)
     write_e57(aside, cloud.points_mm, columns, to=path, time_s=cloud.time_s, further=further)
+
+
+FORMATS = {
+    ".xyz": CloudFormat(_read_text, _write_text),
+    ".laz": CloudFormat(None, _write_las, libraries=("laspy", "lazrs"), coloured=True, unit="m"),
+    ".copc.laz": CloudFormat(libraries=("copclib",), unit="m"),
+    ".e57": CloudFormat(lambda path, unit: read_e57(path), _write_e57, libraries=("pye57",), coloured=True, unit="m"),
+    ".las": CloudFormat(lambda path, unit: read_las(path), _write_las, libraries=("laspy",), coloured=True, unit="m"),
+    ".mcap": CloudFormat(None, _write_mcap, unit="m", ambiguous=True),
+    ".txt": CloudFormat(_read_text, ambiguous=True),
+    ".csv": CloudFormat(_read_text, ambiguous=True),
+    ".asc": CloudFormat(_read_text, ambiguous=True),
+    ".pcd": CloudFormat(_read_pcd),
+}
+"""Formats by the file's ending; COPC is read and written in parts (`uwlts.storage.copc_file`).
+
+Text has columns x, y, z by name, or the first three, and optionally intensity.
+"""

@@ -19,7 +19,8 @@ from uwlts.storage.hdf5_file import DAMAGE, read_array, read_label, write_label
 FORMAT = "uwlts-truth"
 VERSION = 1  # of the file format
 _DIMENSIONS = {"centre_px": 2, "point_mm": 3, "normal": 3, "status": 2, "crossings": 2, "depth_mm": 2}
-_POSE = "pose"
+_LATER = {"pose": 3, "centroid_px": 2, "visible_fraction": 2, "mixed_fraction": 2}
+"""Arrays that files of earlier versions lack, with their dimensions."""
 
 
 class TruthStatus(IntEnum):
@@ -45,7 +46,15 @@ class Truth(Brief):
     centre. ``point_mm (F, L, 3)`` and ``normal (F, L, 3)`` are the surface there in scene coordinates. ``status (F,
     L)`` is a `TruthStatus`. ``crossings (F, L)`` counts the lit crossings of the sheet; the brightest one is stored.
     ``depth_mm (H, W)`` is the camera-frame z of the surface at every pixel in the first frame. Missing values are NaN.
-    ``pose (F, 4, 4)`` is ``T_scene_object`` of the sensor's OCS in mm, or None in files of earlier versions.
+    ``pose (F, 4, 4)`` is ``T_scene_object`` of the sensor's OCS in mm.
+
+    The light of a line's stripe is that of directly lit surfaces over pixel, pupil and exposure, without speckle, haze,
+    side lobes and noise. The stripe is the run of pixels about the centre that exceed 1e-3 of the light there.
+    ``centroid_px (F, L)`` is its centroid across the stripe. ``visible_fraction (F, L)`` is the fraction of the sheet's
+    profile that is lit and seen on the surface at the centre: 1 for a whole stripe, less where an edge, a shadow or the
+    image's border cuts it. ``mixed_fraction (F, L)`` is the fraction of the light from other surfaces, which are
+    farther than one standard deviation of the sheet from the tangent plane at the centre. Files of earlier versions
+    have None in place of these and of the pose.
     """
 
     centre_px: np.ndarray
@@ -55,6 +64,9 @@ class Truth(Brief):
     crossings: np.ndarray
     depth_mm: np.ndarray
     pose: np.ndarray | None = None
+    centroid_px: np.ndarray | None = None
+    visible_fraction: np.ndarray | None = None
+    mixed_fraction: np.ndarray | None = None
 
 
 def scene_digest(scene: Table) -> str:
@@ -85,13 +97,13 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, TruthHeader, path=path, file_format=FORMAT, version=VERSION)
-            pose = _array(file, _POSE, path, dimensions=3) if _POSE in file else None
-            truth = Truth(**{name: _array(file, name, path) for name in _DIMENSIONS}, pose=pose)
+            stored = [*_DIMENSIONS, *(name for name in _LATER if name in file)]
+            truth = Truth(**{name: _array(file, name, path) for name in stored})
     except DAMAGE as error:
         raise CaptureError(f"{path} is not a truth file, or is damaged: {error}") from error
     lines = truth.status.shape
-    shapes = {name: getattr(truth, name).shape for name in _DIMENSIONS if name != "depth_mm"}
-    if shapes != {name: lines if _DIMENSIONS[name] == 2 else (*lines, 3) for name in shapes}:
+    shapes = {name: getattr(truth, name).shape for name in stored if name not in ("depth_mm", "pose")}
+    if shapes != {name: (*lines, 3) if name in ("point_mm", "normal") else lines for name in shapes}:
         raise CaptureError(f"{path} contradicts itself: its arrays have the shapes {shapes}")
     if truth.pose is not None and truth.pose.shape != (lines[0], 4, 4):
         raise CaptureError(f"{path} contradicts itself: it has {lines[0]} frames and poses {truth.pose.shape}")
@@ -103,10 +115,10 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     return header, truth
 
 
-def _array(file: h5py.File, name: str, path: str | Path, *, dimensions: int | None = None) -> np.ndarray:
+def _array(file: h5py.File, name: str, path: str | Path) -> np.ndarray:
     values = read_array(file, name, path=path)
     kinds = "iu" if name in ("status", "crossings") else "f"
-    dimensions = _DIMENSIONS[name] if dimensions is None else dimensions
+    dimensions = (_DIMENSIONS | _LATER)[name]
     if values is None or values.dtype.kind not in kinds or values.ndim != dimensions:
         raise CaptureError(f"{path} is damaged: it has no numbers '{name}' in {dimensions} dimensions")
     return values

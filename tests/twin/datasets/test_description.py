@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.datasets.data_set import SPLITS, DataSetDescription, LogUniform, Normal, OneOf, Uniform, load_description
+from twin.datasets.data_set import DataSetDescription, LogUniform, Normal, OneOf, Uniform, load_description
 from twin.datasets.draws import choose_split, draw_scene
 from uwlts.errors import DescriptionError
 from uwlts.model.library import list_names
+from uwlts.storage.data_set import SPLITS
 
 TINY = {"title": "tiny", "scene": "plane", "sensor": "thesis-small"}
 POWER = "sensor.laser.power_mw"

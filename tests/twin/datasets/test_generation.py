@@ -17,12 +17,14 @@ import webdataset
 
 import twin
 from tests.virtual_sensors import altered
-from twin.datasets.data_set import SPLITS, DataSetDescription
+from twin.datasets.data_set import DataSetDescription
 from twin.datasets.draws import draw_scene
 from uwlts.errors import ArgumentError, CaptureError, DescriptionError, DesignError, OutputError
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import hash_file
 from uwlts.model.library import load_sensor
+from uwlts.radiometry.image_sets import open_image_set
+from uwlts.storage.data_set import SPLITS
 
 SMALL = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}}
 LABELS = ("centre", "quality", "points", "masks", "light", "depth", "sensor")
@@ -195,6 +197,14 @@ def test_hdf5_holds_the_same(folder, tmp_path):
             np.testing.assert_array_equal(values, ours[sample["key"]][name])
 
 
+def test_statistics_of_stripes_read_a_data_set(folder):
+    found, card = open_image_set(folder), twin.load_dataset(folder).card
+    assert (found.count, found.stripe_along, found.full_dn) == (16, "width", 2 ** card.image["bits"] - 1)
+    expected = [sample["image"] for sample in twin.load_dataset(folder)]
+    np.testing.assert_array_equal(list(found.images(100)), expected)
+    np.testing.assert_array_equal(list(found.images(2)), [expected[0], expected[15]])
+
+
 def test_the_card_says_what_there_is(folder):
     card = twin.load_dataset(folder).card
     assert sum(card.frames.values()) == 16 and sum(card.scenes.values()) == 8
@@ -269,7 +279,9 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["stripe-turbid", "stripe-shiny", "pipe-inspection", "calibration-boards"])
+@pytest.mark.parametrize(
+    "name", ["stripe-turbid", "stripe-shiny", "stripe-tank", "pipe-inspection", "calibration-boards"]
+)
 def test_presets_are_rendered(name, tmp_path):
     samples = twin.load_dataset(twin.dataset(name, out=tmp_path / name, scenes=2, workers=1))
     for sample in samples:

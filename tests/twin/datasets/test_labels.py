@@ -99,6 +99,13 @@ def test_centres_are_where_light_of_least_time_shows_the_sheet(thesis):
         expected = np.stack([0 * y, y, 0 * y + 20.0], axis=1)
         np.testing.assert_allclose(arrays["point_mm"][chosen], expected, rtol=0, atol=1e-3)
         assert (arrays["status"][chosen] == LineStatus.VISIBLE).all()
+        # The sheet is a tenth of a pixel wide. 8 samples locate its light to 0.15 px, in the image as in the label.
+        light = arrays["light_e"][0].astype(float)
+        light = light if along == "width" else light.T
+        seen = np.arange(len(light)) @ light[:, chosen] / light[:, chosen].sum(axis=0)
+        np.testing.assert_allclose(arrays["centroid_px"][chosen], seen, rtol=0, atol=2e-3)
+        np.testing.assert_allclose(seen, across, rtol=0, atol=0.15)
+        assert arrays["visible_fraction"][chosen].min() > 0.95 and arrays["mixed_fraction"][chosen].max() == 0
         assert (arrays["object"][chosen] == 0).all()
         # Of 1280 px the sheet of 0.3 mm radius is some 3.5 px wide in full at half maximum, here a quarter of it and
         # the pixel: it is known to be narrower than two pixels and not narrower than one's box.

@@ -10,9 +10,25 @@ import pytest
 from scipy import stats
 
 from tests.oracles import fermat
-from tests.virtual_sensors import altered, clear, laser_origin, oracle_fan, oracle_window, window_transmittance
+from tests.virtual_sensors import (
+    altered,
+    clear,
+    cropped,
+    laser_origin,
+    oracle_fan,
+    oracle_window,
+    plate,
+    scene_of,
+    seen_at,
+    sensor_at,
+    window_transmittance,
+)
 from twin.backend.arrays import to_jit, to_numpy
+from twin.light.renderer import Renderer
 from twin.light.sheet import PowerTable, Sheet
+from twin.recording.frame_truth import find_true_stripe, measure_line_light
+from twin.rendering_options import NONE, Flaws
+from twin.sensor.flaws import as_built
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object
@@ -111,7 +127,7 @@ def fan_edges(sheet: Sheet, z: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fan_profile": "even"}, "fan_profile.*'flat' or 'gaussian'"),
+        ({"fan_profile": "even"}, "fan_profile.*'flat', 'gaussian' or 'powell'"),
         ({"fan_profile": [[0.0, 1.0]]}, r"has 1 pairs .*: give at least two"),
         ({"fan_profile": [[0.0, 1.0], [0.0, 2.0]]}, r"must increase, found \(0\.0, 0\.0\) deg"),
         ({"fan_profile": [[-1.0, 1.0], [1.0, -0.5]]}, r"must not be negative nor all zero, found \(1\.0, -0\.5\)"),
@@ -119,6 +135,9 @@ def fan_edges(sheet: Sheet, z: float) -> np.ndarray:
         ({"fan_profile": [[-23.0, 1.0], [22.0, 1.0]]}, r"from -23 to 22 deg, .* only from -22\.5 to 22\.5 deg"),
         ({"fan_profile": [[-1.0, math.nan], [1.0, 1.0]]}, "finite number"),
         ({"fan_profile": [[-1.0, 1.0, 2.0], [1.0, 1.0]]}, "fan_profile"),
+        ({"side_lobes": [[0.0, 20.0, 0.6], [3.0, 1.0, 0.4]]}, "add up to 1; the main sheet needs the rest"),
+        ({"side_lobes": [[190.0, 20.0, 0.1]]}, "reach farther than 200 radii"),
+        ({"side_lobes": [[0.0, 0.0, 0.1]]}, "side_lobes.*greater than 0"),
         ({"bow_deg": 12.0}, "bow_deg.*less than 10"),
         ({"linewidth_nm": -0.1}, "linewidth_nm.*greater than or equal to 0"),
     ],
@@ -248,6 +267,81 @@ def test_the_profile_is_the_one_described(thesis, name):
         assert (expected == 0).sum() > 100
     if name == "gaussian":
         assert expected.max() / expected.min() > 6, "a flat profile would be noticed"
+
+
+def test_a_powell_lens_spreads_a_gaussian_beam_as_refraction_at_its_surface_does(thesis):
+    laser = altered(thesis, {"laser": {"fan_profile": "powell"}}).laser
+    angle, power = np.array(laser.fan_table()).T
+    # Rays of a Gaussian beam through a glass cylinder with a hyperbolic face, so flat that small angles hold. The
+    # conic constant and the curvature only scale the angles; the height is in units of the vertex radius.
+    flat, glass = 1e-3, 1.5
+    height = math.sqrt(4 / 3 * 1.7) * stats.norm.ppf((np.arange(400_000) + 0.5) / 400_000) / 2
+    surface = flat * np.sqrt(1 + height**2)
+    incidence = np.arctan(np.gradient(surface, height))
+    behind = np.arcsin(glass * np.sin(incidence - np.arcsin(np.sin(incidence) / glass)))
+    edge = math.asin(glass * math.sin(math.atan(flat) - math.asin(math.sin(math.atan(flat)) / glass)))
+    counts, ends = np.histogram(behind / edge, bins=40, range=(-1, 1))
+    below = np.concatenate([[0.0], np.cumsum(0.5 * (power[1:] + power[:-1]) * np.diff(angle))])
+    expected = np.diff(np.interp(22.5 * ends, angle, below / below[-1]))
+    # Linear interpolation in the table: 1 % of the power in the middle.
+    np.testing.assert_allclose(counts / counts.sum(), expected, rtol=0, atol=1e-2 / 40)
+    assert power.max() / power[48] == pytest.approx(1.195, abs=2e-3)
+    assert abs(angle[power.argmax()]) == pytest.approx(22.5 * math.sqrt(1 - 1 / 1.7), abs=0.5)
+
+
+LOBES = ((0.0, 20.0, 0.05), (3.0, 1.2, 0.02), (-4.0, 0.8, 0.01))
+
+
+def test_side_lobes_have_their_power_at_their_places(thesis):
+    plain, lobed = (Sheet(altered(thesis, {"laser": {"side_lobes": lobes}}), WATER) for lobes in ((), LOBES))
+    for z in DEPTHS:
+        sigma = light_at(plain, middle(plain, np.zeros(1), z))["sigma_mm"][0]
+        x = sigma * np.linspace(-200, 200, 16001)
+        points = np.stack([x, 0 * x, np.full_like(x, z)], axis=1)
+        main, seen = (light_at(each, points)["irradiance"] for each in (plain, lobed))
+        # The radius is two standard deviations; each lobe is a normal density with its share of the main sheet's sum.
+        t = x / sigma
+        density = 0.92 * stats.norm.pdf(t) + sum(f * stats.norm.pdf(t, 2 * at, r) for at, r, f in LOBES)
+        np.testing.assert_allclose(seen, main.sum() * density / density.sum(), rtol=1e-3, atol=1e-6 * main.max())
+        assert seen.sum() == pytest.approx(main.sum(), rel=1e-4)
+    assert lobed.power_w == plain.power_w and plain.reach == 1.0 and lobed.reach == 20.0
+
+
+def test_a_cut_beam_has_its_first_side_lobes_where_diffraction_puts_them(thesis):
+    built = as_built(thesis, Flaws.parse("side-lobes=0.01", "stray-light")).laser.side_lobes
+    assert built[0] == (0.0, 30.0, 0.02) and [lobe[2] for lobe in built[1:]] == [0.005, 0.005]
+    x, k = np.linspace(-1, 1, 4001), np.linspace(0, 9, 1801)
+    for cut, each in ((0.8, 0.0079), (1.0, 0.0034)):
+        field = np.cos(k[:, None] * x) @ np.exp(-np.square(cut * x))
+        radius = k[np.argmax(field**2 < math.exp(-2) * field[0] ** 2)]
+        first, second = np.flatnonzero(np.diff(np.sign(field)))[:2]
+        light, place = field[first:second] ** 2, k[first:second] / radius
+        centre = (light * place).sum() / light.sum()
+        assert centre == pytest.approx(built[2][0], abs=0.05)
+        spread = 2 * math.sqrt((light * (place - centre) ** 2).sum() / light.sum())
+        assert spread == pytest.approx(built[2][1], abs=0.05)
+        assert light.sum() / (2 * (field**2).sum()) == pytest.approx(each, rel=0.03)
+
+
+def test_side_lobes_appear_beside_the_stripe(thesis):
+    wide = altered(cropped(thesis, 32, 400), {"laser": {"waist_radius_mm": 0.6, "side_lobes": [[8.0, 1.0, 0.1]]}})
+    plain = altered(wide, {"laser": {"side_lobes": []}})
+    renderers = [Renderer(each, WATER, scene_of(plate()), effects=NONE) for each in (plain, wide)]
+    frames = [each.laser_frame(sensor_at(), spp=16) for each in renderers]
+    truths = [measure_line_light(each, sensor_at(), find_true_stripe(each, sensor_at()), spp=16) for each in renderers]
+    for name in ("centre_px", "centroid_px", "visible_fraction", "mixed_fraction"):
+        np.testing.assert_allclose(*(getattr(truth, name) for truth in truths), atol=1e-5, err_msg=name)
+    first, second = (frame.direct().astype(float).sum(axis=1) for frame in frames)
+    place = np.arange(400)
+    centre = (place * first).sum() / first.sum()
+    # Offset by 8 radii of 0.6 mm towards the normal: least time shows where, to a tenth of a pixel.
+    points = np.array([[0.0, 0.0, 0.0], [4.8, 0.0, 0.0]])
+    v = seen_at(wide, WATER, points)[:, 1]
+    beside = np.abs(place - (centre + v[1] - v[0])) < 15
+    assert second.sum() == pytest.approx(first.sum(), rel=0.02)
+    assert second[beside].sum() == pytest.approx(0.1 * first.sum(), rel=0.03)
+    assert (place * second)[beside].sum() / second[beside].sum() == pytest.approx(centre + v[1] - v[0], abs=0.2)
+    assert first[beside].sum() == 0
 
 
 # --- rays drawn from it ----------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
 
 from tests.virtual_sensors import (
     altered,
@@ -27,9 +28,11 @@ from twin.recording.frame_truth import (
     find_crossings,
     find_true_stripe,
     find_visible_surfaces,
+    mark_run,
+    measure_line_light,
     project_points,
 )
-from twin.rendering_options import NONE
+from twin.rendering_options import NONE, Effects
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus
 
@@ -293,3 +296,73 @@ def test_of_two_crossings_on_a_line_the_brighter_is_given(thesis):
         assert (faces.min(axis=0) < SURFACE_MM).all()
         assert (truth.crossings == 2).sum() >= 3
         np.testing.assert_allclose(z[truth.crossings == 2], brighter_z, rtol=0, atol=SURFACE_MM)
+
+
+WIDE = {"laser": {"waist_radius_mm": 2.0, "waist_distance_mm": 360.0}}
+"""A sheet with a standard deviation of 1 mm, which is 5 px."""
+
+
+def middle_line(sensor: Sensor, x: np.ndarray, z: float) -> np.ndarray:
+    """Return the coordinate across the stripe (N,) of points (x, 0, z) by least time; they are on the middle line."""
+    seen = seen_at(sensor, clear(), np.stack([x, 0 * x, np.full_like(x, z)], axis=1))
+    return seen[:, 1 if sensor.camera.stripe_along == "width" else 0]
+
+
+@pytest.mark.parametrize("along", ["width", "height"])
+def test_light_cut_by_an_edge_is_a_truncated_gaussian(thesis, along):
+    sensor = altered(cropped(thesis, 96, 96), WIDE | {"camera": {"stripe_along": along}})
+    x = np.linspace(-6.0, 6.0, 1201)
+    across = middle_line(sensor, x, 0.0)
+    for edge in (0.3, 1.0, 2.0, 20.0):
+        renderer = Renderer(sensor, clear(), scene_of(plate(side=100.0, x=edge - 50.0)), effects=NONE)
+        truth = find_true_stripe(renderer, sensor_at())
+        light = measure_line_light(renderer, sensor_at(), truth, spp=64)
+        np.testing.assert_array_equal(light.centre_px, truth.centre_px)
+        seen = np.where(x < edge, np.exp(-0.5 * x**2), 0.0)
+        # Brightness and scale change by 5e-3 per mm, and the sheet's width is that of the waist within 1e-3. The
+        # samples resolve the edge to an eighth of a pixel, 0.03 of the visible light of 5 px.
+        assert light.visible_fraction[48] == pytest.approx(ndtr(edge), abs=0.02)
+        expected = (seen * across).sum() / seen.sum()
+        assert light.centroid_px[48] == pytest.approx(expected, abs=0.06)
+        assert light.mixed_fraction[48] == 0.0
+        if edge < 2:
+            assert np.abs(light.centroid_px[48] - light.centre_px[48]) > 0.2
+
+
+def test_light_of_a_surface_behind_the_edge_is_mixed_in(thesis):
+    sensor = altered(cropped(thesis, 64, 128), WIDE)
+    depth = 1.2
+    for edge, share in ((0.3, 0.8), (0.8, 0.4)):
+        behind = plate(depth, reflectance=share)
+        renderer = Renderer(
+            sensor, clear(), scene_of(plate(side=100.0, x=edge - 50.0, reflectance=0.8), behind), effects=NONE
+        )
+        light = measure_line_light(renderer, sensor_at(), find_true_stripe(renderer, sensor_at()), spp=64)
+        # Map pixels to X on both planes. The laser shines along Z, the camera stands at smaller X.
+        x, pixel = np.linspace(-8.0, 8.0, 3201), np.linspace(0.0, 127.0, 12701)
+        front, back = (np.interp(pixel, middle_line(sensor, x[::-1], z), x[::-1]) for z in (0.0, depth))
+        near = np.where(front < edge, np.exp(-0.5 * front**2), 0.0)
+        far = np.where((front >= edge) & (back > edge), share / 0.8 * np.exp(-0.5 * back**2), 0.0)
+        mixed = far.sum() / (near + far).sum()
+        assert 0.01 < mixed < 0.5
+        assert light.mixed_fraction[32] == pytest.approx(mixed, abs=0.02)
+        assert light.centroid_px[32] == pytest.approx(((near + far) * pixel).sum() / (near + far).sum(), abs=0.1)
+        assert light.visible_fraction[32] == pytest.approx(ndtr(edge), abs=0.02)
+
+
+def test_whole_stripes_are_visible_and_their_centroid_is_that_of_the_image(thesis):
+    sensor = cropped(thesis, 64, 512)
+    tilted = plate() | {"rotation_deg": (0.0, 35.0, 0.0)}
+    renderer = Renderer(sensor, clear(0.3), scene_of(tilted), effects=Effects())
+    light = measure_line_light(renderer, sensor_at(), find_true_stripe(renderer, sensor_at()), spp=16)
+    image = renderer.laser_frame(sensor_at(), spp=16).direct().astype(float)
+    np.testing.assert_allclose(light.centroid_px, np.arange(512) @ image / image.sum(axis=0), atol=2e-3)
+    assert light.visible_fraction.min() > 0.98 and light.mixed_fraction.max() == 0.0
+
+
+def test_a_run_ends_where_its_light_fades():
+    light = np.array([[0.0, 5.0, 9.0, 4.0, 0.001, 3.0, 7.0]] * 2).T
+    marked = mark_run(light, np.array([2.2, 6.0]), 1e-3)
+    assert marked[:, 0].tolist() == [False, True, True, True, False, False, False]
+    assert marked[:, 1].tolist() == [False] * 5 + [True] * 2
+    assert not mark_run(np.zeros((5, 1)), np.array([2.0]), 1e-3).any()

@@ -1,5 +1,6 @@
 """Campaigns: values drawn for each seed, deviations of real hardware from descriptions, and rejected plans."""
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,11 @@ from twin.scene.campaign import Campaign, Imperfections, Take, _SampledImperfect
 from twin.scene.description import load_scene
 from uwlts.errors import DescriptionError
 from uwlts.model.library import list_names, load_sensor
+from uwlts.model.sensor import Sensor
 
 SIZES = {
     "circle_centre_std_mm": 0.002,
+    "target_stretch_std": 1e-4,
     "target_bow_std_mm": 0.02,
     "circle_detection_std_px": 0.03,
     "target_tilt_std_deg": 0.1,
@@ -23,7 +26,12 @@ SIZES = {
     "stage_misalignment_std_deg": 0.2,
     "temperature_half_width_c": 5.0,
     "window_tilt_std_deg": 0.3,
+    "glass_thickness_std_mm": 0.05,
+    "glass_index_std": 1e-3,
+    "focus_std_mm": 10.0,
     "sheet_bow_std_deg": 0.15,
+    "waist_std": 0.1,
+    "waist_distance_std_mm": 20.0,
     "step_height_half_width_mm": 0.02,
 }
 RECORDINGS = [
@@ -135,6 +143,7 @@ def test_recordings_do_not_depend_on_which_others_there_are():
 
 CHANGED = {
     "circle_centre_std_mm": {"scene.objects.centre_std_mm": TARGETS},
+    "target_stretch_std": {"scene.objects.stretch": TARGETS},
     "target_bow_std_mm": {"scene.objects.bow_mm": TARGETS},
     "circle_detection_std_px": {"scene.objects.detection_std_px": TARGETS},
     "target_tilt_std_deg": {"scene.objects.rotation_deg": TARGETS},
@@ -143,7 +152,12 @@ CHANGED = {
     "stage_misalignment_std_deg": {"scene.motion.direction": NAMES[:-1]},
     "temperature_half_width_c": {"built.media.water.temperature_c": NAMES[:-1]},
     "window_tilt_std_deg": {f"built.camera.window.tilt_{axis}_deg": NAMES[:-1] for axis in "xy"},
+    "glass_thickness_std_mm": {"built.camera.window.thickness_mm": NAMES[:-1]},
+    "glass_index_std": {f"built.camera.window.{key}": NAMES[:-1] for key in ("glass", "absorption_per_m")},
+    "focus_std_mm": {"built.camera.focus_distance_mm": NAMES[:-1]},
     "sheet_bow_std_deg": {"built.laser.bow_deg": NAMES[:-1]},
+    "waist_std": {"built.laser.waist_radius_mm": NAMES[:-1]},
+    "waist_distance_std_mm": {"built.laser.waist_distance_mm": NAMES[:-1]},
     "step_height_half_width_mm": {"scene.objects.position_mm": [STEP]},
 }
 
@@ -262,6 +276,26 @@ def test_size_of_the_targets_errors():
 
 
 @pytest.mark.slow
+def test_size_of_window_focus_waist_and_print():
+    names = ["glass_thickness_std_mm", "glass_index_std", "focus_std_mm", "waist_std", "waist_distance_std_mm"]
+    chosen = campaign([RECORDINGS[0]], **{name: SIZES[name] for name in [*names, "target_stretch_std"]})
+    drawings = [list_takes(chosen, seed=seed)[0] for seed in range(SEEDS)]
+    as_built = load_sensor("thesis-as-built")
+
+    def values(sensor: Sensor) -> list[float]:
+        window, laser = sensor.camera.window, sensor.laser
+        focus, waist = sensor.camera.focus_distance_mm, math.log(laser.waist_radius_mm)
+        return [window.thickness_mm, window.index(laser.wavelength_nm), focus, waist, laser.waist_distance_mm]
+
+    found = np.array([[*values(take.built), *plate(take).stretch] for take in drawings])
+    errors = found - [*values(as_built), 0.0, 0.0]
+    for column, name in zip(errors.T, [*names, *["target_stretch_std"] * 2], strict=True):
+        assert_spread(column, SIZES[name])
+    for one, other in itertools.combinations(errors.T, 2):
+        assert_independent(one, other)
+
+
+@pytest.mark.slow
 def test_size_of_the_targets_tilt():
     """The target is mounted again for every recording, with rotations about X and Y, not about Z."""
     drawings = over_seeds("target_tilt_std_deg", [0, 1])
@@ -356,6 +390,22 @@ def written(path: Path, text: str) -> Path:
 
 HEAD = 'title = "test"\nsensor = "thesis"\nas_built = "thesis"\n'
 PLANE = '[[recordings]]\nscene = "plane"\n'
+
+
+def test_the_campaigns_water_replaces_that_of_scenes_in_water():
+    described = campaign(RECORDINGS[:4]).model_copy(update={"water": "coastal"})
+    waters = {take.name: take.scene.water for take in list_takes(described, seed=0)}
+    assert {name: water for name, water in waters.items() if water is None} == dict.fromkeys(
+        ["target", "plane-near-air", "plane-far-turned-air"]
+    )
+    assert {water for water in waters.values() if water is not None} == {"coastal"}
+
+
+def test_each_campaign_draws_its_own_pits_and_undercuts():
+    described = campaign([{"scene": "pits"}, {"scene": "undercut"}, {"scene": "pitted-pipe"}])
+    seeds = np.array([[take.scene.objects[0].seed for take in list_takes(described, seed=seed)] for seed in (0, 1)])
+    assert (seeds[0, :2] != seeds[1, :2]).all()
+    assert (seeds[:, 2] == 0).all(), "pits of given depths stay"
 
 
 def test_shipped_campaigns_can_be_drawn():

@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.virtual_sensors import altered, plate, scene_of
 from twin.light.renderer import Renderer
-from twin.recording.sensor_simulator import check_scene, medium_of
+from twin.recording.sensor_simulator import check_scene
 from twin.rendering_options import Options
-from twin.scene.description import Scene, load_scene
+from twin.scene.description import Scene, load_scene, medium_of
 from twin.scene.motion import Motion
 from twin.scene.objects import Objects, build_objects
 from twin.scene.scene_object import Pose
@@ -184,9 +184,20 @@ BAD_SCENES = {
     "no frames": ("base = 'plane'\n[motion]\ncount = 0", r"motion\.count: .*found 0"),
     "step not a number": ("base = 'plane'\n[motion]\nstep_mm = nan", r"motion\.step_mm: .*finite"),
     "backwards in time": ("base = 'plane'\n[motion]\nspeed_mm_per_s = -1.0", r"motion\.speed_mm_per_s: .*found -1"),
-    "unknown finish": (PLATE + "finish = 'velvet'", r"finish: .*'diffuse', 'painted', 'pvc' or 'metal'.*'velvet'"),
+    "unknown finish": (PLATE + "finish = 'velvet'", r"finish: .*'diffuse', 'painted', .*'marine-growth'.*'velvet'"),
     "too smooth": (PLATE + "finish = 'metal'\nalpha = 0.001", r"alpha: .*0\.02.*found 0\.001"),
     "rough gloss of none": (PLATE + "alpha = 0.2", r"alpha 0\.2 .* finish is 'diffuse': omit alpha"),
+    "white and uneven": (PLATE + "mottle = 0.3", r"reflectance 0\.8 with mottle 0\.3 .* lose 4\.\d % .*reduce"),
+    "two textures": (
+        PLATE + "finish = 'concrete'\ntexture = 'wall.png'",
+        r"texture .*wall\.png and mottle 0\.2: use one of them, or mottle = 0",
+    ),
+    "translucent steel": (PLATE + "finish = 'metal'\nmean_free_path_mm = 0.1", r"mean_free_path_mm 0\.1 in a metal"),
+    "no length": (PLATE + "reflectance = 0.2\nmottle = 0.3\nmottle_mm = 0.0", r"mottle_mm.*found 0"),
+    "rusted print": (
+        "base = 'target'\n[[objects]]\nkind = 'target_plate'\nfinish = 'rusted-steel'",
+        r"mottle 0\.3 .*printed",
+    ),
     "negative height": (PLATE + "roughness_um = -1.0", r"roughness_um: .*found -1"),
     "more than all light": (PLATE + "mirror = 0.5", r"reflectance 0\.8 and mirror 0\.5 add up to more than 1"),
     "coated mirror": (PLATE + "reflectance = 0.1\nfinish = 'pvc'\nmirror = 0.5", r"mirror 0\.5 under a coat"),
@@ -262,9 +273,14 @@ def test_what_a_finish_does_not_say_is_usual_for_it():
     plain, steel, mirror = scene_of(
         plate(), plate() | {"finish": "metal"}, plate(reflectance=0.1) | {"mirror": 0.8, "roughness_um": 0.01}
     ).objects
-    assert (plain.finish, plain.mirror_share(), plain.polarisation(), plain.rms_height_um()) == ("diffuse", 0, 0, 5)
-    assert (steel.gloss_alpha(), steel.mirror_share(), steel.polarisation(), steel.rms_height_um()) == (0.3, 0, 1, 1)
-    assert (mirror.mirror_share(), mirror.polarisation(), mirror.rms_height_um()) == (0.8, 1, 0.01)
+    assert (plain.finish, plain.mirror_share(), plain.polarisation(), plain.finish_properties().roughness_um) == (
+        "diffuse",
+        0,
+        0,
+        5,
+    )
+    assert (steel.finish_properties().alpha, steel.mirror_share(), steel.polarisation()) == (0.3, 0, 1)
+    assert (mirror.mirror_share(), mirror.polarisation(), mirror.finish_properties().roughness_um) == (0.8, 1, 0.01)
     assert Motion().speed_mm_per_s == 0
 
 

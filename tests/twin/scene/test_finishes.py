@@ -390,6 +390,6 @@ def test_a_circle_plate_may_be_glossy():
     objects = built(scene)
     start = np.array([[thing.spacing_x_mm * 3, 0.0, -50.0], [thing.spacing_x_mm * 3.5, 0.0, -50.0]])
     found = objects.albedo(hit(objects, start, [0.0, 0.0, 1.0])).numpy()
-    bodies = (thing.circle_reflectance, thing.reflectance)
+    bodies = (thing.circle_reflectance, thing.background_reflectance())
     expected = [directional_albedo(bsdf_of({"finish": "painted", "reflectance": b}), np.ones(1))[0] for b in bodies]
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3)

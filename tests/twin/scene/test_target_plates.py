@@ -15,7 +15,7 @@ from twin.light.renderer import Renderer
 from twin.recording.sensor_simulator import with_window
 from twin.rendering_options import NONE
 from twin.scene.description import TargetPlate
-from twin.scene.finish import draw_print_errors, pattern_texture, register_pattern
+from twin.scene.finish import draw_print_errors, pattern_texture, register_textures
 from uwlts.model.sensor import Sensor
 from uwlts.targets import CharucoTarget, ChessboardTarget, CircleGridTarget, CircleTarget, Target
 
@@ -63,7 +63,7 @@ def test_the_first_square_of_a_chessboard_is_dark():
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.kind)
 def test_the_texture_is_the_print(target):
-    register_pattern()
+    register_textures()
     scene = scene_of(
         {"kind": "target_plate", "reflectance": GROUND, "ink_reflectance": INK}, target=target.model_dump()
     )
@@ -109,7 +109,7 @@ def test_rendered_boards_are_found_where_a_pinhole_sees_them(bare, target):
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.kind)
 def test_the_print_about_each_point_is_off_by_its_error(target):
-    register_pattern()
+    register_textures()
     thing = TargetPlate(
         kind="target_plate", target=target, reflectance=GROUND, ink_reflectance=INK, centre_std_mm=0.3, errors_seed=2
     )
@@ -129,6 +129,13 @@ def test_the_print_about_each_point_is_off_by_its_error(target):
     # Without the shifts some percent would differ; rounding to 32 bits (1e-5 mm) moves a place or two over an edge.
     assert np.count_nonzero(np.abs(seen - expected) > 1e-6) <= 2
     assert np.count_nonzero(expected != np.where(covered(target, points), INK, GROUND)) > 0.01 * len(points)
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.kind)
+def test_a_stretched_print_moves_each_point_by_its_place(target):
+    thing = TargetPlate(kind="target_plate", target=target, stretch=(1e-3, -2e-3))
+    columns, rows = target.indices.T
+    np.testing.assert_allclose(draw_print_errors(thing)[rows, columns], target.points_mm[:, :2] * [1e-3, -2e-3])
 
 
 def test_descriptions_need_no_detector():

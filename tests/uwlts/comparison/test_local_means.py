@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwlts.comparison.local_means import TWO_SIDED, average_locally
+from uwlts.comparison.local_means import TWO_SIDED, _student_ratio, average_locally
 
 
 def test_intervals_of_few_points_hold_as_often_as_stated() -> None:
@@ -15,3 +15,9 @@ def test_intervals_of_few_points_hold_as_often_as_stated() -> None:
     found = average_locally(places, normals, points, uncertainty=None, frame=None, disc_mm=2.0, deep_mm=8.0)
     inside = np.abs(found.mean_mm) < TWO_SIDED * np.sqrt(found.variance_mm2)
     assert abs(inside.mean() - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 3000)
+
+
+def test_the_factor_of_few_points_is_students() -> None:
+    """Quantiles of 97.5 % for 1, 4, 10 and 30 degrees of freedom, from tables."""
+    tabulated = np.array([12.706, 2.776, 2.228, 2.042])
+    np.testing.assert_allclose(_student_ratio(np.array([2, 5, 11, 31])), tabulated / TWO_SIDED, rtol=2e-4)

@@ -21,7 +21,7 @@ from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import CLOUD_FORMATS, COLOURED_FORMATS, read_cloud, write_cloud
 from uwlts.storage.export_ import export, export_capture
-from uwlts.storage.foreign_clouds import WRITTEN_FORMATS
+from uwlts.storage.foreign_clouds import FORMATS
 from uwlts.storage.import_ import import_images
 from uwlts.storage.las_file import LAZ_STEP_M
 
@@ -190,7 +190,7 @@ def test_what_exists_stays_and_nothing_is_made_of_nothing(tmp_path: Path, suffix
     assert {left.name for left in tmp_path.iterdir()} == {path.name, "empty.ply"}
 
 
-@pytest.mark.parametrize("suffix", WRITTEN_FORMATS)
+@pytest.mark.parametrize("suffix", [ending for ending, each in FORMATS.items() if each.write])
 def test_formats_that_hold_no_empty_cloud_say_so(tmp_path: Path, suffix: str):
     empty = a_cloud(0, points_mm=np.empty((0, 3)), intensity=np.empty(0), frame=np.empty(0), line=np.empty(0))
     with pytest.raises(OutputError, match="has no points"):

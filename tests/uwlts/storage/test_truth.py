@@ -15,6 +15,7 @@ from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth, tru
 
 FRAMES, LINES = 3, 7
 NAMES = [field.name for field in fields(Truth)]
+LIGHT = ["centroid_px", "visible_fraction", "mixed_fraction"]
 
 
 def a_truth() -> Truth:
@@ -31,6 +32,7 @@ def a_truth() -> Truth:
         crossings=np.where(hidden, 0, 2).astype(np.uint8),
         depth_mm=np.full((16, 20), np.nan, np.float32),
         pose=np.tile(np.eye(4), (FRAMES, 1, 1)),
+        **{name: np.where(hidden, np.nan, rng.uniform(0, 1, (FRAMES, LINES))) for name in LIGHT},
     )
 
 
@@ -69,6 +71,7 @@ def test_scan_without_any_stripe(tmp_path: Path):
     found = read_truth(tmp_path / "a.truth.h5")[1]
     assert (found.status == TruthStatus.NO_STRIPE).all()
     assert found.pose is None
+    assert all(getattr(found, name) is None for name in LIGHT), "as in files of earlier versions"
 
 
 def test_place_beside_the_capture():
@@ -139,6 +142,7 @@ CONTRADICTIONS = {
     "real status": (replaced("status", np.zeros((FRAMES, LINES))), "no numbers 'status'"),
     "fewer lines": (replaced("centre_px", np.zeros((FRAMES, LINES - 1))), "contradicts itself"),
     "fewer poses": (replaced("pose", np.zeros((FRAMES - 1, 4, 4))), "3 frames and poses"),
+    "fewer centroids": (replaced("centroid_px", np.zeros((FRAMES, LINES - 1))), "contradicts itself"),
     "fewer frames": (replaced("normal", np.zeros((FRAMES - 1, LINES, 3))), "contradicts itself"),
     "plane points": (replaced("point_mm", np.zeros((FRAMES, LINES, 2))), "contradicts itself"),
     "unknown status": (changed_at("status", (0, 0), 9), "unknown statuses"),
@@ -148,7 +152,7 @@ CONTRADICTIONS = {
 } | {
     f"missing {name}": (lambda file, name=name: file.__delitem__(name), f"no numbers '{name}'")
     for name in NAMES
-    if name != "pose"
+    if name not in ("pose", *LIGHT)
 }
 
 

@@ -6,14 +6,15 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
-from twin.datasets.data_set import SPLITS, Split
-from twin.datasets.shards import SUFFIXES, Format, ShardReader
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.files.json_files import read_model
 from uwlts.model.sensor import Description, Table
+from uwlts.storage.data_set_shards import SUFFIXES, Format, ShardReader
 
+Split = Literal["train", "validation", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
 CARD = "dataset.json"
 CARD_FORMAT = "uwlts-dataset"
 CARD_VERSION = 1  # of the file format
@@ -64,7 +65,7 @@ class DataSet(Sequence[dict[str, Any]]):
     Attributes
     ----------
     card
-        Content of the data set (`twin.datasets.loading.DataCard`).
+        Content of the data set (`uwlts.storage.data_set.DataCard`).
     """
 
     def __init__(self, folder: Path, card: DataCard, split: Split | None, names: tuple[str, ...] | None):

@@ -1,0 +1,322 @@
+"""Domain gap between generated and real images: distance of the distributions of the stripe's statistics.
+
+The gap is the energy coefficient of inhomogeneity, H = (2 E|X - Y| - E|X - X'| - E|Y - Y'|) / (2 E|X - Y|), of windows
+X and Y of two sets: 0 for equal distributions, and at most 1 (Rizzo and Székely, Energy distance, WIREs Computational
+Statistics 8, 2016, 27-38). Each statistic is first replaced by its quantile in the mixture of both sets with equal
+weights, so that units and transformations do not matter. Means are over pairs of different windows (U-statistics).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from uwlts._version import __version__
+from uwlts.errors import CaptureError, DescriptionError, RangeError
+from uwlts.fitting.propagation import jackknife
+from uwlts.model.brief import Brief
+from uwlts.model.sensor import Table
+from uwlts.radiometry.image_sets import open_image_set
+from uwlts.radiometry.stripe_windows import STATISTICS, WINDOW_LINES, StripeWindows, measure_windows
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.stripe import StripeSettings
+
+_MOST_WINDOWS = 2000
+"""Largest number of windows of a set whose pairs are compared; more are thinned evenly."""
+_FEWEST_WINDOWS = 6
+"""Least number of windows of a set: median and range of fewer say little."""
+_FEWEST_IMAGES = 6
+"""Least number of images for a jackknife over images; with fewer, it is over parts of successive windows."""
+_PARTS = 8
+"""Parts of successive windows: a jackknife over fewer has no stable standard deviation."""
+_HALVINGS = 50
+"""Random halves of a real set: their mean is then known to a seventh of its scatter."""
+_COVERED = (0.01, 0.99)
+"""Quantiles of the generated values between which a real value counts as covered."""
+QUANTILES = (0.05, 0.5, 0.95)
+"""Quantiles in tables: the middle, and the range without one of twenty on either side."""
+
+
+@dataclass(frozen=True)
+class SetGap:
+    """Domain gap of a set from a real one.
+
+    Attributes
+    ----------
+    name, real : str
+        Names of both sets.
+    gap, std : float
+        Energy coefficient, and its standard uncertainty by the jackknife over images.
+    by_statistic : dict
+        Energy coefficient of each statistic alone.
+    covered : dict
+        Fraction of the real windows whose statistic is within the central 98 % of the set's.
+    covered_at_once : float
+        Fraction of the real windows for which this holds for all statistics.
+    """
+
+    name: str
+    real: str
+    gap: float
+    std: float
+    by_statistic: dict[str, float]
+    covered: dict[str, float]
+    covered_at_once: float
+
+
+@dataclass(frozen=True)
+class GapFloor:
+    """Domain gap between random halves of a real set: mean, and standard deviation of halvings."""
+
+    real: str
+    gap: float
+    std: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DomainGap(Brief):
+    """Statistics of generated and real stripes, and the gaps between them.
+
+    Attributes
+    ----------
+    generated, real : tuple of StripeWindows
+        Statistics of all windows of each set.
+    gaps : tuple of SetGap
+        Gap of every generated set, and of every other real set, from every real set.
+    floors : tuple of GapFloor
+        Gap between halves of each real set.
+    """
+
+    generated: tuple[StripeWindows, ...]
+    real: tuple[StripeWindows, ...]
+    gaps: tuple[SetGap, ...]
+    floors: tuple[GapFloor, ...]
+
+    def sets(self) -> tuple[StripeWindows, ...]:
+        """Return all sets, generated ones first."""
+        return self.generated + self.real
+
+    def gap_table(self) -> tuple[list[str], list[list[str]]]:
+        """Return heading and rows of the table of gaps: one column for each real set."""
+        by_pair = {(each.name, each.real): each for each in self.gaps}
+        rows = []
+        for each in self.sets():
+            found = [by_pair.get((each.name, real.name)) for real in self.real]
+            cells = ["" if pair is None else f"{pair.gap:.2f} ± {pair.std:.2f}" for pair in found]
+            rows.append([each.name, f"{len(each.values)}", *cells])
+        rows.append(["two halves", "", *(f"{floor.gap:.2f} ± {floor.std:.2f}" for floor in self.floors)])
+        return ["gap", "windows", *(each.name for each in self.real)], rows
+
+    def covered_table(self) -> tuple[list[str], list[list[str]]]:
+        """Return heading and rows of the table of covered real windows, in percent, and of the gaps by statistic."""
+        pairs = [each for each in self.gaps if each.name in {own.name for own in self.generated}]
+        rows = [
+            [
+                each.name,
+                *(f"{100 * pair.covered[each.name]:.0f} / {pair.by_statistic[each.name]:.2f}" for pair in pairs),
+            ]
+            for each in STATISTICS
+        ]
+        rows.append(["all", *(f"{100 * pair.covered_at_once:.0f} / {pair.gap:.2f}" for pair in pairs)])
+        return ["% covered / gap", *(f"{pair.name}, {pair.real}" for pair in pairs)], rows
+
+    def statistics_table(self) -> tuple[list[str], list[list[str]]]:
+        """Return heading and rows of the table of all statistics: 5 %, median and 95 % of each set."""
+        rows = [
+            [
+                f"{each.name} {each.unit}".rstrip(),
+                *(", ".join(f"{x:.3g}" for x in np.quantile(own.values[:, k], QUANTILES)) for own in self.sets()),
+            ]
+            for k, each in enumerate(STATISTICS)
+        ]
+        return ["5 %, median, 95 %", *(each.name for each in self.sets())], rows
+
+    def lines(self) -> list[str]:
+        """Return the result as text."""
+        blocks = [self.statistics_table()]
+        if self.real:
+            blocks += [self.covered_table()] if self.generated else []
+            blocks.append(self.gap_table())
+        return [line for head, rows in blocks for line in (*_aligned([head, *rows]), "")][:-1]
+
+    def record(self) -> Table:
+        """Return the result as JSON."""
+        content: Table = {
+            "format": "uwlts-domain-gap",
+            "version": 1,
+            "software": __version__,
+            "window_lines": WINDOW_LINES,
+            "statistics": [asdict(each) for each in STATISTICS],
+            "sets": [
+                {
+                    "name": each.name,
+                    "real": each in self.real,
+                    "images": len(np.unique(each.image)),
+                    "windows": len(each.values),
+                    "quantiles": {
+                        statistic.name: np.quantile(each.values[:, k], QUANTILES).tolist()
+                        for k, statistic in enumerate(STATISTICS)
+                    },
+                }
+                for each in self.sets()
+            ],
+            "gaps": [asdict(each) for each in self.gaps],
+            "floors": [asdict(each) for each in self.floors],
+        }
+        return content
+
+
+def measure_domain_gap(
+    generated: Sequence[str | Path],
+    *,
+    real: Sequence[str | Path] = (),
+    most_images: int = 200,
+    stripe: StripeSettings = None,
+    progress: ProgressListener = ignore_progress,
+) -> DomainGap:
+    """Measure the statistics of generated and real stripes, and the gaps between them; see `write_domain_gap`."""
+    if not generated and not real:
+        raise DescriptionError("no images are given: give `generated` or `real` sets of images, or both")
+    if most_images < 1:
+        raise RangeError(f"most_images is {most_images}; expected 1 or more")
+    sources = [*generated, *real]
+    found = []
+    for number, source in enumerate(sources):
+        own = measure_windows(open_image_set(source, stripe=stripe), most_images=most_images)
+        if len(own.values) < _FEWEST_WINDOWS:
+            raise CaptureError(
+                f"{source} shows {len(own.values)} pieces of a stripe {WINDOW_LINES} lines long; expected "
+                f"{_FEWEST_WINDOWS} or more: give more images"
+            )
+        found.append(own)
+        progress(number + 1, len(sources), "statistics")
+    names = [each.name for each in found]
+    found = [
+        each if names.count(each.name) == 1 else replace(each, name=str(source))
+        for each, source in zip(found, sources, strict=True)
+    ]
+    ours, theirs = tuple(found[: len(generated)]), tuple(found[len(generated) :])
+    pairs = [(one, other) for other, one in product(theirs, found) if one is not other]
+    return DomainGap(ours, theirs, tuple(_set_gap(*pair) for pair in pairs), tuple(map(_floor, theirs)))
+
+
+def _set_gap(own: StripeWindows, real: StripeWindows) -> SetGap:
+    x, y = _thinned(own), _thinned(real)
+    p, q = _to_quantiles(x.values, y.values)
+    low, high = np.quantile(own.values, _COVERED, axis=0)
+    inside = (real.values >= low) & (real.values <= high)
+    names = [each.name for each in STATISTICS]
+    single = [_GroupedDistances.between(p[:, [k]], x, q[:, [k]], y).coefficient() for k in range(len(names))]
+    whole = _GroupedDistances.between(p, x, q, y)
+    return SetGap(
+        own.name,
+        real.name,
+        whole.coefficient(),
+        whole.std(),
+        dict(zip(names, single, strict=True)),
+        dict(zip(names, inside.mean(axis=0).tolist(), strict=True)),
+        float(inside.all(axis=1).mean()),
+    )
+
+
+def _floor(real: StripeWindows) -> GapFloor:
+    """Return the gap between random halves of the images of a real set, or of its parts if it has few images."""
+    own, rng = _thinned(real), np.random.default_rng(0)
+    values = _to_quantiles(own.values, own.values)[0]
+    whole = _GroupedDistances.between(values, own, values, own)
+    count = len(whole.first_count)
+    halves = [rng.permutation(count) for _ in range(_HALVINGS)]
+    gaps = [whole.select(each[: count // 2], each[count // 2 :]).coefficient() for each in halves]
+    return GapFloor(real.name, float(np.mean(gaps)), float(np.std(gaps)))
+
+
+def _thinned(own: StripeWindows) -> StripeWindows:
+    kept = np.unique(np.linspace(0, len(own.values) - 1, min(_MOST_WINDOWS, len(own.values))).astype(int))
+    return StripeWindows(own.name, own.values[kept], own.image[kept], ())
+
+
+def _to_quantiles(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Replace statistics (N, K) and (M, K) by their mid-quantiles in the mixture of both with equal weights."""
+
+    def share(values: np.ndarray, among: np.ndarray) -> np.ndarray:
+        order = np.sort(among)
+        below, up_to = (np.searchsorted(order, values, side) for side in ("left", "right"))
+        return 0.5 * (below + up_to) / len(order)
+
+    mixed = [
+        np.column_stack(
+            [0.5 * (share(values[:, k], x[:, k]) + share(values[:, k], y[:, k])) for k in range(x.shape[1])]
+        )
+        for values in (x, y)
+    ]
+    return mixed[0], mixed[1]
+
+
+@dataclass(frozen=True, eq=False)
+class _GroupedDistances:
+    """Sums of distances between windows of groups: within two sets, and from one to the other.
+
+    Groups are images, or parts of successive windows. ``first`` (G, G), ``second`` (H, H) and ``across`` (G, H) are
+    sums over all pairs of windows of two groups, with ``first_count`` (G,) and ``second_count`` (H,) windows.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    across: np.ndarray
+    first_count: np.ndarray
+    second_count: np.ndarray
+
+    @classmethod
+    def between(cls, p: np.ndarray, x: StripeWindows, q: np.ndarray, y: StripeWindows) -> _GroupedDistances:
+        """Sum the distances of standardised statistics (N, K) and (M, K) of two sets."""
+        rows, columns = _group_starts(x.image), _group_starts(y.image)
+
+        def sums(one: np.ndarray, other: np.ndarray, by: np.ndarray, to: np.ndarray) -> np.ndarray:
+            return np.add.reduceat(np.add.reduceat(cdist(one, other), by, axis=0), to, axis=1)
+
+        counts = np.diff(rows, append=len(p)), np.diff(columns, append=len(q))
+        return cls(sums(p, p, rows, rows), sums(q, q, columns, columns), sums(p, q, rows, columns), *counts)
+
+    def select(self, some: np.ndarray, others: np.ndarray) -> _GroupedDistances:
+        """Return the distances of some groups of the first set and of other groups of the second one."""
+        return _GroupedDistances(
+            self.first[np.ix_(some, some)],
+            self.second[np.ix_(others, others)],
+            self.across[np.ix_(some, others)],
+            self.first_count[some],
+            self.second_count[others],
+        )
+
+    def coefficient(self) -> float:
+        """Return the energy coefficient of inhomogeneity."""
+        n, m = int(self.first_count.sum()), int(self.second_count.sum())
+        within = self.first.sum() / (n * (n - 1)) + self.second.sum() / (m * (m - 1))
+        between = 2 * self.across.sum() / (n * m)
+        return float((between - within) / between) if between > 0 else 0.0
+
+    def std(self) -> float:
+        """Return the standard uncertainty of the coefficient by the jackknife over the groups of both sets."""
+        every = np.arange(len(self.first_count)), np.arange(len(self.second_count))
+        first = np.array([self.select(np.delete(every[0], g), every[1]).coefficient() for g in every[0]])
+        second = np.array([self.select(every[0], np.delete(every[1], g)).coefficient() for g in every[1]])
+        variances = [float(jackknife((left - left.mean())[:, None])[0, 0]) for left in (first, second)]
+        return math.sqrt(sum(variances))
+
+
+def _group_starts(image: np.ndarray) -> np.ndarray:
+    """Return the first windows of groups: images, or parts of successive windows if there are few images."""
+    starts = np.flatnonzero(np.diff(image, prepend=-1))
+    if len(starts) >= _FEWEST_IMAGES:
+        return starts
+    return np.unique(np.linspace(0, len(image), min(_PARTS, len(image) // 2), endpoint=False).astype(int))
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
