@@ -175,7 +175,7 @@ def simulate(
             side-lobes=0.01, lamp-reflection=0.001, dirt=0.1, lamp-and-laser, pixel-aspect=1.002, tangential=0.001,
         rolling-shutter=10 (us per row), jpeg=90, colour-filter, camera-3d=16 (steps per px; laser images become
         centre lines).
-        without
+    without
         Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
         fixed-pattern, noise.
     ideal
