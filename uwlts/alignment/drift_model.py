@@ -86,8 +86,8 @@ class DriftModel:
     def _increment(self, t: np.ndarray | float) -> np.ndarray:
         """Return the variance of the integral over a time t of a rate with the correlation exp(-a).
 
-        A smooth rate has the correlation (1 + a) exp(-a) (Matern: Rasmussen and Williams, Gaussian Processes for Machine
-        Learning, 2006, section 4.2).
+        A smooth rate has the correlation (1 + a) exp(-a) (Matern: Rasmussen and Williams, Gaussian Processes for
+        Machine Learning, 2006, section 4.2).
         """
         a = np.asarray(t) / self.correlation
         if self.smooth:
