@@ -26,8 +26,8 @@ _AS_DEAD_RECKONED = 0.5
 """Least ratio of the position-heading covariance to that of dead reckoning, for positions to count as dead-reckoned."""
 _WALKS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 """Candidate fractions of a random walk in the variance at the end, if none is stated."""
-CORRELATION_TIMES = (0.03, 0.1, 0.3, 1.0, 3.0)
-"""Candidate correlation times of the rates, relative to the path, if none is stated.
+RATES = (0.03, False), (0.1, False), (0.3, False), (1.0, False), (3.0, False), (0.3, True)
+"""Candidates for the rates if none is stated: correlation time relative to the path, and whether they are smooth.
 
 Faster rates are like a random walk, slower ones like a constant rate with a random walk of its own.
 """
@@ -46,6 +46,8 @@ class DriftModel:
         Fraction of the random walk in this variance; the rest is due to the rates.
     correlation : float
         Correlation time of the rates, relative to the duration of the path; inf for constant rates.
+    smooth : bool
+        Whether the correlation of rates is that of a smooth process, instead of a first-order Gauss-Markov process.
     dead_reckoned : bool
         Whether heading errors rotate the direction of travel.
     stated : bool
@@ -55,6 +57,7 @@ class DriftModel:
     std: np.ndarray
     walk: np.ndarray
     correlation: float
+    smooth: bool
     dead_reckoned: bool
     stated: bool
 
@@ -66,7 +69,7 @@ class DriftModel:
                 f"the drift is {drift_mm:g} mm and {drift_deg:g} deg; expected positive numbers, below 90 deg"
             )
         std = np.repeat([drift_mm, float(np.radians(drift_deg))], 3)
-        return cls(std, np.full(6, 0.01), 1.0, False, False)
+        return cls(std, np.full(6, 0.01), 1.0, False, False, False)
 
     def covariance(self, earlier_s: np.ndarray, later_s: np.ndarray, lasting_s: float) -> np.ndarray:
         """Return the covariances (6, ...) of each component between times since the start, for a given duration."""
@@ -81,15 +84,21 @@ class DriftModel:
         return variance * ((1 - walk) * by_rates + walk * np.minimum(t, u))
 
     def _increment(self, t: np.ndarray | float) -> np.ndarray:
-        """Return the variance of the integral over a time t of a rate with the correlation exp(-a)."""
+        """Return the variance of the integral over a time t of a rate with the correlation exp(-a).
+
+        A smooth rate has the correlation (1 + a) exp(-a) (Matern: Rasmussen and Williams, Gaussian Processes for
+        Machine Learning, 2006, section 4.2).
+        """
         a = np.asarray(t) / self.correlation
+        if self.smooth:
+            return 2 * a - 3 + (3 + a) * np.exp(-a)
         return 2 * (a + np.expm1(-a))
 
     def candidates(self) -> list[DriftModel]:
-        """Return the drift with each candidate correlation time of the rates and each fraction of a random walk."""
+        """Return the drift with each candidate for the rates and each fraction of a random walk."""
         return [
-            replace(self, walk=np.full(6, share), correlation=correlation)
-            for correlation, share in product(CORRELATION_TIMES, _WALKS)
+            replace(self, walk=np.full(6, share), correlation=correlation, smooth=smooth)
+            for (correlation, smooth), share in product(RATES, _WALKS)
         ]
 
 
@@ -119,7 +128,7 @@ def choose_drift_model(trajectory: Trajectory, drift_mm: float | None, drift_deg
     parts *= grown[:, None]
     parts[measured] = np.column_stack([np.zeros(6), 2 * variance[0]])[measured]
     size = np.maximum(parts.sum(axis=1), _EXACT**2)
-    return DriftModel(np.sqrt(size), parts[:, 1] / size, np.inf, dead_reckoned, True)
+    return DriftModel(np.sqrt(size), parts[:, 1] / size, np.inf, False, dead_reckoned, True)
 
 
 def _rate_and_walk(times_s: np.ndarray, variance: np.ndarray) -> np.ndarray:

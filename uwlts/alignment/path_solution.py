@@ -13,7 +13,7 @@ from scipy.linalg import cho_solve, eigh, solve_triangular
 from scipy.sparse import csr_array
 
 from uwlts.alignment.alignment_options import AlignmentOptions
-from uwlts.alignment.drift_model import CORRELATION_TIMES, DriftModel
+from uwlts.alignment.drift_model import RATES, DriftModel
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.pieces import Survey, fit_piece
@@ -104,7 +104,7 @@ def refit(estimate: PathEstimate, numbers: Iterable[int]) -> PathEstimate:
 def settle(estimate: PathEstimate) -> PathEstimate:
     """Estimate path and patches alternately; drop pairs that then disagree.
 
-    If no drift model is stated, the most likely random walk and correlation time of the rates are used.
+    If no drift model is stated, the most likely random walk and rates are used.
     """
     estimate = solve(refine_nodes(estimate))
     crossing = {number for pair in estimate.pairs for number in pair}
@@ -117,7 +117,7 @@ def settle(estimate: PathEstimate) -> PathEstimate:
 
 
 def _select_drift(estimate: PathEstimate) -> PathEstimate:
-    """Select the random walk and the correlation time of maximum marginal likelihood, unless they are stated.
+    """Select random walk and rates of maximum marginal likelihood, unless they are stated.
 
     The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992). A normal matrix V L V^T corresponds
     to observations L^(1/2) V^T x of the path x with unit noise. Their covariance is I + L^(1/2) V^T P V L^(1/2) for a
@@ -141,17 +141,20 @@ def _select_drift(estimate: PathEstimate) -> PathEstimate:
         return np.einsum("ckr,cks->rs", parts, model.covariance(at[:, None], at, at[-1]) @ parts, optimize=True)
 
     walk = observed(replace(drift, walk=np.ones(6)))
-    rates = {each: observed(replace(drift, walk=np.zeros(6), correlation=each)) for each in CORRELATION_TIMES}
+    rates = {
+        (correlation, smooth): observed(replace(drift, walk=np.zeros(6), correlation=correlation, smooth=smooth))
+        for correlation, smooth in RATES
+    }
 
     def twice_log_likelihood(model: DriftModel) -> float:
         share = model.walk[0]
-        covariance = (1 - share) * rates[model.correlation] + share * walk
+        covariance = (1 - share) * rates[model.correlation, model.smooth] + share * walk
         factor = np.linalg.cholesky(np.eye(len(root)) + covariance)
         off = solve_triangular(factor, seen, lower=True)
         return float(-np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor))))
 
     best = max(drift.candidates(), key=twice_log_likelihood)
-    same = best.correlation == drift.correlation and (best.walk == drift.walk).all()
+    same = (best.correlation, best.smooth) == (drift.correlation, drift.smooth) and (best.walk == drift.walk).all()
     return estimate if same else _change_prior(estimate, replace(prior, drift=best))
 
 

@@ -23,10 +23,14 @@ def straight_path(towards: Sequence[float]) -> Trajectory:
 
 
 def prior_of(
-    *, correlation: float = np.inf, dead_reckoned: bool = False, towards: Sequence[float] = (0.6, 0.8)
+    *,
+    correlation: float = np.inf,
+    smooth: bool = False,
+    dead_reckoned: bool = False,
+    towards: Sequence[float] = (0.6, 0.8),
 ) -> PathPrior:
     """With 81 even nodes."""
-    drift = DriftModel(STD, WALK, correlation, dead_reckoned, True)
+    drift = DriftModel(STD, WALK, correlation, smooth, dead_reckoned, True)
     return PathPrior.from_times(np.linspace(0, SECONDS, 41), drift, straight_path(towards), intervals=80)
 
 
@@ -37,18 +41,18 @@ def covariance(prior: PathPrior, times_s: np.ndarray) -> np.ndarray:
     return np.einsum("ink,jmk->injm", at, at)
 
 
-@pytest.mark.parametrize("correlation", [0.3, np.inf])
-def test_the_drift_has_the_covariance_of_drifts_drawn_step_by_step(correlation: float):
+@pytest.mark.parametrize(("correlation", "smooth"), [(0.3, False), (0.3, True), (np.inf, False)])
+def test_the_drift_has_the_covariance_of_drifts_drawn_step_by_step(correlation: float, smooth: bool):
     draws, steps = 20_000, 400
     rng = np.random.default_rng(4)
     t = np.arange(1, steps + 1) / steps
     walk = rng.standard_normal((draws, steps)).cumsum(axis=1) / np.sqrt(steps)
     apart = np.abs(t[:, None] - t) / correlation
-    root = np.linalg.cholesky(np.exp(-apart) + 1e-9 * np.eye(steps))
+    root = np.linalg.cholesky((1 + smooth * apart) * np.exp(-apart) + 1e-9 * np.eye(steps))
     drifted = (rng.standard_normal((draws, steps)) @ root.T).cumsum(axis=1) / steps
     drifted /= drifted[:, -1].std()
     rows = np.array([99, 199, 299, 399])
-    found = covariance(prior_of(correlation=correlation), SECONDS * t[rows])
+    found = covariance(prior_of(correlation=correlation, smooth=smooth), SECONDS * t[rows])
     for component in range(6):
         share = WALK[component]
         drawn = np.sqrt(1 - share) * drifted[:, rows] + np.sqrt(share) * walk[:, rows]

@@ -348,16 +348,16 @@ class Problem(GroupedEvidence[MountState]):
         by_points = by_bins / np.sqrt(np.maximum(counts, 1))[:, None]
         errors = self.project(state, self.pose_error_derivatives(state))
         noise, shifts, turns = (own @ np.swapaxes(own, 1, 2) for own in (by_points, errors[:, :, :3], errors[:, :, 3:]))
-        filled = np.eye(basis.shape[2]) * ~basis.any(axis=1)[:, :, None]
+        filled = np.eye(basis.shape[2]) * np.logical_not(basis.any(axis=1))[:, :, None]
 
         def covariances(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             scatter = Scatter(*np.exp(logs))
             far = apart / scatter.length_mm
             falling = scatter.smooth_mm**2 * np.exp(-far)
             smooth, longer = (by_bins @ (falling * each) @ np.swapaxes(by_bins, 1, 2) for each in (1 + far, far**2))
-            parts = scatter.point_mm**2 * noise, smooth, scatter.pose_mm**2 * shifts, scatter.turn_rad**2 * turns
+            parts = [scatter.point_mm**2 * noise, smooth, scatter.pose_mm**2 * shifts, scatter.turn_rad**2 * turns]
             changes = [2 * parts[0], 2 * smooth, longer, 2 * parts[2], 2 * parts[3]]
-            total = sum(parts)
+            total = np.sum(parts, axis=0)
             largest = np.max(np.diagonal(total, axis1=1, axis2=2), axis=1)
             rounding = _ROUNDING * largest[:, None, None] * np.eye(total.shape[1])
             return total + filled + rounding, np.array(changes)
