@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.evaluate import evaluate
+from uwlts.evaluation.evaluate import EvaluationRecord, evaluate
 from uwlts.model.library import load_sensor
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.truth import Truth, TruthHeader, scene_digest, write_truth
@@ -86,3 +87,10 @@ def test_the_truth_of_every_second_image_is_refused(tmp_path: Path):
     whole = truth_file(tmp_path / "b.truth.h5", scene=SCENE)
     with pytest.raises(EvaluationError, match="of a capture of 3 images, the truth of one of 6"):
         evaluate(replace(first, metadata=METADATA | {"images": 3}), truth=whole)
+
+
+@pytest.mark.parametrize("index", [float("inf"), float("nan")])
+def test_a_stored_evaluation_has_finite_values(index: float) -> None:
+    EvaluationRecord(cloud="a.ply", medium_index=1.33)
+    with pytest.raises(ValidationError, match="finite number"):
+        EvaluationRecord(cloud="a.ply", medium_index=index)

@@ -108,5 +108,7 @@ def test_wrong_numbers_are_refused():
         uwlts.gauge_study(ROWS, tolerance=-1.0)
     with pytest.raises(EvaluationError, match="the table contains several"):
         uwlts.gauge_study(ROWS, true_value=1.0)
-    with pytest.raises(EvaluationError, match="at least 10"):
-        uwlts.gauge_study(ROWS[:1], true_value=1.0)
+    ten = [("ball", "me", value) for value in np.linspace(0.9, 1.1, 10)]
+    assert uwlts.gauge_study(ten, true_value=1.0) is not None
+    with pytest.raises(EvaluationError, match="found 9 measurements; .* at least 10"):
+        uwlts.gauge_study(ten[1:], true_value=1.0)
