@@ -81,6 +81,8 @@ class Flaws:
     """Fraction of the laser's power in a wide pedestal of the sheet, which its optics scatter."""
     side_lobes: float = _flaw(off=0.0, typical=0.01, least=0.0, most=0.1)
     """Fraction of the laser's power in the two first side lobes of a beam that its aperture cuts."""
+    lamp_reflection: float = _flaw(off=0.0, typical=0.001, least=0.0, most=0.05)
+    """Reflectance of the camera's window for a ring lamp around the lens, which appears out of focus."""
     dirt: float = _flaw(off=0.0, typical=0.1, least=0.0, most=0.9)
     """Fraction of the camera's window that is covered with spots, which darken blurred patches of the image."""
     lamp_and_laser: bool = False

@@ -284,7 +284,8 @@ class Renderer:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Render the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
 
-        A line's surface is what lies within one standard deviation of the sheet of the plane through its point.
+        Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet
+        of the plane through its point.
 
         Parameters
         ----------
@@ -312,13 +313,13 @@ class Renderer:
         def sums(pose: SensorPose, bundle: Rays, after_s: Float | None, planes: Float) -> tuple[Float, ...]:
             segment = next(self._segments(pose, bundle, after_s))
             here = light.evaluate(segment.end(), after_s)
-            value = segment.weight * self._radiance(pose, segment, [light], after_s)
+            value = segment.weight * self._radiance(pose, segment, [light], after_s, lobes=False)
             pixel = dr.arange(mi.UInt32, dr.width(value)) // dr.opaque(mi.UInt32, spp)
             plane = dr.gather(mi.Vector4f, planes, pixel)
             away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
             same = dr.abs(away) <= here.sigma_mm
-            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm)) / here.sigma_mm
-            profile /= math.sqrt(2 * math.pi)
+            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm))
+            profile /= here.sigma_mm * math.sqrt(2 * math.pi)
             return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
 
         for part in _split_pixels(rows, columns, spp=spp):
@@ -334,21 +335,26 @@ class Renderer:
         mirrors = _MIRRORS if self._mirrors else 0
         return trace_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
 
-    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None) -> Float:
-        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start."""
+    def _radiance(
+        self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None, *, lobes: bool = True
+    ) -> Float:
+        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start.
+
+        It is that of the main parts of the sheets alone without ``lobes``.
+        """
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
             here = light.evaluate(end, after_s)
+            across = light.sheet.parts if lobes else light.sheet.parts[:1]
+            arriving = here.irradiance if lobes else across[0][0] * here.main_irradiance()
             # The light of a coat or metal leaves where it arrives, that of a body is spread.
-            parts = [(mi.BSDFContext(), here.irradiance)]
+            parts = [(mi.BSDFContext(), arriving)]
             if self.objects.translucent:
                 body, coat = mi.BSDFContext(), mi.BSDFContext()
                 body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
                 normal = pose.object_direction(segment.si.n, after_s)
-                parts = [
-                    (coat, here.irradiance),
-                    (body, spread_irradiance(self.objects, segment.si, normal, here, light.sheet)),
-                ]
+                spread = spread_irradiance(self.objects, segment.si, normal, here, across)
+                parts = [(coat, arriving), (body, spread)]
             bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
             lit = light.reaches(self.objects.scene, end, here, after_s, bright)
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))

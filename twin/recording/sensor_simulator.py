@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from twin.light.caustics import Caustics
+from twin.light.lamp_ring import reflect_ring
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth, measure_line_light
@@ -144,6 +145,7 @@ class SensorSimulator:
         if flaws.dirt and mounted:
             clean = dirt(camera, flaws.dirt, seed=options.seed)
             self._passed = clean if self._passed is None else self._passed * clean
+        self._lamp_ring = self._reflect_lamp() if flaws.lamp_reflection and mounted else None
         self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else None
         self.peak_finder = None
         if flaws.camera_3d:
@@ -154,6 +156,16 @@ class SensorSimulator:
         self.exposure_ms = {light: self._exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
         longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
         self.period_s = self._period_s(max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz))
+
+    def _reflect_lamp(self) -> np.ndarray:
+        """Return the irradiance (H, W) by the lamp ring that the camera's window reflects."""
+        return reflect_ring(
+            self.renderer.view,
+            self.sensor,
+            irradiance_w_per_m2=self.sensor.lamp.irradiance_w_per_m2,
+            distance_mm=float(camera_from_object(self.sensor)[2, 3]),
+            reflectance=self.options.flaws.lamp_reflection,
+        )
 
     def _water_surface(self) -> Caustics | None:
         """Return the waves above the scene; None without daylight or wind."""
@@ -257,6 +269,8 @@ class SensorSimulator:
     ) -> ShotLight:
         others, pose = "lamp" if self.shows(shot, "lamp") else "day", self.pose(shot)
         even = self.renderer.irradiance(others, pose, spp=spp, travel=travel, time_s=time_s, exposure_s=exposure_s)
+        if others == "lamp" and self._lamp_ring is not None:
+            even = even + self._lamp_ring
         if not self.shows(shot, "laser"):
             return even, None
         return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel, through_water=through_water)

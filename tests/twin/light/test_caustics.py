@@ -35,7 +35,7 @@ def test_slopes_are_those_of_a_sea_in_the_wind():
         )
         curvature.append(bend.std())
     # A variance v per ln k is v / (2 pi k^2) per area of the plane of wave numbers. Each wave of the patch has a cell
-    # of this plane. Few waves are long: four surfaces know the variance to 6 %, and differ by three times that at most.
+    # of this plane. Few waves are long: four surfaces know the variance to 6 %. The limit is three times that.
     number = np.arange(-31, 32)
     squares = np.add.outer(number**2, number**2)
     per_ln = slope_variance_per_octave(2.0) / math.log(2)
