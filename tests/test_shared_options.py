@@ -37,6 +37,7 @@ MEANING = {
         "--medium": "One of the sensor's media",
         "--out": "to write|New folder",
         "--page": "Page to write",
+        "--title": "Title of the",
         "--overwrite": "Replace|replace",
         "--pixels": "Whether pixels are square",
         "--pdf": "Also print the page",

@@ -1,4 +1,4 @@
-"""Detection rates and errors of inspections of rendered scans.
+"""Errors of inspections of rendered scans; `docs/studies/prediction.py` has the probability of detection.
 
     python docs/studies/inspection_scenes.py runs/inspection      # and render, as it says
     cd runs/inspection/calibration && uwlts calibrate --air target-bare.h5 target-air.h5 --water target-water.h5 \
@@ -6,9 +6,8 @@
     python docs/studies/inspection.py runs/inspection docs/pictures
     python docs/studies/inspection.py runs/inspection-5 5         # pits and welds of another draw
 
-Prints the tables of the documentation: probability of detection of pits, errors and coverage of all values against the
-closed form, and false claims of change. The probability of detection is a logistic function of the logarithm of the
-depth, fitted to hits and misses, with the bound of its likelihood ratio (MIL-HDBK-1823A, appendix G).
+Prints the tables of the documentation: errors and coverage of all values against the closed form, and false claims of
+change.
 """
 
 from dataclasses import replace
@@ -18,8 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from cyclopts import App
 from inspection_scenes import AXIS_Z_MM, DIAMETER_MM, OVALITY, SIDES_DEG, WATERS, Pits, large_pits, small_pits
-from result_tables import publish, table
-from scipy import optimize
+from result_tables import table
 from scipy.spatial.transform import Rotation
 
 import uwlts
@@ -85,32 +83,6 @@ def false_ones(found: Inspection, pits: Pits) -> int:
     return sum(
         bool(np.all(distances(pits, each.place_mm) > pits.diameter / 2 + 0.5)) for each in found.select(*BLEMISHES)
     )
-
-
-def detection(depth: np.ndarray, hit: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Return depths a90 and a90/95, and the logistic's parameters (2,): depth of 90 % and slope in the logarithm.
-
-    The bound is that of the one-sided profile likelihood at 95 %. It also exists if hits and misses do not overlap.
-    """
-    x = np.log(depth)
-
-    def loss(at_90: float, slope: float) -> float:
-        logit = np.log(9.0) + slope * (x - at_90)
-        return float(np.sum(np.logaddexp(0, np.where(hit, -logit, logit))))
-
-    def profile(at_90: float) -> float:
-        best = optimize.minimize_scalar(lambda s: loss(at_90, np.exp(s)), bounds=(-1, 5), method="bounded")
-        return float(best.fun)
-
-    grid = np.linspace(x.min() - 1, x.max() + 1, 600)
-    losses = np.array([profile(at) for at in grid])
-    best = int(np.argmin(losses))
-    slope = float(
-        np.exp(optimize.minimize_scalar(lambda s: loss(grid[best], np.exp(s)), bounds=(-1, 5), method="bounded").x)
-    )
-    # Half of chi-square's 90 % quantile with one degree of freedom.
-    within = losses <= losses[best] + 1.3528
-    return float(np.exp(grid[best])), float(np.exp(grid[within].max())), np.array([grid[best], slope])
 
 
 def true_values(diameter: float, depth: float, edge: float) -> dict[str, float]:
@@ -182,23 +154,18 @@ def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> li
     ]
 
 
-def small_pits_in(folder: Path, water: str, draw: int = 0) -> tuple[list[list[str]], list[list[str]], dict]:
-    """Return rows of detection and of figures, and the data of the curve of each diameter."""
+def small_pits_in(folder: Path, water: str, draw: int = 0) -> list[list[str]]:
+    """Rows of the figures of small pits, for each diameter."""
     pits, inspected = small_pits(draw), uwlts.inspect_pipe(cloud_of(folder, water, "pipe-after"))
     found = matched(inspected, pits)
-    hit = np.array([each is not None for each in found])
     plain = uwlts.inspect_pipe(cloud_of(folder, water, "pipe-before"))
     false = false_ones(inspected, pits), len(plain.select(*BLEMISHES))
     print(f"{water}: indications that are no pit: {false[0]} with pits, {false[1]} without; {inspected.notes[-1]}")
-    seen, figures, curves = [], [], {}
+    figures = []
     for diameter in np.unique(pits.diameter):
-        own = pits.diameter == diameter
-        a90, bound, fitted = detection(pits.depth[own], hit[own])
-        curves[water, float(diameter)] = pits.depth[own], hit[own], fitted, bound
-        seen.append([water, f"{diameter:g}", f"{np.sum(hit[own])} of {np.sum(own)}", f"{a90:.3f}", f"{bound:.3f}"])
-        deep = pit_pairs(found, pits, own & (pits.depth > 0.1))
+        deep = pit_pairs(found, pits, (pits.diameter == diameter) & (pits.depth > 0.1))
         figures += figure_rows(f"{water}, {diameter:g} mm, 0.1 to 0.4 mm deep", deep)
-    return seen, figures, curves
+    return figures
 
 
 def large_pits_in(folder: Path, water: str, draw: int = 0) -> list[list[str]]:
@@ -262,60 +229,30 @@ def draw_again(folder: Path, draw: int) -> None:
     """Print the figures of the pits and welds of another draw."""
     rows = []
     for water in WATERS:
-        rows += small_pits_in(folder, water, draw)[1] + large_pits_in(folder, water, draw) + welds_in(folder, water)
+        rows += small_pits_in(folder, water, draw) + large_pits_in(folder, water, draw) + welds_in(folder, water)
         unchanged_in(folder, water, draw)
     print(table(HEAD, rows))
 
 
-def main(folder: Path, pictures: str, *, write: bool = False) -> None:
-    """Print all tables and draw the pictures into a folder; with the number of another draw, only print its tables.
-
-    With `--write`, put the table of the detection into its page.
-    """
+def main(folder: Path, pictures: str) -> None:
+    """Print all tables and draw the pictures into a folder; with the number of another draw, only print its tables."""
     if pictures.isdecimal():
         draw_again(folder, int(pictures))
     else:
-        print_and_draw(folder, Path(pictures), write=write)
+        print_and_draw(folder, Path(pictures))
 
 
-def print_and_draw(folder: Path, pictures: Path, *, write: bool) -> None:
-    """Print all tables and draw the pictures."""
-    seen, figures, curves = [], [], {}
+def print_and_draw(folder: Path, pictures: Path) -> None:
+    """Print all tables and draw the picture."""
+    figures = []
     for water in WATERS:
-        detected, rows, drawn = small_pits_in(folder, water)
-        seen, figures, curves = seen + detected, figures + rows, curves | drawn
-        figures += large_pits_in(folder, water)
+        figures += small_pits_in(folder, water) + large_pits_in(folder, water)
         unchanged_in(folder, water)
         print(table(HEAD, wholes_in(folder, water)))
-    head = ["water", "pit's diameter, mm", "found", "90 % are found from (depth, mm)"]
-    publish({"detection of pits": table([*head, "with 95 % confidence (a90/95)"], seen)}, write=write)
     print(table(HEAD, figures))
-    draw_curves(curves, pictures / "inspection-detection.svg")
     draw_map(folder, pictures / "inspection-pits.png")
     for water in WATERS:
         print(table(HEAD, flanges_in(folder, water)))
-
-
-def draw_curves(curves: dict, path: Path) -> None:
-    """Probability of detection against depth: hits, misses, the logistic and the depth of 90 % at 95 % confidence."""
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")
-    for ax, water in zip(axes, WATERS, strict=True):
-        for diameter, colour in ((2.0, "#d1495b"), (3.0, "#2152ac"), (5.0, "#3b8d5a")):
-            depth, hit, (at_90, slope), bound = curves[water, diameter]
-            x = np.geomspace(0.006, 0.4, 200)
-            ax.semilogx(
-                x,
-                1 / (1 + np.exp(-np.log(9) - slope * (np.log(x) - at_90))),
-                color=colour,
-                label=f"{diameter:g} mm wide",
-            )
-            ax.plot(depth, np.where(hit, 1.0, 0.0) + 0.01 * (diameter - 3), "|", color=colour, markersize=5)
-            ax.plot([bound], [0.9], "o", color=colour, markersize=4)
-        ax.axhline(0.9, color="#999999", linewidth=0.7)
-        ax.set(title=f"{water} water", xlabel="depth of the pit / mm")
-    axes[0].set(ylabel="probability of detection")
-    axes[1].legend(frameon=False, title="dots: a90/95", loc="center left")
-    figure.savefig(path)
 
 
 def draw_map(folder: Path, path: Path) -> None:

@@ -34,7 +34,9 @@ from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.figure_uncertainty import figure_uncertainties
+from uwlts.evaluation.figure_uncertainty import figure_uncertainties, linearise_figures
+from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty
+from uwlts.fitting.propagation import PointErrors
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.model.parameter_keys import (
@@ -51,6 +53,7 @@ from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.workers import run_jobs
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
+from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import CaptureStripes
 
 CAMPAIGNS = 200
@@ -245,7 +248,7 @@ def _scan(
         cloud = reconstruct_stripes(capture, found, calibration, with_uncertainty=True)
     evaluation = evaluate_cloud(cloud, SPHERES)
     start = time.perf_counter()
-    stated = figure_uncertainties(cloud, evaluation)
+    stated = (linear_uncertainties if campaign.known_better else figure_uncertainties)(cloud, evaluation)
     seconds = time.perf_counter() - start
     return [
         Measured(
@@ -258,6 +261,28 @@ def _scan(
         )
         for figure in (SPACING, *DIAMETERS)
     ], seconds
+
+
+def linear_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> dict[str, FigureUncertainty]:
+    """Return uncertainties of spacings and diameters as `figure_uncertainties` does, without the draws for the others.
+
+    The draws take a third of a campaign's time.
+    """
+    assert cloud.uncertainty is not None
+    errors = PointErrors.from_uncertainty(cloud.uncertainty, cloud.frame)
+    figures, plain = linearise_figures(cloud, evaluation), evaluation.figures_mm
+    gradients = figures.gradients()
+
+    def changed(by: np.ndarray) -> np.ndarray:
+        moved = figures.figures_mm(by)
+        return np.array([moved[name] - plain[name] for name in gradients])
+
+    systematic = errors.by_patterns(changed)
+    assert systematic is not None
+    return {
+        name: FigureUncertainty(errors.linear_std(gradient), float(common))
+        for (name, gradient), common in zip(gradients.items(), systematic, strict=True)
+    }
 
 
 def _empty_capture(folder: Path, sensor: Sensor, medium: str, positions: np.ndarray) -> Capture:

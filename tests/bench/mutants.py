@@ -3,7 +3,8 @@
 Mutants of each package are drawn at random with Cosmic Ray's operators: another arithmetic operator, comparison, sign,
 number or truth value, or a loop left out. Annotations are not changed. Each mutant is tested in a copy of the checkout:
 first with the tests that run the changed line, shortest first, then with the other tests of their files. Slow tests
-are left out. ``--again FILE`` runs all tests on the survivors of earlier results. A mutant survives if no test fails;
+are left out. ``--whole`` runs all fast tests of the package instead, which takes less time for few mutants.
+``--again FILE`` runs all tests on the survivors of earlier results. A mutant survives if no test fails;
 the reader decides if it changes a result at all. Needs ``pip install -e '.[mutants]'``.
 """
 
@@ -33,9 +34,12 @@ TESTS = {
     "uwlts/stripe": ["tests/uwlts/stripe", "tests/uwlts/reconstruction"],
     "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/reconstruction"],
     "uwlts/calibration/mount": ["tests/uwlts/calibration/mount"],
-    "uwlts/calibration": ["tests/uwlts/calibration"],
+    "uwlts/calibration": [
+        f"tests/uwlts/calibration/{name}"
+        for name in ("camera", "guidance", "sequential", "polynomial", "model_comparison", "test_target_stripes.py")
+    ],
     "uwlts/reconstruction": ["tests/uwlts/reconstruction", "tests/uwlts/report", "tests/system/test_joint_command.py"],
-    "uwlts/fitting": [f"tests/uwlts/{name}" for name in ("fitting", "evaluation", "inspection")],
+    "uwlts/fitting": [f"tests/uwlts/{name}" for name in ("fitting", "evaluation", "registration", "inspection")],
     "uwlts/evaluation": ["tests/uwlts/evaluation", "tests/uwlts/acceptance"],
     "uwlts/registration": ["tests/uwlts/registration"],
     "uwlts/alignment": ["tests/uwlts/alignment"],
@@ -213,17 +217,20 @@ def statement_lines(source: str, line: int) -> range:
     return best
 
 
-def tried(mutant: Mutant, folder: Path, tests: Tests) -> Result:
-    """Change the file in a copy of the checkout, run the tests, and put it back."""
+def tried(mutant: Mutant, folder: Path, tests: Tests | None) -> Result:
+    """Change the file in a copy of the checkout, run the tests (default: the package's fast ones), and put it back."""
     path = folder / mutant.file
     source = path.read_text()
     changed = mutant.code(source)
     before, after = (text.splitlines()[mutant.line - 1].strip() for text in (source, changed))
-    chosen = list(tests.chosen(mutant, statement_lines(source, mutant.line)))
+    if tests is None:
+        chosen, limit = ["-m", "not slow", *TESTS[mutant.package]], 4 * _LONGEST_S
+    else:
+        chosen = list(tests.chosen(mutant, statement_lines(source, mutant.line)))
+        limit = 60 + 5 * sum(tests.seconds[test] for test in chosen)
     if not chosen:
         return Result(mutant, "not run", before, after)
     path.write_text(changed)
-    limit = 60 + 5 * sum(tests.seconds[test] for test in chosen)
     try:
         done = subprocess.run(
             [*_pytest(), "-x", *chosen], cwd=folder, timeout=limit, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -240,13 +247,18 @@ def _pytest() -> list[str]:
     return [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
 
 
-def of_package(package: str, mutants: list[Mutant], *, slow: bool, workers: int, console: Console) -> Iterator[Result]:
+def of_package(
+    package: str, mutants: list[Mutant], *, slow: bool, whole: bool, workers: int, console: Console
+) -> Iterator[Result]:
     """Try mutants of a package, one result after the other."""
     with tempfile.TemporaryDirectory() as temporary:
         folders: SimpleQueue[Path] = SimpleQueue()
         for worker in range(workers):
             folders.put(copied(Path(temporary) / str(worker)))
-        tests = Tests.observed(copied(Path(temporary) / "observed"), package, slow=slow, workers=workers)
+        if whole:
+            tests = None
+        else:
+            tests = Tests.observed(copied(Path(temporary) / "observed"), package, slow=slow, workers=workers)
 
         def one(mutant: Mutant) -> Result:
             folder = folders.get()
@@ -269,6 +281,7 @@ def main() -> None:
     parser.add_argument("packages", nargs="*", metavar="package", help=", ".join(TESTS))
     parser.add_argument("--sample", type=int, default=60, help="mutants of each package (default: 60)")
     parser.add_argument("--seed", type=int, default=0, help="draw others by another number")
+    parser.add_argument("--whole", action="store_true", help="run all fast tests of the package for each mutant")
     parser.add_argument("--again", type=Path, help="try the survivors of these results on all tests")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("mutants.json"), help="results, written after each mutant")
@@ -282,7 +295,9 @@ def main() -> None:
         else:
             mutants = drawn(package, options.sample, random.Random(f"{options.seed} {package}"))
         slow = options.again is not None
-        for result in of_package(package, mutants, slow=slow, workers=options.workers, console=console):
+        for result in of_package(
+            package, mutants, slow=slow, whole=options.whole, workers=options.workers, console=console
+        ):
             results = [each for each in results if each.mutant != result.mutant] + [result]
             options.out.write_text(json.dumps([asdict(each) for each in results], indent=1))
     table = Table("package", "mutants", "killed", "survived", "not run", "score")

@@ -20,6 +20,7 @@ from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, gather, solve
 from uwlts.calibration.target_stripes import stripe_on_target
+from uwlts.errors import CaptureError
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import PlaneFound
 from uwlts.model.parameter_keys import LensParameter
@@ -224,6 +225,12 @@ def test_no_reflection_on_the_machine_beside_the_board_is_taken(etna: Capture):
         count += len(here.line)
     # By eye the line crosses all 1024 rows of each image.
     assert count > 0.9 * 1024 * len(np.unique(stripes.frame))
+
+
+def test_radiometry_refuses_photographs_of_a_target_by_hand(etna: Capture):
+    known = uwlts.nominal(etna.header.sensor, medium="air")
+    with pytest.raises(CaptureError, match="give a scan by a stage"):
+        uwlts.fit_radiometry(etna, known)
 
 
 @pytest.mark.slow

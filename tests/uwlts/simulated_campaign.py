@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -180,6 +181,7 @@ class FanRays:
     steps: np.ndarray
 
     @classmethod
+    @lru_cache(maxsize=4)
     def of(cls, real: Reality, index: float, count: int) -> "FanRays":
         """Construct rays from the points lit on two planes; behind the window, light runs straight.
 

@@ -40,6 +40,7 @@ from twin.light.multiple_scattering import IndirectLight, LightSources, decay_wi
 from twin.light.particles import Body, sample_spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
+from twin.light.translucency import lit_sigma_mm, spread_irradiance
 from twin.light.walk import Walker
 from twin.light.water import Scattering
 from twin.rendering_options import ALL, Effects
@@ -307,7 +308,7 @@ class Renderer:
         along_width = self.sensor.camera.stripe_along == "width"
         known = np.isfinite(points_mm[columns if along_width else rows, 0])
         rows, columns, found = rows[known], columns[known], [np.zeros((3, 0), np.float32)]
-        (light, *_), _ = make_lights(self._sheets[:1], pose)
+        (light,), _ = make_lights([self.sheet.without_side_lobes()], pose)
 
         def sums(pose: SensorPose, bundle: Rays, after_s: Float | None, planes: Float) -> tuple[Float, ...]:
             segment = next(self._segments(pose, bundle, after_s))
@@ -318,8 +319,6 @@ class Renderer:
             away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
             same = dr.abs(away) <= here.sigma_mm
             profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm))
-            if light.sheet.side_lobes:
-                value *= dr.select(value > 0, here.in_middle * profile / here.irradiance, 0.0)
             profile /= here.sigma_mm * math.sqrt(2 * math.pi)
             return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
 
@@ -341,9 +340,21 @@ class Renderer:
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
             here = light.evaluate(end, after_s)
-            lit = light.reaches(self.objects.scene, end, here, after_s, segment.valid & (here.irradiance > 0))
+            # The light of a coat or metal leaves where it arrives, that of a body is spread.
+            parts = [(mi.BSDFContext(), here.irradiance)]
+            if self.objects.translucent:
+                body, coat = mi.BSDFContext(), mi.BSDFContext()
+                body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
+                normal = pose.object_direction(segment.si.n, after_s)
+                parts = [
+                    (coat, here.irradiance),
+                    (body, spread_irradiance(self.objects, segment.si, normal, here, light.sheet)),
+                ]
+            bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
+            lit = light.reaches(self.objects.scene, end, here, after_s, bright)
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
-            radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
+            for context, value in parts:
+                radiance += dr.select(lit, bsdf.eval(context, segment.si, towards, lit)[0] * value, 0.0)
         return radiance * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
 
     # --- nodes: where the stripe is, and the haze ---------------------------------------------------------------------
@@ -361,7 +372,10 @@ class Renderer:
             scattered = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
                 ends = [light.evaluate(segment.end()) for light in sources]
-                across = [_sigmas(here, segment, light.sheet.reach) for light, here in zip(sources, ends, strict=True)]
+                across = [
+                    self._sigmas(here, segment, moment, light.sheet.reach)
+                    for light, here in zip(sources, ends, strict=True)
+                ]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
                 if index == 0 and moment is pose and self._scatters:
@@ -593,15 +607,18 @@ class Renderer:
         blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
         return blur
 
+    def _sigmas(self, here: SheetLight, segment: RaySegment, pose: SensorPose, reach: float) -> Float:
+        """Return distances of segment ends from a sheet in ``reach`` standard deviations; infinite off surfaces."""
+        sigma = here.sigma_mm
+        if self.objects.translucent:
+            sigma = lit_sigma_mm(self.objects, segment.si, pose.object_direction(segment.si.n), here)
+        if reach != 1:
+            sigma = sigma * opaque(reach)
+        return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
+
     def _expand_cells(self, cells: np.ndarray) -> np.ndarray:
         """Expand values of grid cells to pixels (H, W)."""
         return expand_cells(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
-
-
-def _sigmas(here: SheetLight, segment: RaySegment, reach: float) -> Float:
-    """Return the distance of segment ends from a sheet in ``reach`` standard deviations; infinite without a surface."""
-    sigma = here.sigma_mm if reach == 1 else here.sigma_mm * opaque(reach)
-    return dr.select(segment.valid, here.distance_mm / sigma, dr.inf)
 
 
 def _split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -12,6 +12,7 @@ identified by the angle in rad between the axis and its projection along x.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 from typing import assert_never, cast
 
@@ -105,12 +106,18 @@ class Sheet:
         index = medium.refractive_index(laser.wavelength_nm)
         rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
         self._waist, self._rayleigh, self._waist_at = map(opaque, (waist, rayleigh, laser.waist_distance_mm))
-        lobes = [(2 * offset, radius, share) for offset, radius, share in laser.side_lobes]
-        self.side_lobes = [tuple(map(opaque, lobe)) for lobe in lobes]
-        self._main_share = opaque(1 - math.fsum(share for _, _, share in lobes))
-        reaches = [(abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS for offset, radius, _ in lobes]
-        self.reach = max([1.0, *reaches])
+        lobes = [(share, 2 * offset, radius) for offset, radius, share in laser.side_lobes]
+        main = (1 - math.fsum(share for share, _, _ in lobes), 0.0, 1.0)
+        self.parts = [tuple(map(opaque, part)) for part in (main, *lobes)]
+        reaches = [(2 * abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS for offset, radius, _ in laser.side_lobes]
+        self.reach = max(1.0, *reaches) if reaches else 1.0
         self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))
+
+    def without_side_lobes(self) -> Sheet:
+        """Return the sheet with all its power in the main Gaussian."""
+        alone = copy(self)
+        alone.parts, alone.reach = [tuple(map(opaque, (1.0, 0.0, 1.0)))], 1.0
+        return alone
 
     def evaluate(self, p: Point3f) -> SheetLight:
         """Return the light of the sheet at points in the OCS.
@@ -137,9 +144,9 @@ class Sheet:
         in_middle = density / (sigma * math.sqrt(2 * math.pi)) * stretch * dr.exp(-self._extinction * exit_mm)
         in_middle = dr.select(exit_mm > 0, in_middle, 0.0)
         irradiance = in_middle * dr.exp(-0.5 * dr.square(distance / sigma))
-        if self.side_lobes:
-            irradiance *= self._main_share
-            for offset, radius, share in self.side_lobes:
+        if len(self.parts) > 1:
+            irradiance *= self.parts[0][0]
+            for share, offset, radius in self.parts[1:]:
                 away = (distance / sigma - offset) / radius
                 irradiance += in_middle * (share / radius) * dr.exp(-0.5 * dr.square(away))
         direction = mi.Vector3f(tilt, m, 1.0) / stretch

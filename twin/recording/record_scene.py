@@ -13,9 +13,9 @@ import numpy as np
 
 from twin.backend.llvm import preserve_threads
 from twin.recording.frame_truth import FrameTruth, depth_map
-from twin.recording.sensor_simulator import SensorSimulator, ShotLight, medium_of, with_window
+from twin.recording.sensor_simulator import SensorSimulator, ShotLight, with_window
 from twin.rendering_options import Options
-from twin.scene.description import Scene
+from twin.scene.description import Scene, medium_of
 from twin.scene.motion import Shot
 from twin.scene.platforms import Platform
 from uwlts.errors import OutputError

@@ -12,7 +12,7 @@ from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth, measure_line_light
 from twin.rendering_options import Options
-from twin.scene.description import PrintedPlate, Scene, replace_values
+from twin.scene.description import PrintedPlate, Scene, medium_of, replace_values
 from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
 from twin.scene.platforms import Platform
@@ -21,9 +21,8 @@ from twin.sensor.flaws import add_glare, as_built, deliver_image, dirt, laser_sh
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
-from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import Coordinates
 from uwlts.storage.capture import Frame, Seen
 
@@ -37,16 +36,6 @@ STRAY_LINES = 4
 """Number of brightest lines that may be due to single bright pixels."""
 LIT_SHARE = 0.05
 """A line is lit if it exceeds this fraction of the brightest line that is not one of `STRAY_LINES`."""
-
-
-def medium_of(sensor: Sensor, scene: Scene) -> Medium:
-    """Return the sensor's medium that the scene names, with the scene's water if it defines one."""
-    medium = sensor.medium(scene.medium)
-    if scene.water is None:
-        return medium
-    kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}
-    kept = medium.model_dump(include={"kind", "temperature_c", "salinity_g_kg", "index"})
-    return validate_description(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
 
 
 def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:

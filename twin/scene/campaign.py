@@ -9,8 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from twin.scene.description import Block, PrintedPlate, Scene, load_scene, replace_values
+from twin.scene.forms import PittedPipe, Weld
 from twin.scene.motion import Motion
 from twin.scene.platforms import Platform
+from twin.scene.scene_object import SceneObject
 from uwlts.errors import DescriptionError
 from uwlts.model.library import find_description, load_sensor, read_table, validate_description
 from uwlts.model.sensor import Description, NotNegative, Sensor
@@ -36,7 +38,7 @@ class Imperfections(Description):
     and ``waist_distance_std_mm`` of the waist's distance.
 
     Others: ``temperature_half_width_c`` of the water, drawn once for calibrations and once for measurements;
-    ``step_height_half_width_mm`` of the step standard.
+    ``step_height_half_width_mm`` of the step standard. Depths of pits and undercuts given as a range are drawn again.
     """
 
     circle_centre_std_mm: NotNegative = 0.0
@@ -78,12 +80,14 @@ class CampaignRecording(Description):
 class Campaign(Description):
     """Recordings with one sensor. The imperfections are added to the sensor ``as_built``.
 
-    Sensors are names or paths; relative paths start at the campaign's folder.
+    Sensors are names or paths; relative paths start at the campaign's folder. ``water`` replaces that of all scenes in
+    water, by the name of a water or a turbidity from 0 (pure) to 3 (harbour).
     """
 
     title: str
     sensor: str
     as_built: str
+    water: str | Annotated[float, Field(ge=0, le=3)] | None = None
     imperfections: Imperfections = Imperfections()
     recordings: Annotated[tuple[CampaignRecording, ...], Field(min_length=1)]
 
@@ -119,7 +123,7 @@ def list_takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
     """
     drawn = _SampledImperfections(campaign, seed)
     found = [
-        _take(recording, place, medium, drawn, every=every)
+        _take(recording, place, medium, drawn, water=campaign.water, every=every)
         for recording in campaign.recordings
         for place in recording.placements or (None,)
         for medium in recording.media or (None,)
@@ -131,10 +135,23 @@ def list_takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
 
 
 def _take(
-    recording: CampaignRecording, place: str | None, medium: str | None, drawn: "_SampledImperfections", *, every: int
+    recording: CampaignRecording,
+    place: str | None,
+    medium: str | None,
+    drawn: "_SampledImperfections",
+    *,
+    water: str | float | None,
+    every: int,
 ) -> Take:
-    motion = load_scene(recording.scene, placement=place, medium=medium).motion.model_dump() | recording.motion
-    scene = load_scene(recording.scene, placement=place, medium=medium, motion=motion)
+    plain = load_scene(recording.scene, placement=place, medium=medium)
+    in_water = water is not None and drawn.described.medium(plain.medium).kind != "air"
+    scene = load_scene(
+        recording.scene,
+        placement=place,
+        medium=medium,
+        water=water if in_water else None,
+        motion=plain.motion.model_dump() | recording.motion,
+    )
     name = recording.name or f"{Path(recording.scene).stem}-{scene.placement}-{scene.medium}"
     sensor = drawn.described
     built = sensor if recording.as_described else drawn.sensor
@@ -207,6 +224,8 @@ class _SampledImperfections:
                 tilt = size.target_tilt_std_deg * rng.standard_normal(2)
                 turned = np.array(thing.rotation_deg) + (*tilt, 0.0)
                 objects[number] = replace_values(thing, **self._target, rotation_deg=tuple(turned.tolist()))
+            elif draws_depths(thing):
+                objects[number] = replace_values(thing, seed=int(rng.integers(2**31)))
         if self._lower_step != 0 and _shows_step(scene):
             number = _find_lower_block(scene)
             x, y, z = objects[number].position_mm
@@ -227,6 +246,17 @@ class _SampledImperfections:
             nominal_direction=motion.recorded_direction(),
             position_errors_mm=tuple(errors.tolist()),
         )
+
+
+def draws_depths(thing: SceneObject) -> bool:
+    """Return whether an object has pits or undercuts of drawn depths; each campaign draws them again."""
+    match thing:
+        case PittedPipe():
+            return isinstance(thing.pit_depth_mm, tuple)
+        case Weld():
+            return isinstance(thing.undercut_depth_mm, tuple)
+        case _:
+            return False
 
 
 def _shows_step(scene: Scene) -> bool:

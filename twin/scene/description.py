@@ -22,7 +22,7 @@ from twin.scene.scene_object import FlatObject, Pose, Reflectance, SceneObject
 from twin.scene.vehicle import Vehicle
 from uwlts.errors import DescriptionError
 from uwlts.model.library import find_description, read_table, validate_description
-from uwlts.model.sensor import Description, NotNegative, Positive, Table, Vector
+from uwlts.model.sensor import Description, Medium, NotNegative, Positive, Sensor, Table, Vector
 from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
@@ -95,7 +95,7 @@ class PrintedPlate(SceneObject, ABC):
     errors_seed: Annotated[int, Field(ge=0)] = 0
 
     _no_texture: ClassVar[str] = "on a plate with a printed pattern: put it on an object of kind 'plate'"
-    _no_mottle: ClassVar[str] = "on a plate with a printed pattern: set mottle = 0, or use an object of kind 'plate'"
+    _no_mottle: ClassVar[str] = "on a plate with a printed pattern: use an object of kind 'plate', or"
 
     @abstractmethod
     def described_target(self) -> Target:
@@ -301,6 +301,16 @@ def load_scene(
         table["motion"] = {**moved, "trajectory": str(path.parent / str(moved["trajectory"]))}
     table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
     return validate_description(Scene, table, path)
+
+
+def medium_of(sensor: Sensor, scene: Scene) -> Medium:
+    """Return the sensor's medium that the scene names, with the scene's water if it defines one."""
+    medium = sensor.medium(scene.medium)
+    if scene.water is None:
+        return medium
+    kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}
+    kept = medium.model_dump(include={"kind", "temperature_c", "salinity_g_kg", "index"})
+    return validate_description(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
 
 
 def _with_paths_from(folder: Path, thing: Table) -> Table:

@@ -19,7 +19,8 @@ from pydantic import TypeAdapter
 
 from twin.backend.arrays import Bool, Float, Point3f, SurfaceInteraction3f, UInt32, opaque, to_jit
 from twin.scene.description import AnyObject, FlatObject, PrintedPlate, SceneObject
-from twin.scene.surfaces import WAVES, draw_waves, log_deviation, move_waves
+from twin.scene.subsurface import LateralSpread, lateral_spread
+from twin.scene.surfaces import WAVES, FinishProperties, draw_patches, draw_waves, log_deviation, move_waves
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.model.media import check_range
 from uwlts.storage.image_file import read_image
@@ -82,17 +83,15 @@ def finish_bsdf(
     to the object at its ``pose`` (4, 4) in the scene, by default the identity. DescriptionError if the texture is
     missing, unreadable, or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
     """
-    own, scale, waves = thing.finish_properties(), 1.0, None
-    if own.mottle > 0 and own.reflectance > 0:
-        waves = draw_waves(np.random.default_rng(seed), own.mottle_mm)
-        waves = move_waves(waves, np.eye(4) if pose is None else pose)
+    own, scale = thing.finish_properties(), 1.0
+    field = _random_field(own, np.eye(4) if pose is None else pose, seed)
     if gloss and own.reflection != "diffuse":
-        reflectance = _reflectance(thing, scale, waves)
+        reflectance = _reflectance(thing, scale, field)
         return _make_glossy(thing, reflectance, medium_index=medium_index, wavelength_nm=wavelength_nm)
     if own.reflection == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
         scale = abs((index - 1) / (index + 1)) ** 2
-    return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale, waves)})
+    return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale, field)})
 
 
 def _make_glossy(
@@ -109,17 +108,36 @@ def _make_glossy(
     return mi.load_dict(coat | rough | {"diffuse_reflectance": reflectance})
 
 
-def _reflectance(thing: SceneObject, scale: float, waves: np.ndarray | None) -> float | mi.Texture:
+def _random_field(own: FinishProperties, pose: np.ndarray, seed: Sequence[int]) -> dict[str, object]:
+    """Return the waves of mottle and patches in the scene, and the level of the patches; empty if there are none."""
+    field: dict[str, object] = {}
+    if own.mottle > 0 and own.reflectance > 0:
+        waves = draw_waves(np.random.default_rng([*seed, 0]), own.mottle_mm)
+        field["mottle_waves"] = move_waves(waves, pose).tolist()
+    if own.patch_share > 0:
+        waves, level = draw_patches(
+            np.random.default_rng([*seed, 1]), share=own.patch_share, length_mm=own.patch_length_mm
+        )
+        field |= {"patch_waves": move_waves(waves, pose).tolist(), "level": level}
+    return field
+
+
+def _reflectance(thing: SceneObject, scale: float, field: dict[str, object]) -> float | mi.Texture:
     """Return the reflectance of an object, a number or a texture, multiplied by ``scale``.
 
-    ``waves`` (N, 4) are those of its random variation in the scene.
+    ``field`` describes its random variation in the scene.
     """
     if isinstance(thing, PrintedPlate):
         return pattern_texture(thing.scale_reflectance(scale))
     own = thing.finish_properties()
-    if waves is not None:
-        table = {"waves": waves.tolist(), "mean": own.reflectance, "mottle": own.mottle, "scale": scale}
-        return mi.load_dict({"type": "random_reflectance", "table": json.dumps(table)})
+    if field:
+        numbers = {
+            "mean": own.reflectance,
+            "mottle": own.mottle,
+            "patch": own.patch_reflectance,
+            "share": own.patch_share,
+        }
+        return mi.load_dict({"type": "random_reflectance", "table": json.dumps(field | numbers | {"scale": scale})})
     if thing.texture is None:
         return scale * own.reflectance
     # Texture coordinate v starts at the last row of the picture, but Mitsuba's rows start at the first.
@@ -176,6 +194,16 @@ def albedo_parts(
     unit = float(cast(Float, white.eval_diffuse_reflectance(square))[0][0])
     without = directional_albedo(black, cosines)
     return without, (directional_albedo(white, cosines) - without) / unit
+
+
+def body_spread(thing: SceneObject, *, medium_index: float) -> LateralSpread:
+    """Return the lateral spread of light in an object's body in a medium."""
+    own = thing.finish_properties()
+    return lateral_spread(
+        mean_free_path_mm=own.mean_free_path_mm,
+        reflectance=own.reflectance,
+        index=COAT_INDEX.get(own.reflection, medium_index) / medium_index,
+    )
 
 
 def view_along_normal(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
@@ -259,27 +287,42 @@ def register_textures() -> None:
             return f"TargetPattern[{type(self.plate.described_target()).__name__}]"
 
     class RandomReflectance(mi.Texture):
-        """Log-normal reflectance, limited to 1, from a Gaussian field of plane waves in the scene; times a scale."""
+        """Log-normal reflectance, limited to 1, with patches of another one, both times a scale.
+
+        Both follow from Gaussian fields of plane waves in the scene.
+        """
 
         def __init__(self, props: mi.Properties):
             mi.Texture.__init__(self, props)
             table = json.loads(str(props["table"]))
-            self.waves = to_jit(mi.Float, np.array(table["waves"]))
+            mottle, patches = table.get("mottle_waves"), table.get("patch_waves")
+            self.mottle_waves = None if mottle is None else to_jit(mi.Float, np.array(mottle))
+            self.patch_waves = None if patches is None else to_jit(mi.Float, np.array(patches))
+            mean, share, scale = table["mean"], table["share"], table["scale"]
             deviation = log_deviation(table["mottle"])
-            self.gain, self.mean_value = (
-                opaque(deviation * math.sqrt(2 / WAVES)),
-                opaque(table["scale"] * table["mean"]),
+            self.gain, self.most = opaque(deviation * math.sqrt(2 / WAVES)), opaque(scale)
+            self.middle = opaque(mean * math.exp(-(deviation**2) / 2))
+            self.level = opaque(table.get("level", 0.0) * math.sqrt(WAVES / 2))
+            self.patch, self.average = (
+                opaque(scale * table["patch"]),
+                opaque(scale * (mean + share * (table["patch"] - mean))),
             )
-            self.middle, self.most = opaque(math.log(table["mean"]) - deviation**2 / 2), opaque(table["scale"])
 
         def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
             return self.eval_1(si, active)
 
         def eval_1(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
-            return self.most * dr.minimum(dr.exp(self.middle + self.gain * _sum_waves(self.waves, si.p, active)), 1.0)
+            value = mi.Float(self.middle)
+            if self.mottle_waves is not None:
+                value *= dr.exp(self.gain * _sum_waves(self.mottle_waves, si.p, active))
+            value = self.most * dr.minimum(value, 1.0)
+            if self.patch_waves is not None:
+                covered = _sum_waves(self.patch_waves, si.p, active) > self.level
+                value = dr.select(covered, self.patch, value)
+            return value
 
         def mean(self) -> Float:
-            return self.mean_value
+            return self.average
 
         def is_spatially_varying(self) -> bool:
             return True

@@ -13,9 +13,10 @@ import trimesh
 
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Plate, Scene, Sphere, TargetPlate
-from twin.scene.finish import albedo_parts, finish_bsdf, register_textures, view_along_normal
+from twin.scene.finish import albedo_parts, body_spread, finish_bsdf, register_textures, view_along_normal
 from twin.scene.forms.triangles import bowed_plate
 from twin.scene.scene_object import FreeForm
+from twin.scene.subsurface import GAUSSIANS
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_regular_file
 
@@ -51,13 +52,14 @@ class Objects:
     ``scene`` contains what scatters light and ``mirrors`` the specular faces. Tables list a property of each shape at
     its number in Dr.Jit's registry, which is common to all scenes of the process. ``coherent`` is True if adjacent rays
     are traced faster together, as for meshes but not for spheres and cylinders. ``glossy`` is True if the albedo of any
-    object depends on direction.
+    object depends on direction. ``translucent`` is True if light spreads in the body of any object.
     """
 
     scene: mi.Scene
     mirrors: tuple[MirrorFace, ...]
     coherent: Bool
     glossy: bool
+    translucent: bool
     _facts: dict[str, Float]
 
     def mirror_share(self, si: SurfaceInteraction3f) -> Float:
@@ -71,6 +73,24 @@ class Objects:
     def roughness_um(self, si: SurfaceInteraction3f) -> Float:
         """Return the rms height of the objects hit; 0 without a hit."""
         return self._fact("roughness_um", si)
+
+    def spread_ahead_mm(self, si: SurfaceInteraction3f, cosine: Float) -> Float:
+        """Return the mean way of light in the bodies hit, per sine of its incidence angle of the given cosine.
+
+        See `twin.scene.subsurface.LateralSpread`; the way is along the surface.
+        """
+        index = dr.maximum(self._fact("spread_index", si), 1.0)
+        inside = dr.safe_sqrt(1 - (1 - dr.square(cosine)) / dr.square(index))
+        return self._fact("spread_path_mm", si) / (index * (1 + self._fact("spread_decay", si) * inside))
+
+    def spread_parts(self, si: SurfaceInteraction3f) -> list[tuple[Float, Float]]:
+        """Return weights and variances in mm2 of the Gaussians that spread light in the bodies hit."""
+        start, valid = GAUSSIANS * _registry_number(si.shape), si.is_valid()
+        weights, variances = self._facts["spread_weights"], self._facts["spread_variances_mm2"]
+        return [
+            (dr.gather(mi.Float, weights, start + k, valid), dr.gather(mi.Float, variances, start + k, valid))
+            for k in range(GAUSSIANS)
+        ]
 
     def number(self, shape: mi.ShapePtr, active: Bool) -> Int32:
         """Return the index of the objects that shapes belong to; -1 where not ``active``."""
@@ -127,6 +147,7 @@ def build_objects(
         albedo_parts(thing, _ALBEDO_COSINES, **optics) if shines else flat
         for thing, shines in zip(things, glossy, strict=True)
     ]
+    spreads = [body_spread(thing, medium_index=medium_index) for thing in things]
     facts = {
         "mirror": [thing.mirror_share() if gloss else 0.0 for thing in things],
         "polarisation": [thing.polarisation() for thing in things],
@@ -135,6 +156,11 @@ def build_objects(
         "two_sided": [isinstance(thing, (Mesh, FreeForm)) for thing in things],
         "albedo_black": [black for black, _ in parts],
         "albedo_per_unit": [per_unit for _, per_unit in parts],
+        "spread_weights": [spread.weights for spread in spreads],
+        "spread_variances_mm2": [spread.variances_mm2 for spread in spreads],
+        "spread_path_mm": [spread.path_mm for spread in spreads],
+        "spread_decay": [spread.decay for spread in spreads],
+        "spread_index": [spread.index for spread in spreads],
     }
     # With optimisation, Mitsuba would merge meshes of equal BSDF into one shape. Without robust intersections, one ray
     # in about ten thousand would pass through the edge between two facets.
@@ -144,6 +170,7 @@ def build_objects(
         scene=whole,
         coherent=mi.Bool(any(shape.is_mesh() for shape in shapes)),
         glossy=any(glossy),
+        translucent=any(spread.path_mm > 0 for spread in spreads),
         mirrors=tuple(face for thing, pose in placed if gloss for face in _mirror_faces(thing, pose)),
         _facts={key: _by_registry(shapes, np.array(values, float)) for key, values in facts.items()},
     )

@@ -2,12 +2,12 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Annotated, ClassVar, Self, cast
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from twin.scene.surfaces import FINISHES, LARGEST_CLIPPED, Finish, FinishProperties, clipped_share
@@ -44,6 +44,12 @@ class SceneObject(Pose):
     The random field is log-normal with mean 1 and the standard deviation ``mottle``; products are limited to 1. Its
     autocorrelation falls to 1 / e at the distance ``mottle_mm``, one length or one along each of the object's axes
     (`twin.scene.surfaces.draw_waves`). It is fixed to the object, and drawn from the seed of the recording.
+
+    Random patches of the diffuse reflectance ``patch_reflectance``, such as growth or stains, cover the fraction
+    ``patch_share`` of the surface. A line on the surface is within a patch for ``patch_length_mm`` on average.
+
+    ``mean_free_path_mm`` is the transport mean free path of light in a translucent body, which widens the stripe and
+    shifts it ahead along the laser's direction (`twin.scene.subsurface`); 0 for an opaque one.
     """
 
     reflectance: Reflectance | None = None
@@ -53,6 +59,10 @@ class SceneObject(Pose):
     texture: str | None = None
     mottle: Annotated[float, Field(ge=0, le=1)] | None = None
     mottle_mm: Positive | tuple[Positive, Positive, Positive] | None = None
+    mean_free_path_mm: Annotated[float, Field(ge=0, le=10)] | None = None
+    patch_share: Annotated[float, Field(ge=0, le=0.8)] | None = None
+    patch_length_mm: Positive | None = None
+    patch_reflectance: Reflectance | None = None
 
     _no_texture: ClassVar[str] = ""
     """Reason why objects of a class have no picture as texture."""
@@ -66,10 +76,14 @@ class SceneObject(Pose):
             raise ValueError(f"texture {self.texture} {self._no_texture}")
         if own.reflection == "diffuse" and self.alpha is not None:
             raise ValueError(f"alpha {self.alpha:g} is for glossy finishes, but finish is '{self.finish}': omit alpha")
-        if own.mottle > 0 and self._no_mottle:
-            raise ValueError(f"mottle {own.mottle:g} of the finish '{self.finish}' {self._no_mottle}")
-        if own.mottle > 0 and self.texture is not None:
-            raise ValueError(f"texture {self.texture} and mottle {own.mottle:g}: use one of them, or mottle = 0")
+        for name in ("mottle", "patch_share"):
+            value = getattr(own, name)
+            if value > 0 and self._no_mottle:
+                raise ValueError(f"{name} {value:g} of the finish '{self.finish}' {self._no_mottle} {name} = 0")
+            if value > 0 and self.texture is not None:
+                raise ValueError(f"texture {self.texture} and {name} {value:g}: use one of them, or {name} = 0")
+        if own.mean_free_path_mm > 0 and own.reflection == "metal":
+            raise ValueError(f"mean_free_path_mm {own.mean_free_path_mm:g} in a metal: light does not enter it")
         if (lost := clipped_share(own.reflectance, own.mottle)) > LARGEST_CLIPPED:
             raise ValueError(
                 f"reflectance {own.reflectance:g} with mottle {own.mottle:g} would often exceed 1, and lose "
@@ -80,8 +94,7 @@ class SceneObject(Pose):
     def finish_properties(self) -> FinishProperties:
         """Return the properties of the object's finish, with the given ones in place of those of its row."""
         row = FINISHES[self.finish]
-        names = ("reflectance", "alpha", "roughness_um", "mottle", "mottle_mm")
-        given = {name: getattr(self, name) for name in names}
+        given = {each.name: getattr(self, each.name, None) for each in fields(row)}
         return replace(row, **{name: value for name, value in given.items() if value is not None})
 
     def mirror_share(self) -> float:
@@ -111,6 +124,16 @@ class FlatObject(SceneObject):
         if self.mirror > 0 and own.reflection in ("painted", "pvc"):
             raise ValueError(f"mirror {self.mirror:g} under a coat: use the finish 'diffuse' or 'metal' for a mirror")
         return self
+
+
+def _check_range(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"the range [{ends[0]:g}, {ends[1]:g}] must begin with its smaller end")
+    return ends
+
+
+Range = Annotated[tuple[Positive, Positive], AfterValidator(_check_range)]
+"""Least and largest value of a size that is drawn."""
 
 
 class FreeForm(SceneObject, ABC):

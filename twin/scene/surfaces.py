@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 Reflection = Literal["diffuse", "painted", "pvc", "metal"]
 Finish = Literal[
@@ -19,11 +19,12 @@ Finish = Literal[
     "painted",
     "pvc",
     "metal",
-    "rusted-steel",
-    "weathered-paint",
     "machined-steel",
-    "pvc-pipe",
+    "painted-steel",
+    "rusted-steel",
+    "fouled-steel",
     "concrete",
+    "pvc-pipe",
     "marine-growth",
 ]
 Lengths = tuple[float, float, float]
@@ -47,37 +48,59 @@ class FinishProperties:
     roughness_um: float = 5.0
     mottle: float = 0.0
     mottle_mm: float | Lengths = 1.0
+    mean_free_path_mm: float = 0.0
+    patch_share: float = 0.0
+    patch_length_mm: float = 5.0
+    patch_reflectance: float = 0.03
 
 
-# Roughness of coats and metal (alpha): a satin paint, an extruded pipe, ground steel; assumed. Light from a diffuse
-# body has travelled some um inside it, whatever its surface roughness.
+# Sources. Roughness of coats and metal (alpha): a satin paint, an extruded pipe, ground steel; assumed. Light from a
+# diffuse body has travelled some um inside it, whatever its surface roughness. White, diffuse materials scatter 3 to 8
+# times per mm (reduced; Sensors 23:6853, 2023), coral tissue once at 636 nm (Wangpraseurt et al. 2016, Front. Plant
+# Sci. 7:1404), which is an albedo of 0.5 per mean free path of 0.5 mm. Brown algae reflect 0.02 to 0.04 below 520 nm
+# (Maritorena, Morel and Gentili 1994, Limnol. Oceanogr. 39:1689). Other reflectances, mottle and lengths are assumed;
+# docs/results/surfaces.md compares the stripes with real ones.
 FINISHES: dict[Finish, FinishProperties] = {
     "diffuse": FinishProperties("diffuse"),
     "painted": FinishProperties("painted", alpha=0.3),
     "pvc": FinishProperties("pvc", alpha=0.15),
     "metal": FinishProperties("metal", alpha=0.3, roughness_um=1.0),
-    "rusted-steel": FinishProperties("diffuse", reflectance=0.25, roughness_um=20.0, mottle=0.35, mottle_mm=0.8),
-    "weathered-paint": FinishProperties("painted", reflectance=0.5, alpha=0.4, mottle=0.15, mottle_mm=1.5),
     "machined-steel": FinishProperties(
-        "metal", reflectance=0.6, alpha=0.2, roughness_um=1.6, mottle=0.25, mottle_mm=(10.0, 0.15, 0.15)
+        "metal", reflectance=0.6, alpha=0.2, roughness_um=1.6, mottle=0.2, mottle_mm=(10.0, 0.2, 0.2)
     ),
-    "pvc-pipe": FinishProperties("pvc", reflectance=0.7, alpha=0.15, mottle=0.05, mottle_mm=2.0),
-    "concrete": FinishProperties("diffuse", reflectance=0.35, roughness_um=50.0, mottle=0.25, mottle_mm=0.5),
-    "marine-growth": FinishProperties("diffuse", reflectance=0.12, roughness_um=50.0, mottle=0.5, mottle_mm=1.0),
+    "painted-steel": FinishProperties("painted", reflectance=0.5, alpha=0.4, mottle=0.12, mottle_mm=1.5),
+    "rusted-steel": FinishProperties("diffuse", reflectance=0.25, roughness_um=20.0, mottle=0.3, mottle_mm=0.8),
+    "fouled-steel": FinishProperties(
+        "diffuse",
+        reflectance=0.25,
+        roughness_um=20.0,
+        mottle=0.3,
+        mottle_mm=0.8,
+        patch_share=0.25,
+        patch_length_mm=10.0,
+    ),
+    "concrete": FinishProperties("diffuse", reflectance=0.35, roughness_um=50.0, mottle=0.2, mottle_mm=0.6),
+    "pvc-pipe": FinishProperties("pvc", reflectance=0.7, alpha=0.15, mottle=0.05, mottle_mm=2.0, mean_free_path_mm=0.2),
+    "marine-growth": FinishProperties(
+        "diffuse", reflectance=0.12, roughness_um=50.0, mottle=0.4, mottle_mm=1.5, mean_free_path_mm=0.5
+    ),
 }
 
 
-def draw_waves(rng: np.random.Generator, correlation_mm: float | Lengths) -> np.ndarray:
+def draw_waves(rng: np.random.Generator, correlation_mm: float | Lengths, *, smooth: bool = False) -> np.ndarray:
     """Draw the plane waves (N, 4) of a Gaussian field of mean 0 and variance 1: wave vectors in 1/mm, and phases.
 
     The field is the sum of sqrt(2 / N) cos(k r + phase) (spectral representation, Shinozuka 1971, J. Acoust. Soc. Am.
     49:357). Its autocorrelation is exp(-d) at the distance d = sqrt(sum (r_j / l_j)^2), with the correlation length l_j
     along each of the object's axes. The density of exp(-d) in space is proportional to 1 / (1 + q^2)^2 with q_j = k_j
-    l_j (Abramowitz and Stegun 1964, section 29.3; Matern's class with exponent 1/2), a power law above 1 / l. Wave
-    numbers are drawn one from each of N intervals of equal power, up to `_FINEST`.
+    l_j (Matern's class with exponent 1/2), a power law above 1 / l. Wave numbers are drawn one from each of N intervals
+    of equal power, up to `_FINEST`. A ``smooth`` field has the autocorrelation exp(-d^2 / 2) and the density exp(-q^2 /
+    2).
     """
     numbers = np.geomspace(1e-3, _FINEST, 4096)
-    below = np.arctan(numbers) - numbers / (1 + numbers**2)
+    density = numbers**2 * (np.exp(-0.5 * numbers**2) if smooth else 1 / (1 + numbers**2) ** 2)
+    # Per logarithm of the wave number.
+    below = np.cumsum(density * numbers)
     share = (np.arange(WAVES) + rng.random(WAVES)) / WAVES
     number = np.interp(share * below[-1], below, numbers)
     direction = rng.standard_normal((WAVES, 3))
@@ -85,6 +108,18 @@ def draw_waves(rng: np.random.Generator, correlation_mm: float | Lengths) -> np.
     lengths = np.broadcast_to(correlation_mm, 3)
     phase = rng.uniform(0, 2 * math.pi, WAVES)
     return np.column_stack([number[:, None] * direction / lengths, phase])
+
+
+def draw_patches(rng: np.random.Generator, *, share: float, length_mm: float) -> tuple[np.ndarray, float]:
+    """Draw the waves (N, 4) of a smooth field, and the level above which a ``share`` of the surface lies.
+
+    A line crosses the level u upwards exp(-u^2 / 2) / (2 pi s) times per length if the autocorrelation is exp(-d^2 / (2
+    s^2)) (Rice 1945, Bell Syst. Tech. J. 24:46, Eq. 3.3-14). The share divided by this rate is ``length_mm``, the mean
+    length of the line in a patch.
+    """
+    level = float(ndtri(1 - share))
+    correlation_mm = length_mm * math.exp(-(level**2) / 2) / (2 * math.pi * share)
+    return draw_waves(rng, correlation_mm, smooth=True), level
 
 
 def move_waves(waves: np.ndarray, pose: np.ndarray) -> np.ndarray:

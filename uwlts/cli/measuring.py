@@ -163,7 +163,7 @@ def radiometry(
     found = call()
     found.save(out, overwrite=overwrite)
     if page and earlier and earlier_capture:
-        given = {"earlier": earlier, "earlier_capture": earlier_capture, "overwrite": overwrite}
+        given = {"earlier_capture": earlier_capture, "overwrite": overwrite}
         uwlts.report.write_radiometry(page, found, call.given["capture"], **given)
     show(found.lines())
     say(f"wrote {out} and {out.with_suffix('.json').name}" + (f", {page}" if page else ""))

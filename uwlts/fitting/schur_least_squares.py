@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from uwlts.errors import CalibrationError
 
@@ -17,6 +18,8 @@ _SAFE = 1e-7
 """Largest relative gain for the linear model to replace an evaluation of all residuals."""
 _SINGULAR = 1e-13
 """Eigenvalue of the normal matrix of the scaled global parameters, below which it is rounding noise."""
+_SMALL_BLOCK = 16
+"""Size of a matrix that is inverted as a whole: a search for its diagonal part would take as long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +35,15 @@ class Observation:
     local_columns: np.ndarray | None = None
 
 
-Model = Callable[[int, np.ndarray, np.ndarray], Observation | Sequence[Observation] | None]
+@dataclass(frozen=True, eq=False)
+class LocalPrior:
+    """Residuals (n, 1) of prior knowledge of a group's local parameters, and sparse derivatives (n, b) by them."""
+
+    residuals: np.ndarray
+    by_local: sparse.csr_array
+
+
+Model = Callable[[int, np.ndarray, np.ndarray], Observation | Sequence[Observation | LocalPrior] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,14 +187,23 @@ def _assemble(
         for part in parts:
             if not np.isfinite(part.residuals).all():
                 return None
-            columns = np.hstack([part.by_global, part.by_local, part.residuals.reshape(-1, 1)])
-            squares = np.sum(part.residuals**2, axis=1)
+            squares, weight = np.sum(part.residuals**2, axis=1), None
             if soft_limit is None:
                 cost += float(squares.sum())
             else:
                 root = np.sqrt(1 + squares / soft_limit**2)
                 cost += float(np.sum(2 * soft_limit**2 * (root - 1)))
-                columns /= np.repeat(np.sqrt(root), part.residuals.shape[1])[:, None]
+                weight = np.repeat(np.sqrt(root), part.residuals.shape[1])[:, None]
+            if isinstance(part, LocalPrior):
+                by_local, off = part.by_local, part.residuals
+                if weight is not None:
+                    by_local, off = by_local.multiply(1 / weight).tocsr(), off / weight
+                product[count:-1, count:-1] += (by_local.T @ by_local).toarray()
+                product[count:-1, -1:] += by_local.T @ off
+                continue
+            columns = np.hstack([part.by_global, part.by_local, part.residuals.reshape(-1, 1)])
+            if weight is not None:
+                columns /= weight
             places = np.arange(len(values)) if part.local_columns is None else part.local_columns
             at = np.r_[0:count, count + places, count + len(values)]
             product[np.ix_(at, at)] += columns.T @ columns
@@ -208,7 +228,7 @@ def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]
     """Solve for the damped step; each block is positive definite for positive damping."""
     reduced = normal.block + damping * np.eye(len(normal.block))
     right = -normal.gradient
-    inverses = [np.linalg.inv(group.block + damping * np.eye(len(group.block))) for group in normal.groups]
+    inverses = [invert_block(group.block + damping * np.eye(len(group.block))) for group in normal.groups]
     for group, inverse in zip(normal.groups, inverses, strict=True):
         reduced = reduced - group.border @ inverse @ group.border.T
         right = right + group.border @ inverse @ group.gradient
@@ -218,6 +238,35 @@ def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]
         for group, inverse in zip(normal.groups, inverses, strict=True)
     ]
     return step / normal.scale, local
+
+
+def invert_block(matrix: np.ndarray, *, least: float | None = None) -> np.ndarray:
+    """Return the inverse of a symmetric positive definite matrix (n, n), whose last part may be diagonal.
+
+    The diagonal part is eliminated (Schur complement): only the size of the leading part enters with its third power.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The matrix is singular, or its smallest eigenvalue, after elimination of a diagonal part, is below ``least``.
+    """
+    coupled = np.arange(len(matrix))
+    if len(matrix) > _SMALL_BLOCK:
+        coupled = np.flatnonzero(np.tril(matrix, -1).any(axis=0))
+    head = coupled[-1] + 1 if len(coupled) else 0
+    border, alone = matrix[:head, head:], np.diag(matrix)[head:]
+    if not (alone > 0).all():
+        raise np.linalg.LinAlgError("a diagonal element is not positive")
+    shares = border / alone
+    leading = matrix[:head, :head] - shares @ border.T
+    if least is not None and head and np.linalg.eigvalsh(leading)[0] < least:
+        raise np.linalg.LinAlgError("an eigenvalue is below the least")
+    inverse = np.diag(np.append(np.zeros(head), 1 / alone))
+    inverse[:head, :head] = corner = np.linalg.inv(leading)
+    inverse[:head, head:] = -corner @ shares
+    inverse[head:, :head] = inverse[:head, head:].T
+    inverse[head:, head:] += shares.T @ corner @ shares
+    return inverse
 
 
 def _expected_gain(normal: _Normal, global_step: np.ndarray, local_steps: list[np.ndarray]) -> float:
@@ -236,9 +285,10 @@ def _make_solution(
     )
     reduced, inverses = normal.block.copy(), []
     for group in normal.groups:
-        if len(group.block) and np.linalg.eigvalsh(group.block)[0] < _SINGULAR:
-            raise undetermined
-        inverses.append(np.linalg.inv(group.block))
+        try:
+            inverses.append(invert_block(group.block, least=_SINGULAR))
+        except np.linalg.LinAlgError:
+            raise undetermined from None
         reduced -= group.border @ inverses[-1] @ group.border.T
     if np.linalg.eigvalsh(reduced)[0] < _SINGULAR:
         raise undetermined

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -197,8 +197,10 @@ def measure_domain_gap(
         found.append(own)
         progress(number + 1, len(sources), "statistics")
     names = [each.name for each in found]
-    if len(set(names)) < len(names):
-        raise CaptureError(f"two sets have the same name ({', '.join(names)}): rename a file or folder")
+    found = [
+        each if names.count(each.name) == 1 else replace(each, name=str(source))
+        for each, source in zip(found, sources, strict=True)
+    ]
     ours, theirs = tuple(found[: len(generated)]), tuple(found[len(generated) :])
     pairs = [(one, other) for other, one in product(theirs, found) if one is not other]
     return DomainGap(ours, theirs, tuple(_set_gap(*pair) for pair in pairs), tuple(map(_floor, theirs)))

@@ -26,7 +26,7 @@ from uwlts.model.placement import apparent_depth_mm
 from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.optics.fitness import check_fits
 from uwlts.radiometry.followed_sensor import follow_sensor
-from uwlts.radiometry.result import ImageEstimate, Radiometry, StripeStatistics, compare_estimates, read_estimates
+from uwlts.radiometry.result import ImageEstimate, Radiometry, compare_estimates, read_estimates
 from uwlts.radiometry.scattering import STEP_PX, HaloKernel
 from uwlts.radiometry.stripe_images import (
     BLOCKS,
@@ -41,7 +41,7 @@ from uwlts.radiometry.stripe_light import StripeLight, stripe_light, working_f_n
 from uwlts.radiometry.water_outlook import outlook
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import resolve_calibration
-from uwlts.storage.capture import Capture, describe_source, open_capture
+from uwlts.storage.capture import NO_STAGE, Capture, describe_source, open_capture
 from uwlts.stripe import StripeSettings, find_stripes
 
 _MOST_SCATTERING_PER_M = 6.0
@@ -135,9 +135,12 @@ def fit_radiometry(
     earlier = None if compared_with is None else read_estimates(compared_with)
     with open_capture(capture) as scan:
         check_fits(scan.header, known, source=scan.path.name)
-        if np.isfinite(scan.pose).any():
-            raise CaptureError(f"{scan.path.name} has poses of a platform: give a scan by a stage")
-        stripes, gaps = fill_gaps(find_stripes(scan, options=stripe, progress=progress))
+        if np.isfinite(scan.pose).any() or scan.header.provenance.get("stage") == NO_STAGE:
+            raise CaptureError(
+                f"{scan.path.name} has poses of a platform or of a target; the slope of the surface is found from the "
+                "steps of a stage: give a scan by a stage"
+            )
+        stripes = fill_gaps(find_stripes(scan, options=stripe, progress=progress))
         light = stripe_light(scan.header, known, stripes, scan.stage_mm)
         images = measure_stripes(scan, stripes, light.usable, progress)
         evidence = _Evidence.gather(scan.header, known, light, images)
@@ -161,9 +164,6 @@ def fit_radiometry(
         scale = np.where(std > 0, std, 1.0)
         correlation = covariance / np.outer(scale, scale)
         kept = tuple(estimate for estimate in estimates if math.isfinite(estimate.value))
-        statistics = StripeStatistics.from_estimates(
-            kept, gaps=gaps, tail=evidence.tail_shares(whole[_NAMES.index("background_dn")])
-        )
         by_name = {estimate.name: estimate for estimate in kept}
         sensor = follow_sensor(
             scan.header,
@@ -182,7 +182,6 @@ def fit_radiometry(
             reflectance=reflectance,
             estimates=kept,
             correlation=correlation,
-            statistics=statistics,
             not_separable=_not_separable(correlation, by_name, determined, described),
             outlook=outlook(scan.header, known, by_name, images, determined=determined),
             changes=() if earlier is None else compare_estimates(kept, earlier),
@@ -367,12 +366,6 @@ class _Evidence:
             options={"xatol": 1e-5},
         )  # fmt: skip
         return float(found.x), background_and_misfit(float(found.x))[0]
-
-    def tail_shares(self, background_dn: float) -> tuple[float, ...]:
-        """Return the light per px at 8, 16 and 32 px beside the stripe, divided by that of the stripe."""
-        images = self.images
-        light = float(np.mean(images.light)) - images.width * background_dn
-        return tuple(float(np.mean(images.tail[:, at - 1]) - background_dn) / light for at in (8, 16, 32))
 
 
 def _phase(header: CaptureHeader) -> Callable[[np.ndarray], np.ndarray]:

@@ -57,42 +57,6 @@ class EstimateChange:
 
 
 @dataclass(frozen=True)
-class StripeStatistics:
-    """Statistics of the stripe for comparisons with rendered images.
-
-    Attributes
-    ----------
-    fwhm_px : float
-        Full width at half maximum of the mean stripe.
-    grain_contrast, grain_length_lines : float
-        Contrast of the stripe's light along it, and the correlation length of this light.
-    tail_per_px : tuple of float
-        Light per px at 8, 16 and 32 px beside the stripe, divided by all of its light.
-    background_dn : float
-        Grey value without the stripe.
-    gaps : float
-        Fraction of the lines between the ends of the stripe that have no stripe centre.
-    """
-
-    fwhm_px: float
-    grain_contrast: float
-    grain_length_lines: float
-    tail_per_px: tuple[float, ...]
-    background_dn: float
-    gaps: float
-
-    @classmethod
-    def from_estimates(
-        cls, estimates: Sequence[ImageEstimate], *, gaps: float, tail: tuple[float, ...]
-    ) -> StripeStatistics:
-        """Return the statistics from estimates, the fraction of gaps and the tail."""
-        value = {each.name: each.value for each in estimates}
-        width = 2 * math.sqrt(2 * math.log(2)) * value["stripe_sigma_px"]
-        grain = value["grain_contrast"], value["grain_length_lines"]
-        return cls(width, *grain, tail, value["background_dn"], gaps)
-
-
-@dataclass(frozen=True)
 class Outlook:
     """Water at a glance for the operator.
 
@@ -141,7 +105,6 @@ class Radiometry(Brief):
     estimates : tuple of ImageEstimate
     correlation : (P, P) float64
         Correlation of the first P estimates, those of the stripe.
-    statistics : StripeStatistics
     not_separable : tuple of str
         Quantities that the images do not separate.
     outlook : Outlook
@@ -159,7 +122,6 @@ class Radiometry(Brief):
     reflectance: float
     estimates: tuple[ImageEstimate, ...]
     correlation: np.ndarray
-    statistics: StripeStatistics
     not_separable: tuple[str, ...]
     outlook: Outlook
     changes: tuple[EstimateChange, ...]
@@ -194,7 +156,6 @@ class Radiometry(Brief):
             "reflectance": self.reflectance,
             "estimates": [asdict(each) for each in self.estimates],
             "correlation": self.correlation.tolist(),
-            "statistics": asdict(self.statistics) | {"tail_per_px": list(self.statistics.tail_per_px)},
             "not_separable": list(self.not_separable),
             "outlook": asdict(self.outlook),
             "changes": [asdict(each) for each in self.changes],
@@ -236,15 +197,6 @@ def read_estimates(path: str | Path) -> tuple[ImageEstimate, ...]:
         return tuple(ImageEstimate(**each) for each in found)
     except TypeError as error:
         raise CaptureError(f"{path} is damaged: its estimates are no table") from error
-
-
-def read_statistics(path: str | Path) -> StripeStatistics:
-    """Read the statistics of an earlier result; CaptureError if the file is missing, foreign or damaged."""
-    found = _read(path, "statistics")
-    try:
-        return StripeStatistics(**found | {"tail_per_px": tuple(found["tail_per_px"])})
-    except (KeyError, TypeError) as error:
-        raise CaptureError(f"{path} is damaged: its statistics are no table") from error
 
 
 def _read(path: str | Path, key: str) -> Any:

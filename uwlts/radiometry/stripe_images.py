@@ -91,8 +91,8 @@ class StripeImages:
     peak_dn: float
 
 
-def fill_gaps(stripes: CaptureStripes) -> tuple[CaptureStripes, float]:
-    """Interpolate centres in short gaps, and return the fraction of lines in gaps of any length.
+def fill_gaps(stripes: CaptureStripes) -> CaptureStripes:
+    """Interpolate centres in short gaps.
 
     Lines without a centre are dim by chance; without them, a faint stripe would seem brighter than it is.
     """
@@ -107,8 +107,7 @@ def fill_gaps(stripes: CaptureStripes) -> tuple[CaptureStripes, float]:
     filled = stripes[source[order]]
     line = np.concatenate([stripes.line, stripes.line[before] + step])[order]
     centre = np.interp(place[order], np.arange(len(stripes.line)), stripes.centre_px)
-    whole = replace(filled, line=line, centre_px=centre)
-    return whole, float(missing.sum() / (missing.sum() + len(stripes.line)))
+    return replace(filled, line=line, centre_px=centre)
 
 
 def measure_stripes(
@@ -129,7 +128,7 @@ def measure_stripes(
     of_group, light, exposure = np.full(len(stripes.line), -1), [], []
     parts: list[_Part] = []
     frames = np.unique(stripes.frame).tolist()
-    peaks = []
+    peaks, clipped = [], 0
     for number, frame in enumerate(frames):
         own = np.flatnonzero(stripes.frame == frame)
         line = stripes.line[own]
@@ -140,6 +139,7 @@ def measure_stripes(
             part = _measure_run(profiles, stripes.line[chosen], stripes.centre_px[chosen], core, _CLIPPED * full_dn)
             peaks.append(part.values[:, part.middle])
             if np.mean(part.clipped) > _MOST_CLIPPED:
+                clipped += len(run)
                 continue
             for some in np.array_split(np.arange(len(chosen)), max(1, len(chosen) // GROUP_LINES)):
                 kept = some[np.isfinite(part.light[some])]
@@ -151,9 +151,14 @@ def measure_stripes(
                 parts.append(part.select(kept))
         progress(number + 1, len(frames), "brightness of the stripe")
     if len(light) < BLOCKS:
+        share = clipped / max(len(stripes.line), 1)
+        advice = (
+            "record them with a shorter exposure" if share > 0.5 else "record more images of a smooth, matt surface"
+        )
         raise CaptureError(
             f"{capture.path.name} has {len(light)} groups of {GROUP_LINES} neighbouring stripe centres on a smooth "
-            f"surface that are not saturated; {BLOCKS} are needed: record more images, or with a shorter exposure"
+            f"surface that are not saturated, and {BLOCKS} are needed; {100 * share:.0f} % of the centres are in "
+            f"saturated pieces of the stripe: {advice}"
         )
     block = np.arange(len(light)) * BLOCKS // len(light)
     of_block = [_Part.join([part for part, at in zip(parts, block, strict=True) if at == j]) for j in range(BLOCKS)]

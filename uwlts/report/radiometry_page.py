@@ -18,7 +18,8 @@ from uwlts.pages.toolkit import (
     render_page,
     write_page,
 )
-from uwlts.radiometry.result import SIGNIFICANT, Radiometry, StripeStatistics, read_statistics
+from uwlts.radiometry.domain_gap import measure_domain_gap
+from uwlts.radiometry.result import SIGNIFICANT, Radiometry
 from uwlts.storage.capture import Capture, open_capture
 
 _HALF_PX = 40
@@ -30,7 +31,6 @@ def write_radiometry(
     radiometry: Radiometry,
     capture: Capture | str | Path,
     *,
-    earlier: str | Path,
     earlier_capture: Capture | str | Path,
     title: str = "Radiometry of two captures",
     overwrite: bool = False,
@@ -45,8 +45,6 @@ def write_radiometry(
         Result for the capture, with the changes since the earlier one.
     capture : Capture or path
         Capture of the result.
-    earlier : path
-        Earlier result (JSON).
     earlier_capture : Capture or path
         Capture of the earlier result.
     title : str
@@ -64,6 +62,7 @@ def write_radiometry(
     with open_capture(earlier_capture) as before, open_capture(capture) as after:
         names = before.path.name, after.path.name
         pictures = _views(before, after)
+        stripes = measure_domain_gap([after.path], real=[before.path])
         explained = [each.line() for each in radiometry.changes if abs(each.significance) > SIGNIFICANT]
         text = render_page(
             "uwlts.report",
@@ -78,7 +77,8 @@ def write_radiometry(
             residual=_draw_residual(pictures),
             profile=_draw_profile(pictures, names),
             estimates=_estimates(radiometry, names),
-            statistics=_statistics((read_statistics(earlier), radiometry.statistics), names),
+            statistics=stripes.statistics_table(),
+            gaps=stripes.gap_table(),
             not_separable=radiometry.not_separable,
         )
     write_page(path, text, overwrite=overwrite)
@@ -152,18 +152,3 @@ def _estimates(radiometry: Radiometry, names: Sequence[str]) -> ComparisonTable:
         for each in radiometry.changes
     ]
     return ComparisonTable((*names, "std", "in std"), tuple(rows))
-
-
-def _statistics(both: Sequence[StripeStatistics], names: Sequence[str]) -> ComparisonTable:
-    rows = [
-        ("full width at half maximum", "px", tuple(f"{each.fwhm_px:.2f}" for each in both)),
-        ("contrast of the light along the stripe", "", tuple(f"{each.grain_contrast:.3f}" for each in both)),
-        ("correlation length along the stripe", "lines", tuple(f"{each.grain_length_lines:.2f}" for each in both)),
-        *(
-            (f"light per px at {at} px beside it", "%", tuple(f"{100 * each.tail_per_px[n]:.3f}" for each in both))
-            for n, at in enumerate((8, 16, 32))
-        ),
-        ("background", "DN", tuple(f"{each.background_dn:.2f}" for each in both)),
-        ("lines without a stripe", "%", tuple(f"{100 * each.gaps:.1f}" for each in both)),
-    ]
-    return ComparisonTable(tuple(names), tuple(rows))

@@ -23,6 +23,7 @@ from uwlts.errors import ArgumentError, CaptureError, DescriptionError, DesignEr
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import hash_file
 from uwlts.model.library import load_sensor
+from uwlts.radiometry.image_sets import open_image_set
 from uwlts.storage.data_set import SPLITS
 
 SMALL = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}}
@@ -194,6 +195,14 @@ def test_hdf5_holds_the_same(folder, tmp_path):
         assert set(sample) == set(ours[sample["key"]])
         for name, values in sample.items():
             np.testing.assert_array_equal(values, ours[sample["key"]][name])
+
+
+def test_statistics_of_stripes_read_a_data_set(folder):
+    found, card = open_image_set(folder), twin.load_dataset(folder).card
+    assert (found.count, found.stripe_along, found.full_dn) == (16, "width", 2 ** card.image["bits"] - 1)
+    expected = [sample["image"] for sample in twin.load_dataset(folder)]
+    np.testing.assert_array_equal(list(found.images(100)), expected)
+    np.testing.assert_array_equal(list(found.images(2)), [expected[0], expected[15]])
 
 
 def test_the_card_says_what_there_is(folder):

@@ -7,10 +7,13 @@ from pathlib import Path
 import pytest
 
 import twin
+from twin.recording.detection import ProbabilityOfDetection
 from twin.recording.predict import PredictedFigure, PredictedUncertainty
 from uwlts.errors import CommandFailed, DescriptionError
 
-FIGURE = PredictedFigure(scan="spheres", name="SSE", expanded_mm=(0.03, 0.04), errors_mm=(-0.035, 0.005))
+FIGURE = PredictedFigure(
+    scan="spheres", name="SSE", checked="two spheres", expanded_mm=(0.03, 0.04), errors_mm=(-0.035, 0.005)
+)
 CAMPAIGN = """
 title = "small"
 sensor = "thesis-small"
@@ -41,14 +44,36 @@ def test_figures_compare_uncertainty_and_errors():
     result = PredictedUncertainty(campaign="c", sensor="s", as_built="b", seeds=(0, 1), figures=(FIGURE, FIGURE))
     assert result.covered_share() == 0.5
     assert any(line.split() == ["spheres", "SSE", "0.0354", "0.0500", "1", "of", "2"] for line in result.lines())
+    assert result.lines()[-1] == "  spheres: two spheres"
+
+
+def test_detections_have_their_own_table():
+    pits = ProbabilityOfDetection(
+        flaw="pit",
+        width_mm=5.0,
+        method="hit/miss",
+        checked="a pipe",
+        depths_mm=(0.1, 0.2),
+        found=(False, True),
+        false_calls=1,
+        a90_mm=0.18,
+    )
+    result = PredictedUncertainty(
+        campaign="c", sensor="s", as_built="b", seeds=(0,), figures=(FIGURE,), detections=(pits,)
+    )
+    (row,) = (line for line in result.lines() if line.startswith("pit "))
+    assert row.split(maxsplit=8)[:8] == ["pit", "hit/miss", "5", "1", "of", "2", "1", "0.180"]
+    assert row.endswith("-  2 flaws, fewer than 60; a90 is not bounded")
+    assert result.validity() == ["spheres: two spheres", "pits: a pipe"]
 
 
 @pytest.mark.parametrize(
     ("recordings", "options", "says"),
     [
         (SPHERES, {}, "'small' has no recording of a target for the calibration"),
-        (TARGET, {}, "'small' has no scan of an artefact"),
+        (TARGET, {}, "'small' has no scan of an artefact, a pitted pipe or a weld"),
         (TARGET + SPHERES, {"campaigns": 0}, "campaigns is 0; it must be at least 1"),
+        (TARGET + SPHERES, {"water": 4.0}, "4"),
         (TARGET + SPHERES, {"first": -1}, "first is -1; it must be at least 0"),
     ],
 )
@@ -73,20 +98,25 @@ def test_a_failed_calibration_is_reported_with_its_reason(tmp_path: Path, capfd:
 
 @pytest.mark.slow
 def test_errors_of_a_rendered_campaign_are_within_the_prediction(tmp_path: Path):
-    out = tmp_path / "out"
-    result = twin.predict("thesis-small", out=out, campaigns=1, every=6, spp=8)
-    assert {each.scan for each in result.figures} == {
-        *("spheres-near", "spheres-standoff", "spheres-far", "step-scan", "pipe")
+    out, options = tmp_path / "out", {"campaign": "prediction", "water": "clear", "campaigns": 1, "every": 5, "spp": 8}
+    result = twin.predict("thesis-small", out=out, **options)
+    assert {each.scan for each in result.figures} >= {
+        *("spheres-near", "spheres-standoff", "spheres-far", "step-scan", "pipe", "plane", "pipe-around", "undercuts")
     }
     # Twice the expanded uncertainty is exceeded once in 15,000 figures.
     for each in result.figures:
         assert abs(each.errors_mm[0]) < 2 * each.expanded_mm[0], each
         assert 0.001 < each.predicted_mm < 1.0, each
+        assert "a = 0." in each.checked, "the water is stated"
+    assert any("20 profiles 2.5 mm apart" in each.checked for each in result.detections), "thinned by `every`"
+    assert {each.flaw for each in result.detections} == {"pit", "dent", "undercut"}
     written = json.loads((out / "prediction.json").read_text(encoding="utf-8"))
     assert written["format"] == "twin-prediction"
     assert len(written["figures"]) == len(result.figures)
-    assert "pipe, diameter error" in (out / "prediction.html").read_text(encoding="utf-8")
+    assert len(written["detections"]) == 3
+    page = (out / "prediction.html").read_text(encoding="utf-8")
+    assert "pipe, diameter error" in page and "Probability of detection" in page
     # A second call renders nothing again.
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.truth.h5")}
-    assert twin.predict("thesis-small", out=out, campaigns=1, every=6, spp=8).figures == result.figures
+    assert twin.predict("thesis-small", out=out, **options) == result
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.truth.h5")} == before

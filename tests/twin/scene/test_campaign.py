@@ -392,6 +392,22 @@ HEAD = 'title = "test"\nsensor = "thesis"\nas_built = "thesis"\n'
 PLANE = '[[recordings]]\nscene = "plane"\n'
 
 
+def test_the_campaigns_water_replaces_that_of_scenes_in_water():
+    described = campaign(RECORDINGS[:4]).model_copy(update={"water": "coastal"})
+    waters = {take.name: take.scene.water for take in list_takes(described, seed=0)}
+    assert {name: water for name, water in waters.items() if water is None} == dict.fromkeys(
+        ["target", "plane-near-air", "plane-far-turned-air"]
+    )
+    assert {water for water in waters.values() if water is not None} == {"coastal"}
+
+
+def test_each_campaign_draws_its_own_pits_and_undercuts():
+    described = campaign([{"scene": "pits"}, {"scene": "undercut"}, {"scene": "pitted-pipe"}])
+    seeds = np.array([[take.scene.objects[0].seed for take in list_takes(described, seed=seed)] for seed in (0, 1)])
+    assert (seeds[0, :2] != seeds[1, :2]).all()
+    assert (seeds[:, 2] == 0).all(), "pits of given depths stay"
+
+
 def test_shipped_campaigns_can_be_drawn():
     assert "thesis" in list_names("campaigns")
     for name in list_names("campaigns"):

@@ -9,8 +9,8 @@ from scipy.signal import argrelmin
 from twin.scene import scene_object
 from twin.scene.forms import Head, PittedPipe, Weld
 from twin.scene.forms.head import head_depth
-from twin.scene.forms.pitted_pipe import pit_places, pitted_radius
-from twin.scene.forms.weld import weld_height
+from twin.scene.forms.pitted_pipe import pit_depths, pit_places, pitted_radius
+from twin.scene.forms.weld import undercut_depths, weld_height
 from uwlts.errors import DescriptionError
 
 HEIGHT = 160.0
@@ -220,3 +220,34 @@ def test_a_pipe_without_pits_is_a_plain_one_and_too_many_vertices_are_refused():
     np.testing.assert_allclose(np.hypot(*plain.vertices.T[1:]), 50.0, rtol=1e-12)
     with pytest.raises(DescriptionError, match="make its pits wider or flatter"):
         PittedPipe(kind="pitted_pipe", diameter_mm=400, length_mm=600, pit_diameter_mm=2, pit_depth_mm=5).triangles()
+
+
+def test_pits_of_drawn_depths_stand_apart_and_cover_their_range():
+    size = {"pits": 30, "pit_diameter_mm": 5.0, "pit_depth_mm": (0.01, 0.4), "pit_gap_mm": 2.0}
+    pipe = PittedPipe(kind="pitted_pipe", length_mm=60.0, **size)
+    places = pit_places(pipe) * (1.0, 50.0)
+    apart = np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(30, dtype=bool)]
+    assert apart.min() >= 7.0
+    depths = pit_depths(pipe)
+    # One depth in each of 30 equal steps of the logarithm, in random order.
+    steps = np.floor(30 * np.log(depths / 0.01) / np.log(40)).astype(int)
+    assert sorted(steps) == list(range(30)) and list(steps) != list(range(30))
+    middle = pitted_radius(pipe, places[:, 0], places[:, 1] / 50.0)
+    np.testing.assert_allclose(50.0 - middle, depths, rtol=1e-9)
+    assert not np.allclose(pit_depths(pipe.model_copy(update={"seed": 1})), depths)
+    with pytest.raises(ValidationError, match="would cover 72 % of their area; at most 45 % can be placed"):
+        PittedPipe(kind="pitted_pipe", length_mm=60.0, **size | {"pits": 108})
+    with pytest.raises(ValidationError, match=r"the range \[0.4, 0.01\] must begin with its smaller end"):
+        PittedPipe(kind="pitted_pipe", pit_depth_mm=(0.4, 0.01))
+
+
+def test_undercuts_of_drawn_depths_differ_on_both_sides():
+    weld = Weld(kind="weld", beads=1, irregularity=0.0, ripple_height_mm=0.0, undercut_depth_mm=(0.1, 0.8))
+    ((left, right),) = undercut_depths(weld)
+    assert 0.1 <= min(left, right) < max(left, right) <= 0.8
+    along = np.zeros(1)
+    assert -weld_height(weld, along, np.array([-5.0])) == pytest.approx(left)
+    assert -weld_height(weld, along, np.array([5.0])) == pytest.approx(right)
+    mesh = mesh_of(weld.surface())
+    x, y, z = np.moveaxis(inner_points(mesh), -1, 0)
+    assert np.abs(weld_height(weld, x, y) + z).max() < 0.015

@@ -1,6 +1,7 @@
 """Random reflectance of surfaces against its stated distribution and spectrum, in numbers and in rendered stripes."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -13,14 +14,16 @@ from scipy.stats import lognorm
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
 from twin.backend.arrays import to_jit
 from twin.light.renderer import Renderer
+from twin.recording.frame_truth import find_true_stripe
 from twin.rendering_options import NONE
 from twin.scene.objects import Objects, build_objects
 from twin.scene.scene_object import Pose
-from twin.scene.surfaces import FINISHES, clipped_share, draw_waves
+from twin.scene.surfaces import FINISHES, clipped_share, draw_patches, draw_waves
 from uwlts.model.sensor import Sensor
 
 FINEST = 10 * math.pi
 """Cut-off of the spectrum times the correlation length, as stated: a wavelength of a fifth of that length."""
+ROOT = Path(__file__).resolve().parents[3]
 SEEDS = 200
 SHAPES: list[dict[str, Any]] = [
     plate(side=60.0),
@@ -95,7 +98,7 @@ def test_the_reflectance_is_fixed_to_the_object_whatever_its_shape_and_pose(thin
     matrix = Pose(**pose).matrix()
     values, points = albedo(built(mottled | pose, seed=3), start)
     # The waves of the object's own frame, as drawn for the first object of the scene.
-    waves = draw_waves(np.random.default_rng([3, 0, 11]), (4.0, 1.0, 2.0))
+    waves = draw_waves(np.random.default_rng([3, 0, 11, 0]), (4.0, 1.0, 2.0))
     own = (points - matrix[:3, 3]) @ matrix[:3, :3]
     field = math.sqrt(2 / len(waves)) * np.cos(own @ waves[:, :3].T + waves[:, 3]).sum(axis=1)
     s = math.sqrt(math.log1p(0.3**2))
@@ -125,12 +128,70 @@ def test_equal_seeds_give_equal_surfaces_and_objects_differ():
     assert abs(np.corrcoef(albedo(first, left)[0], albedo(first, right)[0])[0, 1]) < 0.5
 
 
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_patches_cover_their_share_in_pieces_of_their_length(share):
+    length, way = 3.0, np.arange(0, 400, 0.02)
+    covered, pieces = [], []
+    for seed in range(60):
+        waves, level = draw_patches(np.random.default_rng(seed), share=share, length_mm=length)
+        field = np.zeros_like(way)
+        for k, phase in waves[:, [0, 3]]:
+            field += math.sqrt(2 / len(waves)) * np.cos(k * way + phase)
+        inside = field > level
+        covered.append(inside.mean())
+        pieces.append(np.count_nonzero(inside[1:] & ~inside[:-1]))
+    for found, expected in ((covered, share), (pieces, share * np.ptp(way) / length)):
+        # A sum of 64 waves is normal to 1 % of the share at these levels.
+        assert abs(np.mean(found) - expected) < 5 * np.std(found) / math.sqrt(len(found)) + 0.02 * expected
+        assert np.std(found) / math.sqrt(len(found)) < 0.05 * expected
+
+
+def test_patches_have_their_own_reflectance_and_interrupt_the_stripe(thesis: Sensor):
+    sensor = altered(thesis, {"camera": {"width_px": 600, "height_px": 96}})
+    grown = plate() | {"reflectance": 0.5, "patch_share": 0.3, "patch_length_mm": 6.0, "patch_reflectance": 0.0}
+    start = np.column_stack([np.random.default_rng(0).uniform(-25, 25, (400, 2)), np.full(400, -10.0)])
+    found, _ = albedo(built(grown, seed=2), start)
+    assert set(np.unique(found.round(5))) == {0.0, 0.5}
+    whole, gaps = (
+        Renderer(sensor, clear(), scene_of(thing), effects=NONE, surface_seed=2)
+        for thing in (plate(reflectance=0.5), grown)
+    )
+    light = [each.irradiance("laser", sensor_at(), spp=16).sum(axis=0) for each in (whole, gaps)]
+    share = light[1] / light[0]
+    # The stripe is 1 to 2 px wide, so that most lines are within a patch or beside one.
+    assert 0.05 < (share < 0.01).mean() < 0.6
+    assert (share > 0.99).mean() > 0.3
+    assert ((share > 0.05) & (share < 0.95)).mean() < 0.15
+    # Lines without light have no true centre; the centre of the others is that of the sheet.
+    truths = [find_true_stripe(each, sensor_at()) for each in (whole, gaps)]
+    lost = np.isnan(truths[1].centre_px)
+    assert lost[share < 0.01].mean() > 0.95
+    assert not lost[share > 0.99].any()
+    np.testing.assert_allclose(truths[1].centre_px[~lost], truths[0].centre_px[~lost], atol=1e-4)
+
+
 @pytest.mark.parametrize("finish", FINISHES)
 def test_every_finish_is_physical(finish):
     (thing,) = scene_of(plate() | {"reflectance": None, "finish": finish}).objects
     own = thing.finish_properties()
     assert own == FINISHES[finish]
     assert clipped_share(own.reflectance, own.mottle) < 0.01
+
+
+def test_the_documented_table_of_finishes_is_the_one_that_is_rendered():
+    page = (ROOT / "docs" / "explanation" / "light.md").read_text(encoding="utf-8")
+    documented = {}
+    for line in page[page.index("| `finish` | reflection") :].split("\n\n")[0].splitlines()[2:]:
+        name, reflection, *numbers = (cell.strip() for cell in line.strip("|").split(" | "))
+        documented[name.strip("`")] = reflection, *(numbers[k] for k in (0, 2, 3)), numbers[5].strip("| ")
+    for name, row in FINISHES.items():
+        reflection, reflectance, roughness, mottle, others = documented.pop(name)
+        found = reflection, float(reflectance), float(roughness), float(mottle or 0)
+        assert found == (row.reflection, row.reflectance, row.roughness_um, row.mottle)
+        for key in ("mean_free_path_mm", "patch_share"):
+            value = getattr(row, key)
+            assert (f"`{key}` {value:g}" in others) == (value > 0)
+    assert not documented
 
 
 def filtered_covariance(lag_mm: float, *, sigma_mm: float, pixel_mm: float, length_mm: float, mottle: float) -> float:

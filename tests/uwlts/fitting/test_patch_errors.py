@@ -59,6 +59,20 @@ def test_sums_of_heights_vary_as_propagated(by_images: bool) -> None:
     assert (low / 1.15 < ratio).all() and (ratio < 1.15 * high).all()
 
 
+def test_large_distances_are_measured_at_their_feet() -> None:
+    """A surface 2 mm from its like, two thirds of a patch's radius: all patches find their foot, on the surface."""
+    cloud = exact_cloud()
+    patches = patches_of(cloud, np.zeros(len(cloud)))
+    away = np.eye(4)
+    away[2, 3] = 2.0
+    found = distances_between(patches, away, patches, np.eye(4), reach_mm=3.0)
+    again = refit_distances(found, patches, patches, np.eye(4))
+    assert len(again.source) > 0.8 * len(patches)
+    # The distance along a normal inclined by up to 0.3, from a shift along z, without the edges.
+    inner = np.abs(again.places_mm[:, :2] - 15).max(axis=1) < 9
+    np.testing.assert_allclose(again.distance_mm[inner], 2.0 * again.normals[inner, 2], atol=0.01)
+
+
 def test_errors_of_the_second_order_cancel_at_the_foot() -> None:
     """Two exact views of one surface: distances fall by half or more if both surfaces are smoothed in the same way.
 

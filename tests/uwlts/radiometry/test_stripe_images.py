@@ -5,9 +5,12 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pytest
 
+from uwlts.errors import CaptureError
 from uwlts.model.stripe import CaptureStripes
-from uwlts.radiometry.stripe_images import fill_gaps, measure_noise
+from uwlts.radiometry.stripe_images import fill_gaps, measure_noise, measure_stripes
+from uwlts.runtime.progress import ignore_progress
 
 GAIN, DARK_DN, BLACK = 0.4, 6.0, 60.0
 
@@ -58,6 +61,31 @@ def test_photon_transfer_of_repeated_images_with_grains():
     assert abs(found.dark_dn / DARK_DN - 1) < 0.02
 
 
+def test_shot_noise_of_the_halo_is_not_noise_in_the_dark():
+    """A halo of 30 electrons on two thirds of the rows adds their shot noise to two thirds of the dark pixels.
+
+    The variance of a pixel in the dark is (6 / 0.4)^2 = 225 electrons; 20 more on average would be 4 % more noise.
+    """
+    row = np.arange(200)[:, None]
+    rng = np.random.default_rng(8)
+    electrons = 6000.0 * np.exp(-0.5 * ((row - 130) / 8.0) ** 2) + 30.0 * (row > 66)
+    light = GAIN * rng.poisson(np.broadcast_to(electrons, (200, 300)), (6, 200, 300))
+    images = np.rint(BLACK + light + rng.normal(0, DARK_DN, light.shape)).astype(np.uint16)
+    found = measure_noise(cast(Any, DrawnCapture(images, np.zeros(6))), stripes_on(np.arange(10)), repeats=None)
+    assert abs(found.dark_dn / DARK_DN - 1) < 0.015
+    assert abs(found.dark_dn - DARK_DN) < 3 * found.dark_std < 0.6
+
+
+def test_saturated_stripes_are_refused_with_the_reason():
+    scan: Any = drawn(2, np.random.default_rng(9))
+    scan.images[:] = np.where(scan.images > 500, 4095, scan.images)
+    scan.path = SimpleNamespace(name="scan.h5")
+    lines, ones = np.tile(np.arange(300), 2), np.ones(600)
+    stripes = CaptureStripes(np.repeat([0, 1], 300), lines, np.full(600, 100.0), ones, 18 * ones, lines_by_status={})
+    with pytest.raises(CaptureError, match="100 % of the centres are in saturated pieces.*shorter exposure"):
+        measure_stripes(scan, stripes, np.ones(600, bool), ignore_progress)
+
+
 def test_noise_without_repeated_images_has_no_gain():
     scan = drawn(2, np.random.default_rng(6))
     scan.stage_mm[:] = [0.0, 1.0]
@@ -72,7 +100,6 @@ def test_noise_without_repeated_images_has_no_gain():
 
 def test_short_gaps_are_interpolated_and_long_ones_kept():
     lines = np.array([0, 1, 4, 5, 40, 41])
-    filled, share = fill_gaps(stripes_on(lines))
+    filled = fill_gaps(stripes_on(lines))
     assert filled.line.tolist() == [0, 1, 2, 3, 4, 5, 40, 41]
     np.testing.assert_allclose(filled.centre_px, 2.0 * filled.line)
-    assert share == 36 / 42

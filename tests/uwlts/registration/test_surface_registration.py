@@ -23,9 +23,9 @@ def white(points: np.ndarray, normals: np.ndarray, std: float) -> PointUncertain
 def test_the_covariance_is_that_of_the_errors(points_each: int) -> None:
     """40 registrations of six parameters; the sum of squares is within limits exceeded 1 time in 10,000.
 
-    A point of the reference serves one or six points of the cloud. Both sides have the same noise.
+    A point of the reference serves one or six points of the cloud, and has twice their noise.
     """
-    rng, std, squares, draws = np.random.default_rng(8), 0.02, 0.0, 40
+    rng, std, own_std, squares, draws = np.random.default_rng(8), 0.02, 0.01, 0.0, 40
     side = np.arange(-30, 30, 1.5)
     x, y = (each.ravel() for each in np.meshgrid(side, side))
     surface = np.column_stack([x, y, height(x, y)])
@@ -37,12 +37,12 @@ def test_the_covariance_is_that_of_the_errors(points_each: int) -> None:
     own = np.repeat(np.arange(len(x)), points_each)
     for _ in range(draws):
         moved = surface + std * rng.standard_normal(len(x))[:, None] * normals
-        cloud = surface[own] + std * rng.standard_normal(len(own))[:, None] * normals[own]
+        cloud = surface[own] + own_std * rng.standard_normal(len(own))[:, None] * normals[own]
         found = register_to_surface(
             cloud,
             SampledSurface(moved, normals, uncertainty=white(moved, normals, std)),
             reach_mm=1.0,
-            uncertainty=white(cloud, normals[own], std),
+            uncertainty=white(cloud, normals[own], own_std),
         )
         turn = found.transform[:3, :3]
         error = np.concatenate(

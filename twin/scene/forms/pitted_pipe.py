@@ -6,13 +6,19 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from twin.scene.forms.triangles import chord_step, require_few_vertices, space_angles, tube
-from twin.scene.scene_object import FreeForm
+from twin.scene.scene_object import FreeForm, Range
 from uwlts.model.sensor import NotNegative, Positive
 
 _PIT_SAG_MM = 0.01
 """Largest distance of a pitted pipe's facets from its surface."""
+_DRAWN_PIT_SAG_MM = 0.002
+"""The same for pits of drawn depths, which may be as shallow as the noise of points."""
 _PITTED_DEG = 60.0
 """Pits are within this angle of the side that faces the sensor."""
+_MOST_COVERED = 0.45
+"""Largest share of the area that discs with gaps may cover; random placing ends at 0.547 (Feder 1980)."""
+_DEPTHS_STREAM = 1
+"""Stream of random numbers of depths, separate from that of positions."""
 
 
 class PittedPipe(FreeForm):
@@ -20,7 +26,8 @@ class PittedPipe(FreeForm):
 
     The largest diameter is along z, the smallest perpendicular to it; ``ovality`` is their difference divided by their
     mean, ``diameter_mm``. ``pits`` pits of ``pit_diameter_mm`` and ``pit_depth_mm`` are within 60 deg of -z at random
-    positions from ``seed`` (`pit_places`).
+    positions from ``seed`` (`pit_places`). A pair [least, most] of depths draws each pit's depth (`pit_depths`).
+    ``pit_gap_mm`` is the least distance between the rims of pits; without it, pits may overlap.
     """
 
     kind: Literal["pitted_pipe"]
@@ -29,7 +36,8 @@ class PittedPipe(FreeForm):
     ovality: Annotated[float, Field(ge=0, le=0.2)] = 0.0
     pits: Annotated[int, Field(ge=0, le=1000)] = 12
     pit_diameter_mm: Positive = 10.0
-    pit_depth_mm: NotNegative = 2.0
+    pit_depth_mm: NotNegative | Range = 2.0
+    pit_gap_mm: NotNegative | None = None
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
@@ -39,21 +47,35 @@ class PittedPipe(FreeForm):
                 f"pit_diameter_mm {self.pit_diameter_mm:g} is more than length_mm {self.length_mm:g}, or than half of "
                 f"diameter_mm {self.diameter_mm:g}"
             )
-        if self.pit_depth_mm > self.diameter_mm / 4:
+        if self.deepest_mm() > self.diameter_mm / 4:
             raise ValueError(
-                f"pit_depth_mm {self.pit_depth_mm:g} is more than a quarter of diameter_mm {self.diameter_mm:g}"
+                f"pit_depth_mm {self.deepest_mm():g} is more than a quarter of diameter_mm {self.diameter_mm:g}"
             )
+        if self.pit_gap_mm is not None:
+            disc = self.pits * np.pi / 4 * (self.pit_diameter_mm + self.pit_gap_mm) ** 2
+            share = disc / float(np.prod(2 * np.array(_pitted_area(self)) * (1, self.diameter_mm / 2)))
+            if share > _MOST_COVERED:
+                raise ValueError(
+                    f"pits {self.pits} of {self.pit_diameter_mm:g} mm with a pit_gap_mm of {self.pit_gap_mm:g} would "
+                    f"cover {100 * share:.0f} % of their area; at most {100 * _MOST_COVERED:.0f} % can be placed"
+                )
         return self
+
+    def deepest_mm(self) -> float:
+        """Return the largest possible depth of a pit."""
+        return self.pit_depth_mm[1] if isinstance(self.pit_depth_mm, tuple) else self.pit_depth_mm
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return a tube with open ends.
 
-        Facets deviate from `pitted_radius` by `_PIT_SAG_MM`, by up to ten times that at creases between overlapping
-        pits. DescriptionError if small and deep pits on a large pipe require too many vertices.
+        Facets deviate from `pitted_radius` by `_PIT_SAG_MM`, or by a fifth of that if depths are drawn; by up to ten
+        times that at creases between overlapping pits. DescriptionError if small and deep pits on a large pipe require
+        too many vertices.
         """
         # The second derivative of a pit is largest at its rim.
         radius = self.diameter_mm / 2
-        step = chord_step(_PIT_SAG_MM, 1 / radius + 8 * self.pit_depth_mm / (0.5 * self.pit_diameter_mm) ** 2)
+        sag = _DRAWN_PIT_SAG_MM if isinstance(self.pit_depth_mm, tuple) else _PIT_SAG_MM
+        step = chord_step(sag, 1 / radius + 8 * self.deepest_mm() / (0.5 * self.pit_diameter_mm) ** 2)
         plain = chord_step(_PIT_SAG_MM, 1 / radius)
         reach = np.radians(_PITTED_DEG) + 0.5 * self.pit_diameter_mm / radius if self.pits else 0.0
         around = space_angles(reach, radius, step=step, plain=plain)
@@ -67,19 +89,42 @@ class PittedPipe(FreeForm):
 
 def pit_places(pipe: PittedPipe) -> np.ndarray:
     """Return positions (pits, 2) of the centres of a pipe's pits: x in mm, and the angle in rad from -z towards y."""
-    most = 0.5 * (pipe.length_mm - pipe.pit_diameter_mm), np.radians(_PITTED_DEG)
-    return np.random.default_rng(pipe.seed).uniform(-1, 1, (pipe.pits, 2)) * most
+    most, rng = _pitted_area(pipe), np.random.default_rng(pipe.seed)
+    if pipe.pit_gap_mm is None:
+        return rng.uniform(-1, 1, (pipe.pits, 2)) * most
+    # A candidate too near to earlier pits is drawn again; the limit of the covered area leaves room for all.
+    places, scale = np.zeros((0, 2)), np.array([1.0, pipe.diameter_mm / 2])
+    while len(places) < pipe.pits:
+        drawn = rng.uniform(-1, 1, (1, 2)) * most
+        apart = np.linalg.norm((places - drawn) * scale, axis=1)
+        if not (apart < pipe.pit_diameter_mm + pipe.pit_gap_mm).any():
+            places = np.concatenate([places, drawn])
+    return places
+
+
+def pit_depths(pipe: PittedPipe) -> np.ndarray:
+    """Return the depths (pits,) in mm; depths of a range are even in the logarithm, in random order."""
+    if not isinstance(pipe.pit_depth_mm, tuple):
+        return np.full(pipe.pits, float(pipe.pit_depth_mm))
+    rng = np.random.default_rng([pipe.seed, _DEPTHS_STREAM])
+    share = (rng.permutation(pipe.pits) + rng.random(pipe.pits)) / max(pipe.pits, 1)
+    return np.exp(np.interp(share, [0, 1], np.log(pipe.pit_depth_mm)))
+
+
+def _pitted_area(pipe: PittedPipe) -> tuple[float, float]:
+    """Return the largest x in mm and angle in rad of a pit's centre."""
+    return 0.5 * (pipe.length_mm - pipe.pit_diameter_mm), float(np.radians(_PITTED_DEG))
 
 
 def pitted_radius(pipe: PittedPipe, x: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Return the distance of a pitted pipe's surface from its axis at ``x`` in mm and angles in rad from -z to y.
 
-    R (1 + ovality / 2 cos(2 angle)), minus the depth of the deepest pit: `pit_depth_mm` (1 - t^2)^2, where t is 0 at
-    the pit's centre and 1 at its rim, measured along the surface of the round pipe.
+    R (1 + ovality / 2 cos(2 angle)), minus the depth of the deepest pit: d (1 - t^2)^2 with d from `pit_depths`, where
+    t is 0 at the pit's centre and 1 at its rim, measured along the surface of the round pipe.
     """
     round_mm, pit_mm = pipe.diameter_mm / 2, pipe.pit_diameter_mm / 2
     depth = np.zeros(np.broadcast(x, angle).shape)
-    for at_x, at_angle in pit_places(pipe):
+    for (at_x, at_angle), deep in zip(pit_places(pipe), pit_depths(pipe), strict=True):
         squared = (np.square(x - at_x) + np.square(round_mm * (angle - at_angle))) / pit_mm**2
-        depth = np.maximum(depth, pipe.pit_depth_mm * np.square(np.maximum(1 - squared, 0)))
+        depth = np.maximum(depth, deep * np.square(np.maximum(1 - squared, 0)))
     return round_mm * (1 + 0.5 * pipe.ovality * np.cos(2 * angle)) - depth

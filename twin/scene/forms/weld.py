@@ -6,11 +6,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from twin.scene.forms.triangles import chord_step, grid_faces, nodes, require_few_vertices, wave
-from twin.scene.scene_object import FreeForm
+from twin.scene.scene_object import FreeForm, Range
 from uwlts.model.sensor import NotNegative, Positive
 
 _TRAIL = 1 / 3
 """Lag of the ripples at a bead's toes, in units of its width."""
+_DEPTHS_STREAM = 1_000_000
+"""Stream of random numbers of undercuts, separate from those of beads, which are numbered from 0."""
 _SAG_MM = 0.004
 """Largest distance of a weld's facets from its surface."""
 
@@ -21,7 +23,8 @@ class Weld(FreeForm):
     The beads run along the plate's x or y axis (``along``), ``spacing_mm`` apart. ``length_mm``, ``width_mm`` and
     ``height_mm`` are those of one bead; ``ripple_height_mm`` is measured from trough to crest. ``irregularity`` is the
     relative variation of width and height, and the displacement of path and ripples in units of width and pitch; it is
-    drawn from ``seed``. Grooves of ``undercut_depth_mm`` and ``undercut_width_mm`` run along both toes of each bead.
+    drawn from ``seed``. Grooves of ``undercut_depth_mm`` and ``undercut_width_mm`` run along both toes of each bead; a
+    pair [least, most] of depths draws the depth of each (`undercut_depths`).
     """
 
     kind: Literal["weld"]
@@ -35,7 +38,7 @@ class Weld(FreeForm):
     ripple_pitch_mm: Positive = 3.0
     ripple_height_mm: NotNegative = 0.25
     irregularity: Annotated[float, Field(ge=0, le=0.3)] = 0.06
-    undercut_depth_mm: NotNegative = 0.0
+    undercut_depth_mm: NotNegative | Range = 0.0
     undercut_width_mm: Positive = 1.5
     seed: Annotated[int, Field(ge=0)] = 0
 
@@ -72,7 +75,7 @@ class Weld(FreeForm):
         """
         ripple = 0.5 * self.ripple_height_mm * (2 * np.pi / self.ripple_pitch_mm) ** 2
         toe = 8 * self.height_mm / (0.5 * self.width_mm) ** 2
-        undercut = 8 * self.undercut_depth_mm / (0.5 * self.undercut_width_mm) ** 2
+        undercut = 8 * float(undercut_depths(self).max()) / (0.5 * self.undercut_width_mm) ** 2
         step = chord_step(_SAG_MM, 1.3 * ripple + toe + undercut)
         plate = self.plate_mm if self.along == "x" else self.plate_mm[::-1]
         along = nodes([0.0], 0.5 * self.length_mm, step=step, length=plate[0])
@@ -83,16 +86,27 @@ class Weld(FreeForm):
         return np.stack([x, y, -weld_height(self, x, y)], axis=-1).reshape(-1, 3), grid_faces(x.shape)
 
 
+def undercut_depths(weld: Weld) -> np.ndarray:
+    """Return the depths (beads, 2) in mm of the grooves on the negative and positive side across each bead.
+
+    Depths of a range are drawn evenly in the logarithm.
+    """
+    if not isinstance(weld.undercut_depth_mm, tuple):
+        return np.full((weld.beads, 2), float(weld.undercut_depth_mm))
+    least, most = np.log(weld.undercut_depth_mm)
+    return np.exp(np.random.default_rng([weld.seed, _DEPTHS_STREAM]).uniform(least, most, (weld.beads, 2)))
+
+
 def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the height of weld beads above the plate, towards -z, at ``x``, ``y`` (N,), all in mm.
 
     A bead is `height_mm` (1 - t^2)^2, where t is 0 at its centre and 1 at its toes and round ends, with cosine ripples
-    that lag at the sides. An undercut is a groove of `undercut_depth_mm` (1 - u^2)^2 along each toe, where u is 0 at
-    its centre and 1 at its rims. It ends with the straight part of the bead.
+    that lag at the sides. An undercut is a groove d (1 - u^2)^2 along each toe, with d from `undercut_depths`, where u
+    is 0 at its centre and 1 at its rims. It ends with the straight part of the bead.
     """
     along, across = (x, y) if weld.along == "x" else (y, x)
     height = np.zeros(np.broadcast(x, y).shape)
-    for number, middle in enumerate(_bead_middles(weld)):
+    for number, (middle, grooves) in enumerate(zip(_bead_middles(weld), undercut_depths(weld), strict=True)):
         rng = np.random.default_rng([weld.seed, number])
         swell, thickness, sway, hurry = (weld.irregularity * wave(along / weld.width_mm, rng) for _ in range(4))
         sideways = (across - middle - weld.width_mm * sway) / (0.5 * weld.width_mm * (1 + swell))
@@ -101,10 +115,10 @@ def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         crests = (along + _TRAIL * weld.width_mm * np.square(sideways)) / weld.ripple_pitch_mm + hurry
         ripple = 0.5 * weld.ripple_height_mm * np.cos(2 * np.pi * crests)
         height += envelope * (weld.height_mm * (1 + thickness) + ripple)
-        if weld.undercut_depth_mm:
+        if grooves.any():
             from_toe = (np.abs(sideways) - 1) * weld.width_mm * (1 + swell) / weld.undercut_width_mm
             ends = np.square(np.maximum(1 - np.square(beyond), 0))
-            height -= weld.undercut_depth_mm * ends * np.square(np.maximum(1 - np.square(from_toe), 0))
+            height -= np.where(sideways < 0, *grooves) * ends * np.square(np.maximum(1 - np.square(from_toe), 0))
     return height
 
 

@@ -243,18 +243,21 @@ def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
     The stripe's shift on the target is excluded: images have little information on it, so that small model errors
     dominate.
     """
-    parameters = result.parameters
-    for key, value, known, std, after in zip(
+    parameters, covariance = result.parameters, result.covariance
+    formal = covariance if result.formal_covariance is None else result.formal_covariance
+    for key, value, known, std, after, exact in zip(
         parameters.keys,
         result.values,
         parameters.prior_mean(),
         parameters.prior_std(),
-        result.std().values(),
+        np.diag(covariance),
+        np.diag(formal),
         strict=True,
     ):
         if np.isfinite(std) and key is not SHIFT:
-            # The estimate includes the prior: this is the variance of their difference if both are right.
-            gain = float(np.sqrt(max(1.0 - (after / std) ** 2, _LEAST_GAIN**2)))
+            # The estimate includes the prior, with the weight of the formal variance, in which tied parameters are
+            # exact: this is the variance of their difference if both are right (for none tied, 1 - after / std^2).
+            gain = float(np.sqrt(max(1.0 + (after - 2 * exact) / std**2, _LEAST_GAIN**2)))
             alone = known + (value - known) / gain**2
             yield Deviation(abs(value - known) / (gain * std), key, alone, known, std), gain
 
@@ -401,14 +404,20 @@ def _check_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor)
 def _check_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
     """Find images that fit worse than similar ones: contradictions by source, and doubts for noisy images."""
     unfit: dict[str, str] = {}
-    noisy = []
+    noisy: list[str] = []
+    scatters: dict[object, list[float]] = {}
     for image in images:
-        others = [other.scatter_px for other in images if other.peers == image.peers and other is not image]
-        usual = float(np.median(others)) if others else image.noise_px
+        scatters.setdefault(image.peers, []).append(image.scatter_px)
+    ordered = {peers: np.sort(values) for peers, values in scatters.items()}
+    for image in images:
+        # Of all images with the same peers, without this one.
+        others = ordered[image.peers]
+        others = np.delete(others, np.searchsorted(others, image.scatter_px))
+        usual = float(np.median(others)) if len(others) else image.noise_px
         if image.scatter_px <= max(_OVER_OTHERS * usual, usual + _OVER_OTHERS_PX):
             continue
         shaped = image.scatter_px > _OVER_NOISE * image.noise_px
-        than = f"in the other images {usual:.2f} px" if others else f"its noise being {usual:.2f} px"
+        than = f"in the other images {usual:.2f} px" if len(others) else f"its noise being {usual:.2f} px"
         words = f"{image.source}: the {image.kind} is {image.scatter_px:.2f} px off (rms), {than}"
         if shaped or image.scatter_px > image.largest_px():
             unfit.setdefault(image.source, words)

@@ -10,7 +10,7 @@ from uwlts.calibration.joint.residuals import STEP, STRIPE, TARGET, Residuals, S
 from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
 from uwlts.errors import CalibrationError
 from uwlts.fitting.least_squares import MAD_TO_STD
-from uwlts.fitting.schur_least_squares import Observation, SchurFit, schur_least_squares
+from uwlts.fitting.schur_least_squares import LocalPrior, Observation, SchurFit, schur_least_squares
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Uncertainty
 
@@ -62,7 +62,8 @@ class Estimate:
 
     ``local`` (b,) with ``local_covariances`` (b, b) and ``residuals`` (with outliers) are those of every piece of
     evidence. ``noise`` is that of every kind of residual, ``outliers`` the number of rejected residuals. ``rounds``
-    counts all least-squares iterations.
+    counts all least-squares iterations. ``formal_covariance`` (P, P) takes tied parameters as exactly known; None if
+    none are tied.
     """
 
     parameters: Parameters
@@ -75,6 +76,7 @@ class Estimate:
     outliers: int
     rounds: int
     stopped: str
+    formal_covariance: np.ndarray | None = None
 
     def std(self) -> dict[ParameterKey, float]:
         """Return the standard uncertainty of every parameter."""
@@ -172,21 +174,21 @@ def _fit(
 ) -> SchurFit:
     """Solve with every piece of evidence as a group with local parameters; the last group is prior knowledge."""
 
-    def model(group: int, global_values: np.ndarray, local: np.ndarray) -> list[Observation] | None:
+    def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Sequence[Observation | LocalPrior] | None:
         if group == len(evidence):
             return _prior_observations(parameters, global_values)
         piece = evidence[group]
         parts = piece.residuals(parameters, global_values, local)
         if parts is None:
             return None
-        rows = []
+        rows: list[Observation | LocalPrior] = []
         for number, part in enumerate(parts):
             used = slice(None) if left_out is None else ~left_out[group][number]
             columns, scale = (part.values[:, None], part.by_global, part.by_local), noise[part.kind].effective_px()
             values, by_global, by_local = (column[used] / scale for column in columns)
             rows.append(Observation(values, by_global, by_local, part.local_columns))
-        off, by_local = piece.known_before(local, uncertainty)
-        return [*rows, Observation(off[:, None], np.zeros((len(off), len(global_values))), by_local)]
+        known = piece.known_before(local, uncertainty)
+        return [*rows, known] if len(known.residuals) else rows
 
     starts = [*local, np.empty(0)]
     if left_out is not None:

@@ -325,8 +325,8 @@ def _compute_information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | 
         noise[kind] = add_common_error(noise[kind], evidence.common_px, bodies=surface.count)
     count, local = len(known.values), len(local_values)
     total = np.zeros((count + local,) * 2)
-    _, before = evidence.known_before(local_values, uncertainty)
-    total[count:, count:] = before.T @ before
+    before = evidence.known_before(local_values, uncertainty).by_local
+    total[count:, count:] = (before.T @ before).toarray()
     for part in parts:
         rows = np.hstack([part.by_global, part.by_local])
         at = np.r_[0:count, count + part.local_columns]

@@ -97,7 +97,7 @@ class JointProblem:
         parts = [e.residuals(free, result.values, own) for e, own in zip(self.evidence, result.local, strict=True)]
         full = replace(result, residuals=[each or [] for each in parts])
         covariance = self.linearise(full).covariance_with(self.parameters.tied)
-        return replace(result, covariance=covariance)
+        return replace(result, covariance=covariance, formal_covariance=result.covariance)
 
     def linearise(self, result: Estimate) -> LinearisedEstimate:
         """Return the normal equations of an estimate of this problem."""

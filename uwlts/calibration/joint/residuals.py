@@ -3,15 +3,17 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Self
 
 import cv2
 import numpy as np
+from scipy import sparse
 
 from uwlts.calibration.camera.target_images import Placement
 from uwlts.calibration.camera.target_poses import centre_offsets
 from uwlts.calibration.joint.parameters import Parameters, SheetPoints, ViewMedium
+from uwlts.fitting.schur_least_squares import LocalPrior
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
 from uwlts.model.sensor import Uncertainty
@@ -81,22 +83,24 @@ class StripeEvidence(ABC):
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
         """Return the prior standard uncertainty (b,) of the local parameters; infinite without prior knowledge."""
 
-    def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> tuple[np.ndarray, np.ndarray]:
-        """Return prior residuals (c,) of local parameters in standard uncertainties, and derivatives (c, b)."""
+    def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> LocalPrior:
+        """Return prior knowledge of the local parameters, in standard uncertainties."""
         std = self.local_std(uncertainty)
-        known = np.isfinite(std)
-        return local[known] / std[known], np.diag(1.0 / std)[known]
+        known = np.flatnonzero(np.isfinite(std))
+        places = np.arange(len(known)), known
+        by_local = sparse.csr_array((1.0 / std[known], places), shape=(len(known), len(std)))
+        return LocalPrior((local[known] / std[known])[:, None], by_local)
 
-    def stripe_mask(self, image: int) -> np.ndarray:
-        """Return a mask of the stripe pixels (N,) of an image."""
-        return np.ones(len(self.pixels), dtype=bool)
+    def stripe_pixels(self, image: int) -> np.ndarray | slice:
+        """Return the numbers of an image's stripe pixels."""
+        return slice(None)
 
     def linearise(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
         """Compute rays at the pixels that residuals predict; those that are not ``used`` (n,) stay as detected."""
         predicted = self.pixels.copy()
         for part, kept in zip(residuals, used, strict=True):
             if part.kind != TARGET:
-                predicted[self.stripe_mask(part.image), self.across] -= np.where(kept, part.values, 0.0)
+                predicted[self.stripe_pixels(part.image), self.across] -= np.where(kept, part.values, 0.0)
         return replace(self, predicted=predicted)
 
     def on_sheet(self, parameters: Parameters, global_values: np.ndarray, *, shifted_px: float = 0.0) -> "SeenSheet":
@@ -221,12 +225,22 @@ class TargetEvidence(StripeEvidence):
         object.__setattr__(self, "middle_mm", middle)
         object.__setattr__(self, "radius_mm", float(np.linalg.norm(self.extent_mm - middle, axis=1).max()))
 
+    @cached_property
+    def every_image(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers of all images (F,), ascending, and the stage position of each."""
+        images, first = np.unique(self.placement.image, return_index=True)
+        return images, self.placement.shifts_mm[first]
+
     def images(self) -> np.ndarray:
         """Return the numbers of the images with a position error."""
-        return np.unique(self.placement.image)[1:] if self.staged else np.empty(0, dtype=int)
+        return self.every_image[0][1:] if self.staged else np.empty(0, dtype=int)
 
-    def stripe_mask(self, image: int) -> np.ndarray:
-        return self.image == image
+    @cached_property
+    def _stripe_of_image(self) -> dict[int, np.ndarray]:
+        return group_by_image(self.image)
+
+    def stripe_pixels(self, image: int) -> np.ndarray | slice:
+        return self._stripe_of_image[image]
 
     def with_stripes(self, chosen: np.ndarray | slice) -> Self:
         """Return the evidence with some of the stripe pixels only."""
@@ -238,8 +252,8 @@ class TargetEvidence(StripeEvidence):
         """Correct the detected centres of circle images to the images of the circles' centres."""
         placement, seen_by = self.placement, partial(parameters.project, global_values, self.view)
         pixels = placement.pixels.copy()
-        for image in np.unique(placement.image):
-            pose, here = self.pose(parameters, global_values, local, image), placement.image == image
+        for image, here in group_by_image(placement.image).items():
+            pose = self.pose(parameters, global_values, local, image)
             pixels[here] -= centre_offsets(seen_by, pose, placement.points_mm[here], diameter_mm=diameter_mm)
         return replace(self, placement=replace(placement, pixels=pixels))
 
@@ -268,10 +282,10 @@ class TargetEvidence(StripeEvidence):
         return sorted(found, key=lambda part: part.image)
 
     def linearise(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
-        points = self.placement.pixels.copy()
+        points, of_image = self.placement.pixels.copy(), group_by_image(self.placement.image)
         for part, kept in zip(residuals, used, strict=True):
             if part.kind == TARGET:
-                points[self.placement.image == part.image] -= np.where(kept, part.values, 0.0).reshape(-1, 2)
+                points[of_image[part.image]] -= np.where(kept, part.values, 0.0).reshape(-1, 2)
         return replace(super().linearise(residuals, used), predicted_points=points)
 
     def _of_points(
@@ -355,6 +369,13 @@ def _values(parameters: Parameters, global_values: np.ndarray, keys: tuple[Param
     return np.array([parameters.value(global_values, key) for key in keys])
 
 
+def group_by_image(image: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the numbers of the pixels of each image, from the images (n,) of pixels."""
+    order = np.argsort(image, kind="stable")
+    starts = np.flatnonzero(np.diff(image[order], prepend=-1))
+    return dict(zip(image[order][starts].tolist(), np.split(order, starts[1:]), strict=True)) if len(order) else {}
+
+
 def _split_batches(image: np.ndarray) -> list[np.ndarray]:
     """Split pixel numbers into batches of whole images that fit into the processor's cache."""
     order = np.argsort(image, kind="stable")
@@ -386,10 +407,10 @@ class _Poses:
         )
         self._nominal = self.travel = np.zeros(len(image))
         if evidence.staged:
-            images, first = np.unique(placement.image, return_index=True)
+            images, shifts_mm = evidence.every_image
             # The first image lacks a position error.
             self._place = np.searchsorted(images, image)
-            self._nominal = placement.shifts_mm[first][self._place]
+            self._nominal = shifts_mm[self._place]
             scale = 1.0 + parameters.value(global_values, StageParameter.SCALE)
             self.travel = self._nominal * scale + np.append(0.0, local[8:])[self._place]
 

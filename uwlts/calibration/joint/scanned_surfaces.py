@@ -2,12 +2,15 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
+from scipy import sparse
 
 from uwlts.calibration.joint.parameters import Parameters
-from uwlts.calibration.joint.residuals import Distances, Residuals, StripeEvidence
+from uwlts.calibration.joint.residuals import Distances, Residuals, StripeEvidence, group_by_image
+from uwlts.fitting.schur_least_squares import LocalPrior
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.window import tilt_direction
@@ -225,14 +228,21 @@ class SurfaceScanEvidence(StripeEvidence):
         positions = np.full(len(self.stage_mm), uncertainty.stage_position_mm)
         return np.append(np.full(self.surface.parameter_count(), np.inf), positions)
 
-    def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> tuple[np.ndarray, np.ndarray]:
-        off, by_local = super().known_before(local, uncertainty)
+    def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> LocalPrior:
+        known = super().known_before(local, uncertainty)
         sizes, by_surface = self.surface.sizes(local[: -len(self.stage_mm)]).residuals()
         by_sizes = np.pad(by_surface, ((0, 0), (0, len(self.stage_mm))))
-        return np.append(off, sizes), np.vstack([by_local, by_sizes])
+        return LocalPrior(
+            np.append(known.residuals, sizes[:, None], axis=0),
+            sparse.csr_array(sparse.vstack([known.by_local, sparse.csr_array(by_sizes)])),
+        )
 
-    def stripe_mask(self, image: int) -> np.ndarray:
-        return self.frame == image - self.image
+    @cached_property
+    def _pixels_of_frame(self) -> dict[int, np.ndarray]:
+        return group_by_image(self.frame)
+
+    def stripe_pixels(self, image: int) -> np.ndarray | slice:
+        return self._pixels_of_frame[image - self.image]
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
         points = self.on_sheet(parameters, global_values).points()
@@ -254,10 +264,10 @@ class SurfaceScanEvidence(StripeEvidence):
         of_all = self.stripe_residuals(
             parameters, points, off, kind=kind, local_columns=surface_columns, image=self.image, least_share=LEAST_SHARE
         )
-        for number in np.unique(self.frame):
-            here, columns = self.frame == number, np.append(surface_columns, count + number)
+        for number, here in self._pixels_of_frame.items():
+            columns = np.append(surface_columns, count + number)
             rows = of_all.values[here], of_all.by_global[here], of_all.by_local[here]
-            found.append(Residuals(kind, *rows, columns, self.image + int(number)))
+            found.append(Residuals(kind, *rows, columns, self.image + number))
         return found
 
     def stage_direction(self, parameters: Parameters, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

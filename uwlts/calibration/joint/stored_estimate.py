@@ -84,7 +84,7 @@ def _build_joint_estimate(result: Estimate, evidence: Sequence[Evidence], object
                 )
             )
             if part.kind != TARGET:
-                lit.setdefault(piece.view, []).append(piece.pixels[piece.stripe_mask(part.image)][~left_out])
+                lit.setdefault(piece.view, []).append(piece.pixels[piece.stripe_pixels(part.image)][~left_out])
     return JointEstimate(
         parameters=result.parameters.keys,
         values=tuple(result.values.tolist()),

@@ -11,9 +11,10 @@ import numpy as np
 
 from uwlts.calibration.camera.lens import HALVES_APART
 from uwlts.calibration.joint.estimate import Estimate, Evidence, Noise, outliers
-from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.residuals import TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.errors import CalibrationError
+from uwlts.fitting.schur_least_squares import invert_block
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Uncertainty
 
@@ -29,16 +30,20 @@ ImageId = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Residuals (n,) of one image without outliers, in px, their scale (n,) and derivatives (n, P) and (n, b)."""
+    """Residuals (n,) of one image without outliers, in px, their scale (n,) and derivatives (n, P) and (n, c).
+
+    The derivatives by local parameters are those by ``local_columns`` (c,); all others are zero.
+    """
 
     values: np.ndarray
     scale: np.ndarray
     kind: np.ndarray
     by_global: np.ndarray
     by_local: np.ndarray
+    local_columns: np.ndarray
 
     def normal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the normal matrix (P + b, P + b) and gradient (P + b,)."""
+        """Return the normal matrix (P + c, P + c) and gradient (P + c,)."""
         design = np.hstack([self.by_global, self.by_local]) / self.scale[:, None]
         return design.T @ design, design.T @ (self.values / self.scale)
 
@@ -95,14 +100,19 @@ class LinearisedEstimate:
         self._result, self._count = result, len(result.values)
         self._rows: dict[ImageId, _Rows] = {}
         self._local_prior: list[tuple[np.ndarray, np.ndarray]] = []
+        self._images: list[list[ImageId]] = []
         self._shared: set[int] = set()
         for number, (piece, local, parts) in enumerate(zip(evidence, result.local, result.residuals, strict=True)):
-            off, by_local = piece.known_before(local, uncertainty)
-            self._local_prior.append((by_local.T @ by_local, by_local.T @ off))
+            known = piece.known_before(local, uncertainty)
+            by_local = known.by_local
+            self._local_prior.append(((by_local.T @ by_local).toarray(), by_local.T @ known.residuals[:, 0]))
             if isinstance(piece, SurfaceScanEvidence):
                 self._shared.add(number)
-            for image in dict.fromkeys(part.image for part in parts):
-                self._rows[number, image] = self._gather_rows([p for p in parts if p.image == image], len(local))
+            of_image: dict[int, list[Residuals]] = {}
+            for part in parts:
+                of_image.setdefault(part.image, []).append(part)
+            self._images.append([(number, image) for image in of_image])
+            self._rows |= {(number, image): self._gather_rows(some) for image, some in of_image.items()}
         self._normal = {image: rows.normal() for image, rows in self._rows.items()}
         self._targets = [image for image in self._rows if isinstance(evidence[image[0]], TargetEvidence)]
         self._halves = split_in_halves(evidence)
@@ -114,16 +124,17 @@ class LinearisedEstimate:
             self._prior = self._prior + by_global.T @ by_global
             self._prior_gradient = self._prior_gradient + by_global.T @ off
 
-    def _gather_rows(self, parts: Sequence, local: int) -> _Rows:
+    def _gather_rows(self, parts: Sequence[Residuals]) -> _Rows:
         columns: list[tuple[np.ndarray, ...]] = []
+        places = np.unique(np.concatenate([part.local_columns for part in parts]))
         for part in parts:
             noise = self._result.noise[part.kind]
             used = ~outliers(part, noise)
-            by_local = np.zeros((len(part.values), local))
-            by_local[:, part.local_columns] = part.by_local
+            by_local = np.zeros((len(part.values), len(places)))
+            by_local[:, np.searchsorted(places, part.local_columns)] = part.by_local
             scale, kind = np.full(used.sum(), noise.effective_px()), np.full(used.sum(), part.kind)
             columns.append((part.values[used], scale, kind, part.by_global[used], by_local[used]))
-        return _Rows(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+        return _Rows(*(np.concatenate(column) for column in zip(*columns, strict=True)), local_columns=places)
 
     def _reduce(self, chosen: Collection[ImageId]) -> tuple[np.ndarray, np.ndarray, dict[int, tuple[np.ndarray, ...]]]:
         """Return the normal equations (P, P) and (P,) of chosen images without prior knowledge of global parameters.
@@ -133,11 +144,14 @@ class LinearisedEstimate:
         p = self._count
         total, gradient, backwards = np.zeros((p, p)), np.zeros(p), {}
         for number, (prior, prior_gradient) in enumerate(self._local_prior):
-            own = [image for image in self._rows if image[0] == number and image in chosen]
+            own = [image for image in self._images[number] if image in chosen]
             if not own:
                 continue
-            matrix = np.sum([self._normal[image][0] for image in own], axis=0)
-            vector = np.sum([self._normal[image][1] for image in own], axis=0)
+            matrix, vector = np.zeros((p + len(prior),) * 2), np.zeros(p + len(prior))
+            for image in own:
+                at = np.append(np.arange(p), p + self._rows[image].local_columns)
+                matrix[np.ix_(at, at)] += self._normal[image][0]
+                vector[at] += self._normal[image][1]
             block, border = matrix[p:, p:] + prior, matrix[:p, p:]
             inverse = _invert(block)
             if inverse is None:
@@ -173,7 +187,7 @@ class LinearisedEstimate:
                 moved = rows.values + rows.by_global @ step
                 if image[0] in backwards:
                     local_inverse, border, own_gradient = backwards[image[0]]
-                    local = -local_inverse @ (own_gradient + border.T @ step)
+                    local = -(local_inverse @ (own_gradient + border.T @ step))[rows.local_columns]
                 else:
                     points = rows.kind == TARGET
                     local = -np.linalg.lstsq(rows.by_local[points], moved[points], rcond=None)[0]
@@ -246,10 +260,10 @@ def _invert(matrix: np.ndarray) -> np.ndarray | None:
     scale = np.sqrt(np.diag(matrix))
     if not (scale > 0).all():
         return None
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    if values[0] < _SINGULAR:
+    try:
+        return invert_block(matrix / np.outer(scale, scale), least=_SINGULAR) / np.outer(scale, scale)
+    except np.linalg.LinAlgError:
         return None
-    return (vectors / values) @ vectors.T / np.outer(scale, scale)
 
 
 def keep_images(

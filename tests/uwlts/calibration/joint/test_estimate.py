@@ -1,10 +1,14 @@
-"""Number of independent residuals among correlated ones, for random residuals with a known number."""
+"""Number of independent residuals among correlated ones, and deviations of an estimate from prior knowledge."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from uwlts.calibration.joint.estimate import estimate_noise
+from uwlts.calibration.joint.consistency import deviations
+from uwlts.calibration.joint.estimate import Estimate, estimate_noise
 from uwlts.calibration.joint.residuals import STRIPE, TARGET, Residuals
+from uwlts.model.parameter_keys import StageParameter, TargetParameter
 
 IMAGES = 9
 
@@ -63,3 +67,26 @@ def test_neighbouring_residuals_of_a_stripe_count_as_fewer(correlation):
         parts.append(Residuals(STRIPE, values, np.empty((2000, 0)), np.empty((2000, 0)), np.arange(0), number))
     factor = estimate_noise(STRIPE, parts, []).together
     assert factor == pytest.approx((1 + correlation) / (1 - correlation), rel=0.15)
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_a_deviation_is_compared_with_its_own_scatter(tied: bool) -> None:
+    """One reading of the sum of two parameters with prior knowledge 0; the second may be tied to its prior.
+
+    Over all values of the parameters, the first estimate scatters about 0 as the weighted sum of both parameters and
+    the noise.
+    """
+    std, noise, reading = np.array([5e-5, 1e-4]), 4e-5, 3e-4
+    information = np.ones((2, 2)) / noise**2 + np.diag(std**-2.0)
+    weights = np.linalg.inv(information) @ np.ones(2) / noise**2
+    covariance = formal = np.linalg.inv(information)
+    if tied:
+        formal = np.diag([1 / information[0, 0], 0.0])
+        weights = np.array([formal[0, 0] / noise**2, 0.0])
+        covariance = np.diag([formal[0, 0] + (weights[0] * std[1]) ** 2, std[1] ** 2])
+    keys = (StageParameter.SCALE, TargetParameter.STRETCH_X)
+    parameters = SimpleNamespace(keys=keys, prior_mean=lambda: np.zeros(2), prior_std=lambda: std)
+    found = Estimate(parameters, weights * reading, covariance, [], [], {}, [], 0, 1, "", formal if tied else None)
+    scatter = weights[0] * np.sqrt(np.sum(std**2) + noise**2)
+    (scale,) = (each for each in deviations(found, least=0.0) if each.key is StageParameter.SCALE)
+    assert scale.sigmas == pytest.approx(weights[0] * reading / scatter)

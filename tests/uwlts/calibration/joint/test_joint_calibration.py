@@ -171,9 +171,9 @@ def test_every_derivative_is_what_differences_say(view, kind):
     assert max(np.abs(part.values).max() for part in found) < 1e-8
     assert_derivatives(evidence, parameters, global_values, local, within=1e-5)
     # Prior residuals are linear, and zero for other parameters.
-    off, by_local = evidence.known_before(local, BUILT.uncertainty)
-    assert len(off) == (len(local) - 6 if kind is TargetEvidence else 0)
-    assert by_local @ local == pytest.approx(off, rel=1e-12)
+    known = evidence.known_before(local, BUILT.uncertainty)
+    assert len(known.residuals) == (len(local) - 6 if kind is TargetEvidence else 0)
+    assert known.by_local @ local == pytest.approx(known.residuals[:, 0], rel=1e-12)
 
 
 def _without_residuals(evidence, parts):

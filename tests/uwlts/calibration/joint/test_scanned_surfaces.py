@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from tests.uwlts.calibration_views import WATER
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, target_series
@@ -20,6 +21,7 @@ from uwlts.calibration.joint.residuals import STEP, Residuals
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Spheres
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError
+from uwlts.fitting.schur_least_squares import LocalPrior
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
 from uwlts.model.parameter_keys import parse_parameter
 from uwlts.model.placement import camera_from_object, laser_pose
@@ -167,7 +169,7 @@ class _Held:
         self._lens = lens
 
     def known_before(self, local, uncertainty):
-        return np.empty(0), np.empty((0, 0))
+        return LocalPrior(np.empty((0, 1)), sparse.csr_array((0, 0)))
 
     def residuals(self, parameters, global_values, local):
         count = len(self._lens)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.stats import t
 
 from uwlts.calibration.mount.restricted_likelihood import NotSettled, settle
 
@@ -55,3 +56,45 @@ def test_an_estimate_that_cannot_settle_is_an_error():
         NotSettled, match=r"does not converge: after \d+ rounds it still changes by .* Record more poses"
     ):
         settle(TwoReadings(slope=1e6), [(-0.9, np.ones(1)), (0.9, np.ones(1))])
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings of one number with a common unknown scatter, which repeats of another number share."""
+
+    read: np.ndarray
+    repeats: int
+    squares: float
+
+    size = 1
+
+    def bounds(self):
+        return np.array([(1e-3, 1e3)])
+
+    def apply_step(self, state, step):
+        return state + float(step[0])
+
+    def residuals(self, state, step=None):
+        return state - self.read[:, None] + (0.0 if step is None else step[0])
+
+    def jacobian(self, state, step=None):
+        return np.ones((len(self.read), 1, 1))
+
+    def covariance(self, state):
+        every = np.ones((len(self.read), 1, 1))
+        return lambda logs: (np.exp(2 * logs[0]) * every, 2 * np.exp(2 * logs[:, None, None, None]) * every[None])
+
+    def pool_repeats(self, state):
+        return self.repeats, self.squares
+
+
+@pytest.mark.parametrize("repeats", [0, 4])
+def test_a_mean_has_students_factor_and_the_pooled_scatter(repeats: int):
+    """Six readings leave five degrees of freedom, and repeats add theirs (GUM, H.5: pooled variances)."""
+    read, squares = np.array([1.2, 0.7, 1.9, 1.1, 0.4, 1.3]), 0.9 * repeats
+    found = settle(Readings(read, repeats, squares), [(0.0, np.ones(1))])
+    assert found.state == pytest.approx(read.mean(), abs=1e-6)
+    pooled = (np.sum((read - read.mean()) ** 2) + squares) / (5 + repeats)
+    assert found.scatter[0] == pytest.approx(np.sqrt(pooled), rel=1e-4)
+    factor = found.coverage_factor(np.ones(1), np.ones((1, 1)))
+    assert factor == pytest.approx(t.ppf(0.975, 5 + repeats), rel=1e-6)

@@ -1,0 +1,67 @@
+"""Blocks with a diagonal part are inverted as any matrix, and prior knowledge counts as any observation."""
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from uwlts.fitting.schur_least_squares import LocalPrior, Observation, invert_block, schur_least_squares
+
+HEAD, ALONE = 8, 30
+
+
+def block(rng, *, head=HEAD, alone=ALONE):
+    """Return a normal matrix of ``head`` parameters of all images, and one parameter of each image."""
+    matrix = np.zeros((head + alone,) * 2)
+    for image in range(alone):
+        places = [*range(head), head + image]
+        rows = rng.normal(size=(12, len(places)))
+        matrix[np.ix_(places, places)] += rows.T @ rows
+    return matrix
+
+
+@pytest.mark.parametrize(("head", "alone"), [(8, 30), (0, 30), (30, 0), (6, 2), (0, 0)])
+def test_the_inverse_of_a_block_is_that_of_the_whole_matrix(head, alone):
+    matrix = block(np.random.default_rng(3), head=head, alone=alone)
+    if not alone:
+        rows = np.random.default_rng(4).normal(size=(3 * head, head))
+        matrix = rows.T @ rows
+    np.testing.assert_allclose(invert_block(matrix, least=1e-9), np.linalg.inv(matrix), rtol=1e-9, atol=1e-12)
+
+
+def test_a_singular_block_is_refused_wherever_it_is_singular():
+    matrix = block(np.random.default_rng(5))
+    empty = matrix.copy()
+    empty[HEAD + 4] = empty[:, HEAD + 4] = 0.0
+    twice = matrix.copy()
+    twice[:, 1] = twice[:, 0]
+    twice[1] = twice[0]
+    for each in (empty, twice):
+        with pytest.raises(np.linalg.LinAlgError):
+            invert_block(each, least=1e-9)
+
+
+@pytest.mark.parametrize("soft_limit", [None, 1.5])
+def test_prior_knowledge_of_local_parameters_counts_as_an_observation(soft_limit):
+    """Of twenty parameters per group, each in its own rows: the solution is the same with dense derivatives."""
+    rng, count = np.random.default_rng(6), 20
+    by_global, values = rng.normal(size=(2, 6 * count, 3)), rng.normal(size=(2, 6 * count))
+    own = np.kron(np.eye(count), np.ones((6, 1)))
+    known = rng.normal(size=(2, count))
+
+    def fit(dense):
+        def model(group, global_values, local):
+            off = values[group] - by_global[group] @ global_values - own @ local
+            prior, by_prior = (local - known[group])[:, None] / 0.5, np.eye(count) / 0.5
+            rest = Observation(prior, np.zeros((count, 3)), by_prior)
+            return [
+                Observation(off[:, None], -by_global[group], -own),
+                rest if dense else LocalPrior(prior, sparse.csr_array(by_prior)),
+            ]
+
+        return schur_least_squares(model, np.zeros(3), [np.zeros(count)] * 2, soft_limit=soft_limit)
+
+    one, other = fit(dense=True), fit(dense=False)
+    for name in ("global_values", "covariance", "local", "local_covariances"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-7, atol=1e-9)
+    assert one.rounds == other.rounds
+    assert one.sigma == pytest.approx(other.sigma)

@@ -1,0 +1,355 @@
+"""Probability of detection of pits, dents and undercuts in rendered campaigns, after MIL-HDBK-1823A (2009).
+
+A search reports only what it finds: its hits and misses are a logistic function of the logarithm of the depth, and the
+bound is that of the likelihood ratio (appendix G.3). Undercuts are measured on every weld: their signals are a linear
+function of the depth, left-censored at zero, and the bound is Wald's (appendix G.2).
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel
+from scipy import optimize, special, stats
+
+from twin.scene.campaign import Take
+from twin.scene.description import Scene
+from twin.scene.forms import PittedPipe, Weld
+from twin.scene.forms.pitted_pipe import pit_depths, pit_places
+from twin.scene.forms.weld import undercut_depths
+from twin.scene.motion import Motion
+from uwlts.errors import CaptureError
+
+Flaw = Literal["pit", "dent", "undercut"]
+Method = Literal["hit/miss", "signal response"]
+
+FEWEST = {"hit/miss": 60, "signal response": 40}
+"""Fewest flaws of an experiment (MIL-HDBK-1823A, 4.5.2.2)."""
+_DENT_SHARE = 0.1
+"""Width of a dent, as a fraction of the pipe's diameter; narrower hollows are pits, as `uwlts inspect` names them."""
+_PLACE_MM = 1.0
+"""Largest distance of a finding from the rim of its pit: errors of calibration and of the deepest place."""
+_NINETY = 0.9
+_ONE_SIDED = 0.95
+_SLOPES = (-1.0, 5.0)
+"""Range of the logarithm of the logistic's slope: from a factor of 400 between 10 and 90 % to one of 1.03."""
+_SIGNAL_VALUES = ("undercut left", "undercut right")
+
+
+class ProbabilityOfDetection(BaseModel, frozen=True):
+    """Probability of detection of one kind of flaw against its depth.
+
+    Attributes
+    ----------
+    flaw : str
+        "pit", "dent" or "undercut".
+    width_mm : float
+        Width of the flaws.
+    method : str
+        "hit/miss" or "signal response".
+    checked : str
+        Where the statement was checked: scene, place, profiles and water.
+    depths_mm : tuple of N float
+        True depths.
+    found : tuple of N bool
+        Whether each flaw was found.
+    signals_mm : tuple of N float or None
+        Measured depths of a signal response, 0 where nothing was measured; None for hits and misses.
+    false_calls : int
+        FlawFindings that are no flaw.
+    a90_mm : float or None
+        Depth found with a probability of 90 %; None if the flaws do not determine it.
+    a90_95_mm : float or None
+        Its upper bound with 95 % confidence; None if the flaws do not bound it.
+    location, scale : float or None
+        Parameters of the curve. Hit or miss: logarithm of the depth in mm with 50 %, and inverse slope of the logistic.
+        Signal response: depth with 50 % and standard deviation of a normal distribution, in mm.
+    """
+
+    flaw: Flaw
+    width_mm: float
+    method: Method
+    checked: str
+    depths_mm: tuple[float, ...]
+    found: tuple[bool, ...]
+    signals_mm: tuple[float, ...] | None = None
+    false_calls: int = 0
+    a90_mm: float | None = None
+    a90_95_mm: float | None = None
+    location: float | None = None
+    scale: float | None = None
+
+    def probability(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Return the probability of detection (K,) at depths (K,) in mm; NaN if it is not determined."""
+        if self.location is None or self.scale is None:
+            return np.full(np.shape(depth_mm), np.nan)
+        if self.method == "hit/miss":
+            return 1 / (1 + np.exp(-(np.log(depth_mm) - self.location) / self.scale))
+        return stats.norm.cdf((depth_mm - self.location) / self.scale)
+
+    def limits(self) -> str:
+        """Return limitations as a text; empty if there are none."""
+        count = len(self.depths_mm)
+        found = [f"{count} flaws, fewer than {FEWEST[self.method]}"] if count < FEWEST[self.method] else []
+        if self.a90_mm is None:
+            found.append("hits and misses do not determine a90")
+        elif self.a90_95_mm is None:
+            found.append("a90 is not bounded")
+        if self.method == "signal response" and (false := float(self.probability(np.zeros(1))[0])) > 1 - _ONE_SIDED:
+            found.append(f"false calls with {100 * false:.0f} % probability")
+        return "; ".join(found)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Fitted probability of detection; see `ProbabilityOfDetection`."""
+
+    a90_mm: float | None = None
+    a90_95_mm: float | None = None
+    location: float | None = None
+    scale: float | None = None
+
+
+def fit_hit_miss(depth_mm: np.ndarray, found: np.ndarray) -> Fitted:
+    """Fit a logistic of the logarithm of the depth to hits and misses.
+
+    The bound of a90 is that of the one-sided profile likelihood (chi-square's 90 % quantile, one degree of freedom). It
+    also exists if hits and misses do not overlap.
+
+    Parameters
+    ----------
+    depth_mm : (N,)
+        True depths.
+    found : (N,) bool
+        Hits.
+    """
+    if found.all() or not found.any():
+        return Fitted()
+    x, odds = np.log(depth_mm), math.log(_NINETY / (1 - _NINETY))
+
+    def loss(at_90: float, slope: float) -> float:
+        logit = odds + slope * (x - at_90)
+        return float(np.sum(np.logaddexp(0, np.where(found, -logit, logit))))
+
+    def best_slope(at_90: float) -> tuple[float, float]:
+        logarithm, least = _minimise(lambda s: loss(at_90, math.exp(s)), _SLOPES)
+        return least, math.exp(logarithm)
+
+    # The likelihood is concave in intercept and slope, so that its profile has one maximum.
+    ends = float(x.min()) - 1, float(x.max()) + 1
+    at_90, least = _minimise(lambda at: best_slope(at)[0], ends)
+    if min(at_90 - ends[0], ends[1] - at_90) < 1e-3:
+        return Fitted()
+    limit = least + 0.5 * float(stats.chi2.ppf(2 * _ONE_SIDED - 1, 1))
+    bound = None
+    if best_slope(ends[1])[0] > limit:
+        crossing = optimize.root_scalar(lambda at: best_slope(at)[0] - limit, bracket=(at_90, ends[1]), xtol=1e-4)
+        bound = math.exp(crossing.root)
+    slope = best_slope(at_90)[1]
+    return Fitted(math.exp(at_90), bound, at_90 - odds / slope, 1 / slope)
+
+
+def _minimise(of: Callable[[float], float], ends: tuple[float, float]) -> tuple[float, float]:
+    """Return the place and the value of a function's minimum between two ends."""
+    found: Any = optimize.minimize_scalar(of, bounds=ends, method="bounded")
+    return float(found.x), float(found.fun)
+
+
+def fit_signal_response(depth_mm: np.ndarray, signal_mm: np.ndarray, *, threshold_mm: float) -> Fitted:
+    """Fit a line to signals against depths, and return the probability that a signal exceeds a threshold.
+
+    Signals of 0 are censored: their value before the correction for noise was 0 or less. The scatter is normal and of
+    equal size at all depths. The bound of a90 is Wald's.
+
+    Parameters
+    ----------
+    depth_mm, signal_mm : (N,)
+        True and measured depths.
+    threshold_mm
+        Signal from which a flaw counts as found.
+    """
+    seen = signal_mm > 0
+    if np.count_nonzero(seen) < 3:
+        return Fitted()
+    slope, offset = np.polyfit(depth_mm[seen], signal_mm[seen], 1)
+    scatter = max(float(np.std(signal_mm[seen] - slope * depth_mm[seen] - offset)), 1e-6)
+
+    def loss(free: np.ndarray) -> float:
+        z = (signal_mm - free[0] - free[1] * depth_mm) / math.exp(free[2])
+        logs = np.where(seen, -0.5 * z**2 - free[2], special.log_ndtr(z))
+        return -float(np.sum(logs))
+
+    best = optimize.minimize(loss, [offset, slope, math.log(scatter)], method="Nelder-Mead", options=_TIGHT).x
+    if best[1] <= 0:
+        return Fitted()
+
+    def at_90(free: np.ndarray) -> float:
+        return (threshold_mm - free[0] + float(stats.norm.ppf(_NINETY)) * math.exp(free[2])) / free[1]
+
+    steps = np.array([0.1 * math.exp(best[2]), 0.02 * best[1], 0.02])
+    gradient = np.array([(at_90(best + e) - at_90(best - e)) / 2 for e in np.diag(steps)])
+    information = _second_differences(loss, best, steps)
+    a90, (location, scale) = at_90(best), ((threshold_mm - best[0]) / best[1], math.exp(best[2]) / best[1])
+    try:
+        variance = float(gradient @ np.linalg.solve(information, gradient))
+    except np.linalg.LinAlgError:
+        variance = math.nan
+    bound = a90 + float(stats.norm.ppf(_ONE_SIDED)) * math.sqrt(variance) if variance > 0 else None
+    return Fitted(a90, bound, float(location), float(scale))
+
+
+_TIGHT = {"xatol": 1e-7, "fatol": 1e-9, "maxiter": 4000}
+
+
+def _second_differences(of: Callable[[np.ndarray], float], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return the second derivatives (K, K) of a function, with respect to parameters in units of ``steps`` (K,)."""
+    moves = np.diag(steps)
+    return (
+        np.array([[of(at + a + b) - of(at + a - b) - of(at - a + b) + of(at - a - b) for b in moves] for a in moves])
+        / 4
+    )
+
+
+@dataclass
+class FlawFindings:
+    """Flaws of one kind, collected over scans and campaigns.
+
+    ``thresholds_mm`` are the least significant signals of undercuts, ``values`` the measured value, its standard
+    uncertainty and the true value of each flaw found.
+    """
+
+    flaw: Flaw
+    width_mm: float
+    checked: str
+    depths_mm: list[float] = field(default_factory=list)
+    found: list[bool] = field(default_factory=list)
+    signals_mm: list[float] = field(default_factory=list)
+    thresholds_mm: list[float] = field(default_factory=list)
+    values: list[tuple[float, float, float]] = field(default_factory=list)
+    false_calls: int = 0
+
+    def detection(self) -> ProbabilityOfDetection:
+        """Return the probability of detection."""
+        depth, found = np.array(self.depths_mm), np.array(self.found)
+        if self.flaw == "undercut":
+            method: Method = "signal response"
+            level = float(np.median(self.thresholds_mm)) if self.thresholds_mm else math.inf
+            fitted = fit_signal_response(depth, np.array(self.signals_mm), threshold_mm=level)
+        else:
+            method, fitted = "hit/miss", fit_hit_miss(depth, found)
+        return ProbabilityOfDetection(
+            flaw=self.flaw,
+            width_mm=self.width_mm,
+            method=method,
+            checked=self.checked,
+            depths_mm=tuple(self.depths_mm),
+            found=tuple(self.found),
+            signals_mm=tuple(self.signals_mm) if self.flaw == "undercut" else None,
+            false_calls=self.false_calls,
+            a90_mm=fitted.a90_mm,
+            a90_95_mm=fitted.a90_95_mm,
+            location=fitted.location,
+            scale=fitted.scale,
+        )
+
+
+def flaws_of(scene: Scene) -> tuple[Flaw, float] | None:
+    """Return the kind and width in mm of a scene's flaws with drawn depths; None without any."""
+    for thing in scene.objects:
+        match thing:
+            case PittedPipe() if isinstance(thing.pit_depth_mm, tuple):
+                is_dent = thing.pit_diameter_mm > _DENT_SHARE * thing.diameter_mm
+                return "dent" if is_dent else "pit", thing.pit_diameter_mm
+            case Weld() if isinstance(thing.undercut_depth_mm, tuple):
+                return "undercut", thing.undercut_width_mm
+            case _:
+                pass
+    return None
+
+
+def collect_findings(into: FlawFindings, take: Take, inspection: dict[str, Any]) -> None:
+    """Add the flaws of a recording and the findings of its inspection (the content of its file).
+
+    CaptureError if the inspection is incomplete.
+    """
+    try:
+        if into.flaw == "undercut":
+            _collect_undercuts(into, take.scene, inspection)
+        else:
+            _collect_pits(into, take.scene, inspection)
+    except (KeyError, TypeError, IndexError) as error:
+        raise CaptureError(f"the inspection of {take.name} is incomplete: {error}") from error
+
+
+def _collect_pits(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) -> None:
+    """Add the pits within the scanned part of a pipe."""
+    number = next(n for n, thing in enumerate(scene.objects) if isinstance(thing, PittedPipe))
+    pipe, place = scene.objects[number], scene.object_poses()[number]
+    assert isinstance(pipe, PittedPipe)
+    scale = np.array([1.0, pipe.diameter_mm / 2])
+    pits, reach = pit_places(pipe) * scale, pipe.pit_diameter_mm / 2
+
+    def on_surface(place_mm: list[float]) -> np.ndarray:
+        x, y, z = (np.linalg.inv(place) @ [*place_mm, 1.0])[:3]
+        return np.array([x, math.atan2(y, -z)]) * scale
+
+    hollows = [each for each in inspection["features"] if each["kind"] in ("pit", "dent")]
+    known: dict[int, dict[str, Any] | None] = {}
+    for feature in hollows:
+        # Neighbours that the search joined are found, too, but their depths are not measured.
+        for own, at in [(feature, feature["place_mm"]), *((None, at) for at in feature["hollows_mm"])]:
+            away = np.linalg.norm(pits - on_surface(at), axis=1)
+            nearest = int(np.argmin(away))
+            if away[nearest] < reach + _PLACE_MM and known.get(nearest) is None:
+                known[nearest] = own
+    into.false_calls += sum(
+        bool(np.all(np.linalg.norm(pits - on_surface(each["place_mm"]), axis=1) > reach + _PLACE_MM))
+        for each in inspection["features"]
+        if each["kind"] in ("pit", "dent", "protrusion")
+    )
+    first, last = _scanned_mm(scene)
+    along = pits[:, 0] + place[0, 3]
+    for pit in np.flatnonzero((along - reach > first) & (along + reach < last)).tolist():
+        depth = float(pit_depths(pipe)[pit])
+        into.depths_mm.append(depth)
+        into.found.append(pit in known)
+        if (feature := known.get(pit)) is not None:
+            into.values.append((*_value(feature["values"]["depth"]), depth))
+
+
+def _collect_undercuts(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) -> None:
+    """Add the undercuts on both sides of a weld."""
+    weld = next(thing for thing in scene.objects if isinstance(thing, Weld))
+    found = next(each for each in inspection["features"] if each["kind"] == "weld")
+    # "left" is the side of smaller values along the feature's second axis.
+    across = found["axes"][1][1 if weld.along == "x" else 0]
+    depths = undercut_depths(weld)[0] if across > 0 else undercut_depths(weld)[0, ::-1]
+    for name, depth in zip(_SIGNAL_VALUES, depths.tolist(), strict=True):
+        value = found["values"].get(name)
+        into.depths_mm.append(depth)
+        into.found.append(value is not None and value["low"] > 0)
+        into.signals_mm.append(value["value"] if value is not None else 0.0)
+        if value is not None:
+            into.thresholds_mm.append(value["high"] - value["value"])
+            into.values.append((*_value(value), depth))
+
+
+def _value(value: dict[str, Any]) -> tuple[float, float]:
+    """Return a value and its standard uncertainty."""
+    return value["value"], math.hypot(value["random"], value["systematic"] or 0.0)
+
+
+def _scanned_mm(scene: Scene) -> tuple[float, float]:
+    """Return the ends of a scan along X; without a stage, everything."""
+    if not isinstance(scene.motion, Motion):
+        return -math.inf, math.inf
+    ends = scene.motion.start_mm, scene.motion.start_mm + scene.motion.step_mm * (scene.motion.count - 1)
+    return min(ends), max(ends)
+
+
+def deep_values(found: FlawFindings, detection: ProbabilityOfDetection) -> Iterator[tuple[float, float, float]]:
+    """Yield the values of flaws at least as deep as a90/95; shallower ones are found by the noise that deepens them."""
+    least = detection.a90_95_mm if detection.a90_95_mm is not None else math.inf
+    return (each for each in found.values if found.flaw == "undercut" or each[2] >= least)
