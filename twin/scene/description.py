@@ -57,10 +57,25 @@ class Plate(FlatObject):
 
 
 class Block(FlatObject):
-    """A box centred at its own origin."""
+    """A box centred at its own origin.
+
+    Edges rounded with ``edge_radius_mm`` reflect glints on glossy finishes.
+    """
 
     kind: Literal["block"]
     size_mm: tuple[Positive, Positive, Positive]
+    edge_radius_mm: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _is_round_at_its_edges_only(self) -> Self:
+        if self.edge_radius_mm == 0:
+            return self
+        if 2 * self.edge_radius_mm >= min(self.size_mm):
+            raise ValueError(f"edge_radius_mm {self.edge_radius_mm:g} is half of the least side or more: reduce it")
+        for name, value in (("mirror", self.mirror), ("texture", self.texture)):
+            if value:
+                raise ValueError(f"{name} {value} on a block with rounded edges: use edge_radius_mm = 0")
+        return self
 
 
 class Pipe(SceneObject):

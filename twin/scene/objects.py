@@ -15,7 +15,7 @@ import trimesh
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Plate, Scene, Sphere, TargetPlate
 from twin.scene.finish import albedo_parts, body_spread, finish_bsdf, register_textures, view_along_normal
-from twin.scene.forms.triangles import bowed_plate
+from twin.scene.forms.triangles import bowed_plate, rounded_box
 from twin.scene.scene_object import FreeForm
 from twin.scene.subsurface import GAUSSIANS
 from uwlts.errors import DescriptionError
@@ -213,6 +213,8 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
             if thing.texture is None:
                 matrix[:3, :3] = np.eye(3)  # Mitsuba mistakes rounding errors of a rotated sphere for shear
             matrix, kind = matrix @ _make_scaling(*[thing.diameter_mm / 2] * 3), "sphere"
+        case Block() if thing.edge_radius_mm > 0:
+            return _mesh(thing, pose, bsdf)
         case Block():
             matrix, kind = pose @ _make_scaling(*(side / 2 for side in thing.size_mm)), "cube"
         case Pipe():
@@ -238,7 +240,7 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
     return mi.load_dict({"type": kind, "to_world": scalar_transform(matrix), "bsdf": bsdf})
 
 
-def _mesh(thing: Mesh | FreeForm | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
+def _mesh(thing: Block | Mesh | FreeForm | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
     """Return a triangle mesh with its vertices in scene coordinates."""
     vertices, faces, uv = _surface(thing)
     vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -254,11 +256,15 @@ def _mesh(thing: Mesh | FreeForm | CirclePlate | TargetPlate, pose: np.ndarray, 
     return mesh
 
 
-def _surface(thing: Mesh | FreeForm | CirclePlate | TargetPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _surface(
+    thing: Block | Mesh | FreeForm | CirclePlate | TargetPlate,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return vertices (V, 3) in the object's own frame, faces (F, 3), and texture coordinates (V, 2) or None."""
     match thing:
         case FreeForm():
             return *thing.surface(), None
+        case Block():
+            return *rounded_box(np.array(thing.size_mm), radius_mm=thing.edge_radius_mm), None
         case CirclePlate() | TargetPlate():
             return bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
         case Mesh():

@@ -157,6 +157,7 @@ def test_a_base_gives_what_a_description_leaves_out(tmp_path):
 
 
 PLATE = "title = 't'\n[[objects]]\nkind = 'plate'\nwidth_mm = 5.0\nheight_mm = 5.0\n"
+BLOCK = "title = 't'\n[[objects]]\nkind = 'block'\nsize_mm = [10.0, 10.0, 10.0]\n"
 HEAD = "title = 't'\n[[objects]]\nkind = 'head'\n"
 WELD = "title = 't'\n[[objects]]\nkind = 'weld'\n"
 
@@ -193,6 +194,11 @@ BAD_SCENES = {
         r"texture .*wall\.png and mottle 0\.2: use one of them, or mottle = 0",
     ),
     "translucent steel": (PLATE + "finish = 'metal'\nmean_free_path_mm = 0.1", r"mean_free_path_mm 0\.1 in a metal"),
+    "all edge": (BLOCK + "edge_radius_mm = 5.0", r"edge_radius_mm 5 is half of the least side or more"),
+    "round mirror block": (
+        BLOCK + "edge_radius_mm = 1.0\nreflectance = 0.1\nmirror = 0.5",
+        r"mirror 0\.5 on a block with rounded edges",
+    ),
     "no length": (PLATE + "reflectance = 0.2\nmottle = 0.3\nmottle_mm = 0.0", r"mottle_mm.*found 0"),
     "rusted print": (
         "base = 'target'\n[[objects]]\nkind = 'target_plate'\nfinish = 'rusted-steel'",

@@ -12,6 +12,7 @@ from twin.scene.forms.cables_and_ropes import rope_radius
 from twin.scene.forms.flange import flange_face
 from twin.scene.forms.overgrown_pipe import overgrown_radius
 from twin.scene.forms.seabed import seabed_height
+from twin.scene.forms.triangles import rounded_box
 from twin.scene.scene_object import FreeForm
 
 
@@ -161,3 +162,17 @@ def test_forms_that_cannot_be_are_refused(message):
     form, given = WRONG[message]
     with pytest.raises(ValidationError, match=message):
         form.model_validate(given)
+
+
+def test_a_block_with_rounded_edges_is_a_box_moved_by_a_sphere():
+    size, radius = np.array([30.0, 20.0, 10.0]), 1.5
+    mesh = trimesh.Trimesh(*rounded_box(size, radius_mm=radius), process=True)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    a, b, c = size - 2 * radius
+    # Steiner's formula; chords over a quarter of a turn in 24 parts lack 7e-4 of the rounded parts.
+    rounded = np.pi * radius**2 * (a + b + c) + 4 / 3 * np.pi * radius**3
+    volume = a * b * c + 2 * radius * (a * b + b * c + c * a) + rounded
+    assert volume - 2e-3 * rounded < mesh.volume < volume
+    # Every point of the surface has the distance of the radius from the inner box.
+    beyond = np.maximum(np.abs(middles(mesh)) - (size / 2 - radius), 0)
+    assert np.abs(np.linalg.norm(beyond, axis=1) - radius).max() < 1.2e-3 * radius

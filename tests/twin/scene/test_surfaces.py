@@ -1,6 +1,7 @@
 """Random reflectance of surfaces against its stated distribution and spectrum, in numbers and in rendered stripes."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -230,3 +231,30 @@ def test_the_rendered_stripe_has_the_spectrum_filtered_by_the_sheet(thesis: Sens
     assert (np.abs(np.mean(found, axis=0) - expected) < 5 * error + 0.02 * expected[0]).all()
     assert expected[0] < 0.9 * mottle**2, "the sheet must average the texture, or nothing is tested"
     assert error[0] < 0.1 * expected[0]
+
+
+def test_a_rounded_edge_of_steel_glints_where_its_normal_bisects_light_and_view(thesis: Sensor):
+    sensor = altered(thesis, {"camera": {"width_px": 64, "height_px": 160}})
+    steel = {"kind": "block", "size_mm": (40.0, 40.0, 20.0), "position_mm": (0.0, 0.0, 10.0), "edge_radius_mm": 3.0}
+    steel |= {"finish": "metal", "alpha": 0.1}
+    renderer = Renderer(sensor, clear(), scene_of(steel), effects=replace(NONE, gloss=True))
+    bundle = renderer.view.trace_bundle(mi.Float(31.5), mi.Float(79.5))
+    seen = np.array([float(each[0]) for each in bundle.direction])
+    half = -seen - (0.0, 0.0, 1.0)
+    half /= np.linalg.norm(half)
+    # The arc's centre is 17 mm from the middle, on the side to which the bisector leans.
+    side = np.sign(half[0])
+    glint = side * 17.0 + 3.0 * half[0]
+    places = side * np.arange(12.0, 19.5, 0.15)
+    light = np.array([renderer.irradiance("laser", sensor_at(x=x), spp=16).max() for x in places])
+    # Facets are 3.75 degrees wide, 0.2 mm here.
+    assert abs(places[np.argmax(light)] - glint) < 0.3
+    flat = light[np.abs(places) < 16.5]
+    assert light.max() > 3 * flat.max()
+    np.testing.assert_allclose(flat, flat.mean(), rtol=0.05)
+    # The truth follows the rounding: the true surface point is on the arc.
+    truth = find_true_stripe(renderer, sensor_at(x=glint))
+    points = truth.point_mm[np.isfinite(truth.centre_px)]
+    away = np.hypot(points[:, 0] - side * 17.0, points[:, 2] - 3.0)
+    assert len(points) > 30
+    np.testing.assert_allclose(away, 3.0, atol=2e-3)

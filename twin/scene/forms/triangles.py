@@ -114,3 +114,36 @@ def bowed_plate(
         grid_faces(x.shape),
         np.stack([u, v], -1).reshape(-1, 2),
     )
+
+
+def rounded_box(size_mm: np.ndarray, *, radius_mm: float, facets: int = 24) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) and faces (F, 3) of a box (3,) about its origin with rounded edges and corners.
+
+    A sphere of the radius is cut along the coordinate planes, and its parts are moved apart. Each edge has ``facets``
+    over its quarter of a turn, whose chords deviate by radius / 8 (pi / 2 / facets)^2: 0.5 um for 1 mm.
+    """
+    half = np.asarray(size_mm) / 2 - radius_mm
+    quarter = np.linspace(0, np.pi / 2, facets + 1)
+    around = np.concatenate([quarter + k * np.pi / 2 for k in range(4)])
+    up = np.concatenate([quarter - np.pi / 2, quarter])
+    # Signs of each part: the angles at the cuts stand twice, once on either side.
+    side_x, side_y = (np.repeat(signs, facets + 1) for signs in ((1, -1, -1, 1), (1, 1, -1, -1)))
+    side_z = np.repeat((-1, 1), facets + 1)
+    vertices = np.stack(
+        [
+            half[0] * side_x + radius_mm * np.cos(around) * np.cos(up)[:, None],
+            half[1] * side_y + radius_mm * np.sin(around) * np.cos(up)[:, None],
+            (half[2] * side_z + radius_mm * np.sin(up))[:, None] + np.zeros(len(around)),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    corner = np.arange(len(vertices)).reshape(len(up), len(around))
+    beside = np.roll(corner, -1, axis=1)
+    faces = quads(*(part.ravel() for part in (corner[:-1], beside[:-1], beside[1:], corner[1:])))
+    # Bottom and top are the rectangles between the poles of the four parts.
+    bottom, top = corner[0, :: facets + 1], corner[-1, :: facets + 1]
+    caps = [(bottom[0], bottom[3], bottom[2]), (bottom[0], bottom[2], bottom[1]), top[[0, 1, 2]], top[[0, 2, 3]]]
+    faces = np.concatenate([faces, np.array(caps)])
+    # Triangles at the poles have no area.
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return vertices, faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0]
