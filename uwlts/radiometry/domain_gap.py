@@ -185,7 +185,7 @@ def measure_domain_gap(
     if not generated and not real:
         raise DescriptionError("no images are given: give `generated` or `real` sets of images, or both")
     if most_images < 1:
-        raise RangeError(f"most_images is {most_images}; expected 1 or more")
+        raise RangeError(f"`most_images` is {most_images}; expected 1 or more")
     sources = [*generated, *real]
     found = []
     for number, source in enumerate(sources):
