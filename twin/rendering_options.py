@@ -75,12 +75,14 @@ class Flaws:
     """Number of grains of marine snow above 0.1 mm per litre, rendered individually in the laser's sheet."""
     bubbles: float = _flaw(off=0.0, typical=200.0, least=0.0, most=1e5)
     """Number of air bubbles above 0.1 mm in diameter per litre, which glint in the sheet."""
-    caustics: float = _flaw(off=0.0, typical=0.3, least=0.0, most=1.0)
-    """Strength of the daylight's pattern on surfaces under a wavy water surface."""
+    caustics: float = _flaw(off=0.0, typical=2.0, least=0.0, most=15.0)
+    """Wind speed in m/s over the water, whose waves focus daylight to moving filaments on surfaces."""
     stray_light: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.3)
     """Fraction of the laser's power in a wide pedestal of the sheet, which its optics scatter."""
     side_lobes: float = _flaw(off=0.0, typical=0.01, least=0.0, most=0.1)
     """Fraction of the laser's power in the two first side lobes of a beam that its aperture cuts."""
+    lamp_reflection: float = _flaw(off=0.0, typical=0.001, least=0.0, most=0.05)
+    """Reflectance of the camera's window for a ring lamp around the lens, which appears out of focus."""
     dirt: float = _flaw(off=0.0, typical=0.1, least=0.0, most=0.9)
     """Fraction of the camera's window that is covered with spots, which darken blurred patches of the image."""
     lamp_and_laser: bool = False

@@ -23,6 +23,7 @@ import numpy as np
 
 from twin.backend.arrays import Float, Point3f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
+from twin.light.caustics import CELLS, PATCH_MM, Caustics
 from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
 from twin.light.illumination import Light, make_lights
 from twin.light.image_sampling import (
@@ -69,10 +70,6 @@ _SPOT_ASIDE = 0.25
 """Offset of an uneven lamp's axis from the camera's axis, as a fraction of the view's corner slope."""
 _DRIFTING_STREAM = 7
 """Random number stream of particles and bubbles, separate from those of walks and noise."""
-_CAUSTIC_WAVES = 10
-"""Number of surface waves that form caustics."""
-_CAUSTIC_MM = (20.0, 120.0)
-"""Range of their wavelengths on the lit surfaces, for a rippled tank or harbour."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor moves, lit pixels are located at positions of this spacing."""
 _REACH_SHARE = 1.5
@@ -119,8 +116,8 @@ class LaserFrame:
 class Renderer:
     """Renderer of one sensor in one medium and one scene.
 
-    ``uneven_lamp`` is the relative loss of lamp light away from its spot. ``caustics`` is the contrast of daylight on
-    surfaces. ``drifting`` is the number of bodies of each kind per litre (`twin.rendering_options.Flaws`).
+    ``uneven_lamp`` is the relative loss of lamp light away from its spot. ``caustics`` is the water surface that
+    focuses daylight. ``drifting`` is the number of bodies of each kind per litre (`twin.rendering_options.Flaws`).
     ``surface_seed`` is the seed of random reflectances. DesignError if the sensor cannot work in the medium;
     DescriptionError if an object cannot be built.
     """
@@ -133,7 +130,7 @@ class Renderer:
         *,
         effects: Effects = ALL,
         uneven_lamp: float = 0.0,
-        caustics: float = 0.0,
+        caustics: Caustics | None = None,
         drifting: Mapping[Body, float] | None = None,
         surface_seed: int = 0,
     ):
@@ -163,7 +160,15 @@ class Renderer:
         self._last_stripe: tuple[SensorPose, np.ndarray, np.ndarray] | None = None
 
     def irradiance(
-        self, light: LightName, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
+        self,
+        light: LightName,
+        scene_from_object: np.ndarray,
+        *,
+        spp: int,
+        seed: int = 0,
+        travel: Travel | None = None,
+        time_s: float = 0.0,
+        exposure_s: float = 0.0,
     ) -> np.ndarray:
         """Return the irradiance (H, W) on the image sensor in W/mm2, float32.
 
@@ -179,13 +184,20 @@ class Renderer:
             Seed of the random walks. Equal arguments give equal images.
         travel
             Motion of the sensor during the exposure; None: at rest.
+        time_s, exposure_s
+            Time and duration of the exposure, for the waves of the water surface.
         """
         if light == "laser":
-            day = self.irradiance("day", scene_from_object, spp=spp, travel=travel)
+            day = self.irradiance(
+                "day", scene_from_object, spp=spp, travel=travel, time_s=time_s, exposure_s=exposure_s
+            )
             return day + self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
         if light == "day" and not (self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
             return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
-        return self._render_lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
+        pose, pattern = SensorPose(scene_from_object, travel), None
+        if self._caustics is not None and light == "day":
+            pattern = to_jit(mi.Float, self._caustics.pattern(time_s, exposure_s))
+        return self._render_lamp_frame(pose, spp=spp, ambient=light == "day", pattern=pattern)
 
     def laser_frame(
         self,
@@ -272,7 +284,8 @@ class Renderer:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Render the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
 
-        A line's surface is what lies within one standard deviation of the sheet of the plane through its point.
+        Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet
+        of the plane through its point.
 
         Parameters
         ----------
@@ -300,13 +313,13 @@ class Renderer:
         def sums(pose: SensorPose, bundle: Rays, after_s: Float | None, planes: Float) -> tuple[Float, ...]:
             segment = next(self._segments(pose, bundle, after_s))
             here = light.evaluate(segment.end(), after_s)
-            value = segment.weight * self._radiance(pose, segment, [light], after_s)
+            value = segment.weight * self._radiance(pose, segment, [light], after_s, lobes=False)
             pixel = dr.arange(mi.UInt32, dr.width(value)) // dr.opaque(mi.UInt32, spp)
             plane = dr.gather(mi.Vector4f, planes, pixel)
             away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
             same = dr.abs(away) <= here.sigma_mm
-            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm)) / here.sigma_mm
-            profile /= math.sqrt(2 * math.pi)
+            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm))
+            profile /= here.sigma_mm * math.sqrt(2 * math.pi)
             return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
 
         for part in _split_pixels(rows, columns, spp=spp):
@@ -322,21 +335,26 @@ class Renderer:
         mirrors = _MIRRORS if self._mirrors else 0
         return trace_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
 
-    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None) -> Float:
-        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start."""
+    def _radiance(
+        self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None, *, lobes: bool = True
+    ) -> Float:
+        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start.
+
+        It is that of the main parts of the sheets alone without ``lobes``.
+        """
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
             here = light.evaluate(end, after_s)
+            across = light.sheet.parts if lobes else light.sheet.parts[:1]
+            arriving = here.irradiance if lobes else across[0][0] * here.main_irradiance()
             # The light of a coat or metal leaves where it arrives, that of a body is spread.
-            parts = [(mi.BSDFContext(), here.irradiance)]
+            parts = [(mi.BSDFContext(), arriving)]
             if self.objects.translucent:
                 body, coat = mi.BSDFContext(), mi.BSDFContext()
                 body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
                 normal = pose.object_direction(segment.si.n, after_s)
-                parts = [
-                    (coat, here.irradiance),
-                    (body, spread_irradiance(self.objects, segment.si, normal, here, light.sheet)),
-                ]
+                spread = spread_irradiance(self.objects, segment.si, normal, here, across)
+                parts = [(coat, arriving), (body, spread)]
             bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
             lit = light.reaches(self.objects.scene, end, here, after_s, bright)
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
@@ -426,12 +444,14 @@ class Renderer:
 
     # --- lamp ---------------------------------------------------------------------------------------------------------
 
-    def _render_lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
+    def _render_lamp_frame(
+        self, pose: SensorPose, *, spp: int, ambient: bool = False, pattern: Float | None = None
+    ) -> np.ndarray:
         """Return the light (H, W) of lamp or daylight in W/mm2; only pixels with changes are sampled finely."""
         begin_kernels()
         bundle, shape = self.view.trace_grid(1)
         segment = next(self._segments(pose, bundle, None))
-        value = self._compute_even_light(segment, ambient)
+        value = self._compute_even_light(segment, ambient, pattern)
         depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
         nodes = value.numpy().reshape(shape)
@@ -444,27 +464,27 @@ class Renderer:
         image = 0.25 * combine_corners(np.add, nodes)
 
         def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None) -> tuple[Float]:
-            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient),)
+            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
 
         for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
             image[rows, columns] = self._render_pixels(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
         return image
 
-    def _compute_even_light(self, segment: RaySegment, ambient: bool) -> Float:
+    def _compute_even_light(self, segment: RaySegment, ambient: bool, pattern: Float | None) -> Float:
         """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
 
         A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight is isotropic, so the water
         scatters the radiance E / pi into every ray. The lamp is beside the camera, so only backscattered light returns.
         Up to the distance t, the veiling light is E / pi (1 - exp(-c t)) times the scattered fraction of the extinction
-        c (Duntley 1963, Eq. 4, for an even light field).
+        c (Duntley 1963, Eq. 4, for an even light field). ``pattern`` is that of focused daylight on surfaces.
         """
         lamp = self.sensor.lamp
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
         albedo = self.objects.albedo(segment.si) if ambient else self.objects.lamp_albedo(segment.si)
         radiance = dr.select(segment.valid, albedo * left, 0.0)
-        if self._caustics and ambient:
-            radiance *= self._caustic(segment.si.p)
+        if pattern is not None:
+            radiance *= self._caustic(segment.si.p, pattern)
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
@@ -472,26 +492,18 @@ class Renderer:
             radiance *= self._lamp_share(segment)
         return segment.weight * level * radiance
 
-    def _caustic(self, p: Point3f) -> Float:
-        """Return the daylight factor of focusing waves on surfaces at points of the scene; its mean is about 1.
+    def _caustic(self, p: Point3f, pattern: Float) -> Float:
+        """Return the relative daylight at points of the scene: the pattern at X and Y, interpolated linearly."""
+        x, y = p.x * (CELLS / PATCH_MM), p.y * (CELLS / PATCH_MM)
+        left, top = dr.floor(x), dr.floor(y)
 
-        A wavy surface of height h displaces rays by the length L times its slopes. The irradiance is proportional to 1
-        / |det(1 - L H)| with the second derivatives H of h (Lock and Andrews, Am. J. Phys. 60, 397, 1992). Waves of all
-        directions give the trace of L H the standard deviation ``caustics``; singularities at folds are clipped.
-        """
-        rng = np.random.default_rng(_DRIFTING_STREAM)
-        angle, phase = rng.uniform(0, 2 * math.pi, (2, _CAUSTIC_WAVES))
-        number = 2 * math.pi / np.geomspace(*_CAUSTIC_MM, _CAUSTIC_WAVES)
-        xx, xy, yy = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
-        for k, a, start in zip(number.tolist(), angle.tolist(), phase.tolist(), strict=True):
-            x, y = math.cos(a), math.sin(a)
-            bend = math.sqrt(2 / _CAUSTIC_WAVES) * dr.cos(k * (x * p.x + y * p.y) + start)
-            xx, xy, yy = xx + x * x * bend, xy + x * y * bend, yy + y * y * bend
-        size = opaque(self._caustics)
-        determinant = (1 - size * xx) * (1 - size * yy) - dr.square(size * xy)
-        # For a normally distributed trace t, the mean of 1 / (1 - t) is 1 + std^2 + 3 std^4 + ...
-        mean = 1 + dr.square(size) + 3 * dr.square(dr.square(size))
-        return 1 / (dr.clip(dr.abs(determinant), 0.15, 10.0) * mean)
+        def read(beside: int, below: int) -> Float:
+            column, row = mi.Int32(left) + beside, mi.Int32(top) + below
+            # The number of cells is a power of two, so that the bits below it count periodically.
+            return dr.gather(mi.Float, pattern, mi.UInt32((row & (CELLS - 1)) * CELLS + (column & (CELLS - 1))))
+
+        above, below = (dr.lerp(read(0, row), read(1, row), x - left) for row in (0, 1))
+        return dr.lerp(above, below, y - top)
 
     def _lamp_share(self, segment: RaySegment) -> Float:
         """Return the fraction of lamp light at the end of camera rays: a round Gaussian spot about the lamp's axis.

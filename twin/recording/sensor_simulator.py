@@ -6,6 +6,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from twin.light.caustics import Caustics
+from twin.light.lamp_ring import reflect_ring
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth, measure_line_light
@@ -131,7 +133,7 @@ class SensorSimulator:
             scene,
             effects=options.effects,
             uneven_lamp=flaws.uneven_lamp,
-            caustics=flaws.caustics,
+            caustics=self._water_surface(),
             drifting={"particles": flaws.particles, "bubbles": flaws.bubbles},
             surface_seed=options.seed,
         )
@@ -143,6 +145,7 @@ class SensorSimulator:
         if flaws.dirt and mounted:
             clean = dirt(camera, flaws.dirt, seed=options.seed)
             self._passed = clean if self._passed is None else self._passed * clean
+        self._lamp_ring = self._reflect_lamp() if flaws.lamp_reflection and mounted else None
         self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else None
         self.peak_finder = None
         if flaws.camera_3d:
@@ -153,6 +156,29 @@ class SensorSimulator:
         self.exposure_ms = {light: self._exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
         longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
         self.period_s = self._period_s(max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz))
+
+    def _reflect_lamp(self) -> np.ndarray:
+        """Return the irradiance (H, W) by the lamp ring that the camera's window reflects."""
+        return reflect_ring(
+            self.renderer.view,
+            self.sensor,
+            irradiance_w_per_m2=self.sensor.lamp.irradiance_w_per_m2,
+            distance_mm=float(camera_from_object(self.sensor)[2, 3]),
+            reflectance=self.options.flaws.lamp_reflection,
+        )
+
+    def _water_surface(self) -> Caustics | None:
+        """Return the waves above the scene; None without daylight or wind."""
+        wind, wavelength = self.options.flaws.caustics, self.sensor.laser.wavelength_nm
+        if wind == 0 or self.medium.kind == "air":
+            return None
+        return Caustics(
+            wind_m_s=wind,
+            depth_mm=1e3 * self.scene.depth_m,
+            index=self.medium.refractive_index(wavelength),
+            scattering_per_mm=self.medium.scattering_per_mm(wavelength),
+            seed=self.options.seed,
+        )
 
     def _period_s(self, shortest_s: float) -> float:
         """Return the time between shots: motion or settling of the platform, exposure and read-out of the camera.
@@ -231,10 +257,20 @@ class SensorSimulator:
         return self._electrons_per_ms(*self._light(shot, spp=spp, seed=seed, travel=travel), shot)
 
     def _light(
-        self, shot: Shot, *, spp: int, seed: int, travel: Travel | None, through_water: Travel | None = None
+        self,
+        shot: Shot,
+        *,
+        spp: int,
+        seed: int,
+        travel: Travel | None,
+        through_water: Travel | None = None,
+        time_s: float = 0.0,
+        exposure_s: float = 0.0,
     ) -> ShotLight:
         others, pose = "lamp" if self.shows(shot, "lamp") else "day", self.pose(shot)
-        even = self.renderer.irradiance(others, pose, spp=spp, travel=travel)
+        even = self.renderer.irradiance(others, pose, spp=spp, travel=travel, time_s=time_s, exposure_s=exposure_s)
+        if others == "lamp" and self._lamp_ring is not None:
+            even = even + self._lamp_ring
         if not self.shows(shot, "laser"):
             return even, None
         return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel, through_water=through_water)
@@ -282,8 +318,19 @@ class SensorSimulator:
         """Return the light of image number ``index`` before the lens."""
         self._shift_points(shot, index)
         seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
-        motion = {"travel": self.travel(shot), "through_water": self.through_water(shot)}
-        return self._light(shot, spp=self.options.spp, seed=seed, **motion)
+        return self._light(
+            shot,
+            spp=self.options.spp,
+            seed=seed,
+            travel=self.travel(shot),
+            through_water=self.through_water(shot),
+            time_s=self._time_s(shot, index),
+            exposure_s=1e-3 * self.exposure_ms[shot.light] * shot.exposure,
+        )
+
+    def _time_s(self, shot: Shot, index: int) -> float:
+        """Return the time of an image since the first of the scan."""
+        return index * self.period_s if shot.time_s is None else shot.time_s
 
     def frame(self, shot: Shot, index: int) -> Frame:
         """Return image number ``index`` of the scan with its metadata in the capture."""
@@ -305,7 +352,7 @@ class SensorSimulator:
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
-            time_s=index * self.period_s if shot.time_s is None else shot.time_s,
+            time_s=self._time_s(shot, index),
             pose=pose,
             pose_covariance=covariance,
             speed_mm_per_s=self.speed_mm_per_s(),

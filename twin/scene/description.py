@@ -223,13 +223,15 @@ class Scene(Description):
     ``medium`` is one of the sensor's media. ``water`` replaces its dissolved and suspended matter, by the name of a
     water or a turbidity from 0 (pure) to 3 (harbour). ``artefact`` and ``target`` are what an operator would record
     about the objects (calibrated values, the description of the target); they are stored in the capture.
-    ``current_mm_per_s`` is the velocity of the water and its particles in scene coordinates.
+    ``current_mm_per_s`` is the velocity of the water and its particles in scene coordinates. ``depth_m`` is the depth
+    below the water surface, whose waves focus daylight (effect ``caustics``).
     """
 
     title: str
     medium: str = "water"
     water: str | Annotated[float, Field(ge=0, le=3)] | None = None
     current_mm_per_s: Vector = (0.0, 0.0, 0.0)
+    depth_m: Positive = 1.0
     motion: AnyMotion = Motion()
     objects: Annotated[tuple[AnyObject, ...], Field(min_length=1)]
     placements: dict[str, Pose] = {"standoff": Pose()}

@@ -48,13 +48,13 @@ class Truth(Brief):
     ``depth_mm (H, W)`` is the camera-frame z of the surface at every pixel in the first frame. Missing values are NaN.
     ``pose (F, 4, 4)`` is ``T_scene_object`` of the sensor's OCS in mm.
 
-    The light of a line's stripe is that of directly lit surfaces over pixel, pupil and exposure, without speckle, haze
-    and noise. The stripe is the run of pixels about the centre that exceed 1e-3 of the light there. ``centroid_px (F,
-    L)`` is its centroid across the stripe. ``visible_fraction (F, L)`` is the fraction of the sheet's profile that is
-    lit and seen on the surface at the centre: 1 for a whole stripe, less where an edge, a shadow or the image's border
-    cuts it. ``mixed_fraction (F, L)`` is the fraction of the light from other surfaces, which are farther than one
-    standard deviation of the sheet from the tangent plane at the centre. Files of earlier versions have None in place
-    of these and of the pose.
+    The light of a line's stripe is that of directly lit surfaces over pixel, pupil and exposure, without speckle, haze,
+    side lobes and noise. The stripe is the run of pixels about the centre that exceed 1e-3 of the light there.
+    ``centroid_px (F, L)`` is its centroid across the stripe. ``visible_fraction (F, L)`` is the fraction of the sheet's
+    profile that is lit and seen on the surface at the centre: 1 for a whole stripe, less where an edge, a shadow or the
+    image's border cuts it. ``mixed_fraction (F, L)`` is the fraction of the light from other surfaces, which are
+    farther than one standard deviation of the sheet from the tangent plane at the centre. Files of earlier versions
+    have None in place of these and of the pose.
     """
 
     centre_px: np.ndarray

@@ -279,7 +279,9 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["stripe-turbid", "stripe-shiny", "pipe-inspection", "calibration-boards"])
+@pytest.mark.parametrize(
+    "name", ["stripe-turbid", "stripe-shiny", "stripe-tank", "pipe-inspection", "calibration-boards"]
+)
 def test_presets_are_rendered(name, tmp_path):
     samples = twin.load_dataset(twin.dataset(name, out=tmp_path / name, scenes=2, workers=1))
     for sample in samples:

@@ -26,6 +26,7 @@ from tests.virtual_sensors import (
 from twin.backend.arrays import to_jit, to_numpy
 from twin.light.renderer import Renderer
 from twin.light.sheet import PowerTable, Sheet
+from twin.recording.frame_truth import find_true_stripe, measure_line_light
 from twin.rendering_options import NONE, Flaws
 from twin.sensor.flaws import as_built
 from uwlts.errors import DescriptionError, DesignError
@@ -325,10 +326,11 @@ def test_a_cut_beam_has_its_first_side_lobes_where_diffraction_puts_them(thesis)
 def test_side_lobes_appear_beside_the_stripe(thesis):
     wide = altered(cropped(thesis, 32, 400), {"laser": {"waist_radius_mm": 0.6, "side_lobes": [[8.0, 1.0, 0.1]]}})
     plain = altered(wide, {"laser": {"side_lobes": []}})
-    frames = [
-        Renderer(each, WATER, scene_of(plate()), effects=NONE).laser_frame(sensor_at(), spp=16)
-        for each in (plain, wide)
-    ]
+    renderers = [Renderer(each, WATER, scene_of(plate()), effects=NONE) for each in (plain, wide)]
+    frames = [each.laser_frame(sensor_at(), spp=16) for each in renderers]
+    truths = [measure_line_light(each, sensor_at(), find_true_stripe(each, sensor_at()), spp=16) for each in renderers]
+    for name in ("centre_px", "centroid_px", "visible_fraction", "mixed_fraction"):
+        np.testing.assert_allclose(*(getattr(truth, name) for truth in truths), atol=1e-5, err_msg=name)
     first, second = (frame.direct().astype(float).sum(axis=1) for frame in frames)
     place = np.arange(400)
     centre = (place * first).sum() / first.sum()

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, camera_axes, clear, cropped, oracle_paths, plate, scene_of, sensor_at
+from twin.light.camera import CameraView
+from twin.light.lamp_ring import RING_MM, reflect_ring
 from twin.light.renderer import Renderer
 from twin.recording.record_scene import record_scene
 from twin.recording.sensor_simulator import SensorSimulator
@@ -22,9 +24,10 @@ TYPICAL = [
     "uneven-lamp=0.6",
     "particles=1000",
     "bubbles=200",
-    "caustics=0.3",
+    "caustics=2",
     "stray-light=0.02",
     "side-lobes=0.01",
+    "lamp-reflection=0.001",
     "dirt=0.1",
     "lamp-and-laser",
     "pixel-aspect=1.002",
@@ -98,31 +101,41 @@ def test_what_is_no_flaw_is_refused(text, message):
 def test_each_flaw_alone_changes_an_image(sensor, plain, name):
     changed = images(studio(sensor, name))
     assert max(np.abs(a - b).max() for a, b in zip(plain, changed, strict=True)) >= 1
-    uneven = name == "uneven-lamp"
-    assert (plain[1] == changed[1]).all() == uneven, "an uneven lamp leaves the laser's image as it is"
+    of_lamp = name in ("uneven-lamp", "lamp-reflection")
+    assert (plain[1] == changed[1]).all() == of_lamp, "the lamp does not change the laser's image"
 
 
-def test_caustics_pattern_the_days_light_on_surfaces_alone(sensor):
-    bright = altered(sensor, {"lamp": {"ambient_w_per_m2": 20.0}})
-    scene = scene_of(plate(side=400.0))
-    day = replace(NONE, ambient=True)
-    even, faint, strong = (
-        Renderer(bright, clear(), scene, effects=day, caustics=size).irradiance("day", sensor_at(), spp=4)
-        for size in (0.0, 0.05, 0.3)
-    )
-    inside = even > 0.5 * even.max()
-    assert inside.mean() > 0.5
-    for image, size in ((faint, 0.05), (strong, 0.3)):
-        share = image[inside] / even[inside]
-        # The trace's standard deviation is the strength; over a field of some waves it is known to a third of itself,
-        # and of strong ones the bright crests stand out.
-        assert 0.6 * size < share.std() < 2.0 * size
-        assert share.mean() == pytest.approx(1.0, abs=0.05 + size**2)
-    lamp = [
-        Renderer(bright, clear(), scene, effects=day, caustics=c).irradiance("lamp", sensor_at(), spp=4)
-        for c in (0.0, 0.3)
-    ]
-    np.testing.assert_array_equal(*lamp)
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (1.0, -0.5)])
+def test_a_ring_lamp_is_seen_mirrored_by_the_window(thesis, tilt):
+    window = {"tilt_x_deg": tilt[0], "tilt_y_deg": tilt[1]}
+    (inner, outer), images = RING_MM, []
+    for f_number in (100.0, 4.0):
+        sensor = altered(thesis, {"camera": {"f_number": f_number, "window": window}})
+        view, lamp = CameraView(sensor, clear()), {"irradiance_w_per_m2": 4.0, "distance_mm": 400.0}
+        images.append(reflect_ring(view, sensor, reflectance=0.02, **lamp).astype(float))
+    camera, image = sensor.camera, images[0]
+    y, x = np.indices(image.shape)
+    cx, cy = camera.principal_point()
+    focal, normal = camera.focal_length_px(), camera.window.normal()
+    # The mirrored ring is as far behind the window as the pupil is before it, about the mirror image of the pupil.
+    mirrored = 2 * camera.window.distance_mm * normal[2] * normal
+    centre = np.array([cx, cy]) + focal * mirrored[:2] / mirrored[2]
+    apparent = focal / mirrored[2]
+    away = np.hypot(x - centre[0], y - centre[1]) / apparent
+    on_ring, inside = (away > inner + 0.6) & (away < outer - 0.6), away < inner - 0.6
+    assert on_ring.sum() > 1e4
+    # Seen slanted by the tilt, the ring is an ellipse to 0.1 mm; a cell of 4 px is 0.2 mm, the blur of f/100 0.1 mm.
+    assert image[inside].max() < 0.02 * image.max() and image[away > outer + 0.6].max() < 0.02 * image.max()
+    # The radiance of a ring that illuminates surfaces with 4 W/m2, by a sum over its elements, through the lens.
+    radius = np.linspace(inner, outer, 2001)
+    per_radiance = np.trapezoid(2 * np.pi * radius * 400.0**2 / (400.0**2 + radius**2) ** 2, radius)
+    working = 100.0 * (1 + camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm))
+    expected = 0.02 * 4e-6 / per_radiance * np.pi / 4 / working**2
+    cosine = 1 / np.sqrt(1 + ((x - cx) ** 2 + (y - cy) ** 2) / focal**2)
+    np.testing.assert_allclose((image / cosine**4)[on_ring], expected, rtol=0.02)
+    # At f/4 the ring is blurred over a sixth of its width more, and keeps its light: irradiance grows by 25 squared.
+    assert (images[1] > 0.02 * images[1].max()).sum() > 1.1 * (image > 0.02 * image.max()).sum()
+    assert images[1].max() == pytest.approx(625 * image.max(), rel=0.1)
 
 
 def test_dirt_takes_its_share_in_patches_as_wide_as_the_pupil(sensor):

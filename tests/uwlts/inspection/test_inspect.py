@@ -421,7 +421,7 @@ def test_a_weld_of_few_profiles_far_apart_is_refused():
         along=(-12, 13, 4.0),
         across=(-40, 40, 300),
     )
-    with pytest.raises(EvaluationError, match="points in whole sections .* scan with profiles closer together"):
+    with pytest.raises(EvaluationError, match="points of complete sections, .* scan with profiles closer together"):
         uwlts.inspect_weld(cloud)
 
 
