@@ -412,6 +412,19 @@ def test_a_weld_is_measured(undercut, offset):
     assert np.abs(weld.axes[0]) == pytest.approx([1, 0, 0], abs=0.02)
 
 
+def test_a_weld_of_few_profiles_far_apart_is_refused():
+    """Sections of 3 mm with profiles 4 mm apart: many have no points, and no strip along the weld has 50."""
+    cloud = flat_scan(
+        np.random.default_rng(10),
+        lambda x, y: weld_height(x, y, undercut=0.1, offset=0.0),
+        everywhere,
+        along=(-12, 13, 4.0),
+        across=(-40, 40, 300),
+    )
+    with pytest.raises(EvaluationError, match="points of complete sections, .* scan with profiles closer together"):
+        uwlts.inspect_weld(cloud)
+
+
 def test_noise_does_not_raise_a_bead_on_average():
     """The mean of eight draws of 0.003 mm is within 4.5 deviations of 0.001 mm, and the correction of 0.005 mm once."""
     heights = []
