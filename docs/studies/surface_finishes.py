@@ -26,6 +26,8 @@ PICTURE = Path(__file__).resolve().parents[1] / "pictures" / "surface-finishes.p
 SHOWN = ("scatter", "correlation", "lowest", "gaps")
 """Statistics of windows in the table."""
 FRAMES = 5
+_LINES, _HALF_PX = (240, 1040), 20
+"""Lines of the picture, and half its height."""
 _TILT_DEG = (20.0, 15.0, 0.0)
 
 
@@ -60,10 +62,11 @@ def main(*, real: tuple[str, ...] = (), write: bool = False) -> None:
             path = twin.simulate(scene, out=Path(folder) / "stripe.h5", sensor="thesis")[0]
             cells = cells_of(path)
         recording = twin.render(scene, sensor="thesis", frames=[FRAMES // 2])
-        shift = (recording.truth.centroid_px - recording.truth.centre_px)[np.isfinite(recording.truth.centroid_px)]
+        centroid = recording.truth.centroid_px
+        assert centroid is not None  # by rendering
+        shift = (centroid - recording.truth.centre_px)[np.isfinite(centroid)]
         rows.append([finish, *cells, f"{shift.mean():+.3f}", f"{shift.std():.3f}"])
-        row = round(float(np.nanmedian(recording.truth.centre_px)))
-        strips.append((finish, recording.images[0, row - 24 : row + 25, 300:940]))
+        strips.append((finish, straighten(recording.images[0], recording.truth.centre_px[0])))
         print(rows[-1], flush=True)
     head = [
         "surface",
@@ -80,8 +83,15 @@ def main(*, real: tuple[str, ...] = (), write: bool = False) -> None:
         draw(strips)
 
 
+def straighten(image: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
+    """Return the middle lines of an image (H, W), shifted by whole pixels so that the true centre is in the middle."""
+    columns = np.arange(*_LINES)
+    rows = np.rint(centre_px[columns]).astype(int) + np.arange(-_HALF_PX, _HALF_PX + 1)[:, None]
+    return image[rows, columns]
+
+
 def draw(strips: list[tuple[Finish, np.ndarray]]) -> None:
-    """Draw the middle of the stripe on each finish."""
+    """Draw the straightened stripe on each finish."""
     figure, axes = plt.subplots(len(strips), 1, figsize=(8.0, 0.78 * len(strips)), layout="constrained")
     for axis, (finish, image) in zip(axes, strips, strict=True):
         axis.imshow((image / image.max()) ** 0.6, cmap="gray", interpolation="none", aspect="auto")

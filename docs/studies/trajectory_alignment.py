@@ -62,6 +62,9 @@ KINDS = {
     "steady rate 95 %, random walk 5 %": {"rate": 0.95, "walk": 0.05},
     "steady rate 50 %, random walk 50 %": {"rate": 0.5, "walk": 0.5},
     "random walk": {"walk": 1.0},
+    "Gauss-Markov rate, correlation time 0.05 of the path": {"wandering": 1.0, "correlation": 0.05},
+    "Gauss-Markov rate, correlation time 0.5 of the path": {"wandering": 1.0, "correlation": 0.5},
+    "half steady rate, half Gauss-Markov rate of 0.2": {"rate": 0.5, "wandering": 0.5, "correlation": 0.2},
 }
 RIDE = {"rate": (1.2**3 - 0.7**3) / 1.5, "wave": 0.2}
 """Drift of `ride`: a rate of 0.7 to 1.2 times the drift, and a wave of a fifth of it."""
@@ -169,7 +172,7 @@ def given_crossings(
     for pair in _true_pairs(
         [correct_places(correction(p.times_s), p.platform_mm, p.places_mm) for p in estimate.pieces]
     ):
-        own = estimate.surfaces[pair[1]].places_mm
+        own = estimate.surface(pair[1]).places_mm
         middle = own.mean(axis=0)
         relative = estimate.relative_movement(pair, middle) @ correction(estimate.prior.nodes_s).T.ravel()
         std = survey.radius_mm * np.repeat([1.0, 1 / float(np.sqrt(np.mean(np.sum((own - middle) ** 2, axis=1))))], 3)
@@ -203,21 +206,24 @@ def _true_pairs(places: list[np.ndarray]) -> list[tuple[int, int]]:
     return sorted(chosen, key=lambda pair: pair[1])
 
 
-def bounds(*, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave: float = 0.0) -> str:
+def bounds(
+    *, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave: float = 0.0, correlation: float = np.inf
+) -> str:
     """Return, as text, the factors that three exact crossings can reduce the rms error of a path by.
 
     The drift is a Gaussian process. Its variance at the end is the sum of ``rate`` (steady rate), ``wandering`` (rate
-    with a random walk) and ``walk`` (random walk). ``wave`` is the amplitude of the wave of `ride`. The known
-    displacement is that within each crossing, or at two positions of it, which also determines the rates. The linear
-    Gaussian estimate with the true covariance has the smallest possible error. `align_trajectory` knows only the size
-    of the drift: it uses its own model with the most likely walk.
+    with a random walk, or Gauss-Markov rate with a ``correlation`` time) and ``walk`` (random walk). ``wave`` is the
+    amplitude of the wave of `ride`. The known displacement is that within each crossing, or at two positions of it,
+    which also determines the rates. The linear Gaussian estimate with the true covariance has the smallest possible
+    error. `align_trajectory` knows only the size of the drift: it uses its own model with the most likely random walk
+    and correlation time.
     """
     found = []
     for apart in (0.0, SWATH_MM / LENGTH_MM):
         ends = [np.add(crossing, off) for crossing, off in product(CROSSINGS, (-apart / 2, apart / 2))]
         t = np.concatenate([GRID, np.ravel(ends)])
         first, second = np.minimum(t[:, None], t), np.maximum(t[:, None], t)
-        true = rate * np.outer(t, t) + wandering * first**2 * (3 * second - first) / 2 + walk * first
+        true = rate * np.outer(t, t) + wandering * _wandered(first, second, correlation) + walk * first
         turns = 2 * np.pi * 0.8 * t
         true += wave**2 / 2 * (np.cos(turns[:, None] - turns) - np.cos(turns)[:, None] - np.cos(turns) + 1)
         seen = np.zeros((len(ends), len(t)))
@@ -226,7 +232,7 @@ def bounds(*, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave
         _, std, _ = _estimated(true, seen)
         found.append(float(np.sqrt(np.mean(np.diag(true)[: len(GRID)]) / np.mean(std**2))))
     models = [
-        _estimated(model.covariance(t[:, None], t, 1.0)[0], seen) for model in DriftModel.of_size(1.0, 1.0).with_walks()
+        _estimated(model.covariance(t[:, None], t, 1.0)[0], seen) for model in DriftModel.of_size(1.0, 1.0).candidates()
     ]
     rng, root = np.random.default_rng(0), np.linalg.cholesky(true + EXACT * np.eye(len(t)))
     before, after, inside, sizes = [], [], [], []
@@ -244,6 +250,18 @@ def bounds(*, rate: float = 0.0, wandering: float = 0.0, walk: float = 0.0, wave
         f"{100 * np.mean(inside):.0f} % within twice what is stated; errors of one drift are {_rms(sizes):.2f} times "
         f"those stated (rms), {max(sizes):.1f} times in the worst of {DRIFTS}"
     )
+
+
+def _wandered(first: np.ndarray, second: np.ndarray, correlation: float) -> np.ndarray:
+    """Return the covariance of the integral of a rate between times, relative to the variance at time 1.
+
+    The rate has the covariance exp(-|t - u| / T) of a Gauss-Markov process, or that of a random walk for T = inf.
+    """
+    if np.isinf(correlation):
+        return first**2 * (3 * second - first) / 2
+    of_first, of_second, apart = (np.exp(-each / correlation) for each in (first, second, second - first))
+    end = 2 / correlation + 2 * np.exp(-1 / correlation) - 2
+    return (2 * first / correlation + of_first + of_second - 1 - apart) / end
 
 
 def _estimated(covariance: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -237,6 +237,8 @@ PAGES_RUN = {
         tables={"small-pipe-campaign.toml": 0},
         instead={
             "--campaigns 2 --every 4": "--campaign small-pipe-campaign.toml --campaigns 1 --every 4",
+            "--campaign detection --water coastal --campaigns 2 --every 2": "--campaign small-pipe-campaign.toml "
+            "--campaigns 1 --every 4",
             "--campaigns 10": "--campaigns 1 --every 4",
         },
     ),

@@ -308,12 +308,12 @@ class Renderer:
         along_width = self.sensor.camera.stripe_along == "width"
         known = np.isfinite(points_mm[columns if along_width else rows, 0])
         rows, columns, found = rows[known], columns[known], [np.zeros((3, 0), np.float32)]
-        (light,), _ = make_lights([self.sheet.without_side_lobes()], pose)
+        (light, *_), _ = make_lights(self._sheets[:1], pose)
 
         def sums(pose: SensorPose, bundle: Rays, after_s: Float | None, planes: Float) -> tuple[Float, ...]:
             segment = next(self._segments(pose, bundle, after_s))
             here = light.evaluate(segment.end(), after_s)
-            value = segment.weight * self._radiance(pose, segment, [light], after_s)
+            value = segment.weight * self._radiance(pose, segment, [light], after_s, lobes=False)
             pixel = dr.arange(mi.UInt32, dr.width(value)) // dr.opaque(mi.UInt32, spp)
             plane = dr.gather(mi.Vector4f, planes, pixel)
             away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
@@ -335,21 +335,26 @@ class Renderer:
         mirrors = _MIRRORS if self._mirrors else 0
         return trace_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
 
-    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None) -> Float:
-        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start."""
+    def _radiance(
+        self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None, *, lobes: bool = True
+    ) -> Float:
+        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start.
+
+        It is that of the main parts of the sheets alone without ``lobes``.
+        """
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
             here = light.evaluate(end, after_s)
+            across = light.sheet.parts if lobes else light.sheet.parts[:1]
+            arriving = here.irradiance if lobes else across[0][0] * here.main_irradiance()
             # The light of a coat or metal leaves where it arrives, that of a body is spread.
-            parts = [(mi.BSDFContext(), here.irradiance)]
+            parts = [(mi.BSDFContext(), arriving)]
             if self.objects.translucent:
                 body, coat = mi.BSDFContext(), mi.BSDFContext()
                 body.type_mask, coat.type_mask = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
                 normal = pose.object_direction(segment.si.n, after_s)
-                parts = [
-                    (coat, here.irradiance),
-                    (body, spread_irradiance(self.objects, segment.si, normal, here, light.sheet)),
-                ]
+                spread = spread_irradiance(self.objects, segment.si, normal, here, across)
+                parts = [(coat, arriving), (body, spread)]
             bright = segment.valid & (sum((value for _, value in parts), mi.Float(0.0)) > 0)
             lit = light.reaches(self.objects.scene, end, here, after_s, bright)
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
@@ -476,7 +481,8 @@ class Renderer:
         lamp = self.sensor.lamp
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
-        radiance = dr.select(segment.valid, self.objects.albedo(segment.si) * left, 0.0)
+        albedo = self.objects.albedo(segment.si) if ambient else self.objects.lamp_albedo(segment.si)
+        radiance = dr.select(segment.valid, albedo * left, 0.0)
         if pattern is not None:
             radiance *= self._caustic(segment.si.p, pattern)
         if self.effects.haze and self.scattering.coefficient > 0:

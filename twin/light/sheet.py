@@ -12,7 +12,6 @@ identified by the angle in rad between the axis and its projection along x.
 from __future__ import annotations
 
 import math
-from copy import copy
 from dataclasses import dataclass
 from typing import assert_never, cast
 
@@ -47,6 +46,10 @@ _SMALLEST_SPREAD_MM = 1e-3
 """Smallest distance from the fan's vertex; rays closer to it are treated as at this distance."""
 
 
+Part = tuple[Float, Float, Float]
+"""Gaussian across a sheet: share of the power; place and standard deviation in standard deviations of the main one."""
+
+
 @dataclass(frozen=True)
 class SheetLight:
     """Light of the sheet at points: distance, width, irradiance in W/mm2 perpendicular to the ray, direction.
@@ -64,14 +67,19 @@ class SheetLight:
     normal: Vector3f
     exit_mm: Float
 
+    def main_irradiance(self) -> Float:
+        """Return the irradiance in W/mm2 if all power were in the main part of the sheet."""
+        return self.in_middle * dr.exp(-0.5 * dr.square(self.distance_mm / self.sigma_mm))
+
 
 class Sheet:
     """The lit surface of a laser in a medium: of the sensor's main laser, or of ``laser``, another laser of the sensor.
 
     ``power_w`` is the power behind the window, before absorption. ``begins_at_z_mm`` is the smallest Z of the window's
-    outer face in the OCS, before which there is no light. Side lobes make the lit surface ``reach`` times as wide. The
-    sheet of another laser has its own OCS; ``own_from_object`` (4, 4) transforms from the sensor's OCS to it.
-    DesignError if part of the fan does not pass the window, or the window bends the fan too unevenly.
+    outer face in the OCS, before which there is no light. ``parts`` are the Gaussians across the sheet, the main one
+    first. Side lobes make the lit surface ``reach`` times as wide. The sheet of another laser has its own OCS;
+    ``own_from_object`` (4, 4) transforms from the sensor's OCS to it. DesignError if part of the fan does not pass the
+    window, or the window bends the fan too unevenly.
     """
 
     def __init__(self, sensor: Sensor, medium: Medium, laser: Laser | None = None):
@@ -108,16 +116,10 @@ class Sheet:
         self._waist, self._rayleigh, self._waist_at = map(opaque, (waist, rayleigh, laser.waist_distance_mm))
         lobes = [(share, 2 * offset, radius) for offset, radius, share in laser.side_lobes]
         main = (1 - math.fsum(share for share, _, _ in lobes), 0.0, 1.0)
-        self.parts = [tuple(map(opaque, part)) for part in (main, *lobes)]
-        reaches = [(2 * abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS for offset, radius, _ in laser.side_lobes]
-        self.reach = max(1.0, *reaches) if reaches else 1.0
+        self.parts: list[Part] = [(opaque(share), opaque(at), opaque(radius)) for share, at, radius in (main, *lobes)]
+        reaches = [(abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS for _, offset, radius in lobes]
+        self.reach = max([1.0, *reaches])
         self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))
-
-    def without_side_lobes(self) -> Sheet:
-        """Return the sheet with all its power in the main Gaussian."""
-        alone = copy(self)
-        alone.parts, alone.reach = [tuple(map(opaque, (1.0, 0.0, 1.0)))], 1.0
-        return alone
 
     def evaluate(self, p: Point3f) -> SheetLight:
         """Return the light of the sheet at points in the OCS.

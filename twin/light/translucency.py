@@ -6,16 +6,18 @@ edges are those of the point where the light leaves, so light does not pass arou
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
 from twin.backend.arrays import Float, SurfaceInteraction3f, Vector3f
-from twin.light.sheet import Sheet, SheetLight
+from twin.light.sheet import Part, SheetLight
 from twin.scene.objects import Objects
 
 
 def spread_irradiance(
-    objects: Objects, si: SurfaceInteraction3f, normal: Vector3f, here: SheetLight, sheet: Sheet
+    objects: Objects, si: SurfaceInteraction3f, normal: Vector3f, here: SheetLight, parts: Sequence[Part]
 ) -> Float:
     """Return the irradiance in W/mm2 that light leaving the bodies at surface points stands for.
 
@@ -33,8 +35,8 @@ def spread_irradiance(
         Unit normals there in the OCS.
     here
         Light of the sheet there.
-    sheet
-        The sheet, whose profile is a sum of Gaussians.
+    parts
+        The Gaussians across the sheet.
     """
     across = dr.dot(normal, here.normal)
     tilted, variance = 1 - dr.square(across), dr.square(here.sigma_mm)
@@ -42,7 +44,7 @@ def spread_irradiance(
     ahead = dr.dot(here.direction, here.normal) - cosine * across
     distance = here.distance_mm - objects.spread_ahead_mm(si, cosine) * ahead
     total = mi.Float(0.0)
-    for share, offset, radius in sheet.parts:
+    for share, offset, radius in parts:
         squared, narrow = dr.square(distance - offset * here.sigma_mm), variance * dr.square(radius)
         for weight, added in objects.spread_parts(si):
             wide = narrow + added * tilted

@@ -111,8 +111,9 @@ class PrintedPlate(SceneObject, ABC):
 
     def scale_reflectance(self, scale: float) -> Self:
         """Return the plate with all reflectances multiplied by ``scale``."""
-        printed = [name for name in type(self).model_fields if name.endswith("_reflectance")]
-        values = {name: getattr(self, name) for name in printed} | {"reflectance": self.background_reflectance()}
+        own = set(type(self).model_fields) - set(SceneObject.model_fields)
+        printed = {name: getattr(self, name) for name in own if name.endswith("_reflectance")}
+        values = printed | {"reflectance": self.background_reflectance()}
         return self.model_copy(update={name: scale * value for name, value in values.items()})
 
     def background_reflectance(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, assert_never, cast
@@ -52,7 +53,8 @@ class Objects:
     ``scene`` contains what scatters light and ``mirrors`` the specular faces. Tables list a property of each shape at
     its number in Dr.Jit's registry, which is common to all scenes of the process. ``coherent`` is True if adjacent rays
     are traced faster together, as for meshes but not for spheres and cylinders. ``glossy`` is True if the albedo of any
-    object depends on direction. ``translucent`` is True if light spreads in the body of any object.
+    object depends on direction. ``translucent`` is True if light spreads in the body of any object,
+    and ``retroreflects`` if any returns the lamp's light.
     """
 
     scene: mi.Scene
@@ -60,6 +62,7 @@ class Objects:
     coherent: Bool
     glossy: bool
     translucent: bool
+    retroreflects: bool
     _facts: dict[str, Float]
 
     def mirror_share(self, si: SurfaceInteraction3f) -> Float:
@@ -73,6 +76,15 @@ class Objects:
     def roughness_um(self, si: SurfaceInteraction3f) -> Float:
         """Return the rms height of the objects hit; 0 without a hit."""
         return self._fact("roughness_um", si)
+
+    def lamp_albedo(self, si: SurfaceInteraction3f) -> Float:
+        """Return the radiance of surfaces lit from the camera with the radiance 1 of a uniform sky, as `albedo`.
+
+        A retroreflecting front adds pi times its coefficient of retroreflected luminance.
+        """
+        if not self.retroreflects:
+            return self.albedo(si)
+        return self.albedo(si) + math.pi * dr.select(si.wi.z > 0, self._fact("retroreflection", si), 0.0)
 
     def spread_ahead_mm(self, si: SurfaceInteraction3f, cosine: Float) -> Float:
         """Return the mean way of light in the bodies hit, per sine of its incidence angle of the given cosine.
@@ -156,6 +168,7 @@ def build_objects(
         "two_sided": [isinstance(thing, (Mesh, FreeForm)) for thing in things],
         "albedo_black": [black for black, _ in parts],
         "albedo_per_unit": [per_unit for _, per_unit in parts],
+        "retroreflection": [thing.retroreflection for thing in things],
         "spread_weights": [spread.weights for spread in spreads],
         "spread_variances_mm2": [spread.variances_mm2 for spread in spreads],
         "spread_path_mm": [spread.path_mm for spread in spreads],
@@ -170,6 +183,7 @@ def build_objects(
         scene=whole,
         coherent=mi.Bool(any(shape.is_mesh() for shape in shapes)),
         glossy=any(glossy),
+        retroreflects=any(thing.retroreflection > 0 for thing in things),
         translucent=any(spread.path_mm > 0 for spread in spreads),
         mirrors=tuple(face for thing, pose in placed if gloss for face in _mirror_faces(thing, pose)),
         _facts={key: _by_registry(shapes, np.array(values, float)) for key, values in facts.items()},

@@ -50,6 +50,9 @@ class SceneObject(Pose):
 
     ``mean_free_path_mm`` is the transport mean free path of light in a translucent body, which widens the stripe and
     shifts it ahead along the laser's direction (`twin.scene.subsurface`); 0 for an opaque one.
+
+    ``retroreflection`` is the coefficient of retroreflected luminance in cd/m2/lx (CIE 17-24-104), for tapes and marks
+    that return the light of the lamp beside the camera. The laser is too far beside: its stripe shows ``reflectance``.
     """
 
     reflectance: Reflectance | None = None
@@ -63,6 +66,7 @@ class SceneObject(Pose):
     patch_share: Annotated[float, Field(ge=0, le=0.8)] | None = None
     patch_length_mm: Positive | None = None
     patch_reflectance: Reflectance | None = None
+    retroreflection: NotNegative = 0.0
 
     _no_texture: ClassVar[str] = ""
     """Reason why objects of a class have no picture as texture."""

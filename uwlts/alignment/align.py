@@ -215,7 +215,7 @@ def _require_gain(estimate: PathEstimate) -> None:
     """Raise EvaluationError unless some crossing reduces the position uncertainty by the factor ``least_gain``."""
     navigation = replace(estimate, factor=np.eye(len(estimate.factor)))
     for pair in estimate.pairs:
-        middle = estimate.surfaces[pair[1]].places_mm.mean(axis=0)
+        middle = estimate.surface(pair[1]).places_mm.mean(axis=0)
         after, before = (each.relative_covariance(pair, middle)[:3, :3] for each in (estimate, navigation))
         if eigh(after, before, eigvals_only=True)[0] < 1 / estimate.options.least_gain**2:
             return
@@ -257,7 +257,7 @@ def _make_crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
     # Distances of the same patches along the original path.
     shift = np.zeros_like(now.places_mm)
     for number, rows, sign in zip(pair, (now.target, now.source), (-1.0, 1.0), strict=True):
-        shift += sign * (estimate.surfaces[number].places_mm - estimate.pieces[number].places_mm)[rows]
+        shift += sign * (estimate.surface(number).places_mm - estimate.pieces[number].places_mm)[rows]
     before = now.distance_mm - np.einsum("qi,qi->q", shift, now.normals)
     inside = np.abs(now.distance_mm) < estimate.options.agreeing_sigmas * now.std_mm * noise_factor(
         now.distance_mm / now.std_mm

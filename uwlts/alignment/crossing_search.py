@@ -81,7 +81,7 @@ def accept_hypothesis(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEst
 def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
     """Add all pairs of the first pieces that overlap along the current path and whose surfaces agree."""
     closed = estimate.pairs
-    places = [surface.places_mm for surface in estimate.surfaces[:count]]
+    places = [estimate.surface(number).places_mm for number in range(count)]
     low, high = (np.array([of(each, axis=0) for each in places]) for of in (np.min, np.max))
     new = []
     for later in range(count):
@@ -102,7 +102,7 @@ def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
 
 def _search_range(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:
     """Return the search range (3,) of the later piece; None if it cannot reach the earlier one."""
-    other, own = (estimate.surfaces[number].places_mm for number in pair)
+    other, own = (estimate.surface(number).places_mm for number in pair)
     low, high = own.min(axis=0), own.max(axis=0)
     std = np.sqrt(np.diag(estimate.relative_covariance(pair, (low + high) / 2)))
     turned = float(np.linalg.norm(high - low)) / 2 * std[3:].max()
@@ -116,7 +116,7 @@ def _find_hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> l
 
     The height maps of both, including their neighbours on the path, are correlated for all shifts.
     """
-    other, own = (estimate.surfaces[number] for number in pair)
+    other, own = (estimate.surface(number) for number in pair)
     normal = np.linalg.eigh(other.normals.T @ other.normals)[1][:, 2]
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)

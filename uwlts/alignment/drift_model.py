@@ -1,13 +1,15 @@
 """Drift model of a navigation: each component is the integral of a rate error, plus a random walk.
 
-A navigation filter models the same two errors for a velocity sensor or a gyroscope: bias and white noise (Farrell,
-Aided Navigation, 2008, sections 4.6 and 4.9). If positions are dead-reckoned from velocities v, a heading error e adds
+A navigation filter models the same two errors for a velocity sensor or a gyroscope: a bias, constant or a first-order
+Gauss-Markov process, and white noise (Farrell, Aided Navigation, 2008, sections 4.6 and 4.9). If positions are
+dead-reckoned from velocities v, a heading error e adds
 the integral of e z x v to the position error (ibid., chapter 12).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -24,9 +26,10 @@ _AS_DEAD_RECKONED = 0.5
 """Least ratio of the position-heading covariance to that of dead reckoning, for positions to count as dead-reckoned."""
 _WALKS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 """Candidate fractions of a random walk in the variance at the end, if none is stated."""
-_CORRELATION = 0.3
-"""Default correlation time of rates, relative to the pass: they change several times at most. Chosen on simulated loops
-0 and 1 of 4 m. Gains and coverage differ little from 0.2 to 0.5; a constant rate underestimates the uncertainty.
+CORRELATION_TIMES = (0.03, 0.1, 0.3, 1.0, 3.0)
+"""Candidate correlation times of the rates, relative to the path, if none is stated.
+
+Faster rates are like a random walk, slower ones like a constant rate with a random walk of its own.
 """
 
 
@@ -46,7 +49,7 @@ class DriftModel:
     dead_reckoned : bool
         Whether heading errors rotate the direction of travel.
     stated : bool
-        Whether a covariance states these values; otherwise the fraction of the walk is estimated.
+        Whether a covariance states these values; otherwise walk and correlation are estimated.
     """
 
     std: np.ndarray
@@ -63,7 +66,7 @@ class DriftModel:
                 f"the drift is {drift_mm:g} mm and {drift_deg:g} deg; expected positive numbers, below 90 deg"
             )
         std = np.repeat([drift_mm, float(np.radians(drift_deg))], 3)
-        return cls(std, np.full(6, 0.01), _CORRELATION, False, False)
+        return cls(std, np.full(6, 0.01), 1.0, False, False)
 
     def covariance(self, earlier_s: np.ndarray, later_s: np.ndarray, lasting_s: float) -> np.ndarray:
         """Return the covariances (6, ...) of each component between times since the start, for a given duration."""
@@ -78,16 +81,16 @@ class DriftModel:
         return variance * ((1 - walk) * by_rates + walk * np.minimum(t, u))
 
     def _increment(self, t: np.ndarray | float) -> np.ndarray:
-        """Return the variance of the integral over a time t of a rate with the Matern correlation (1 + a) exp(-a).
-
-        Such a rate is smooth (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 4.2).
-        """
+        """Return the variance of the integral over a time t of a rate with the correlation exp(-a)."""
         a = np.asarray(t) / self.correlation
-        return 2 * a - 3 + (3 + a) * np.exp(-a)
+        return 2 * (a + np.expm1(-a))
 
-    def with_walks(self) -> list[DriftModel]:
-        """Return the drift with each candidate fraction of a random walk."""
-        return [replace(self, walk=np.full(6, share)) for share in _WALKS]
+    def candidates(self) -> list[DriftModel]:
+        """Return the drift with each candidate correlation time of the rates and each fraction of a random walk."""
+        return [
+            replace(self, walk=np.full(6, share), correlation=correlation)
+            for correlation, share in product(CORRELATION_TIMES, _WALKS)
+        ]
 
 
 def choose_drift_model(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> DriftModel:

@@ -65,9 +65,15 @@ class PathEstimate:
         return self.corrections(self.survey.moments_s)
 
     @cached_property
-    def surfaces(self) -> tuple[Patches, ...]:
-        """Patches of each piece along the corrected path."""
-        return tuple(piece.along(self.corrections(piece.times_s), self.rates(piece.times_s)) for piece in self.pieces)
+    def _surfaces(self) -> dict[int, Patches]:
+        return {}
+
+    def surface(self, number: int) -> Patches:
+        """Return the patches of a piece along the corrected path."""
+        if number not in self._surfaces:
+            piece = self.pieces[number]
+            self._surfaces[number] = piece.along(self.corrections(piece.times_s), self.rates(piece.times_s))
+        return self._surfaces[number]
 
     @property
     def reach_mm(self) -> float:
@@ -80,7 +86,8 @@ class PathEstimate:
 
     def distances(self, source: int, target: int, *, reach_mm: float) -> tuple[PatchDistances, np.ndarray]:
         """Measure the distances (Q,) of one piece from another; return them with a mask (Q,) of held-out ones."""
-        found = distances_between(self.surfaces[source], np.eye(4), self.surfaces[target], np.eye(4), reach_mm=reach_mm)
+        surfaces = self.surface(source), self.surface(target)
+        found = distances_between(surfaces[0], np.eye(4), surfaces[1], np.eye(4), reach_mm=reach_mm)
         return found, self.pieces[source].held_out[found.source] | self.pieces[target].held_out[found.target]
 
     def measure_distances(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
@@ -112,9 +119,9 @@ class PathEstimate:
 
     def relative_covariance(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
         """Return the covariance (6, 6) of the later piece's motion relative to the earlier one at a place (3,)."""
-        by = self.relative_movement(pair, at_mm)
-        used = np.flatnonzero(by.any(axis=0))
-        return by[:, used] @ self.covariance[np.ix_(used, used)] @ by[:, used].T
+        by = self.prior.times_transposed_root(self.relative_movement(pair, at_mm).T)
+        half = solve_triangular(self.factor, by, lower=True)
+        return half.T @ half
 
     @cached_property
     def covariance(self) -> np.ndarray:

@@ -5,13 +5,15 @@ Motions that the surface does not determine, for example along a plain pipe, kee
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import cho_solve, eigh, solve_triangular
+from scipy.sparse import csr_array
 
 from uwlts.alignment.alignment_options import AlignmentOptions
+from uwlts.alignment.drift_model import CORRELATION_TIMES, DriftModel
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.pieces import Survey, fit_piece
@@ -23,6 +25,9 @@ from uwlts.fitting.patches import (
     rigid_derivatives,
     slope_information,
 )
+
+_NEGLIGIBLE = 1e-3
+"""Information of all nodes together in units of the drift's variance, below which an observation shows nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,35 +104,55 @@ def refit(estimate: PathEstimate, numbers: Iterable[int]) -> PathEstimate:
 def settle(estimate: PathEstimate) -> PathEstimate:
     """Estimate path and patches alternately; drop pairs that then disagree.
 
-    If no random walk is stated, the most likely one is used.
+    If no drift model is stated, the most likely random walk and correlation time of the rates are used.
     """
     estimate = solve(refine_nodes(estimate))
     crossing = {number for pair in estimate.pairs for number in pair}
     for _ in range(estimate.options.refits):
-        before, estimate = estimate.numbers, solve(refit(_select_walk(estimate), crossing))
+        before, estimate = estimate.numbers, solve(refit(_select_drift(estimate), crossing))
         if _step_size(estimate, before) < estimate.options.settled:
             break
     agreeing = tuple(pair for pair in estimate.pairs if estimate.agrees(pair))
     return estimate if len(agreeing) == len(estimate.pairs) else settle(replace(estimate, pairs=agreeing))
 
 
-def _select_walk(estimate: PathEstimate) -> PathEstimate:
-    """Select the random walk of maximum marginal likelihood, unless one is stated.
+def _select_drift(estimate: PathEstimate) -> PathEstimate:
+    """Select the random walk and the correlation time of maximum marginal likelihood, unless they are stated.
 
-    The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992).
+    The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992). A normal matrix V L V^T corresponds
+    to observations L^(1/2) V^T x of the path x with unit noise. Their covariance is I + L^(1/2) V^T P V L^(1/2) for a
+    prior covariance P.
     """
-    if estimate.prior.drift.stated:
+    prior, drift = estimate.prior, estimate.prior.drift
+    if drift.stated:
         return estimate
     normal, right = _normal_equations(estimate)
+    size = np.repeat(drift.std, prior.count)
+    near = np.flatnonzero(normal.any(axis=0))
+    values, vectors = eigh(size[near, None] * normal[np.ix_(near, near)] * size[near])
+    used = values > _NEGLIGIBLE / len(near)
+    root = np.sqrt(values[used])
+    by = np.zeros((len(size), len(root)))
+    by[near] = vectors[:, used] * root / size[near, None]
+    seen = (vectors[:, used].T @ (size[near] * right[near, 0])) / root
+    parts, at = by.reshape(6, prior.count, -1), prior.nodes_s - prior.nodes_s[0]
 
-    def twice_log_likelihood(prior: PathPrior) -> float:
-        factor = np.linalg.cholesky(prior.with_evidence(normal))
-        off = solve_triangular(factor, prior.times_transposed_root(right), lower=True)
-        return float(np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor))))
+    def observed(model: DriftModel) -> np.ndarray:
+        return np.einsum("ckr,cks->rs", parts, model.covariance(at[:, None], at, at[-1]) @ parts, optimize=True)
 
-    priors = [replace(estimate.prior, drift=drift) for drift in estimate.prior.drift.with_walks()]
-    best = max(priors, key=twice_log_likelihood)
-    return estimate if (best.drift.walk == estimate.prior.drift.walk).all() else _change_prior(estimate, best)
+    walk = observed(replace(drift, walk=np.ones(6)))
+    rates = {each: observed(replace(drift, walk=np.zeros(6), correlation=each)) for each in CORRELATION_TIMES}
+
+    def twice_log_likelihood(model: DriftModel) -> float:
+        share = model.walk[0]
+        covariance = (1 - share) * rates[model.correlation] + share * walk
+        factor = np.linalg.cholesky(np.eye(len(root)) + covariance)
+        off = solve_triangular(factor, seen, lower=True)
+        return float(-np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor))))
+
+    best = max(drift.candidates(), key=twice_log_likelihood)
+    same = best.correlation == drift.correlation and (best.walk == drift.walk).all()
+    return estimate if same else _change_prior(estimate, replace(prior, drift=best))
 
 
 def _change_prior(estimate: PathEstimate, prior: PathPrior) -> PathEstimate:
@@ -153,14 +178,17 @@ def _solve_step(estimate: PathEstimate, normal: np.ndarray, right: np.ndarray) -
 def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix (6 C, 6 C) and right-hand side (6 C, 1) of the values from all pairs, without prior."""
     count = len(estimate.values)
-    normal, gradient = np.zeros((count, count)), np.zeros(count)
+    total, gradient = csr_array((count, count)), np.zeros(count)
     for pair in estimate.pairs:
-        _add_pair(estimate, pair, normal, gradient)
+        for derivatives, weight, distance_mm in _linearise_pair(estimate, pair):
+            total += derivatives.T @ derivatives.multiply(weight[:, None]).tocsr()
+            gradient += derivatives.T @ (weight * distance_mm)
+    normal = total.toarray()
     return normal, (normal @ estimate.values - gradient)[:, None]
 
 
-def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: np.ndarray) -> None:
-    """Add the distances of a pair, measured in both directions, to the normal matrix and the gradient."""
+def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_array, np.ndarray, np.ndarray]]:
+    """Yield sparse derivatives (Q, 6 C), weights (Q,) and distances (Q,) of a pair, measured in both directions."""
     ways = []
     for source, target in (pair[::-1], pair):
         found, held_out = estimate.distances(source, target, reach_mm=estimate.reach_mm)
@@ -177,24 +205,25 @@ def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: 
     middle = np.vstack([used.places_mm for _, _, used, _ in ways]).mean(axis=0)
     twists = [rigid_derivatives(used.places_mm, used.normals, middle) for _, _, used, _ in ways]
     observable = _observable_projection([(*way[2:], twist) for way, twist in zip(ways, twists, strict=True)], middle)
+    component = estimate.prior.count * np.arange(6)
     for (source, target, used, weight), twist in zip(ways, twists, strict=True):
-        seen = twist @ observable
-        derivatives = np.zeros((len(weight), 6, estimate.prior.count))
+        seen, columns, values = twist @ observable, [], []
         for number, at, sign in ((source, used.source, 1.0), (target, used.target, -1.0)):
             piece, by = estimate.pieces[number], seen.copy()
             # Points off the centre of a patch were measured slightly earlier or later.
-            off = used.places_mm - estimate.surfaces[number].places_mm[at]
+            off = used.places_mm - estimate.surface(number).places_mm[at]
             later = np.einsum("qi,qi->q", piece.slopes_s_mm[at], off)
             times = piece.times_s[at] + later
             # Rotations of the path are about the platform.
             platform = piece.platform_mm[at] + later[:, None] * piece.velocity_mm_s[at]
             by[:, 3:] += np.cross(middle - platform - estimate.corrections(times)[:, :3], by[:, :3])
-            derivatives += sign * by[:, :, None] * estimate.prior.basis(times)[:, None]
-        derivatives = derivatives.reshape(len(weight), -1)
-        near = np.flatnonzero(derivatives.any(axis=0))
-        derivatives = derivatives[:, near]
-        normal[np.ix_(near, near)] += derivatives.T @ (weight[:, None] * derivatives)
-        gradient[near] += derivatives.T @ (weight * used.distance_mm)
+            before, after = estimate.prior.weights(times)
+            for node, share in ((before, 1 - after), (before + 1, after)):
+                columns.append(node[:, None] + component)
+                values.append(sign * share[:, None] * by)
+        ends = np.arange(0, 6 * len(columns) * len(weight) + 1, 6 * len(columns))
+        places = np.hstack(values).ravel(), np.hstack(columns).ravel(), ends
+        yield csr_array(places, shape=(len(weight), len(estimate.values))), weight, used.distance_mm
 
 
 def _observable_projection(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:

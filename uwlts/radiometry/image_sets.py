@@ -14,7 +14,6 @@ from uwlts.files.reading import is_regular_file
 from uwlts.model.clipped import split_clipped
 from uwlts.model.library import load_sensor, validate_description
 from uwlts.model.sensor import Sensor
-from uwlts.model.stripe import Stripe
 from uwlts.storage.capture import CAPTURES, Capture
 from uwlts.storage.data_set import CARD, load_dataset
 from uwlts.storage.image_file import read_image
@@ -88,7 +87,9 @@ def open_image_set(source: str | Path, *, stripe: StripeSettings = None) -> Imag
 
 def _open_data_set(folder: Path, stripe: StripeSettings) -> ImageSet:
     samples = load_dataset(folder, names=("image", "info"))
-    sensor = validate_description(Sensor, samples.card.description["sensor"], folder / CARD)
+    sensor = validate_description(Sensor, samples.card.description.get("sensor"), folder / CARD)
+    if "bits" not in samples.card.image:
+        raise CaptureError(f"{folder / CARD} is damaged: it does not state the number of bits of the images")
 
     def read(number: int) -> np.ndarray | None:
         sample = samples[number]
@@ -136,22 +137,28 @@ def _open_files(path: Path, stripe: StripeSettings) -> ImageSet:
         for channel in range(len(channels))
         for along in ("height", "width")
     ]
-    lengths = [
-        _smooth_length(extract_stripe(channels[channel], stripe_along=along, options=own, saturation=full))
-        for channel, along, own in tried
-    ]
+    lengths = [_smooth_length(channels[channel], along, own, full) for channel, along, own in tried]
     if not max(lengths):
         raise ImageError(f"no stripe is found in {files[0]}; expected images with the laser on")
     channel, along, options = tried[int(np.argmax(lengths))]
 
     def read(number: int) -> np.ndarray:
         image = read_image(files[number])
+        if image.dtype != first.dtype or image.max() > full:
+            raise ImageError(
+                f"{files[number]} is {image.dtype} with grey values up to {image.max()}, {files[0]} is of {bits} bits: "
+                "give images of one camera in a folder"
+            )
         return np.ascontiguousarray(image if image.ndim == 2 else image[:, :, channel])
 
     name = path.name if path.is_dir() else f"{path.parent.name}/{path.name}"
     return ImageSet(name, along, full, options, len(files), read)
 
 
-def _smooth_length(stripe: Stripe) -> int:
-    """Return the number of neighbouring lines with nearly equal centres."""
+def _smooth_length(image: np.ndarray, along: str, options: StripeOptions, full: float) -> int:
+    """Return the number of neighbouring lines with nearly equal centres; 0 if the lines are too short for a stripe."""
+    try:
+        stripe = extract_stripe(image, stripe_along=along, options=options, saturation=full)
+    except ImageError:
+        return 0
     return int(np.count_nonzero(np.abs(np.diff(stripe.centre_px)) < _SMOOTH_PX))

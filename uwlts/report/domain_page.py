@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,6 +24,9 @@ from uwlts.radiometry.domain_gap import DomainGap, measure_domain_gap
 from uwlts.radiometry.stripe_windows import STATISTICS
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.stripe import StripeSettings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _SHOWN = 8
 """Pictures of each set."""
@@ -93,14 +97,14 @@ def write_domain_gap(
         covered=found.covered_table() if found.real and found.generated else None,
         statistics=found.statistics_table(),
         definitions=[(each.name, each.unit or "1", each.meaning) for each in STATISTICS],
-        distributions=figure_svg(draw_distributions(found)),
+        distributions=figure_svg(_draw_distributions(found)),
         pictures=_draw_pictures(found),
     )
     write_page(out, text, beside=json_text(found.record()), overwrite=overwrite)
     return found
 
 
-def draw_distributions(found: DomainGap):
+def _draw_distributions(found: DomainGap) -> "Figure":
     """Draw 5 %, quartiles and 95 % of all statistics: generated sets in blue, real ones in red."""
     sets, rows = found.sets(), -(-len(STATISTICS) // 3)
     figure, axes = new_figure(11.0, rows * (0.8 + 0.2 * len(sets)), rows=rows, columns=3)

@@ -228,6 +228,23 @@ def test_a_plate_under_the_lamp_shows_reflectance_times_irradiance_over_pi(thesi
     np.testing.assert_allclose(image[uv[inside, 1], uv[inside, 0]], expected, rtol=3e-4)
 
 
+def test_a_retroreflecting_mark_returns_lamp_light_only(thesis):
+    sensor = altered(thesis, {"lamp": {"irradiance_w_per_m2": 3.0, "ambient_w_per_m2": 2.0}})
+    sensor = altered(sensor, {"camera": {"width_px": 64, "height_px": 48}})
+    plain, tape = plate(reflectance=0.2), plate(reflectance=0.2) | {"retroreflection": 1.5}
+    images = {
+        (name, light): Renderer(sensor, clear(), scene_of(thing), effects=replace(NONE, ambient=True)).irradiance(
+            light, sensor_at(), spp=4
+        )
+        for name, thing in (("plain", plain), ("tape", tape))
+        for light in ("lamp", "day", "laser")
+    }
+    # The radiance of a diffuse surface is reflectance E / pi, that of the tape 1.5 E more.
+    np.testing.assert_allclose(images["tape", "lamp"] / images["plain", "lamp"], 1 + 1.5 * math.pi / 0.2, rtol=1e-4)
+    for light in ("day", "laser"):
+        np.testing.assert_array_equal(images["tape", light], images["plain", light])
+
+
 @pytest.mark.parametrize("light", ["day", "lamp"])
 def test_turbid_water_veils_what_day_and_lamp_light(thesis, light):
     """Duntley's equation, with the backscattered fraction of the lamp's light by Henyey and Greenstein."""

@@ -116,6 +116,21 @@ def test_another_sensor_in_other_water_compiles_nothing(thesis, new_kernels):
     assert new_kernels()[1] > 0
 
 
+def test_another_texture_and_translucency_compile_nothing(thesis, new_kernels):
+    def frames(changes: dict[str, object], *, seed: int) -> None:
+        grown = sphere() | {"finish": "fouled-steel"} | changes
+        pipe = plate(60.0, side=150.0, x=40.0) | {"reflectance": 0.6, "finish": "pvc-pipe"}
+        renderer = Renderer(altered(thesis, SMALL), clear(0.3), scene_of(grown, pipe), surface_seed=seed)
+        renderer.irradiance("laser", sensor_at(x=0.5), spp=4)
+
+    frames({}, seed=1)
+    assert new_kernels()[1] >= 4
+    frames({"mottle": 0.1, "mottle_mm": (3.0, 1.0, 0.3), "patch_share": 0.1, "reflectance": 0.3}, seed=2)
+    launched, new = new_kernels()
+    assert launched >= 5
+    assert new == 0
+
+
 def test_scenes_of_a_data_set_share_their_kernels(thesis, new_kernels):
     table = load_description("stripe-clean").model_dump() | {"sensor": altered(thesis, SMALL), "spp": 4}
     described = DataSetDescription.model_validate(table)

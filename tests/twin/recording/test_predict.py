@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import twin
@@ -96,27 +97,80 @@ def test_a_failed_calibration_is_reported_with_its_reason(tmp_path: Path, capfd:
     assert not (tmp_path / "out" / "prediction.json").exists()
 
 
+SMALL = """
+base = "prediction"
+title = "small"
+sensor = "thesis-small"
+as_built = "thesis-small"
+
+[[recordings]]
+name = "target-bare"
+scene = "target"
+motion = { step_mm = 38.0, count = 8 }
+
+[[recordings]]
+name = "target-air"
+scene = "target-through-window"
+motion = { step_mm = 38.0, count = 8 }
+
+[[recordings]]
+name = "target-water"
+scene = "target-through-window"
+media = ["water"]
+motion = { start_mm = -120.0, step_mm = 26.0, count = 8 }
+
+[[recordings]]
+scene = "step"
+placements = ["near", "far"]
+
+[[recordings]]
+name = "spheres"
+scene = "spheres"
+
+[[recordings]]
+name = "step-scan"
+scene = "step-scan"
+
+[[recordings]]
+name = "plane"
+scene = "plane"
+
+[[recordings]]
+name = "pipe-around"
+scene = "pipe-around"
+
+[[recordings]]
+name = "pits"
+scene = "pits"
+
+[[recordings]]
+name = "undercut"
+scene = "undercut"
+motion = { start_mm = -8.0, step_mm = 0.5, count = 33 }
+"""
+
+
 @pytest.mark.slow
 def test_errors_of_a_rendered_campaign_are_within_the_prediction(tmp_path: Path):
-    out, options = tmp_path / "out", {"campaign": "prediction", "water": "clear", "campaigns": 1, "every": 5, "spp": 8}
-    result = twin.predict("thesis-small", out=out, **options)
-    assert {each.scan for each in result.figures} >= {
-        *("spheres-near", "spheres-standoff", "spheres-far", "step-scan", "pipe", "plane", "pipe-around", "undercuts")
-    }
-    # Twice the expanded uncertainty is exceeded once in 15,000 figures.
+    campaign, out = tmp_path / "small.toml", tmp_path / "out"
+    campaign.write_text(SMALL, encoding="utf-8")
+    options = {"campaign": campaign, "out": out, "water": "clear", "campaigns": 1, "every": 4, "spp": 8}
+    result = twin.predict(**options)
+    assert {each.scan for each in result.figures} >= {"spheres", "step-scan", "plane", "pipe-around", "undercuts"}
+    # Three expanded uncertainties are exceeded once in 10^9 figures; a flatness is biased by its own noise.
     for each in result.figures:
-        assert abs(each.errors_mm[0]) < 2 * each.expanded_mm[0], each
+        assert np.all(np.abs(each.errors_mm) < 3 * np.array(each.expanded_mm)), each
         assert 0.001 < each.predicted_mm < 1.0, each
-        assert "a = 0." in each.checked, "the water is stated"
-    assert any("20 profiles 2.5 mm apart" in each.checked for each in result.detections), "thinned by `every`"
-    assert {each.flaw for each in result.detections} == {"pit", "dent", "undercut"}
+        assert "a = 0.32/m and b = 0.03/m" in each.checked, each
+    assert {each.flaw for each in result.detections} == {"pit", "undercut"}
+    assert any("25 profiles 2 mm apart" in each.checked for each in result.detections), "thinned by `every`"
     written = json.loads((out / "prediction.json").read_text(encoding="utf-8"))
     assert written["format"] == "twin-prediction"
     assert len(written["figures"]) == len(result.figures)
-    assert len(written["detections"]) == 3
+    assert len(written["detections"]) == 2
     page = (out / "prediction.html").read_text(encoding="utf-8")
-    assert "pipe, diameter error" in page and "Probability of detection" in page
+    assert "spheres, SSE" in page and "Probability of detection" in page and "Where the statements were checked" in page
     # A second call renders nothing again.
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.truth.h5")}
-    assert twin.predict("thesis-small", out=out, **options) == result
+    assert twin.predict(**options) == result
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.truth.h5")} == before

@@ -44,7 +44,7 @@ def test_the_drift_has_the_covariance_of_drifts_drawn_step_by_step(correlation: 
     t = np.arange(1, steps + 1) / steps
     walk = rng.standard_normal((draws, steps)).cumsum(axis=1) / np.sqrt(steps)
     apart = np.abs(t[:, None] - t) / correlation
-    root = np.linalg.cholesky((1 + apart) * np.exp(-apart) + 1e-9 * np.eye(steps))
+    root = np.linalg.cholesky(np.exp(-apart) + 1e-9 * np.eye(steps))
     drifted = (rng.standard_normal((draws, steps)) @ root.T).cumsum(axis=1) / steps
     drifted /= drifted[:, -1].std()
     rows = np.array([99, 199, 299, 399])

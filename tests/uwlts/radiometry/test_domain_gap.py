@@ -134,6 +134,10 @@ def test_sets_that_cannot_be_used_are_refused(tmp_path: Path):
         uwlts.report.write_domain_gap(real=[black], out=out)
     with pytest.raises(ImageError, match="has no images"):
         uwlts.report.write_domain_gap(real=[tmp_path], out=out)
+    cv2.imwrite(str(short / "9.png"), np.full((200, 300), 4000, np.uint16))
+    with pytest.raises(ImageError, match="give images of one camera"):
+        uwlts.report.write_domain_gap(real=[short], out=out)
+    (short / "9.png").unlink()
     with pytest.raises(CaptureError, match="shows 5 pieces of a stripe"):
         uwlts.report.write_domain_gap(real=[short], out=out)
     assert not out.exists()

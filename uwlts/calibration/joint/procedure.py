@@ -178,7 +178,8 @@ class JointProblem:
         If all prior knowledge deviates more than stated, or the target is bent or stretched more than stated, the prior
         uncertainties are enlarged to the observed deviations: parameters without evidence may be as wrong. This is not
         done if a single parameter contradicts prior knowledge. Form and size of the target are only believed if both
-        halves of the images agree on them, and never for many times what is stated.
+        halves of the images agree on them, and never for many times what is stated. Otherwise they stay as described,
+        with an uncertainty as many times larger as they deviate in standard uncertainties.
         """
         result = self.solve()
         compared, factor = deviations(result, least=0.0), estimate_birge_ratio(result)
@@ -204,11 +205,16 @@ class JointProblem:
         refused = [each for each in form if many[each.key] > _MOST_WIDENED or apart is None]
         apart = apart or []
         tied = {key for alike in (BENDS, STRETCH) for each in (*apart, *refused) if each.key in alike for key in alike}
+        # What is stated is too small by as many times as the deviation is larger (Birge's ratio of one value).
+        less_sure = {
+            key: max((each.sigmas for each in form if (each.key in BENDS) == (key in BENDS)), default=1.0)
+            for key in tied
+        }
         doubts = [f"{each.words()}; its uncertainty was enlarged accordingly" for each in form if each.key not in tied]
         doubts += [f"{each.words()}: {_NOT_BELIEVED}, the target is taken as described" for each in apart]
         said = {each: f"{each.words()}; {many[each.key]:.0f} times what is stated" for each in refused if not apart}
         if tied := tied & set(self.parameters.keys):
-            known = priors | {key: scaled[key] for key in tied}
+            known = priors | {key: replace(scaled[key], std=less_sure[key] * scaled[key].std) for key in tied}
             parameters = replace(parameters, priors=known, tied=frozenset(tied))
         result = replace(self, parameters=parameters, sensor=sensor).solve()
         against = check_consistency(result, self.evidence, sensor=sensor)
@@ -216,6 +222,10 @@ class JointProblem:
         covered = self.misfits or (not against.contradictions and against.all_against())
         contradictions = [f"{words}: state it if this is so" for e, words in said.items() if e.wrong() and not covered]
         doubts += [f"{words}: {_NOT_BELIEVED}; state it if so" for e, words in said.items() if covered or not e.wrong()]
+        if tied:
+            doubts.append(
+                f"the target's form or size is taken to be {max(less_sure.values()):.1f} times less certain than stated"
+            )
         if factor > 1.0:
             doubts.append(
                 f"the description's values of window, media, laser, stage and target deviate by {factor:.1f} times the "

@@ -373,13 +373,13 @@ class _Calibration:
         )
 
     def _calibration_derivatives(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
-        """Return derivatives (P, K, Q) of the residuals by the parameters of the sensor's calibration."""
+        """Return derivatives (P, q, Q) of the residuals by the parameters of the sensor's calibration."""
         assert self.captured is not None
         numbers = [n for n in range(len(members)) if n not in self.reasons]
         by = np.vstack(
             [self.captured.point_derivatives(number, self.rows[number][members[number]]) for number in numbers]
         )
-        return used.bin_means(used.project_on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
+        return used.project(state, used.project_on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
 
 
 def _thin(points: np.ndarray, most: int) -> np.ndarray:

@@ -128,6 +128,7 @@ class Problem(GroupedEvidence[MountState]):
         """Find the artefact again in the profiles (N, 2) of all poses, near its place in a state; else None."""
         off = np.split(self.shape.surface_distances(state.artefact, self.to_base(state)), np.cumsum(self.counts)[:-1])
         again = [self.shape.find_again(each, own, reach_mm, rng) for each, own in zip(flat, off, strict=True)]
+        again = [each and each.without_isolated(own) for each, own in zip(again, flat, strict=True)]
         return [each if each is not None and each.members.sum() >= LEAST_POINTS else None for each in again]
 
     def thin(self, most: int) -> "Problem":
@@ -294,38 +295,72 @@ class Problem(GroupedEvidence[MountState]):
         turn = _TURN_RAD if self.shape.flat else (_TURN_RAD[0],) * 2
         return np.array([_POINT_MM, _POINT_MM, (beside / 2, longest), _POINT_MM, turn])
 
+    def basis(self, state: MountState) -> np.ndarray:
+        """Return orthonormal bases (P, K, q), padded with 0, of the changes of each profile that the unknowns cause.
+
+        The unknowns are the errors of the pose and the parameters.
+        """
+        if self._last_basis and self._last_basis[0][0] is state:
+            return self._last_basis[0][1]
+        changes = self.pose_error_derivatives(state)
+        if self.shape.flat:
+            # Shifts change the profile of a sphere as all parameters do. Noise would make the columns differ.
+            changes = np.hstack([changes, self.derivatives(state)])
+        means = self.bin_means(changes)
+        sizes = np.linalg.norm(means, axis=1, keepdims=True).clip(1e-30)
+        basis, spans, _ = np.linalg.svd(means / sizes, full_matrices=False)
+        used = spans > _LEAST_SPAN * spans[:, :1]
+        basis = (basis * used[:, None])[:, :, : int(used.sum(axis=1).max())]
+        self._last_basis[:] = [(state, basis)]
+        return basis
+
+    @cached_property
+    def _last_basis(self) -> list[tuple[MountState, np.ndarray]]:
+        """State and basis of the last call: the steps of one fit share a state."""
+        return []
+
+    def project(self, state: MountState, values: np.ndarray) -> np.ndarray:
+        """Return the coordinates (P, q, ...) of changes (N, ...) of the distances, by unweighted least squares."""
+        means, across = self.bin_means(values), np.swapaxes(self.basis(state), 1, 2)
+        return across @ means if means.ndim == 3 else (across @ means[:, :, None])[:, :, 0]
+
     def residuals(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
-        """Return mean distances (P, K) of bins after a step; for a flat artefact, noise off the lines is unchanged."""
+        """Return the coordinates (P, q) of the distances after a step; the noise off their lines is unchanged.
+
+        Weighting the bins of a profile would rely on a model of its smooth error, mostly on its ends.
+        """
         here = self.distances(state)
-        return self.bin_means(
-            here if step is None else here + self.project_on_lines(self.distances(state, step) - here)
+        return self.project(
+            state, here if step is None else here + self.project_on_lines(self.distances(state, step) - here)
         )
 
     def jacobian(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
         if step is None:
-            return self.bin_means(self.derivatives(state))
+            return self.project(state, self.derivatives(state))
         derivatives = self._derivatives(self.apply_step(state, step))
         derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian((self.free @ step)[3:6])
-        return self.bin_means(derivatives @ self.free)
+        return self.project(state, derivatives @ self.free)
 
     def covariance(self, state: MountState) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        there, counts, apart = self._apart
-        share = self.bin_means(self.noise_along(state)[:, 0])
-        both, errors = share[:, :, None] * share[:, None], self.bin_means(self.pose_error_derivatives(state))
-        noise = np.eye(there.shape[1]) * (share**2 / np.maximum(counts, 1))[:, :, None]
-        filled = np.eye(there.shape[1]) * ~there[:, :, None]
-        shifts, turns = (own @ np.swapaxes(own, 1, 2) for own in (errors[:, :, :3], errors[:, :, 3:]))
+        _, counts, apart = self._apart
+        basis, share = self.basis(state), self.bin_means(self.noise_along(state))
+        by_bins = np.swapaxes(share * basis, 1, 2)
+        by_points = by_bins / np.sqrt(np.maximum(counts, 1))[:, None]
+        errors = self.project(state, self.pose_error_derivatives(state))
+        noise, shifts, turns = (own @ np.swapaxes(own, 1, 2) for own in (by_points, errors[:, :, :3], errors[:, :, 3:]))
+        filled = np.eye(basis.shape[2]) * ~basis.any(axis=1)[:, :, None]
 
         def covariances(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             scatter = Scatter(*np.exp(logs))
             far = apart / scatter.length_mm
-            falling = scatter.smooth_mm**2 * both * np.exp(-far)
-            smooth = falling * (1 + far)
+            falling = scatter.smooth_mm**2 * np.exp(-far)
+            smooth, longer = (by_bins @ (falling * each) @ np.swapaxes(by_bins, 1, 2) for each in (1 + far, far**2))
             parts = scatter.point_mm**2 * noise, smooth, scatter.pose_mm**2 * shifts, scatter.turn_rad**2 * turns
-            changes = [2 * parts[0], 2 * smooth, falling * far**2, 2 * parts[2], 2 * parts[3]]
-            total = filled + sum(parts)
+            changes = [2 * parts[0], 2 * smooth, longer, 2 * parts[2], 2 * parts[3]]
+            total = sum(parts)
             largest = np.max(np.diagonal(total, axis1=1, axis2=2), axis=1)
-            return total + _ROUNDING * largest[:, None, None] * np.eye(total.shape[1]), np.array(changes)
+            rounding = _ROUNDING * largest[:, None, None] * np.eye(total.shape[1])
+            return total + filled + rounding, np.array(changes)
 
         return covariances
 
@@ -338,13 +373,7 @@ class Problem(GroupedEvidence[MountState]):
         return len(order) - len(starts), float(np.sum((values - means) ** 2))
 
     def pose_directions(self, state: MountState) -> list[np.ndarray]:
-        """Return orthonormal bases (K, q) of all changes of each profile by poses, mount and artefact."""
-        bases = []
-        for errors in self.bin_means(self.pose_error_derivatives(state)):
-            sizes = np.linalg.norm(errors, axis=0).clip(1e-30)
-            basis, spans, _ = np.linalg.svd(errors / sizes, full_matrices=False)
-            bases.append(basis[:, spans > _LEAST_SPAN * spans[0]])
-        return bases
+        return [np.eye(each.shape[1])[:, each.any(axis=0)] for each in self.basis(state)]
 
     def solve_unweighted(self, state: MountState) -> MountState:
         """Minimise the squares of all distances with equal weights."""

@@ -33,6 +33,11 @@ LEAST_WALL = 6
 _LARGEST_GAP = 5
 """Largest gap within one wall, relative to the usual distance between neighbours, in number and in space."""
 _LARGEST_ROUNDS = 20  # a set of inliers that still changes then alternates between two
+_NEIGHBOURS, _LEAST_BESIDE = 8, 0.25
+"""Neighbours of a point on each side, and their least fraction on the artefact; half at the end of an arc or line.
+
+Scattered points on the continuation of a curve, or on the rear of a circle, have none. They would shift it most.
+"""
 _LINES = 4
 """Lines sought in a profile of a step or ring: its faces, and background beside them."""
 _PARALLEL = 2e-3
@@ -54,6 +59,20 @@ class Detection:
         members, part = np.zeros(len(chosen), dtype=bool), np.zeros(len(chosen), dtype=int)
         members[chosen], part[chosen] = self.members, self.part
         return replace(self, members=members, part=part)
+
+    def without_isolated(self, points: np.ndarray) -> Self:
+        """Return the detection without points of the profile (N, 2) that have few others beside them, or None."""
+        count = len(points)
+        rows = np.flatnonzero(self.members)
+        spacing = float(np.median(np.linalg.norm(np.diff(points[rows], axis=0), axis=1)))
+        beside, there = np.zeros(count), np.zeros(count)
+        for apart in range(1, min(_NEIGHBOURS, count - 1) + 1):
+            near = np.linalg.norm(points[apart:] - points[:-apart], axis=1) < _LARGEST_GAP * spacing * apart
+            beside[:-apart] += near & self.members[apart:]
+            beside[apart:] += near & self.members[:-apart]
+            there[:-apart] += 1
+            there[apart:] += 1
+        return replace(self, members=self.members & (beside >= _LEAST_BESIDE * there))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

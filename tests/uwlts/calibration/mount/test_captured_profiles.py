@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from tests.uwlts.calibration.mount.test_board import CAMERA, MIDDLE, simulated
 
 import uwlts
+from tests.uwlts.calibration.mount.test_hand_eye import CAMERA, MIDDLE, simulated
 from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.mount_views import errors_of
 from tests.uwlts.sensor_profiles import RADIUS_MM, captured_by, half_way, joint_estimate, largest_parts
