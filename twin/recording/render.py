@@ -172,10 +172,10 @@ def simulate(
     effects
         Effects of real images to add, NAME of typical strength or NAME=STRENGTH: glare=0.02, vignetting=0.4,
         uneven-lamp=0.6, particles=1000 and bubbles=200 (per litre), caustics=2 (wind in m/s), stray-light=0.02,
-            side-lobes=0.01, lamp-reflection=0.001, dirt=0.1, lamp-and-laser, pixel-aspect=1.002, tangential=0.001,
+        side-lobes=0.01, lamp-reflection=0.001, dirt=0.1, lamp-and-laser, pixel-aspect=1.002, tangential=0.001,
         rolling-shutter=10 (us per row), jpeg=90, colour-filter, camera-3d=16 (steps per px; laser images become
         centre lines).
-        without
+    without
         Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
         fixed-pattern, noise.
     ideal
