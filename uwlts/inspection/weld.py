@@ -320,8 +320,8 @@ def _local_scatter(profiles: BeadProfiles, raw: np.ndarray, across: np.ndarray, 
             spread[k] = MAD_TO_STD * float(np.median(own))
     if not np.isfinite(spread).any():
         raise EvaluationError(
-            f"no strip of {2 * bandwidth:.2g} mm along the weld has {_RULE.fewest_beside} points of complete sections, for "
-            "the scatter of the points; scan with profiles closer together"
+            f"no strip of {2 * bandwidth:.2g} mm along the weld has {_RULE.fewest_beside} points of complete sections, "
+            "which give the scatter of the points; scan with profiles closer together"
         )
     spread = np.where(np.isfinite(spread), spread, np.nanmedian(spread))
     return np.maximum(spread[cell], 1e-12)

@@ -205,7 +205,7 @@ class JointProblem:
         refused = [each for each in form if many[each.key] > _MOST_WIDENED or apart is None]
         apart = apart or []
         tied = {key for alike in (BENDS, STRETCH) for each in (*apart, *refused) if each.key in alike for key in alike}
-        # What is stated is too small by as many times as the deviation is larger (Birge's ratio of one value).
+        # The stated uncertainty is multiplied by the deviation's ratio to it (Birge's ratio of one value).
         less_sure = {
             key: max((each.sigmas for each in form if (each.key in BENDS) == (key in BENDS)), default=1.0)
             for key in tied

@@ -340,6 +340,6 @@ def test_a_stretch_of_twenty_times_what_is_stated_is_refused_or_not_believed(the
         assert words in str(refusal)
         return
     assert any(words in each and "not believed" in each for each in calibration.origin().warnings)
-    # The target is as described, and so much less certain that the interval reaches to its true size.
+    # The target is as described, with an uncertainty that reaches to its true size.
     place = list(calibration.joint.parameters).index(TargetParameter.STRETCH_X)
     assert abs(calibration.joint.values[place] - real.stretch[0]) < 4 * calibration.joint.std[place]
