@@ -16,6 +16,7 @@ RING_MM = 22.0, 28.0
 _CELL_PX = 4
 """Spacing of the computed pixels: at the distance of the reflected ring, the blur is many times wider."""
 _PUPIL_SAMPLES = 128
+"""Number of rays per computed pixel: a blurred edge has steps of a hundredth of the ring's brightness."""
 
 
 def reflect_ring(

@@ -308,7 +308,7 @@ class Renderer:
         along_width = self.sensor.camera.stripe_along == "width"
         known = np.isfinite(points_mm[columns if along_width else rows, 0])
         rows, columns, found = rows[known], columns[known], [np.zeros((3, 0), np.float32)]
-        (light,), _ = make_lights([self.sheet.without_side_lobes()], pose)
+        (light, *_), _ = make_lights(self._sheets[:1], pose)
 
         def sums(pose: SensorPose, bundle: Rays, after_s: Float | None, planes: Float) -> tuple[Float, ...]:
             segment = next(self._segments(pose, bundle, after_s))

@@ -12,7 +12,6 @@ identified by the angle in rad between the axis and its projection along x.
 from __future__ import annotations
 
 import math
-from copy import copy
 from dataclasses import dataclass
 from typing import assert_never, cast
 
@@ -121,12 +120,6 @@ class Sheet:
         reaches = [(abs(offset) + LIT_SIGMAS * radius) / LIT_SIGMAS for _, offset, radius in lobes]
         self.reach = max([1.0, *reaches])
         self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))
-
-    def without_side_lobes(self) -> Sheet:
-        """Return the sheet with all its power in the main Gaussian."""
-        alone = copy(self)
-        alone.parts, alone.reach = [(opaque(1.0), opaque(0.0), opaque(1.0))], 1.0
-        return alone
 
     def evaluate(self, p: Point3f) -> SheetLight:
         """Return the light of the sheet at points in the OCS.

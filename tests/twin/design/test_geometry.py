@@ -126,7 +126,8 @@ def test_figures_agree_with_the_design_equations(thesis, medium):
 def test_designs_are_judged_alike_alone_and_together(thesis, thesis_as_built):
     height = altered(thesis, {"camera": {"stripe_along": "height"}})
     tabulated = altered(thesis, {"laser": {"fan_profile": ((-20.0, 0.2), (0.0, 1.0), (22.0, 0.5))}})
-    sensors = [thesis, thesis_as_built, height, tabulated]
+    powell = altered(thesis, {"laser": {"fan_profile": "powell"}})
+    sensors = [thesis, thesis_as_built, height, tabulated, powell]
     media = [sensor.media["water"] for sensor in sensors]
     together, reasons = compute_figures(extract_parameters(sensors, media), reflectance=0.5, water_depth_m=10.0)
     assert reasons == [""] * len(sensors)

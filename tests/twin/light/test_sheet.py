@@ -45,6 +45,7 @@ TWISTED = {
 LASERS: dict[str, dict[str, Any]] = {
     "flat": {},
     "gaussian": {"fan_profile": "gaussian"},
+    "powell": {"fan_profile": "powell"},
     "corners": {"fan_profile": CORNERS},
     "bow": {"bow_deg": 0.5},
     "tilted": TILTED | {"fan_profile": "gaussian"},
@@ -64,7 +65,7 @@ def shape_of(laser: Laser, angle: np.ndarray) -> np.ndarray:
             return np.ones_like(a)
         if laser.fan_profile == "gaussian":
             return np.exp(-2 * (a / math.radians(laser.fan_angle_deg / 2)) ** 2)
-        nodes, powers = np.array(laser.fan_profile).T
+        nodes, powers = np.array(laser.fan_table()).T
         return np.interp(a, np.radians(nodes), powers, left=0.0, right=0.0)
 
     half = math.radians(laser.fan_angle_deg / 2)
