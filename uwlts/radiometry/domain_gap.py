@@ -1,10 +1,10 @@
 """Domain gap between generated and real images: distance of the distributions of the stripe's statistics.
 
-The gap is the energy coefficient of inhomogeneity, H = (2 E d(X, Y) - E d(X, X') - E d(Y, Y')) / (2 E d(X, Y)), of
-windows X and Y of two sets at the Euclidean distance d: 0 for equal distributions, and at most 1 (Rizzo and Székely,
-Energy distance, WIREs Computational Statistics 8, 2016, 27-38). Each statistic is first replaced by its quantile in the
-mixture of both sets with equal weights, so that units and transformations do not matter. Means are over pairs of
-different windows (U-statistics).
+The gap is the energy coefficient of inhomogeneity of windows X and Y of two sets at the Euclidean distance d:
+H = (2 E d(X, Y) - E d(X, X') - E d(Y, Y')) / (2 E d(X, Y)). It is 0 for equal distributions, and at most 1 (Rizzo and
+Székely, Energy distance, WIREs Computational Statistics 8, 2016, 27-38). Each statistic is first replaced by its
+quantile in the mixture of both sets with equal weights, so that units and transformations do not matter. Means are over
+pairs of different windows (U-statistics).
 """
 
 from __future__ import annotations
