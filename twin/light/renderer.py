@@ -230,10 +230,8 @@ class Renderer:
             longer = partial(walked.image, LightSources(image, haze, surfaces))
         haze = haze if self.effects.haze else np.zeros_like(haze)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
-        particles, polarisation = (
-            self._render_particles(direct, pose, through_water, seed=seed),
-            np.clip(polarised / bright, 0, 1),
-        )
+        particles = self._render_particles(direct, pose, through_water, seed=seed)
+        polarisation = np.clip(polarised / bright, 0, 1)
         return LaserFrame(longer, haze, particles, rows, columns, stripe, polarisation, rough / bright)
 
     def _render_particles(

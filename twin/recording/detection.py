@@ -58,7 +58,7 @@ class ProbabilityOfDetection(BaseModel, frozen=True):
     signals_mm : tuple of N float or None
         Measured depths of a signal response, 0 where nothing was measured; None for hits and misses.
     false_calls : int
-        FlawFindings that are no flaw.
+        Findings that are no flaw.
     a90_mm : float or None
         Depth found with a probability of 90 %; None if the flaws do not determine it.
     a90_95_mm : float or None
@@ -248,10 +248,7 @@ class FlawFindings:
             found=tuple(self.found),
             signals_mm=tuple(self.signals_mm) if self.flaw == "undercut" else None,
             false_calls=self.false_calls,
-            a90_mm=fitted.a90_mm,
-            a90_95_mm=fitted.a90_95_mm,
-            location=fitted.location,
-            scale=fitted.scale,
+            **vars(fitted),
         )
 
 
@@ -259,10 +256,10 @@ def flaws_of(scene: Scene) -> tuple[Flaw, float] | None:
     """Return the kind and width in mm of a scene's flaws with drawn depths; None without any."""
     for thing in scene.objects:
         match thing:
-            case PittedPipe() if isinstance(thing.pit_depth_mm, tuple):
+            case PittedPipe() if thing.draws_depths():
                 is_dent = thing.pit_diameter_mm > _DENT_SHARE * thing.diameter_mm
                 return "dent" if is_dent else "pit", thing.pit_diameter_mm
-            case Weld() if isinstance(thing.undercut_depth_mm, tuple):
+            case Weld() if thing.draws_depths():
                 return "undercut", thing.undercut_width_mm
             case _:
                 pass
@@ -288,11 +285,11 @@ def _collect_pits(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) 
     number = next(n for n, thing in enumerate(scene.objects) if isinstance(thing, PittedPipe))
     pipe, place = scene.objects[number], scene.object_poses()[number]
     assert isinstance(pipe, PittedPipe)
-    scale = np.array([1.0, pipe.diameter_mm / 2])
+    scale, into_pipe, depths = np.array([1.0, pipe.diameter_mm / 2]), np.linalg.inv(place), pit_depths(pipe).tolist()
     pits, reach = pit_places(pipe) * scale, pipe.pit_diameter_mm / 2
 
     def on_surface(place_mm: list[float]) -> np.ndarray:
-        x, y, z = (np.linalg.inv(place) @ [*place_mm, 1.0])[:3]
+        x, y, z = (into_pipe @ [*place_mm, 1.0])[:3]
         return np.array([x, math.atan2(y, -z)]) * scale
 
     hollows = [each for each in inspection["features"] if each["kind"] in ("pit", "dent")]
@@ -312,11 +309,10 @@ def _collect_pits(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) 
     first, last = _scanned_mm(scene)
     along = pits[:, 0] + place[0, 3]
     for pit in np.flatnonzero((along - reach > first) & (along + reach < last)).tolist():
-        depth = float(pit_depths(pipe)[pit])
-        into.depths_mm.append(depth)
+        into.depths_mm.append(depths[pit])
         into.found.append(pit in known)
         if (feature := known.get(pit)) is not None:
-            into.values.append((*_value(feature["values"]["depth"]), depth))
+            into.values.append((*_value(feature["values"]["depth"]), depths[pit]))
 
 
 def _collect_undercuts(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) -> None:

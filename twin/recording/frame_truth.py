@@ -82,8 +82,8 @@ def measure_line_light(
     """Return the truth of a frame with centroid, visible and mixed fraction of each line's stripe.
 
     Light comes directly from lit surfaces, over pixel, pupil and exposure. A line's stripe is the run of pixels about
-    its centre that exceed 1e-3 of the light there. Speckle, haze, other indirect light, side lobes
-    of the sheet, losses of the lens and noise are excluded.
+    its centre that exceed 1e-3 of the light there. Speckle, haze, other indirect light, side lobes of the sheet, losses
+    of the lens and noise are excluded.
     """
     lines = np.flatnonzero(truth.status == TruthStatus.VISIBLE)
     if len(lines) == 0:

@@ -22,7 +22,7 @@ from uwlts._version import __version__
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.files.json_files import read_json, write_model
 from uwlts.model.artefacts import PlaneStandard, parse_artefact
-from uwlts.model.brief import Brief
+from uwlts.model.brief import Brief, align_columns
 from uwlts.model.library import validate_description
 from uwlts.pages.toolkit import BLUE, figure_svg, new_figure, render_page, write_page
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -136,12 +136,12 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
         ]
         lines = [
             f"sensor {self.sensor}, built as {self.as_built}; campaigns {self.campaign}: {len(self.seeds)}",
-            *_columns([("scan", "figure", "U / mm", "found", "within U"), *figures], words=2),
+            *align_columns([("scan", "figure", "U / mm", "found", "within U"), *figures], right=(2, 3)),
             self.verdict(),
             "U: expanded uncertainty (k = 2) by propagation; found: twice the rms error of the campaigns",
         ]
         if self.detections:
-            lines += _columns([_DETECTION_HEAD, *map(_detection_row, self.detections)], words=2)
+            lines += align_columns([_DETECTION_HEAD, *map(_detection_row, self.detections)], right=range(2, 7))
             lines += ["a90: depth found with 90 % probability; a90/95: its upper bound with 95 % confidence"]
         return [*lines, "valid for this sensor, and for imperfections as in the campaign, where it was checked:"] + [
             f"  {line}" for line in self.validity()
@@ -156,16 +156,6 @@ def _detection_row(each: ProbabilityOfDetection) -> tuple[str, ...]:
     depths = ("-" if depth is None else f"{depth:.3f}" for depth in (each.a90_mm, each.a90_95_mm))
     found = f"{sum(each.found)} of {len(each.found)}"
     return each.flaw, each.method, f"{each.width_mm:g}", found, str(each.false_calls), *depths, each.limits()
-
-
-def _columns(rows: Sequence[tuple[str, ...]], *, words: int) -> list[str]:
-    """Return rows as lines with aligned columns; the first ``words`` and the last column are aligned left."""
-    widths = [max(map(len, texts)) for texts in zip(*rows, strict=True)]
-    left = {*range(words), len(widths) - 1}
-    return [
-        "  ".join(f"{text:{'<' if k in left else '>'}{widths[k]}}" for k, text in enumerate(row)).rstrip()
-        for row in rows
-    ]
 
 
 def predict(

@@ -9,10 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from twin.scene.description import Block, PrintedPlate, Scene, load_scene, replace_values
-from twin.scene.forms import PittedPipe, Weld
 from twin.scene.motion import Motion
 from twin.scene.platforms import Platform
-from twin.scene.scene_object import SceneObject
 from uwlts.errors import DescriptionError
 from uwlts.model.library import find_description, load_sensor, read_table, validate_description
 from uwlts.model.sensor import Description, NotNegative, Sensor
@@ -224,7 +222,7 @@ class _SampledImperfections:
                 tilt = size.target_tilt_std_deg * rng.standard_normal(2)
                 turned = np.array(thing.rotation_deg) + (*tilt, 0.0)
                 objects[number] = replace_values(thing, **self._target, rotation_deg=tuple(turned.tolist()))
-            elif draws_depths(thing):
+            elif thing.draws_depths():
                 objects[number] = replace_values(thing, seed=int(rng.integers(2**31)))
         if self._lower_step != 0 and _shows_step(scene):
             number = _find_lower_block(scene)
@@ -246,17 +244,6 @@ class _SampledImperfections:
             nominal_direction=motion.recorded_direction(),
             position_errors_mm=tuple(errors.tolist()),
         )
-
-
-def draws_depths(thing: SceneObject) -> bool:
-    """Return whether an object has pits or undercuts of drawn depths; each campaign draws them again."""
-    match thing:
-        case PittedPipe():
-            return isinstance(thing.pit_depth_mm, tuple)
-        case Weld():
-            return isinstance(thing.undercut_depth_mm, tuple)
-        case _:
-            return False
 
 
 def _shows_step(scene: Scene) -> bool:

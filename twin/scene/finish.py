@@ -303,10 +303,8 @@ def register_textures() -> None:
             self.gain, self.most = opaque(deviation * math.sqrt(2 / WAVES)), opaque(scale)
             self.middle = opaque(mean * math.exp(-(deviation**2) / 2))
             self.level = opaque(table.get("level", 0.0) * math.sqrt(WAVES / 2))
-            self.patch, self.average = (
-                opaque(scale * table["patch"]),
-                opaque(scale * (mean + share * (table["patch"] - mean))),
-            )
+            self.patch = opaque(scale * table["patch"])
+            self.average = opaque(scale * (mean + share * (table["patch"] - mean)))
 
         def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
             return self.eval_1(si, active)

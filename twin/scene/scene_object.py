@@ -105,6 +105,10 @@ class SceneObject(Pose):
         """Return the specular reflectance of a plane mirror."""
         return getattr(self, "mirror", 0.0)
 
+    def draws_depths(self) -> bool:
+        """Return whether the object has flaws of drawn depths; each campaign draws them again."""
+        return False
+
     def polarisation(self) -> float:
         """Return the degree of polarisation of scattered laser light: 1 for metals and mirrors, else 0."""
         return 1.0 if self.finish_properties().reflection == "metal" or self.mirror_share() > 0 else 0.0

@@ -2,8 +2,8 @@
 
 A navigation filter models the same two errors for a velocity sensor or a gyroscope: a bias, constant or a first-order
 Gauss-Markov process, and white noise (Farrell, Aided Navigation, 2008, sections 4.6 and 4.9). If positions are
-dead-reckoned from velocities v, a heading error e adds
-the integral of e z x v to the position error (ibid., chapter 12).
+dead-reckoned from velocities v, a heading error e adds the integral of e z x v to the position error (ibid.,
+chapter 12).
 """
 
 from __future__ import annotations

@@ -24,6 +24,7 @@ from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.comparison.ideal_shapes import IdealShape, place_shape
 from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, average_locally
 from uwlts.errors import EvaluationError
+from uwlts.fitting.point_groups import number_cubes
 from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
@@ -427,10 +428,8 @@ def _thin_points(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
     The side grows if there would be too many places.
     """
     while True:
-        cells = np.floor((points - points.min(axis=0)) / apart).astype(np.int64)
-        size = cells.max(axis=0) + 1
-        keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
-        first = np.sort(np.unique(keys, return_index=True)[1])
+        cubes = number_cubes(points - points.min(axis=0), apart)
+        first = np.sort(np.unique(cubes, return_index=True)[1])
         if len(first) <= OPTIONS.most_places:
             return first, apart
         # The number of cubes on a surface is inversely proportional to the square of their side.

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.fitting.local_surface import LocalSurface, SurfacePoints, surface_normals
+from uwlts.fitting.point_groups import group_rows
 from uwlts.fitting.point_spacing import choose_disc_diameter
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.cloud import PointCloud, project_image_errors, project_variance
@@ -247,9 +248,7 @@ def _march_cubes(corners: np.ndarray, distance: np.ndarray, known: np.ndarray) -
     low = block.min(axis=0, initial=0)
     size = block.max(axis=0, initial=0) - low + 1
     keys = np.asarray(np.ravel_multi_index(tuple((block - low).T), tuple(size)))
-    order = np.argsort(keys, kind="stable")
-    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    members = {tuple(block[each[0]].tolist()): each for each in np.split(order, starts[1:])} if len(order) else {}
+    members = {tuple(block[each[0]].tolist()): each for each in group_rows(keys).values()}
     vertices, faces, first = [], [], 0
     for each in members:
         volume = np.zeros((_BLOCK + 1,) * 3, np.float32)

@@ -19,6 +19,7 @@ from uwlts.evaluation.figures import (
     spread_mm,
 )
 from uwlts.fitting.least_squares import DEFAULT_K, RobustFit, fit_robustly, robust_std
+from uwlts.fitting.point_groups import number_cubes
 from uwlts.fitting.shapes import SphereFit, fit_sphere
 from uwlts.model.artefacts import SphereStandard
 
@@ -95,7 +96,7 @@ def find_sphere(
             return None
         # One point per cell removes the influence of point density.
         left = points[usable]
-        _, first = np.unique(_cells(left - left.min(axis=0), radius_mm * _THINNING), return_index=True)
+        _, first = np.unique(number_cubes(left - left.min(axis=0), radius_mm * _THINNING), return_index=True)
         centre = _best_centre(left[rng.permutation(first)[:_THINNED]], radius_mm, rng)
         if centre is None:
             return None
@@ -104,12 +105,6 @@ def find_sphere(
             return found
         usable &= np.abs(np.linalg.norm(points - centre, axis=1) - radius_mm) > _SEARCH_LIMIT * radius_mm
     return None
-
-
-def _cells(points: np.ndarray, size: float) -> np.ndarray:
-    """Return the cell (N,) of each point (N, 3) in a cubic grid; coordinates must be non-negative."""
-    cells = np.floor(points / size).astype(np.int64)
-    return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
 
 
 def _best_centre(points: np.ndarray, radius: float, rng: np.random.Generator) -> np.ndarray | None:
@@ -202,7 +197,7 @@ def _mark_crossed(away: np.ndarray, distances: np.ndarray, limit: float, usable:
     if not len(near):
         return crossed
     direction = away[near] / np.linalg.norm(away[near], axis=1, keepdims=True)
-    _, cell = np.unique(_cells(direction + 1.0, _CELL), return_inverse=True)
+    _, cell = np.unique(number_cubes(direction + 1.0, _CELL), return_inverse=True)
     outer = np.bincount(cell, weights=np.abs(distances[near]) > limit)
     total = np.bincount(cell)
     crossed[near] = ((outer >= _OUTER_COUNT) & (outer > _OUTER_SHARE * total))[cell]

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patch_errors import PatchErrors
+from uwlts.fitting.point_groups import number_cubes
 from uwlts.storage.cloud import PointUncertainty, project_image_errors, project_variance
 
 _CELLS_PER_RADIUS = 3.0
@@ -514,9 +515,7 @@ def _columns(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def _average_in_cubes(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Average points in cubes; return the cube (N,) of each point, and means (C, 3) and counts (C,) of the cubes."""
-    cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    size = cells.max(axis=0) + 1
-    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    keys = number_cubes(points - points.min(axis=0), cell)
     _, owner, counts = np.unique(keys, return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(owner, column) for column in points.T], axis=1) / counts[:, None]
     return owner, means, counts.astype(np.float64)

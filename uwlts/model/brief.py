@@ -1,8 +1,8 @@
-"""Short text representations of results, with sizes in place of the contents of arrays and lists."""
+"""Short text representations of results: sizes in place of the contents of arrays and lists, and aligned tables."""
 
 import dataclasses
 import html
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Collection, Mapping, Sequence, Set
 from pathlib import Path
 
 _LONGEST = 60
@@ -50,3 +50,12 @@ def summarise_value(value: object) -> str:
             return text
         return f"{len(value)} {'entries' if isinstance(value, Mapping) else 'items'}"
     return type(value).__name__
+
+
+def align_columns(rows: Sequence[Sequence[str]], *, right: Collection[int] = ()) -> list[str]:
+    """Return the cells of a table as lines with aligned columns; those with a number in ``right`` end together."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(f"{cell:{'>' if k in right else '<'}{widths[k]}}" for k, cell in enumerate(row)).rstrip()
+        for row in rows
+    ]

@@ -216,9 +216,10 @@ class Laser(Description):
 
     ``side_lobes`` are weak Gaussian sheets parallel to the main one: stray light (a wide pedestal at the offset 0) and
     side lobes. Each is an offset towards the sheet's normal and a 1/e^2 radius, both in units of the main sheet's local
-    radius, and a fraction of the power. ``bow_deg`` is the tilt of the beam
-    at the line optics, which curves the line towards the sheet's normal (positive) or away from it. ``linewidth_nm`` is
-    the full width at half maximum of the spectrum.
+    radius, and a fraction of the power.
+
+    ``bow_deg`` is the tilt of the beam at the line optics, which curves the line towards the sheet's normal (positive)
+    or away from it. ``linewidth_nm`` is the full width at half maximum of the spectrum.
     """
 
     wavelength_nm: Annotated[float, Field(ge=400, le=700)]

@@ -21,7 +21,7 @@ from scipy.spatial.distance import cdist
 from uwlts._version import __version__
 from uwlts.errors import CaptureError, DescriptionError, RangeError
 from uwlts.fitting.propagation import jackknife
-from uwlts.model.brief import Brief
+from uwlts.model.brief import Brief, align_columns
 from uwlts.model.sensor import Table
 from uwlts.radiometry.image_sets import open_image_set
 from uwlts.radiometry.stripe_windows import STATISTICS, WINDOW_LINES, StripeWindows, measure_windows
@@ -144,7 +144,7 @@ class DomainGap(Brief):
         if self.real:
             blocks += [self.covered_table()] if self.generated else []
             blocks.append(self.gap_table())
-        return [line for head, rows in blocks for line in (*_aligned([head, *rows]), "")][:-1]
+        return [line for head, rows in blocks for line in (*align_columns([head, *rows]), "")][:-1]
 
     def record(self) -> Table:
         """Return the result as JSON."""
@@ -316,8 +316,3 @@ def _group_starts(image: np.ndarray) -> np.ndarray:
     if len(starts) >= _FEWEST_IMAGES:
         return starts
     return np.unique(np.linspace(0, len(image), min(_PARTS, len(image) // 2), endpoint=False).astype(int))
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -17,9 +17,9 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import CAPTURES, Capture
 from uwlts.storage.data_set import CARD, load_dataset
 from uwlts.storage.image_file import read_image
+from uwlts.storage.image_header import SUFFIXES
 from uwlts.stripe import PeakRule, StripeOptions, StripeSettings, extract_stripe
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _BITS = (8, 10, 12, 14, 16)
 """Bits of cameras."""
 _SMOOTH_PX = 2.0
@@ -117,13 +117,13 @@ def _open_capture(path: Path, stripe: StripeSettings) -> ImageSet:
 
 def _open_files(path: Path, stripe: StripeSettings) -> ImageSet:
     if path.is_dir():
-        files = [each for each in sorted(path.iterdir()) if each.suffix.lower() in _ENDINGS]
+        files = [each for each in sorted(path.iterdir()) if each.suffix.lower() in SUFFIXES]
     else:
         files = [path] if is_regular_file(path) else sorted(map(Path, glob(str(path))))
     if not files:
         raise ImageError(
             f"{path} has no images: give a data set, a capture (.h5), a folder, a file or a quoted pattern of images "
-            f"({', '.join(_ENDINGS)})"
+            f"({', '.join(SUFFIXES)})"
         )
     options = StripeOptions.resolve(load_sensor("thesis"), stripe)
     first = read_image(files[0])

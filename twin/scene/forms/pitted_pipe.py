@@ -61,6 +61,9 @@ class PittedPipe(FreeForm):
                 )
         return self
 
+    def draws_depths(self) -> bool:
+        return isinstance(self.pit_depth_mm, tuple)
+
     def deepest_mm(self) -> float:
         """Return the largest possible depth of a pit."""
         return self.pit_depth_mm[1] if isinstance(self.pit_depth_mm, tuple) else self.pit_depth_mm

@@ -85,6 +85,9 @@ class Weld(FreeForm):
         x, y = np.meshgrid(*((along, across) if self.along == "x" else (across, along)), indexing="ij")
         return np.stack([x, y, -weld_height(self, x, y)], axis=-1).reshape(-1, 3), grid_faces(x.shape)
 
+    def draws_depths(self) -> bool:
+        return isinstance(self.undercut_depth_mm, tuple)
+
 
 def undercut_depths(weld: Weld) -> np.ndarray:
     """Return the depths (beads, 2) in mm of the grooves on the negative and positive side across each bead.

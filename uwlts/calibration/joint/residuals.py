@@ -13,6 +13,7 @@ from scipy import sparse
 from uwlts.calibration.camera.target_images import Placement
 from uwlts.calibration.camera.target_poses import centre_offsets
 from uwlts.calibration.joint.parameters import Parameters, SheetPoints, ViewMedium
+from uwlts.fitting.point_groups import group_rows
 from uwlts.fitting.schur_least_squares import LocalPrior
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
@@ -237,7 +238,7 @@ class TargetEvidence(StripeEvidence):
 
     @cached_property
     def _stripe_of_image(self) -> dict[int, np.ndarray]:
-        return group_by_image(self.image)
+        return group_rows(self.image)
 
     def stripe_pixels(self, image: int) -> np.ndarray | slice:
         return self._stripe_of_image[image]
@@ -252,7 +253,7 @@ class TargetEvidence(StripeEvidence):
         """Correct the detected centres of circle images to the images of the circles' centres."""
         placement, seen_by = self.placement, partial(parameters.project, global_values, self.view)
         pixels = placement.pixels.copy()
-        for image, here in group_by_image(placement.image).items():
+        for image, here in group_rows(placement.image).items():
             pose = self.pose(parameters, global_values, local, image)
             pixels[here] -= centre_offsets(seen_by, pose, placement.points_mm[here], diameter_mm=diameter_mm)
         return replace(self, placement=replace(placement, pixels=pixels))
@@ -282,7 +283,7 @@ class TargetEvidence(StripeEvidence):
         return sorted(found, key=lambda part: part.image)
 
     def linearise(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
-        points, of_image = self.placement.pixels.copy(), group_by_image(self.placement.image)
+        points, of_image = self.placement.pixels.copy(), group_rows(self.placement.image)
         for part, kept in zip(residuals, used, strict=True):
             if part.kind == TARGET:
                 points[of_image[part.image]] -= np.where(kept, part.values, 0.0).reshape(-1, 2)
@@ -367,13 +368,6 @@ class TargetEvidence(StripeEvidence):
 
 def _values(parameters: Parameters, global_values: np.ndarray, keys: tuple[ParameterKey, ...]) -> np.ndarray:
     return np.array([parameters.value(global_values, key) for key in keys])
-
-
-def group_by_image(image: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the numbers of the pixels of each image, from the images (n,) of pixels."""
-    order = np.argsort(image, kind="stable")
-    starts = np.flatnonzero(np.diff(image[order], prepend=-1))
-    return dict(zip(image[order][starts].tolist(), np.split(order, starts[1:]), strict=True)) if len(order) else {}
 
 
 def _split_batches(image: np.ndarray) -> list[np.ndarray]:

@@ -9,7 +9,8 @@ import numpy as np
 from scipy import sparse
 
 from uwlts.calibration.joint.parameters import Parameters
-from uwlts.calibration.joint.residuals import Distances, Residuals, StripeEvidence, group_by_image
+from uwlts.calibration.joint.residuals import Distances, Residuals, StripeEvidence
+from uwlts.fitting.point_groups import group_rows
 from uwlts.fitting.schur_least_squares import LocalPrior
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Uncertainty
@@ -239,7 +240,7 @@ class SurfaceScanEvidence(StripeEvidence):
 
     @cached_property
     def _pixels_of_frame(self) -> dict[int, np.ndarray]:
-        return group_by_image(self.frame)
+        return group_rows(self.frame)
 
     def stripe_pixels(self, image: int) -> np.ndarray | slice:
         return self._pixels_of_frame[image - self.image]

@@ -61,7 +61,7 @@ class Detection:
         return replace(self, members=members, part=part)
 
     def without_isolated(self, points: np.ndarray) -> Self:
-        """Return the detection without points of the profile (N, 2) that have few others beside them, or None."""
+        """Return the detection without points of the profile (N, 2) that have few others beside them."""
         count = len(points)
         rows = np.flatnonzero(self.members)
         spacing = float(np.median(np.linalg.norm(np.diff(points[rows], axis=0), axis=1)))
