@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.calibration.mount.artefact_shapes import SHAPES
 from uwlts.calibration.mount.captured_profiles import CapturedProfiles, mount_covariance, reconstruct_profiles
 from uwlts.calibration.mount.hand_eye import mount_by_board
-from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
+from uwlts.calibration.mount.next_pose import NextPose, next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, from_sheet, to_sheet
 from uwlts.calibration.mount.profiles import LEAST_POINTS
 from uwlts.calibration.mount.restricted_likelihood import (
@@ -217,6 +217,16 @@ class _Calibration:
 
     def make_result(self) -> Mount:
         """Return the mount with its uncertainty, rejected poses and advice."""
+        try:
+            return self._make_result()
+        except NotSettled as error:
+            # A direction that the poses do not determine may keep the estimate moving: it is the better reason.
+            used = error.last.evidence
+            assert isinstance(used, Problem)
+            self._require_determined(used, error.last, used.free @ error.last.covariance @ used.free.T)
+            raise
+
+    def _make_result(self) -> Mount:
         shapes = [self.shape.find(points, self.rng) for points in self.flat]
         for number, shape in enumerate(shapes):
             if shape is None:
@@ -312,12 +322,11 @@ class _Calibration:
                 f"{std:.2g} mm)"
             )
 
-    def _summary(self, used: Problem, estimate: RestrictedEstimate[MountState], members: list[np.ndarray]) -> Mount:
+    def _require_determined(
+        self, used: Problem, estimate: RestrictedEstimate[MountState], covariance: np.ndarray
+    ) -> tuple[list[str], NextPose | None]:
+        """Return weakly determined directions and the best next pose; an error if a direction is undetermined."""
         state, scatter = estimate.state, Scatter(*estimate.scatter)
-        known = None if self.captured is None else self.captured.known
-        covariance, share, factor = mount_covariance(
-            estimate, used.free, state.rotation, known, lambda: self._calibration_derivatives(used, state, members)
-        )
         turns = Rotation.from_matrix(used.motion(state.offset_s)[0])
         weak = weaknesses(covariance[:6, :6], turns, table=used.table)
         names = [name for number, name in enumerate(self.evidence.names) if number not in self.reasons]
@@ -330,6 +339,15 @@ class _Calibration:
             if self.shape.flat or wrong < 0.2 * _NO_FIT * state.artefact[3]:
                 raise
             raise NoFit(f"no mount fits the profiles: the poses would have errors of {wrong:.3g} mm (rms)") from error
+        return weak, advised
+
+    def _summary(self, used: Problem, estimate: RestrictedEstimate[MountState], members: list[np.ndarray]) -> Mount:
+        state, scatter = estimate.state, Scatter(*estimate.scatter)
+        known = None if self.captured is None else self.captured.known
+        covariance, share, factor = mount_covariance(
+            estimate, used.free, state.rotation, known, lambda: self._calibration_derivatives(used, state, members)
+        )
+        weak, advised = self._require_determined(used, estimate, covariance)
         moved = [used.apply_step(state, step) for step, _ in estimate.without_each]
         rms, held = used.rms_mm(state), np.array([used.rms_mm(each)[place] for place, each in enumerate(moved)])
         off = zip(used.counts.tolist(), rms.tolist(), held.tolist(), strict=True)

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
@@ -239,12 +239,16 @@ def settle_agreeing(
 
 
 class NotSettled(CalibrationError):
-    """The iteration has not converged after all rounds."""
+    """The iteration has not converged after all rounds; ``last`` is its last estimate."""
+
+    def __init__(self, text: str, last: RestrictedEstimate[Any]) -> None:
+        super().__init__(text)
+        self.last = last
 
 
 def _iterate(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray) -> RestrictedEstimate[State]:
     """Alternate weighted least squares and maximum likelihood of the components; damp oscillating steps."""
-    fraction, before, size = 1.0, np.zeros(evidence.size), 0.0
+    fraction, before, size, criterion = 1.0, np.zeros(evidence.size), 0.0, np.inf
     sizes: list[float] = []
     for _ in range(_MOST_ROUNDS):
         covariances, _ = evidence.covariance(state)(np.log(scatter))
@@ -268,7 +272,8 @@ def _iterate(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray
     raise NotSettled(
         f"the estimate of the mount does not converge: after {len(sizes)} rounds it still changes by {size:.2g} "
         "standard uncertainties. Record more poses, with rotations about two axes and the artefact in all parts of the "
-        "profile"
+        "profile",
+        RestrictedEstimate(evidence, state, scatter, criterion),
     )
 
 

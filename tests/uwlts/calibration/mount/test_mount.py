@@ -23,6 +23,7 @@ from tests.uwlts.mount_views import (
     sphere_campaign,
     step_campaign,
 )
+from uwlts.calibration.mount import restricted_likelihood
 from uwlts.cli import main
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, PlaneFound, RingFound, SphereFound, StepFound
@@ -243,6 +244,14 @@ def test_a_time_offset_is_found(rng):
 def test_missing_turns_are_named(rng):
     with pytest.raises(CalibrationError, match=r"insufficient rotation about the platform's x axis .*Next pose to add"):
         mount_of(sphere_campaign(rng, tilt_deg=0.0), radius_mm=RADIUS_MM)
+
+
+def test_missing_turns_are_named_if_the_estimate_does_not_converge(rng, monkeypatch):
+    monkeypatch.setattr(restricted_likelihood, "_MOST_ROUNDS", 1)
+    with pytest.raises(CalibrationError, match=r"insufficient rotation about the platform's x axis"):
+        mount_of(sphere_campaign(rng, tilt_deg=0.0), radius_mm=RADIUS_MM)
+    with pytest.raises(CalibrationError, match=r"does not converge: after 1 rounds"):
+        mount_of(sphere_campaign(rng), radius_mm=RADIUS_MM)
 
 
 def test_the_next_pose_lowers_the_uncertainty_as_said(rng):
