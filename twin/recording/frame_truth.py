@@ -28,6 +28,8 @@ _TOLERANCE_MM = 5e-4
 
 _FAINTEST = 1e-3
 """Fraction of the light at a stripe's centre at which the stripe ends: 3.7 standard deviations of a Gaussian."""
+_LEAST_MIXED = 1e-6
+"""Mixed fraction below which it is 0, because some processors and threads flush tiny numbers to zero."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,7 @@ def measure_line_light(
             "visible_fraction": np.where(light > 0, np.minimum(slope * profile.sum(axis=0), 1.0), np.nan),
             "mixed_fraction": other.sum(axis=0) / light,
         }
+    measured["mixed_fraction"][measured["mixed_fraction"] < _LEAST_MIXED] = 0.0
     filled = {name: getattr(truth, name).copy() for name in measured}
     for name, values in measured.items():
         filled[name][lines] = values
