@@ -127,30 +127,19 @@ class WindowGeometry:
 
 @dataclass(frozen=True)
 class Path:
-    """Rays from a module's origin through its window to points outside.
+    """Rays from a module's origin through its window to points outside."""
 
-    Attributes
-    ----------
-    slope, slope_outside
-        Tangent of the angle to the window's normal, in air and in the medium.
-    across : Vector
-        Unit vector of the ray's lateral direction, perpendicular to the normal.
-    height_mm
-        Distance of the point from the origin along the normal.
-    apparent_mm
-        Lateral distance of the point divided by the slope in air: apparent distance perpendicular to the plane of
-        incidence.
-    growth_mm
-        Derivative of the lateral distance with respect to the slope in air: apparent distance in the plane of
-        incidence.
-    """
-
+    # Tangent of the angle to the window's normal, in air and in the medium.
     slope: Array
     slope_outside: Array
-    across: Vector
-    height_mm: Array
+    across: Vector  # unit vector of the ray's lateral direction, perpendicular to the normal
+    height_mm: Array  # distance of the point from the origin along the normal
     apparent_mm: Array
+    """Lateral distance of the point divided by the slope in air: apparent distance perpendicular to the plane of
+    incidence."""
     growth_mm: Array
+    """Derivative of the lateral distance with respect to the slope in air: apparent distance in the plane of
+    incidence."""
 
 
 def snell_root(xp: ModuleType, index: Array, slope: Array) -> Array:

@@ -53,33 +53,17 @@ class VerifiedMeasurements:
 
     Outliers, more than five robust standard deviations from the trend, are excluded except in ``points``. At depths
     with fewer than 20 points, scatter and error are NaN and the line length is 0.
-
-    Attributes
-    ----------
-    z_mm : (K,)
-        True Z of the plane in the OCS, ascending.
-    points : (K,)
-        Number of points, including outliers.
-    scatter_mm : (K,)
-        Standard deviation along Z about the profile's quadratic trend (random error).
-    error_mm : (K,)
-        Mean deviation along Z from the true plane (systematic error). It includes the error of the calibrated OCS's
-        origin, which is equal at all depths.
-    line_mm : (K,)
-        Length of the profile along Y.
-    exposure_ms : float
-        Exposure of the plane's images.
-    seconds : dict
-        Times to render, calibrate and measure.
     """
 
-    z_mm: np.ndarray
-    points: np.ndarray
-    scatter_mm: np.ndarray
+    z_mm: np.ndarray  # (K,); true Z of the plane in the OCS, ascending
+    points: np.ndarray  # (K,); number of points, including outliers
+    scatter_mm: np.ndarray  # (K,); standard deviation along Z about the profile's quadratic trend (random error)
     error_mm: np.ndarray
-    line_mm: np.ndarray
-    exposure_ms: float = math.nan
-    seconds: dict[str, float] = field(default_factory=dict)
+    """(K,); mean deviation along Z from the true plane (systematic error). It includes the error of the calibrated
+    OCS's origin, which is equal at all depths."""
+    line_mm: np.ndarray  # (K,); length of the profile along Y
+    exposure_ms: float = math.nan  # exposure of the plane's images
+    seconds: dict[str, float] = field(default_factory=dict)  # times to render, calibrate and measure
 
 
 def verify(

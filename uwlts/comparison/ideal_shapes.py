@@ -98,26 +98,13 @@ def read_shape(path: Path) -> IdealShape:
 
 @dataclass(frozen=True, eq=False)
 class PlacedShape:
-    """Shape at a position.
-
-    Attributes
-    ----------
-    kind : {"plane", "sphere", "cylinder"}
-    point_mm : (3,) float64
-        Point of the plane, centre of the sphere, or point on the axis.
-    direction : (3,) float64 or None
-        Unit normal or axis; None for a sphere.
-    radius_mm : float
-        Radius; 0 for a plane.
-    registration : Registration or None
-        Uncertainty of a fitted shape; None for a given one.
-    """
+    """Shape at a position."""
 
     kind: Literal["plane", "sphere", "cylinder"]
-    point_mm: np.ndarray
-    direction: np.ndarray | None
-    radius_mm: float
-    registration: Registration | None = None
+    point_mm: np.ndarray  # (3,); point of the plane, centre of the sphere, or point on the axis
+    direction: np.ndarray | None  # (3,) or None; unit normal or axis; None for a sphere
+    radius_mm: float  # radius; 0 for a plane
+    registration: Registration | None = None  # uncertainty of a fitted shape; None for a given one
 
     @property
     def uncertainty(self) -> None:

@@ -111,24 +111,14 @@ class AnalysisJob:
 
 @dataclass(frozen=True)
 class Analysis:
-    """A kind of analysis.
-
-    Attributes
-    ----------
-    run
-        Function of the job and a progress listener, which writes the files.
-    taken
-        Package and name of public functions, and the parameters that the form offers.
-    suffix
-        Addition to the name of the first file, for the results.
-    endings
-        Endings of the results; empty if the form states them.
-    """
+    """A kind of analysis."""
 
     run: Callable[[AnalysisJob, ProgressListener], AnalysisOutcome]
+    """Function of the job and a progress listener, which writes the files."""
     taken: tuple[tuple[ModuleType, str, tuple[str, ...]], ...]
-    suffix: str
-    endings: tuple[str, ...] = ()
+    """Package and name of public functions, and the parameters that the form offers."""
+    suffix: str  # addition to the name of the first file, for the results
+    endings: tuple[str, ...] = ()  # endings of the results; empty if the form states them
 
 
 def _inspect(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:

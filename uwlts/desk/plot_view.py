@@ -22,29 +22,17 @@ _MARGIN = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """Points (N,), or the upper edges of bars, over the horizontal axis.
+    """Points (N,), or the upper edges of bars, over the horizontal axis."""
 
-    Attributes
-    ----------
-    across, up : (N,) float64
-        Coordinates; of bars the middles and the heights.
-    across_label, up_label : str
-        Names of the axes, with units.
-    bar_width : float or None
-        Width of bars; None: points.
-    downwards : bool
-        True if the vertical axis increases downwards.
-    marks : tuple of (float, float)
-        Marked places.
-    """
-
+    # (N,); coordinates; of bars the middles and the heights.
     across: np.ndarray
     up: np.ndarray
+    # Names of the axes, with units.
     across_label: str
     up_label: str
-    bar_width: float | None = None
-    downwards: bool = False
-    marks: Sequence[tuple[float, float]] = ()
+    bar_width: float | None = None  # width of bars; None: points
+    downwards: bool = False  # True if the vertical axis increases downwards
+    marks: Sequence[tuple[float, float]] = ()  # marked places
 
     @property
     def across_range(self) -> tuple[float, float]:

@@ -58,24 +58,12 @@ _OUTER_COUNT = 2
 
 @dataclass(frozen=True, eq=False)
 class FoundSphere:
-    """Sphere in a cloud.
+    """Sphere in a cloud."""
 
-    Attributes
-    ----------
-    robust : RobustFit
-        Fit of free radius to its points.
-    members : (M,) int
-        Indices of these points in the cloud.
-    near : (N,) bool
-        Points of the cloud within three limits of the sphere.
-    points_mixed : int
-        Number of points on the sphere that were excluded, because another surface crosses it there.
-    """
-
-    robust: RobustFit[SphereFit]
-    members: np.ndarray
-    near: np.ndarray
-    points_mixed: int
+    robust: RobustFit[SphereFit]  # fit of free radius to its points
+    members: np.ndarray  # (M,) int; indices of these points in the cloud
+    near: np.ndarray  # (N,) bool; points of the cloud within three limits of the sphere
+    points_mixed: int  # number of points on the sphere that were excluded, because another surface crosses it there
 
 
 def find_sphere(

@@ -11,37 +11,22 @@ from uwlts.storage.truth import TruthStatus
 
 @dataclass(frozen=True, eq=False)
 class TruthComparison:
-    """Errors, completeness and false points of a cloud.
+    """Errors, completeness and false points of a cloud."""
 
-    Attributes
-    ----------
-    matched : (N,) bool
-        Points whose frame and line have a true stripe; all others are false points.
-    error_mm : (N, 3)
-        Measured minus true point; NaN if not matched.
-    distance_mm : (N,)
-        Component of the error along the true normal; NaN if not matched.
-    mean_mm, std_mm, rms_mm : float
-        Statistics of the distances of matched points.
-    p95_mm, p99_mm, largest_mm : float
-        Percentiles and maximum of their absolute values.
-    share_within_tolerance : float
-        Fraction of the matched points with an absolute distance of at most `tolerance_mm`.
-    false_points, missed : int
-        Number of points without a true stripe, and of true stripes (a line of a frame) without a point.
-    """
-
-    matched: np.ndarray
-    error_mm: np.ndarray
-    distance_mm: np.ndarray
+    matched: np.ndarray  # (N,) bool; points whose frame and line have a true stripe; all others are false points
+    error_mm: np.ndarray  # (N, 3); measured minus true point; NaN if not matched
+    distance_mm: np.ndarray  # (N,); component of the error along the true normal; NaN if not matched
     tolerance_mm: float
+    # Statistics of the distances of matched points.
     mean_mm: float
     std_mm: float
     rms_mm: float
+    # Percentiles and maximum of their absolute values.
     p95_mm: float
     p99_mm: float
     largest_mm: float
-    share_within_tolerance: float
+    share_within_tolerance: float  # fraction of the matched points with an absolute distance of at most `tolerance_mm`
+    # Number of points without a true stripe, and of true stripes (a line of a frame) without a point.
     false_points: int
     missed: int
 

@@ -41,55 +41,30 @@ class PointGrid:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points for the fit of patches, with their uncertainty along the normals.
+    """Points for the fit of patches, with their uncertainty along the normals."""
 
-    Attributes
-    ----------
-    points_mm, normals : (N, 3) float64
-        Points and outward unit normals.
-    weight : (N,) float64
-        Inverse of the total variance along the normal.
-    noise_mm2 : (N,) float64
-        Noise variance of each point along the normal; 0 if unknown.
-    position_mm : (N,) float64
-        Standard deviation along the normal by the position of the image, common to all points of an image.
-    image : (N,) int64
-        Image of each point.
-    patterns_mm : (M, N) float64
-        Shift along the normal by each systematic pattern, common to all points of a scan.
-    scan : (N,) int64
-        Scan of each point; the patterns of different scans are independent.
-    """
-
+    # (N, 3); points and outward unit normals.
     points_mm: np.ndarray
     normals: np.ndarray
-    weight: np.ndarray
-    noise_mm2: np.ndarray
+    weight: np.ndarray  # (N,); inverse of the total variance along the normal
+    noise_mm2: np.ndarray  # (N,); noise variance of each point along the normal; 0 if unknown
     position_mm: np.ndarray
-    image: np.ndarray
-    patterns_mm: np.ndarray
-    scan: np.ndarray
+    """(N,); standard deviation along the normal by the position of the image, common to all points of an image."""
+    image: np.ndarray  # (N,) int64; image of each point
+    patterns_mm: np.ndarray  # (M, N); shift along the normal by each systematic pattern, common to all points of a scan
+    scan: np.ndarray  # (N,) int64; scan of each point; the patterns of different scans are independent
 
 
 @dataclass(frozen=True, eq=False)
 class LocalPatches:
-    """Patches at P places.
+    """Patches at P places."""
 
-    Attributes
-    ----------
-    height_mm : (P,) float64
-        Height of the surface above the place, along the normal.
-    normals : (P, 3) float64
-        Outward unit normals of the patches.
-    found : (P,) bool
-        Mask of places whose height is better determined than by one point; elsewhere it would be an extrapolation.
-    noise_mm, shared_mm : (P,) float64
-        Standard uncertainty of the height by errors of points and images, and by systematic errors of a scan.
-    """
-
-    height_mm: np.ndarray
-    normals: np.ndarray
+    height_mm: np.ndarray  # (P,); height of the surface above the place, along the normal
+    normals: np.ndarray  # (P, 3); outward unit normals of the patches
     found: np.ndarray
+    """(P,) bool; mask of places whose height is better determined than by one point; elsewhere it would be an
+    extrapolation."""
+    # (P,); standard uncertainty of the height by errors of points and images, and by systematic errors of a scan.
     noise_mm: np.ndarray
     shared_mm: np.ndarray
 

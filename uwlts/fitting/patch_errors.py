@@ -16,33 +16,17 @@ from scipy.sparse import csr_array, hstack
 
 @dataclass(frozen=True, eq=False)
 class PatchErrors:
-    """Independent errors of a cloud, and the changes of the heights of P patches by them.
+    """Independent errors of a cloud, and the changes of the heights of P patches by them."""
 
-    Attributes
-    ----------
-    near : (P, K) int
-        Averages of points in each disc.
-    rows : (P, K) float32
-        Derivatives of the height in the middle of a disc by the heights of these averages.
-    noise_mm : (P,) float64
-        Standard deviation of one point along the normal.
-    normals : (P, 3) float64
-        Normals of the patches in the cloud's frame.
-    counts : (C,) float64
-        Number of points in each average.
-    images : (C, I) sparse
-        Fraction of the points of each average in each image.
-    image_shifts_mm : (J, C, 3) float64
-        Shift of each average for one standard deviation of each error of its image.
-    """
-
-    near: np.ndarray
+    near: np.ndarray  # (P, K) int; averages of points in each disc
     rows: np.ndarray
-    noise_mm: np.ndarray
-    normals: np.ndarray
-    counts: np.ndarray
-    images: csr_array
+    """(P, K) float32; derivatives of the height in the middle of a disc by the heights of these averages."""
+    noise_mm: np.ndarray  # (P,); standard deviation of one point along the normal
+    normals: np.ndarray  # (P, 3); normals of the patches in the cloud's frame
+    counts: np.ndarray  # (C,); number of points in each average
+    images: csr_array  # (C, I) sparse; fraction of the points of each average in each image
     image_shifts_mm: np.ndarray
+    """(J, C, 3); shift of each average for one standard deviation of each error of its image."""
 
     def __getitem__(self, selection: Any) -> PatchErrors:
         """Select patches by a slice, indices or a mask."""

@@ -64,58 +64,27 @@ class Averages:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """P patches of the surface of a cloud, in its frame.
+    """P patches of the surface of a cloud, in its frame."""
 
-    Attributes
-    ----------
-    places_mm : (P, 3) float64
-        Centre of each patch, on the surface.
-    axes : (P, 3, 3) float64
-        Two tangents and the unit normal, in rows.
-    shape : (P, 6) float64
-        Coefficients of the height over the tangents: 1, u, v, u2, uv, v2.
-    covariance : (P, 6, 6) float64
-        Covariance of the shape by noise of the points.
-    patterns_mm : (M, P, 3) float64
-        Shift of each patch for one standard deviation of each systematic pattern (`PointUncertainty`).
-    numbers : (P,) int
-        Number of a point near the centre of the patch.
-    radius_mm : float
-        Radius of the discs.
-    averages : Averages
-        Averages of points to which the patches are fitted.
-    errors : PatchErrors
-        Effect of the independent errors of the cloud on the heights of the patches.
-    image_variance_mm2 : (P,) float64
-        Variance of the heights by errors of images, which ``covariance`` does not contain.
-    one_sided : bool
-        True if all normals point to the sensor (-Z); otherwise their signs have no meaning.
-    noise_stated : bool
-        True if the cloud states the noise of its points; otherwise it is that of their scatter, with the misfit of
-        second-order surfaces.
-    shared : float
-        Variance of the sum of all heights by noise, relative to the sum of their variances.
-    overlap : float
-        Mean number of patches that contain a point.
-    strips : float
-        Number of independent groups of patches with regard to errors of images.
-    """
-
-    places_mm: np.ndarray
-    axes: np.ndarray
-    shape: np.ndarray
-    covariance: np.ndarray
+    places_mm: np.ndarray  # (P, 3); centre of each patch, on the surface
+    axes: np.ndarray  # (P, 3, 3); two tangents and the unit normal, in rows
+    shape: np.ndarray  # (P, 6); coefficients of the height over the tangents: 1, u, v, u2, uv, v2
+    covariance: np.ndarray  # (P, 6, 6); covariance of the shape by noise of the points
     patterns_mm: np.ndarray
-    numbers: np.ndarray
-    radius_mm: float
-    averages: Averages
-    errors: PatchErrors
+    """(M, P, 3); shift of each patch for one standard deviation of each systematic pattern (`PointUncertainty`)."""
+    numbers: np.ndarray  # (P,) int; number of a point near the centre of the patch
+    radius_mm: float  # radius of the discs
+    averages: Averages  # averages of points to which the patches are fitted
+    errors: PatchErrors  # effect of the independent errors of the cloud on the heights of the patches
     image_variance_mm2: np.ndarray
-    one_sided: bool
+    """(P,); variance of the heights by errors of images, which ``covariance`` does not contain."""
+    one_sided: bool  # True if all normals point to the sensor (-Z); otherwise their signs have no meaning
     noise_stated: bool
-    shared: float
-    overlap: float
-    strips: float
+    """True if the cloud states the noise of its points; otherwise it is that of their scatter, with the misfit of
+    second-order surfaces."""
+    shared: float  # variance of the sum of all heights by noise, relative to the sum of their variances
+    overlap: float  # mean number of patches that contain a point
+    strips: float  # number of independent groups of patches with regard to errors of images
 
     def correlated_count(self, count: int) -> float:
         """Return the number of patches that carry the information of one independent patch, among ``count`` patches."""
@@ -329,33 +298,23 @@ def find_disc_radius(points_mm: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PatchDistances:
-    """Q distances of patches from the patches of another cloud, in the common frame.
+    """Q distances of patches from the patches of another cloud, in the common frame."""
 
-    Attributes
-    ----------
-    source, target : (Q,) int
-        Numbers of the patches.
-    places_mm, normals : (Q, 3) float64
-        Centre of the source patch, and normal of the target surface below it.
-    distance_mm, std_mm : (Q,) float64
-        Distance along the normal, positive on its side, and its standard deviation by noise of both patches.
-    slope_variance : (Q,) float64
-        Variance of the normal's slope in each tangential direction.
-    target_errors : PatchErrors or None
-        Effect of the target's errors on its heights, if its surface was fitted again.
-    target_patterns_mm : (Q, M, 3) float64 or None
-        Systematic patterns of the target at the foot of each distance, if its surface was fitted again.
-    """
-
+    # (Q,) int; numbers of the patches.
     source: np.ndarray
     target: np.ndarray
+    # (Q, 3); centre of the source patch, and normal of the target surface below it.
     places_mm: np.ndarray
     normals: np.ndarray
+    # (Q,); distance along the normal, positive on its side, and its standard deviation by noise of both patches.
     distance_mm: np.ndarray
     std_mm: np.ndarray
-    slope_variance: np.ndarray
+    slope_variance: np.ndarray  # (Q,); variance of the normal's slope in each tangential direction
     target_errors: PatchErrors | None = None
+    """Effect of the target's errors on its heights, if its surface was fitted again."""
     target_patterns_mm: np.ndarray | None = None
+    """(Q, M, 3) or None; systematic patterns of the target at the foot of each distance, if its surface was fitted
+    again."""
 
     def __getitem__(self, selection: np.ndarray) -> PatchDistances:
         """Select distances by indices or a mask."""

@@ -21,24 +21,17 @@ _SEED = 635
 
 @dataclass(frozen=True, eq=False)
 class PointErrors:
-    """Independent components of point errors, as shifts (N, 3) or as distances (N,) along normals, mm.
-
-    Attributes
-    ----------
-    single_mm : (N, 3) or (N,)
-        Shift of each point for one standard deviation of its own noise; zero if the cloud has no uncertainty.
-    image_mm : (K, N, 3) or (K, N)
-        Shifts for one standard deviation of each component of an image's position and pose.
-    image : (N,) int
-        Image of each point.
-    patterns_mm : (M, N, 3) or (M, N) or None
-        Shifts for one standard deviation of each systematic pattern; None if the cloud has no uncertainty.
-    """
+    """Independent components of point errors, as shifts (N, 3) or as distances (N,) along normals, mm."""
 
     single_mm: np.ndarray
+    """(N, 3) or (N,); shift of each point for one standard deviation of its own noise; zero if the cloud has no
+    uncertainty."""
     image_mm: np.ndarray
-    image: np.ndarray
+    """(K, N, 3) or (K, N); shifts for one standard deviation of each component of an image's position and pose."""
+    image: np.ndarray  # (N,) int; image of each point
     patterns_mm: np.ndarray | None
+    """(M, N, 3) or (M, N) or None; shifts for one standard deviation of each systematic pattern; None if the cloud
+    has no uncertainty."""
 
     @classmethod
     def from_uncertainty(cls, known: PointUncertainty, frame: np.ndarray) -> PointErrors:

@@ -48,31 +48,16 @@ Model = Callable[[int, np.ndarray, np.ndarray], Observation | Sequence[Observati
 
 @dataclass(frozen=True, eq=False)
 class SchurFit:
-    """Solution of a grouped least-squares problem.
+    """Solution of a grouped least-squares problem."""
 
-    Attributes
-    ----------
-    global_values : (k,) float64
-    local : list of (b,) float64
-    residuals : list of (n, c) float64
-    covariance : (k, k) float64
-        Covariance of the global parameters, scaled by the variance of the residuals.
-    local_covariances : list of (b, b) float64
-    sigma : float
-        Standard deviation of one coordinate of a residual, by the degrees of freedom.
-    rounds : int
-    stopped : str
-        Reason for the end of the iteration.
-    """
-
-    global_values: np.ndarray
-    local: list[np.ndarray]
-    residuals: list[np.ndarray]
-    covariance: np.ndarray
-    local_covariances: list[np.ndarray]
-    sigma: float
+    global_values: np.ndarray  # (k,)
+    local: list[np.ndarray]  # (b,) each
+    residuals: list[np.ndarray]  # (n, c) each
+    covariance: np.ndarray  # (k, k); covariance of the global parameters, scaled by the variance of the residuals
+    local_covariances: list[np.ndarray]  # (b, b) each
+    sigma: float  # standard deviation of one coordinate of a residual, by the degrees of freedom
     rounds: int
-    stopped: str
+    stopped: str  # reason for the end of the iteration
 
 
 @dataclass(frozen=True, eq=False)

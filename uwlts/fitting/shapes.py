@@ -31,30 +31,15 @@ _LARGEST_SLOPE_STD = 0.2
 
 @dataclass(frozen=True, eq=False)
 class FlatFit:
-    """Straight line (K = 1) or plane (K = 2) fitted to N points with D coordinates.
+    """Straight line (K = 1) or plane (K = 2) fitted to N points with D coordinates."""
 
-    Attributes
-    ----------
-    point_mm : (D,) float64
-        Centroid of the points.
-    axes : (K, D) float64
-        Unit directions in the shape, the longest extent of the points first.
-    normals : (D - K, D) float64
-        Unit directions normal to the shape.
-    residuals_mm : (N,) float64
-        Distances of the points: signed if there is one normal, else non-negative.
-    std_mm : float
-        Standard deviation of one normal coordinate, with (D - K) (N - K - 1) degrees of freedom.
-    covariance : float64
-        Covariance of the offsets along the normals at the point (mm), then of the slopes (rad) along the axes.
-    """
-
-    point_mm: np.ndarray
-    axes: np.ndarray
-    normals: np.ndarray
-    residuals_mm: np.ndarray
-    std_mm: float
+    point_mm: np.ndarray  # (D,); centroid of the points
+    axes: np.ndarray  # (K, D); unit directions in the shape, the longest extent of the points first
+    normals: np.ndarray  # (D - K, D); unit directions normal to the shape
+    residuals_mm: np.ndarray  # (N,); distances of the points: signed if there is one normal, else non-negative
+    std_mm: float  # standard deviation of one normal coordinate, with (D - K) (N - K - 1) degrees of freedom
     covariance: np.ndarray
+    """Covariance of the offsets along the normals at the point (mm), then of the slopes (rad) along the axes."""
 
     @property
     def normal(self) -> np.ndarray:
@@ -117,25 +102,15 @@ def _norms(across: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SphereFit:
-    """Sphere of fitted or known radius.
+    """Sphere of fitted or known radius."""
 
-    Attributes
-    ----------
-    centre_mm : (3,) float64
-    radius_mm : float
-    residuals_mm : (N,) float64
-        Signed distances |p - centre| - radius, positive outside.
-    std_mm : float
-        Standard deviation of the residuals; the degrees of freedom are N minus the number of parameters.
-    covariance : (4, 4) or (3, 3) float64
-        Covariance of the centre and, if free, the radius, mm2, for equal independent noise of all points.
-    """
-
-    centre_mm: np.ndarray
+    centre_mm: np.ndarray  # (3,)
     radius_mm: float
-    residuals_mm: np.ndarray
-    std_mm: float
+    residuals_mm: np.ndarray  # (N,); signed distances |p - centre| - radius, positive outside
+    std_mm: float  # standard deviation of the residuals; the degrees of freedom are N minus the number of parameters
     covariance: np.ndarray
+    """(4, 4) or (3, 3); covariance of the centre and, if free, the radius, mm2, for equal independent noise of all
+    points."""
 
     def distances_mm(self, points: np.ndarray) -> np.ndarray:
         """Return the signed distances (M,) of points (M, 3), as in `residuals_mm`."""
@@ -191,32 +166,17 @@ def _unit_vectors(vectors: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class CylinderFit:
-    """Cylinder of fitted or known radius.
+    """Cylinder of fitted or known radius."""
 
-    Attributes
-    ----------
-    point_mm : (3,) float64
-        Point of the axis nearest to the centroid of the points.
-    axis : (3,) float64
-        Unit direction of the axis; its largest component is positive.
-    across : (2, 3) float64
-        Orthogonal unit directions normal to the axis.
-    radius_mm : float
-    residuals_mm : (N,) float64
-        Distances from the axis minus the radius.
-    std_mm : float
-        Standard deviation of the residuals, as for `SphereFit`.
-    covariance : (5, 5) or (4, 4) float64
-        Covariance of the axis offsets along ``across`` (mm), the axis slopes along them (rad), and a free radius (mm).
-    """
-
-    point_mm: np.ndarray
-    axis: np.ndarray
-    across: np.ndarray
+    point_mm: np.ndarray  # (3,); point of the axis nearest to the centroid of the points
+    axis: np.ndarray  # (3,); unit direction of the axis; its largest component is positive
+    across: np.ndarray  # (2, 3); orthogonal unit directions normal to the axis
     radius_mm: float
-    residuals_mm: np.ndarray
-    std_mm: float
+    residuals_mm: np.ndarray  # (N,); distances from the axis minus the radius
+    std_mm: float  # standard deviation of the residuals, as for `SphereFit`
     covariance: np.ndarray
+    """(5, 5) or (4, 4); covariance of the axis offsets along ``across`` (mm), the axis slopes along them (rad), and
+    a free radius (mm)."""
 
     def distances_mm(self, points: np.ndarray) -> np.ndarray:
         """Return the signed distances (M,) of points (M, 3), as in `residuals_mm`."""

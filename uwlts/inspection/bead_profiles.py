@@ -13,31 +13,16 @@ NO_WEIGHT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class BeadProfiles:
-    """Linear operators from point heights to profiles on a grid across each of S sections, G places each.
+    """Linear operators from point heights to profiles on a grid across each of S sections, G places each."""
 
-    Attributes
-    ----------
-    across_mm : (G,) float64
-        Places of the grid across the weld.
-    sections : int
-        Number of sections S.
-    smooth : (S G, n) sparse
-        Local quadratics through the points.
-    plates : two pairs of (n, 3) and (3, n) float64
-        For each plate: design of its level and slopes, weighted with its part in the reference, and its least-squares
-        rows.
-    seen : (n, S G) sparse
-        Heights that points with their footprints measure on given profiles.
-    sharp : (n, S G) sparse
-        Heights that points without a footprint would measure.
-    """
-
-    across_mm: np.ndarray
-    sections: int
-    smooth: sparse.csr_array
+    across_mm: np.ndarray  # (G,); places of the grid across the weld
+    sections: int  # number of sections S
+    smooth: sparse.csr_array  # (S G, n) sparse; local quadratics through the points
     plates: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-    seen: sparse.csr_array
-    sharp: sparse.csr_array
+    """Two pairs of (n, 3) and (3, n); for each plate: design of its level and slopes, weighted with its part in the
+    reference, and its least-squares rows."""
+    seen: sparse.csr_array  # (n, S G) sparse; heights that points with their footprints measure on given profiles
+    sharp: sparse.csr_array  # (n, S G) sparse; heights that points without a footprint would measure
 
     def subtract_plates(self, heights: np.ndarray) -> np.ndarray:
         """Return heights (n,) of the points above the plates."""

@@ -27,78 +27,40 @@ class BlemishSearchRule:
     The threshold of an indication follows from the probability of a false alarm. The numbers below were chosen by hand
     with the reasons stated, not fitted to data. Results with these numbers are checked on the rendered pipes of
     docs/studies/inspection.py and on the simulated surfaces of tests/uwlts/inspection/test_inspect.py.
-
-    Attributes
-    ----------
-    points_in_smallest : int
-        Points in a disc of the smallest size: at least three profiles, even if points are much denser along profiles.
-    cells_per_radius : int
-        Cells of the maps per radius of a bell.
-    window : float
-        Radius of the fitted surroundings, in radii of the bell.
-    size_ratio : float
-        Ratio of successive sizes: a bell of one size keeps 95 % of its signal at the next size.
-    least_information : float
-        Fraction of the median information on a bell's depth, below which a place is at an edge or in a hole.
-    scatter_block : float
-        Side of the squares for estimates of the local scatter, in radii: about 180 independent places.
-    largest_size : float
-        Largest radius as a fraction of the area's shorter side: larger bells leave no surroundings.
-    most_cells : int
-        Most cells of a map, limited by memory.
-    cells_at_a_time : int
-        Cells whose bells are fitted together, limited by memory: 400 bytes each.
-    points_at_a_time : int
-        Points whose neighbours are searched for together, limited by memory: 400 bytes each.
-    rounds : int
-        Most rounds of searching and removing indications.
-    fewest_points : int
-        Fewest points of an indication; twice as many are needed around it.
-    tail : float
-        Probability of the outer quantile that determines the tail. Nearer quantiles depend little on the tail.
-    fewest_beyond : int
-        Fewest independent places beyond this quantile; it is nearer on small surfaces.
-    neighbours : int
-        Nearest points that each point is compared with to find outliers.
-    outlier : float
-        Distance of an outlier from the median of its neighbours, in robust standard deviations.
-    most_deviation : float
-        Limit of a point's deviation from this median, in the same unit: 1 % of the efficiency for normal noise is lost.
-        Deviations in a pit of the smallest size stay below it, because its slopes increase the standard deviation.
-    enlargements : int
-        Most enlargements of the window around a peak, while its region reaches the window's edge.
-    enlargement : float
-        Ratio of the window's sides before and after an enlargement.
-    core : float
-        Radius, in radii of the bell, within which all points belong to the indication.
-    edge_share : float
-        Height of the region's edge as a fraction of the blemish's height, as metal loss is boxed in pipe inspection.
-    edge_std : float
-        Least height of the region's edge, in standard deviations of a local mean.
     """
 
     points_in_smallest: int = 12
-    cells_per_radius: int = 3
-    window: float = 1.8
+    """Points in a disc of the smallest size: at least three profiles, even if points are much denser along profiles."""
+    cells_per_radius: int = 3  # cells of the maps per radius of a bell
+    window: float = 1.8  # radius of the fitted surroundings, in radii of the bell
     size_ratio: float = np.sqrt(2.0)
+    """Ratio of successive sizes: a bell of one size keeps 95 % of its signal at the next size."""
     least_information: float = 0.4
+    """Fraction of the median information on a bell's depth, below which a place is at an edge or in a hole."""
     scatter_block: float = 24.0
+    """Side of the squares for estimates of the local scatter, in radii: about 180 independent places."""
     largest_size: float = 1 / 6
-    most_cells: int = 4_000_000
-    cells_at_a_time: int = 250_000
+    """Largest radius as a fraction of the area's shorter side: larger bells leave no surroundings."""
+    most_cells: int = 4_000_000  # most cells of a map, limited by memory
+    cells_at_a_time: int = 250_000  # cells whose bells are fitted together, limited by memory: 400 bytes each
     points_at_a_time: int = 250_000
-    rounds: int = 10
-    fewest_points: int = 6
+    """Points whose neighbours are searched for together, limited by memory: 400 bytes each."""
+    rounds: int = 10  # most rounds of searching and removing indications
+    fewest_points: int = 6  # fewest points of an indication; twice as many are needed around it
     tail: float = 1e-3
-    fewest_beyond: int = 4
-    neighbours: int = 9
-    outlier: float = 6.0
+    """Probability of the outer quantile that determines the tail. Nearer quantiles depend little on the tail."""
+    fewest_beyond: int = 4  # fewest independent places beyond this quantile; it is nearer on small surfaces
+    neighbours: int = 9  # nearest points that each point is compared with to find outliers
+    outlier: float = 6.0  # distance of an outlier from the median of its neighbours, in robust standard deviations
     most_deviation: float = 2.0
-    enlargements: int = 3
-    enlargement: float = 1.7
-    core: float = 0.8
+    """Limit of a point's deviation from this median, in the same unit: 1 % of the efficiency for normal noise is
+    lost. Deviations in a pit of the smallest size stay below it, because its slopes increase the standard deviation."""
+    enlargements: int = 3  # most enlargements of the window around a peak, while its region reaches the window's edge
+    enlargement: float = 1.7  # ratio of the window's sides before and after an enlargement
+    core: float = 0.8  # radius, in radii of the bell, within which all points belong to the indication
     edge_share: float = 0.1
-    edge_std: float = 3.0
+    """Height of the region's edge as a fraction of the blemish's height, as metal loss is boxed in pipe inspection."""
+    edge_std: float = 3.0  # least height of the region's edge, in standard deviations of a local mean
 
 
 SEARCH_RULE = BlemishSearchRule()
@@ -109,27 +71,15 @@ _MAD_EFFICIENCY = 0.37
 
 @dataclass(frozen=True, eq=False)
 class UnrolledSurface:
-    """Unrolled surface of N points.
+    """Unrolled surface of N points."""
 
-    Attributes
-    ----------
-    places : (N, 2) float64
-        Places on the surface, mm.
-    heights : (N,) float64
-        Heights above the undamaged shape, mm.
-    std : (N,) float64
-        Standard deviations of the heights, mm.
-    footprint_mm : (N, 2) float64
-        Standard deviations, along both axes, of the part of the surface that a point averages over; zero if unknown.
-    footprint_std : float
-        Relative standard uncertainty of the squared footprints.
-    """
-
-    places: np.ndarray
-    heights: np.ndarray
-    std: np.ndarray
+    places: np.ndarray  # (N, 2); places on the surface, mm
+    heights: np.ndarray  # (N,); heights above the undamaged shape, mm
+    std: np.ndarray  # (N,); standard deviations of the heights, mm
     footprint_mm: np.ndarray
-    footprint_std: float = 0.0
+    """(N, 2); standard deviations, along both axes, of the part of the surface that a point averages over; zero if
+    unknown."""
+    footprint_std: float = 0.0  # relative standard uncertainty of the squared footprints
 
 
 def limit_deviations(surface: UnrolledSurface, tree: KDTree) -> tuple[UnrolledSurface, np.ndarray, float]:

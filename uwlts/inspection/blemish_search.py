@@ -25,33 +25,16 @@ from uwlts.inspection.bell_maps import SEARCH_RULE, BellMap, Tail, UnrolledSurfa
 
 @dataclass(frozen=True, eq=False)
 class Indication:
-    """Significant departure of a surface from its shape.
+    """Significant departure of a surface from its shape."""
 
-    Attributes
-    ----------
-    place : (2,) float64
-        Middle, mm.
-    radius_mm : float
-        Radius of the bell.
-    height_mm : float
-        Signed height.
-    z : float
-        Height in standard deviations.
-    false_alarm : float
-        Probability that noise exceeds ``z`` anywhere.
-    noise_mm : float
-        Standard deviation of independent point noise that explains the scatter of local means of the heights.
-    points : (K,) int
-        Points of the indication.
-    """
-
-    place: np.ndarray
-    radius_mm: float
-    height_mm: float
-    z: float
-    false_alarm: float
+    place: np.ndarray  # (2,); middle, mm
+    radius_mm: float  # radius of the bell
+    height_mm: float  # signed height
+    z: float  # height in standard deviations
+    false_alarm: float  # probability that noise exceeds ``z`` anywhere
     noise_mm: float
-    points: np.ndarray
+    """Standard deviation of independent point noise that explains the scatter of local means of the heights."""
+    points: np.ndarray  # (K,) int; points of the indication
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,33 +48,16 @@ class UnresolvedDeparture:
 
 @dataclass(frozen=True, eq=False)
 class BlemishSearch:
-    """Result of a search on N points.
-
-    Attributes
-    ----------
-    indications : tuple of Indication
-    unresolved : tuple of UnresolvedDeparture
-    outliers : (N,) bool
-    undamaged : (N,) bool
-        Points that are neither outliers nor in an indication.
-    level_mm : (N,) float64
-        Least significant height of an indication of the smallest size.
-    noise_mm : (N,) float64
-        Effective noise of each point.
-    smallest_mm : float
-        Smallest radius of the search.
-    false_alarm : float
-        Probability of any false indication.
-    """
+    """Result of a search on N points."""
 
     indications: tuple[Indication, ...]
     unresolved: tuple[UnresolvedDeparture, ...]
-    outliers: np.ndarray
-    undamaged: np.ndarray
-    level_mm: np.ndarray
-    noise_mm: np.ndarray
-    smallest_mm: float
-    false_alarm: float
+    outliers: np.ndarray  # (N,) bool
+    undamaged: np.ndarray  # (N,) bool; points that are neither outliers nor in an indication
+    level_mm: np.ndarray  # (N,); least significant height of an indication of the smallest size
+    noise_mm: np.ndarray  # (N,); effective noise of each point
+    smallest_mm: float  # smallest radius of the search
+    false_alarm: float  # probability of any false indication
 
 
 def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm: float = np.inf) -> BlemishSearch:

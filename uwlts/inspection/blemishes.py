@@ -37,56 +37,33 @@ class BlemishRule:
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
     pipes of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py. The edge of
     a blemish is that of the search (`SEARCH_RULE`).
-
-    Attributes
-    ----------
-    draws : int
-        Noise draws: three exceed either end of a 95 % interval.
-    depth_draws : int
-        Noise draws for the standard deviation of depths, which 48 give to 10 %.
-    exponents : tuple of int
-        Exponents p of simulated bells (1 - t^2)^p, from a paraboloid with a sharp edge to a bell with a flat edge.
-    bandwidth : float
-        Radius of the local quadratic, in radii of the blemish: it lowers the depth of a bell by 0.3 %.
-    points : int
-        Most points in a local quadratic, whose radius is reduced to this: its noise is a sixth of one point's.
-    ring : float
-        Width of the surroundings, in radii of the blemish.
-    fewest_points : int
-        Fewest undamaged points in the surroundings.
-    most_variance : float
-        Largest variance of a quadratic's value, times its number of points; it is 3 to 5 inside the point set.
-    cells : int
-        Cells of the grid across the blemish.
-    subdivision : int
-        Subdivision of cells for contours, on a cubic spline.
-    dent : float
-        Least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits.
-    end_std : float
-        Standard uncertainty of each end of a length, in spacings of profiles or points: rectangular distribution
-        between two of them (GUM, 4.3.7), as the form of the surface there is unknown.
-    saddle : float
-        Largest depth between neighbours in one contour, as a fraction of the shallower one's depth. Rough ground of a
-        single pit has higher saddles.
-    saddle_std : float
-        Least height of a saddle above the shallower neighbour, in standard deviations of their difference. Rare enough
-        for the dozens of peaks of noise in a contour.
     """
 
-    draws: int = 120
-    depth_draws: int = 48
+    draws: int = 120  # noise draws: three exceed either end of a 95 % interval
+    depth_draws: int = 48  # noise draws for the standard deviation of depths, which 48 give to 10 %
     exponents: tuple[int, ...] = (1, 2, 3)
+    """Exponents p of simulated bells (1 - t^2)^p, from a paraboloid with a sharp edge to a bell with a flat edge."""
     bandwidth: float = 0.35
+    """Radius of the local quadratic, in radii of the blemish: it lowers the depth of a bell by 0.3 %."""
     points: int = 150
-    ring: float = 0.6
-    fewest_points: int = 12
+    """Most points in a local quadratic, whose radius is reduced to this: its noise is a sixth of one point's."""
+    ring: float = 0.6  # width of the surroundings, in radii of the blemish
+    fewest_points: int = 12  # fewest undamaged points in the surroundings
     most_variance: float = 12.0
-    cells: int = 26
-    subdivision: int = 2
+    """Largest variance of a quadratic's value, times its number of points; it is 3 to 5 inside the point set."""
+    cells: int = 26  # cells of the grid across the blemish
+    subdivision: int = 2  # subdivision of cells for contours, on a cubic spline
     dent: float = 0.1
+    """Least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits."""
     end_std: float = 1 / np.sqrt(12.0)
+    """Standard uncertainty of each end of a length, in spacings of profiles or points: rectangular distribution
+    between two of them (GUM, 4.3.7), as the form of the surface there is unknown."""
     saddle: float = 0.75
+    """Largest depth between neighbours in one contour, as a fraction of the shallower one's depth. Rough ground of a
+    single pit has higher saddles."""
     saddle_std: float = 4.0
+    """Least height of a saddle above the shallower neighbour, in standard deviations of their difference. Rare
+    enough for the dozens of peaks of noise in a contour."""
 
 
 _RULE = BlemishRule()
@@ -101,37 +78,19 @@ _NODES = [
 
 @dataclass(frozen=True, eq=False)
 class Blemish:
-    """Measured blemish on an unrolled surface.
-
-    Attributes
-    ----------
-    kind : FeatureKind
-    values : tuple of FeatureValue
-        Without the spacing of profiles and points (`with_spacing`).
-    place : (2,) float64
-        Deepest place.
-    extent_mm : (3,) float64
-        Size along both axes, and depth.
-    points : (K,) int
-    outline : (L, 2) float64
-        Closed contour at the edge depth.
-    hollows : (H, 2) float64
-        Deepest places of neighbours that the search joined, the deepest first; empty for a single blemish.
-    spacing_mm : (2,) float64
-        Spacing of the points along both axes.
-    beneath_mm : float
-        Largest sum of its depth and the surface beneath it, minus its depth; zero without such a surface.
-    """
+    """Measured blemish on an unrolled surface."""
 
     kind: FeatureKind
-    values: tuple[FeatureValue, ...]
-    place: np.ndarray
-    extent_mm: np.ndarray
-    points: np.ndarray
-    outline: np.ndarray
+    values: tuple[FeatureValue, ...]  # without the spacing of profiles and points (`with_spacing`)
+    place: np.ndarray  # (2,); deepest place
+    extent_mm: np.ndarray  # (3,); size along both axes, and depth
+    points: np.ndarray  # (K,) int
+    outline: np.ndarray  # (L, 2); closed contour at the edge depth
     hollows: np.ndarray
-    spacing_mm: np.ndarray
+    """(H, 2); deepest places of neighbours that the search joined, the deepest first; empty for a single blemish."""
+    spacing_mm: np.ndarray  # (2,); spacing of the points along both axes
     beneath_mm: float
+    """Largest sum of its depth and the surface beneath it, minus its depth; zero without such a surface."""
 
     def with_spacing(self) -> tuple[FeatureValue, ...]:
         """Return the values; length and width are known no better than the spacing of the points at both ends."""
@@ -283,48 +242,25 @@ class _Bell:
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """Depths on a grid of G places, as linear functions of the heights of n points near a blemish.
+    """Depths on a grid of G places, as linear functions of the heights of n points near a blemish."""
 
-    Attributes
-    ----------
-    near : (n,) int
-        Points of the blemish, then the undamaged points around it.
-    places, size : (n, 2) float64
-        Places of these points and their footprints, mm.
-    grid : (G, 2) float64
-        Places of the grid, mm.
-    shape : pair of int
-        Shape of the grid.
-    cell : float
-        Side of a cell, mm.
-    smooth : (G, n) sparse
-        Local quadratics.
-    design, plane : (n, 3) and (3, n) float64
-        Terms of the undamaged plane, and their least-squares rows.
-    seen, sharp : (n, G) sparse
-        Heights that points with and without their footprint measure for given depths on the grid.
-    footprint_std : float
-        Relative standard uncertainty of the squared footprints.
-    stride : int
-        Half a bandwidth in cells.
-    region : (G,) bool
-        Cells of the blemish.
-    """
-
-    near: np.ndarray
+    near: np.ndarray  # (n,) int; points of the blemish, then the undamaged points around it
+    # (n, 2); places of these points and their footprints, mm.
     places: np.ndarray
     size: np.ndarray
-    grid: np.ndarray
-    shape: tuple[int, int]
-    cell: float
-    smooth: sparse.csr_array
+    grid: np.ndarray  # (G, 2); places of the grid, mm
+    shape: tuple[int, int]  # shape of the grid
+    cell: float  # side of a cell, mm
+    smooth: sparse.csr_array  # (G, n) sparse; local quadratics
+    # (n, 3) and (3, n); terms of the undamaged plane, and their least-squares rows.
     design: np.ndarray
     plane: np.ndarray
+    # (n, G) sparse; heights that points with and without their footprint measure for given depths on the grid.
     seen: sparse.csr_array
     sharp: sparse.csr_array
-    footprint_std: float
-    stride: int
-    region: np.ndarray
+    footprint_std: float  # relative standard uncertainty of the squared footprints
+    stride: int  # half a bandwidth in cells
+    region: np.ndarray  # (G,) bool; cells of the blemish
 
     @classmethod
     def about(cls, surface: UnrolledSurface, search: BlemishSearch, indication: Indication) -> _Field:

@@ -35,73 +35,35 @@ class FlatRule:
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
     scans of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py.
-
-    Attributes
-    ----------
-    fewest_points : int
-        Fewest points of a cloud, a face or a plate.
-    proposals : int
-        Random planes through three points that are tried for the largest face.
-    judging_points : int
-        Points, evenly thinned, that compare these planes.
-    near : float
-        Largest distance of a point from a proposed plane, as a fraction of the cloud's size. The plane is refined
-        afterwards.
-    refinements : int
-        Robust fits that refine the largest face.
-    off_face : float
-        Largest distance of a point from its face, in standard deviations.
-    histogram_bins : int
-        Bins of the histogram of heights that separates both faces of a step.
-    level_bins : int
-        Bins next to the first face that belong to this face, not to the second one.
-    gap_lines : int
-        Fewest consecutive lines of a gap; fewer lines may be missing by noise.
-    edge_std : float
-        Standard uncertainty of an edge, in point spacings: rectangular distribution between two lines (GUM, 4.3.7).
-    edge_blur : float
-        Standard uncertainty common to all edges, in point spacings: by the camera's blur the stripe may end up to about
-        one line beyond the edge.
-    plain_lines : range
-        Lines from an edge whose brightness is that of the face without the edge.
-    fewest_edges : int
-        Fewest edge points of a hole or of each side of a gap.
-    fewest_images : int
-        Fewest images that show a hole; in a single image lines may be missing by noise.
-    roundness : float
-        Largest scatter of the edge of a round hole, as a fraction of its radius.
-    hole_arc_deg : float
-        Least arc of a hole's edge, deg.
-    same_diameter : float
-        Largest difference of the diameters of bolt holes, as a fraction.
-    flat_cells : int
-        Cells across a face. The flatness is the range of their means.
-    edge_lines : int
-        Lines next to an edge without influence on the flatness: by the camera's blur they also show what is beyond.
-    draws : int
-        Noise draws for the flatness; 48 give a standard deviation to 10 %.
     """
 
-    fewest_points: int = 200
-    proposals: int = 600
-    judging_points: int = 3000
+    fewest_points: int = 200  # fewest points of a cloud, a face or a plate
+    proposals: int = 600  # random planes through three points that are tried for the largest face
+    judging_points: int = 3000  # points, evenly thinned, that compare these planes
     near: float = 2e-3
-    refinements: int = 4
-    off_face: float = 6.0
-    histogram_bins: int = 200
-    level_bins: int = 6
-    gap_lines: int = 4
+    """Largest distance of a point from a proposed plane, as a fraction of the cloud's size. The plane is refined
+    afterwards."""
+    refinements: int = 4  # robust fits that refine the largest face
+    off_face: float = 6.0  # largest distance of a point from its face, in standard deviations
+    histogram_bins: int = 200  # bins of the histogram of heights that separates both faces of a step
+    level_bins: int = 6  # bins next to the first face that belong to this face, not to the second one
+    gap_lines: int = 4  # fewest consecutive lines of a gap; fewer lines may be missing by noise
     edge_std: float = 1 / np.sqrt(12.0)
+    """Standard uncertainty of an edge, in point spacings: rectangular distribution between two lines (GUM, 4.3.7)."""
     edge_blur: float = 0.5
-    plain_lines: range = range(5, 12)
-    fewest_edges: int = 8
-    fewest_images: int = 2
-    roundness: float = 0.08
-    hole_arc_deg: float = 200.0
-    same_diameter: float = 0.2
+    """Standard uncertainty common to all edges, in point spacings: by the camera's blur the stripe may end up to
+    about one line beyond the edge."""
+    plain_lines: range = range(5, 12)  # lines from an edge whose brightness is that of the face without the edge
+    fewest_edges: int = 8  # fewest edge points of a hole or of each side of a gap
+    fewest_images: int = 2  # fewest images that show a hole; in a single image lines may be missing by noise
+    roundness: float = 0.08  # largest scatter of the edge of a round hole, as a fraction of its radius
+    hole_arc_deg: float = 200.0  # least arc of a hole's edge, deg
+    same_diameter: float = 0.2  # largest difference of the diameters of bolt holes, as a fraction
     flat_cells: int = 24
+    """Cells across a face. The flatness is the range of their means."""
     edge_lines: int = 4
-    draws: int = 48
+    """Lines next to an edge without influence on the flatness: by the camera's blur they also show what is beyond."""
+    draws: int = 48  # noise draws for the flatness; 48 give a standard deviation to 10 %
 
 
 _RULE = FlatRule()
@@ -321,56 +283,26 @@ class _Face:
 
 
 class _Edges(NamedTuple):
-    """Edge points in a face.
+    """Edge points in a face."""
 
-    Attributes
-    ----------
-    places : (E, 2) float64
-        Places in the face, mm.
-    frame : (E,) int
-        Image of each point.
-    first : (E,) bool
-        Whether the point comes first along its profile.
-    patterns : (M, E, 2) float64 or None
-        Displacements by the common patterns.
-    points : (E,) int
-        Adjacent points of the cloud.
-    spacing : float
-        Median point spacing, mm.
-    """
-
-    places: np.ndarray
-    frame: np.ndarray
-    first: np.ndarray
-    patterns: np.ndarray | None
-    points: np.ndarray
-    spacing: float
+    places: np.ndarray  # (E, 2); places in the face, mm
+    frame: np.ndarray  # (E,) int; image of each point
+    first: np.ndarray  # (E,) bool; whether the point comes first along its profile
+    patterns: np.ndarray | None  # (M, E, 2) or None; displacements by the common patterns
+    points: np.ndarray  # (E,) int; adjacent points of the cloud
+    spacing: float  # median point spacing, mm
 
 
 @dataclass(frozen=True, eq=False)
 class _Hole:
-    """Circle in a face.
+    """Circle in a face."""
 
-    Attributes
-    ----------
-    middle : (2,) float64
-    radius_mm : float
-    random : (3, 3) float64
-        Covariance of middle and radius by noise.
-    moved : (M, 3) float64 or None
-        Changes of middle and radius by the common patterns.
-    points : (E,) int
-        Points of the edge.
-    blur_mm : float
-        Standard uncertainty of the radius by the camera's blur.
-    """
-
-    middle: np.ndarray
+    middle: np.ndarray  # (2,)
     radius_mm: float
-    random: np.ndarray
-    moved: np.ndarray | None
-    points: np.ndarray
-    blur_mm: float
+    random: np.ndarray  # (3, 3); covariance of middle and radius by noise
+    moved: np.ndarray | None  # (M, 3) or None; changes of middle and radius by the common patterns
+    points: np.ndarray  # (E,) int; points of the edge
+    blur_mm: float  # standard uncertainty of the radius by the camera's blur
 
 
 def _load_faces(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:

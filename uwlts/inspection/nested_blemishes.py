@@ -30,45 +30,25 @@ class NestedRule:
     """Numbers of the surface of a large blemish.
 
     Chosen by hand with the reasons below. Results are checked on the pipes of tests/oracles/pipes.py.
-
-    Attributes
-    ----------
-    bandwidth : float
-        Radius of a local quadratic, in radii of the large blemish. Blemishes of up to half this radius cover a quarter
-        of its points, which the biweight tolerates.
-    window : float
-        Width of the surroundings, in radii of the large blemish, to where a bell that it may be part of has ended.
-    nodes : int
-        Nodes of the surface per bandwidth.
-    most_points : int
-        Most points of a local quadratic; more of them would not change it.
-    fewest_points : int
-        Fewest points of a local quadratic: twice its terms.
-    reweighted : int
-        Reweighted fits of a quadratic; the corrections refine them further.
-    corrections : int
-        Corrections of the surface for what was smoothed away: one leaves 0.04 mm at the bottom of a bell 7 mm deep.
-    rim : float
-        Height of the dent's surface, as a fraction of its largest, below which long indications follow its rim.
-    compact : float
-        Least part of the circle around an indication that its points fill if it does not follow a rim.
-    significant : float
-        Least height of an indication, in errors of the smooth surface.
-    worst : float
-        Quantile of these errors: edges cover a few percent of the window, other pits less than one.
     """
 
     bandwidth: float = 0.35
+    """Radius of a local quadratic, in radii of the large blemish. Blemishes of up to half this radius cover a
+    quarter of its points, which the biweight tolerates."""
     window: float = 1.2
-    nodes: int = 2
-    most_points: int = 400
-    fewest_points: int = 12
-    reweighted: int = 15
+    """Width of the surroundings, in radii of the large blemish, to where a bell that it may be part of has ended."""
+    nodes: int = 2  # nodes of the surface per bandwidth
+    most_points: int = 400  # most points of a local quadratic; more of them would not change it
+    fewest_points: int = 12  # fewest points of a local quadratic: twice its terms
+    reweighted: int = 15  # reweighted fits of a quadratic; the corrections refine them further
     corrections: int = 2
+    """Corrections of the surface for what was smoothed away: one leaves 0.04 mm at the bottom of a bell 7 mm deep."""
     rim: float = 0.3
+    """Height of the dent's surface, as a fraction of its largest, below which long indications follow its rim."""
     compact: float = 0.3
-    significant: float = 3.0
-    worst: float = 0.99
+    """Least part of the circle around an indication that its points fill if it does not follow a rim."""
+    significant: float = 3.0  # least height of an indication, in errors of the smooth surface
+    worst: float = 0.99  # quantile of these errors: edges cover a few percent of the window, other pits less than one
 
 
 _RULE = NestedRule()
@@ -79,31 +59,16 @@ _SMALLEST = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class LargeBlemish:
-    """Large blemish with those inside and beside it.
+    """Large blemish with those inside and beside it."""
 
-    Attributes
-    ----------
-    own : Indication
-        The large one, with the points of those inside it.
-    chosen : (n,) int
-        Points of the window.
-    surface : UnrolledSurface
-        Window with heights relative to the large blemish's surface.
-    height_mm, std_mm : (n,) float64
-        Height of that surface above the undamaged one, and its standard uncertainty by the smoothing.
-    search : BlemishSearch
-        Search in the window.
-    largest_mm : float
-        Largest radius of this search.
-    """
-
-    own: Indication
-    chosen: np.ndarray
-    surface: UnrolledSurface
+    own: Indication  # the large one, with the points of those inside it
+    chosen: np.ndarray  # (n,) int; points of the window
+    surface: UnrolledSurface  # window with heights relative to the large blemish's surface
+    # (n,); height of that surface above the undamaged one, and its standard uncertainty by the smoothing.
     height_mm: np.ndarray
     std_mm: np.ndarray
-    search: BlemishSearch
-    largest_mm: float
+    search: BlemishSearch  # search in the window
+    largest_mm: float  # largest radius of this search
 
     def explains(self, other: Indication) -> bool:
         """Return whether an indication of the first search was searched for again, or is the rest of the large one.

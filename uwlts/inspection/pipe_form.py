@@ -27,48 +27,26 @@ class PipeFormRule:
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
     pipes of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py.
-
-    Attributes
-    ----------
-    start_points : int
-        Points for the first cylinder; more points would not change this start.
-    most_points : int
-        Most points of the fit; with more points the errors common to all of them dominate.
-    rounds : int
-        Most rounds of the fit; each divides the error of the axis by about ten.
-    still_mm : float
-        Change of the axis, mm, that ends the rounds.
-    sectors : int
-        Sectors around the pipe: 5 deg each, as for a pipe standard (`uwlts.evaluation.artefact_figures`).
-    lengths : int
-        Parts of the length within which errors of neighbouring points are correlated.
-    oval_arc : float
-        Least arc, rad, that determines the ovality; on a smaller arc it is not separable from a shift of the axis.
-    whole_arc : float
-        Least arc, rad, for a fit of the third and fourth harmonics, which would bias the others.
-    section_points : int
-        Fewest points of a section.
-    section_arc : float
-        Least arc of a section, as a fraction of the whole pipe's arc (at most half of the circumference).
-    most_sections : int
-        Number of sections by default.
-    off_pipe : float
-        Distance from the pipe, as a fraction of its radius, of the deepest blemish or largest ovality that still counts
-        as its surface.
     """
 
-    start_points: int = 6000
-    most_points: int = 150_000
-    rounds: int = 12
-    still_mm: float = 1e-6
+    start_points: int = 6000  # points for the first cylinder; more points would not change this start
+    most_points: int = 150_000  # most points of the fit; with more points the errors common to all of them dominate
+    rounds: int = 12  # most rounds of the fit; each divides the error of the axis by about ten
+    still_mm: float = 1e-6  # change of the axis, mm, that ends the rounds
     sectors: int = 72
-    lengths: int = 12
+    """Sectors around the pipe: 5 deg each, as for a pipe standard (`uwlts.evaluation.artefact_figures`)."""
+    lengths: int = 12  # parts of the length within which errors of neighbouring points are correlated
     oval_arc: float = np.pi
+    """Least arc, rad, that determines the ovality; on a smaller arc it is not separable from a shift of the axis."""
     whole_arc: float = np.radians(300.0)
-    section_points: int = 60
+    """Least arc, rad, for a fit of the third and fourth harmonics, which would bias the others."""
+    section_points: int = 60  # fewest points of a section
     section_arc: float = 0.8
-    most_sections: int = 12
+    """Least arc of a section, as a fraction of the whole pipe's arc (at most half of the circumference)."""
+    most_sections: int = 12  # number of sections by default
     off_pipe: float = 0.06
+    """Distance from the pipe, as a fraction of its radius, of the deepest blemish or largest ovality that still
+    counts as its surface."""
 
 
 FORM_RULE = PipeFormRule()
@@ -83,17 +61,10 @@ class PipeFrame:
 
     Places along count from `point_mm`, angles from the first direction across towards the second. `shift_and_tilt`
     keeps the directions across, so that places and angles of successive fits are comparable.
-
-    Attributes
-    ----------
-    point_mm : (3,) float64
-        Point on the axis.
-    axes : (3, 3) float64
-        Unit vectors in rows: two directions across, and the axis.
     """
 
-    point_mm: np.ndarray
-    axes: np.ndarray
+    point_mm: np.ndarray  # (3,); point on the axis
+    axes: np.ndarray  # (3, 3); unit vectors in rows: two directions across, and the axis
 
     @classmethod
     def about(cls, cylinder: CylinderFit, points_mm: np.ndarray) -> PipeFrame:
@@ -122,45 +93,22 @@ class PipeFrame:
 
 @dataclass(frozen=True, eq=False)
 class PipeForm:
-    """Undamaged form of a pipe in a cloud of N points.
-
-    Attributes
-    ----------
-    frame : PipeFrame
-    radius_mm : float
-        Mean radius.
-    along_mm, angle : (N,) float64
-        Place along the axis and angle, rad, of all points.
-    distance_mm : (N,) float64
-        Distance of all points from the form, positive outwards.
-    used : (U,) int
-        Points that determine the form.
-    arc : float
-        Part of the circumference, rad, that these points cover.
-    terms : tuple of str
-        Names of the K terms of the radial distance.
-    coefficients : (K,) float64
-        Coefficients of the terms, mm.
-    weights : (K, U) float64
-        Derivatives of the coefficients by the radial distances of the points.
-    scale_mm : float
-        Unit of places along the axis in the terms.
-    largest_ovality : float
-        Assumed largest ovality divided by the diameter, if the points do not determine the ovality.
-    """
+    """Undamaged form of a pipe in a cloud of N points."""
 
     frame: PipeFrame
-    radius_mm: float
+    radius_mm: float  # mean radius
+    # (N,); place along the axis and angle, rad, of all points.
     along_mm: np.ndarray
     angle: np.ndarray
-    distance_mm: np.ndarray
-    used: np.ndarray
-    arc: float
-    terms: tuple[str, ...]
-    coefficients: np.ndarray
-    weights: np.ndarray
-    scale_mm: float
+    distance_mm: np.ndarray  # (N,); distance of all points from the form, positive outwards
+    used: np.ndarray  # (U,) int; points that determine the form
+    arc: float  # part of the circumference, rad, that these points cover
+    terms: tuple[str, ...]  # names of the K terms of the radial distance
+    coefficients: np.ndarray  # (K,); coefficients of the terms, mm
+    weights: np.ndarray  # (K, U); derivatives of the coefficients by the radial distances of the points
+    scale_mm: float  # unit of places along the axis in the terms
     largest_ovality: float
+    """Assumed largest ovality divided by the diameter, if the points do not determine the ovality."""
 
     @property
     def outwards(self) -> np.ndarray:

@@ -25,32 +25,20 @@ class PipeWeldRule:
     """Numbers of the search for welds of a pipe.
 
     Chosen by hand with the reasons below. Results are checked on the pipes of tests/oracles/pipes.py.
-
-    Attributes
-    ----------
-    lengths : int
-        Cells along a weld. A blemish covers a few of them.
-    share : float
-        Part of the cells along a weld that are higher than their surroundings.
-    spacings : float
-        Width of a cell, in point spacings.
-    baseline : float
-        Width of the median that gives the height beside a weld, as a fraction of the pipe's extent across the weld.
-    significant : float
-        Least height of a weld in its cells, in standard deviations of a cell.
-    lean : float
-        Largest inclination of a girth weld's plane, as the change of its place divided by the diameter: a cut of 3 deg.
-    toes : float
-        Half width of the region that belongs to a weld, divided by that of its bead: it contains the undercuts.
     """
 
     lengths: int = 36
-    share: float = 0.8
-    spacings: float = 2.0
+    """Cells along a weld. A blemish covers a few of them."""
+    share: float = 0.8  # part of the cells along a weld that are higher than their surroundings
+    spacings: float = 2.0  # width of a cell, in point spacings
     baseline: float = 0.4
-    significant: float = 3.0
+    """Width of the median that gives the height beside a weld, as a fraction of the pipe's extent across the weld."""
+    significant: float = 3.0  # least height of a weld in its cells, in standard deviations of a cell
     lean: float = 0.05
+    """Largest inclination of a girth weld's plane, as the change of its place divided by the diameter: a cut of 3
+    deg."""
     toes: float = 1.7
+    """Half width of the region that belongs to a weld, divided by that of its bead: it contains the undercuts."""
 
 
 _RULE = PipeWeldRule()
@@ -58,22 +46,13 @@ _RULE = PipeWeldRule()
 
 @dataclass(frozen=True, eq=False)
 class PipeWeld:
-    """Weld of a pipe with N points.
+    """Weld of a pipe with N points."""
 
-    Attributes
-    ----------
-    is_girth : bool
-        True around the pipe, False along it.
-    across_mm, along_mm : (N,) float64
-        Places of the points across the weld, from its middle, and along it.
-    half_mm : float
-        Approximate half width of the bead.
-    """
-
-    is_girth: bool
+    is_girth: bool  # True around the pipe, False along it
+    # (N,); places of the points across the weld, from its middle, and along it.
     across_mm: np.ndarray
     along_mm: np.ndarray
-    half_mm: float
+    half_mm: float  # approximate half width of the bead
 
     @property
     def covers(self) -> np.ndarray:

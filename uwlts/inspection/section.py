@@ -16,21 +16,11 @@ _SMALLEST_MM = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """Points in a strip of a cloud, in the order along it.
+    """Points in a strip of a cloud, in the order along it."""
 
-    Attributes
-    ----------
-    cloud : PointCloud
-        Points of the strip.
-    direction : (3,) float64
-        Unit vector along the strip, perpendicular to Z.
-    origin_mm : (3,) float64
-        Place where ``along_mm`` is zero.
-    """
-
-    cloud: PointCloud
-    direction: np.ndarray
-    origin_mm: np.ndarray
+    cloud: PointCloud  # points of the strip
+    direction: np.ndarray  # (3,); unit vector along the strip, perpendicular to Z
+    origin_mm: np.ndarray  # (3,); place where ``along_mm`` is zero
 
     @property
     def along_mm(self) -> np.ndarray:

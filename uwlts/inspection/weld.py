@@ -44,75 +44,37 @@ class WeldRule:
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
     welds of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py. Lengths "in
     bead widths" are divided by the toe-to-toe width.
-
-    Attributes
-    ----------
-    fewest_points : int
-        Fewest points of a cloud that is inspected.
-    start_points : int
-        Points for the first plane through the plates; more points would not change this start.
-    draws : int
-        Noise draws; 32 give a standard deviation to 13 %.
-    sections_of_largest_height : int
-        Neighbouring sections averaged for the largest height; the maximum of single sections would follow the noise.
-    sections_of_largest_undercut : int
-        Neighbouring sections averaged for the largest undercut, which is noisier than the height.
-    most_sections : int
-        Largest number of sections along the weld.
-    points_in_section : int
-        Points of a section on average, at least.
-    bandwidth : float
-        Half window of a local quadratic, in bead widths: narrower than an undercut.
-    spacings_in_bandwidth : float
-        Least half window of a local quadratic, in point spacings.
-    gap_spacings : float
-        Point spacing divided by the typical gap between points across the bead: they are equal for evenly distributed
-        points, and the gap is larger if images run along the bead.
-    flank_low : float
-        Lower end of the flank, as a fraction of the bead's height. A line through the flank gives toe and toe angle.
-    flank_high : float
-        Upper end of the flank, as a fraction of the bead's height.
-    width_from_crown : float
-        Width of the bead divided by its width at half height: 1.85 for a bell (1 - t^2)^2, 1.4 for a parabola.
-    plate_from : float
-        Distance of the fitted plates from the middle, in half bead widths: beyond the undercuts.
-    plate_width : float
-        Width of the fitted plate on either side of the bead, in bead widths.
-    fewest_beside : int
-        Fewest points of each plate, and of an estimate of the local scatter.
-    groove_outside : float
-        Width of the search for an undercut outside the toe, in bead widths.
-    groove_inside : float
-        Width of this search inside the toe, in bead widths.
-    whole_height : float
-        Fraction of the median height below which a section belongs to the bead's ends and is left out.
-    significant : float
-        Least height of a bead, in standard deviations of the plates' points.
-    bead_gap : float
-        Least gap between beads side by side at half their height, as a fraction of their total width.
     """
 
-    fewest_points: int = 500
-    start_points: int = 20_000
-    draws: int = 32
+    fewest_points: int = 500  # fewest points of a cloud that is inspected
+    start_points: int = 20_000  # points for the first plane through the plates; more points would not change this start
+    draws: int = 32  # noise draws; 32 give a standard deviation to 13 %
     sections_of_largest_height: int = 3
+    """Neighbouring sections averaged for the largest height; the maximum of single sections would follow the noise."""
     sections_of_largest_undercut: int = 5
-    most_sections: int = 100
-    points_in_section: int = 80
-    bandwidth: float = 0.04
-    spacings_in_bandwidth: float = 3.0
+    """Neighbouring sections averaged for the largest undercut, which is noisier than the height."""
+    most_sections: int = 100  # largest number of sections along the weld
+    points_in_section: int = 80  # points of a section on average, at least
+    bandwidth: float = 0.04  # half window of a local quadratic, in bead widths: narrower than an undercut
+    spacings_in_bandwidth: float = 3.0  # least half window of a local quadratic, in point spacings
     gap_spacings: float = 0.6
+    """Point spacing divided by the typical gap between points across the bead: they are equal for evenly distributed
+    points, and the gap is larger if images run along the bead."""
     flank_low: float = 0.1
-    flank_high: float = 0.5
+    """Lower end of the flank, as a fraction of the bead's height. A line through the flank gives toe and toe angle."""
+    flank_high: float = 0.5  # upper end of the flank, as a fraction of the bead's height
     width_from_crown: float = 1.9
-    plate_from: float = 1.3
-    plate_width: float = 2.0
-    fewest_beside: int = 50
-    groove_outside: float = 0.35
-    groove_inside: float = 0.05
+    """Width of the bead divided by its width at half height: 1.85 for a bell (1 - t^2)^2, 1.4 for a parabola."""
+    plate_from: float = 1.3  # distance of the fitted plates from the middle, in half bead widths: beyond the undercuts
+    plate_width: float = 2.0  # width of the fitted plate on either side of the bead, in bead widths
+    fewest_beside: int = 50  # fewest points of each plate, and of an estimate of the local scatter
+    groove_outside: float = 0.35  # width of the search for an undercut outside the toe, in bead widths
+    groove_inside: float = 0.05  # width of this search inside the toe, in bead widths
     whole_height: float = 0.7
-    significant: float = 4.0
+    """Fraction of the median height below which a section belongs to the bead's ends and is left out."""
+    significant: float = 4.0  # least height of a bead, in standard deviations of the plates' points
     bead_gap: float = 0.1
+    """Least gap between beads side by side at half their height, as a fraction of their total width."""
 
 
 _RULE = WeldRule()
@@ -169,44 +131,19 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
 
 @dataclass(frozen=True, eq=False)
 class Bead:
-    """Bead with its plates.
+    """Bead with its plates."""
 
-    Attributes
-    ----------
-    axes : (3, 3) float64
-        Unit vectors along the bead, across it and outwards.
-    middle_mm : (3,) float64
-        Middle of the bead.
-    chosen : (n,) int
-        Points on the bead and on the plates.
-    raw_mm : (n,) float64
-        Heights of these points above the middle.
-    heights_mm : (n,) float64
-        Heights of these points above the plates.
-    on_bead : (n,) bool
-        Points on the bead.
-    half_mm : float
-        Approximate half width of the bead.
-    length_mm : float
-        Length of the bead.
-    noise_mm : (n,) float64
-        Standard deviation of independent point noise that explains the scatter of local means.
-    profiles : BeadProfiles
-    footprint_std : float
-        Relative standard uncertainty of the squared footprints.
-    """
-
-    axes: np.ndarray
-    middle_mm: np.ndarray
-    chosen: np.ndarray
-    raw_mm: np.ndarray
-    heights_mm: np.ndarray
-    on_bead: np.ndarray
-    half_mm: float
-    length_mm: float
-    noise_mm: np.ndarray
+    axes: np.ndarray  # (3, 3); unit vectors along the bead, across it and outwards
+    middle_mm: np.ndarray  # (3,); middle of the bead
+    chosen: np.ndarray  # (n,) int; points on the bead and on the plates
+    raw_mm: np.ndarray  # (n,); heights of these points above the middle
+    heights_mm: np.ndarray  # (n,); heights of these points above the plates
+    on_bead: np.ndarray  # (n,) bool; points on the bead
+    half_mm: float  # approximate half width of the bead
+    length_mm: float  # length of the bead
+    noise_mm: np.ndarray  # (n,); standard deviation of independent point noise that explains the scatter of local means
     profiles: BeadProfiles
-    footprint_std: float
+    footprint_std: float  # relative standard uncertainty of the squared footprints
 
 
 def _prepare_bead(cloud: PointCloud, section_mm: float | None) -> tuple[Bead, list[str]]:
@@ -369,22 +306,14 @@ _NAMES = (
 
 @dataclass(frozen=True, eq=False)
 class _Figures:
-    """Values and section profiles of one set of point heights.
+    """Values and section profiles of one set of point heights."""
 
-    Attributes
-    ----------
-    values : (9,) float64
-        Values in the order of `_NAMES`; the largest ones are NaN, as they are determined later.
-    crest : (W,) float64
-        Height of each section. Sections use the smooth profiles, which are less noisy, plus the mean correction of the
-        smoothing.
-    grooves : pair of (W,) float64
-        Undercut depths at the left and right toe of each section; NaN if lines are missing there.
-    """
-
-    values: np.ndarray
+    values: np.ndarray  # (9,); values in the order of `_NAMES`; the largest ones are NaN, as they are determined later
     crest: np.ndarray
+    """(W,); height of each section. Sections use the smooth profiles, which are less noisy, plus the mean correction
+    of the smoothing."""
     grooves: tuple[np.ndarray, np.ndarray]
+    """Pair of (W,); undercut depths at the left and right toe of each section; NaN if lines are missing there."""
 
 
 def measure_bead(bead: Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray, list[str]]:

@@ -107,29 +107,17 @@ class Stripe:
 
 @dataclass(frozen=True)
 class StripeCandidates:
-    """All M stripe candidates of one image, sorted by line and centre: several sheets, or reflections.
+    """All M stripe candidates of one image, sorted by line and centre: several sheets, or reflections."""
 
-    Attributes
-    ----------
-    line : (M,) int
-        Profile line of each candidate; a line can have any number of candidates.
-    centre_px, amplitude, width_px : (M,) float64, float32, float32
-        As in `Stripe`.
-    log_likelihood : (M,) float64
-        Log likelihood ratio of the pixels with and without the stripe, for white noise of the background.
-    count : int
-        Number L of profile lines.
-    stripe_along : str
-        As in `Stripe`.
-    """
-
-    line: np.ndarray
+    line: np.ndarray  # (M,) int; profile line of each candidate; a line can have any number of candidates
+    # (M,), float32, float32; as in `Stripe`.
     centre_px: np.ndarray
     amplitude: np.ndarray
     width_px: np.ndarray
     log_likelihood: np.ndarray
-    count: int
-    stripe_along: str
+    """(M,); log likelihood ratio of the pixels with and without the stripe, for white noise of the background."""
+    count: int  # number L of profile lines
+    stripe_along: str  # as in `Stripe`
 
     def __getitem__(self, some: np.ndarray) -> StripeCandidates:
         """Return the candidates selected by an index array or a mask."""
@@ -163,24 +151,16 @@ class StripeCandidates:
 
 @dataclass(frozen=True, eq=False)
 class CaptureStripes:
-    """All N stripe centres of a capture's laser images.
+    """All N stripe centres of a capture's laser images."""
 
-    Attributes
-    ----------
-    frame, line : (N,) int
-        Image and profile line of each centre.
-    centre_px, amplitude, width_px : (N,) float64, float32, float32
-        As in `Stripe`; amplitude and width are NaN if a 3D camera does not supply them.
-    lines_by_status : dict
-        Number of profile lines in all images for each name of `StripeStatus`.
-    """
-
+    # (N,) int; image and profile line of each centre.
     frame: np.ndarray
     line: np.ndarray
+    # (N,), float32, float32; as in `Stripe`; amplitude and width are NaN if a 3D camera does not supply them.
     centre_px: np.ndarray
     amplitude: np.ndarray
     width_px: np.ndarray
-    lines_by_status: dict[str, int]
+    lines_by_status: dict[str, int]  # number of profile lines in all images for each name of `StripeStatus`
 
     def __getitem__(self, some: np.ndarray | slice) -> CaptureStripes:
         """Return the centres selected by a slice, an index array or a mask."""

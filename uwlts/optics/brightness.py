@@ -64,34 +64,23 @@ _MOVED_PX = 0.5
 
 @dataclass(frozen=True, eq=False)
 class IlluminatedPoints:
-    """Points on a laser sheet of finite thickness, for N stripe centres.
+    """Points on a laser sheet of finite thickness, for N stripe centres."""
 
-    Attributes
-    ----------
-    found : MeasuredPoints
-        Points on the middle of the sheet, OCS at stage position 0.
-    of_slope : (N, 3)
-        Shift of a point along its camera ray, mm, per gradient of log brightness across the sheet, 1/mm: unit mm^2.
-    sigma_mm : (N,)
-        Standard deviation of the sheet's profile.
-    per_sigma_px : (N,)
-        Shift of the stripe in the image if the sheet moves by ``sigma_mm``, on a surface normal to the laser's axis.
-    calibration : Calibration
-    line, centre_px : (N,)
-        Profile lines and stripe centres.
-    evaluate
-        Function that returns points, ``of_slope``, ``sigma_mm`` and ``per_sigma_px`` as one array (M, 8) for lines (M,)
-        and centres (M,).
-    """
-
-    found: MeasuredPoints
+    found: MeasuredPoints  # points on the middle of the sheet, OCS at stage position 0
     of_slope: np.ndarray
-    sigma_mm: np.ndarray
+    """(N, 3); shift of a point along its camera ray, mm, per gradient of log brightness across the sheet, 1/mm: unit
+    mm^2."""
+    sigma_mm: np.ndarray  # (N,); standard deviation of the sheet's profile
     per_sigma_px: np.ndarray
+    """(N,); shift of the stripe in the image if the sheet moves by ``sigma_mm``, on a surface normal to the laser's
+    axis."""
     calibration: Calibration
+    # (N,); profile lines and stripe centres.
     line: np.ndarray
     centre_px: np.ndarray
     evaluate: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    """Function that returns points, ``of_slope``, ``sigma_mm`` and ``per_sigma_px`` as one array (M, 8) for lines
+    (M,) and centres (M,)."""
 
     @classmethod
     def from_calibration(

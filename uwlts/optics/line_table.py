@@ -31,22 +31,12 @@ _WORTH = 5000
 
 @dataclass(frozen=True, eq=False)
 class LineTable:
-    """Chebyshev series in line and centre of a function with K values.
+    """Chebyshev series in line and centre of a function with K values."""
 
-    Attributes
-    ----------
-    terms : (T, n, K)
-        Coefficients by term of the line, term of the centre, and value.
-    of_lines : (L, T)
-        Chebyshev polynomials at each line, from ``first_line`` on.
-    first_line : int
-    low_px, high_px : float
-        Limits of the centres.
-    """
-
-    terms: np.ndarray
-    of_lines: np.ndarray
+    terms: np.ndarray  # (T, n, K); coefficients by term of the line, term of the centre, and value
+    of_lines: np.ndarray  # (L, T); Chebyshev polynomials at each line, from ``first_line`` on
     first_line: int
+    # Limits of the centres.
     low_px: float
     high_px: float
 

@@ -31,16 +31,10 @@ _BLOCK = 4096
 
 @dataclass(frozen=True)
 class MeasuredPoints:
-    """Measured points in the camera frame, or in the object coordinate system (OCS) at stage position 0.
+    """Measured points in the camera frame, or in the object coordinate system (OCS) at stage position 0."""
 
-    Attributes
-    ----------
-    points_mm : (N, 3) float64, NaN where the status is not OK
-    status : (N,) uint8, `uwlts.optics.window.RayStatus`
-    """
-
-    points_mm: np.ndarray
-    status: np.ndarray
+    points_mm: np.ndarray  # (N, 3), NaN where the status is not OK
+    status: np.ndarray  # (N,) uint8, `uwlts.optics.window.RayStatus`
 
 
 def reconstruct_profile(

@@ -33,21 +33,14 @@ class RayStatus(IntEnum):
 
 @dataclass(frozen=True)
 class RaysInMedium:
-    """Rays in the medium, camera frame.
-
-    Attributes
-    ----------
-    origins : (N, 3)
-        Points on the window's outer face, mm; the entrance pupil without a window. NaN if the status is not OK.
-    directions : (N, 3)
-        Unit vectors away from the sensor. NaN if the status is not OK.
-    status : (N,) uint8
-        `RayStatus`.
-    """
+    """Rays in the medium, camera frame."""
 
     origins: np.ndarray
+    """(N, 3); points on the window's outer face, mm; the entrance pupil without a window. NaN if the status is not
+    OK."""
     directions: np.ndarray
-    status: np.ndarray
+    """(N, 3); unit vectors away from the sensor. NaN if the status is not OK."""
+    status: np.ndarray  # (N,) uint8; `RayStatus`
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,15 +65,9 @@ def choose_points(
 
 @dataclass(frozen=True)
 class CloudDisplay:
-    """View of a cloud for the output of a notebook's cell.
+    """View of a cloud for the output of a notebook's cell."""
 
-    Attributes
-    ----------
-    page : str
-        HTML page with the points, and with the scripts that show them.
-    """
-
-    page: str
+    page: str  # HTML page with the points, and with the scripts that show them
 
     def _repr_html_(self) -> str:
         """Return the page within a frame: scripts and styles of several views in a notebook stay apart."""

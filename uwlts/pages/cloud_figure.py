@@ -63,27 +63,14 @@ def colour_limit_mm(deviation_mm: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class CloudPoints:
-    """Points for a view of a page, seen along `view_direction`.
+    """Points for a view of a page, seen along `view_direction`."""
 
-    Attributes
-    ----------
-    points_mm : (N, 3) float64
-        Positions, mm.
-    field : str
-        Quantity that is shown by colour.
-    values : (N,) float64 or None
-        The quantity, NaN where unknown; None for "depth", which is Z.
-    unit : str
-        Unit of the quantity.
-    limit : float or None
-        Value at the end of the scale `STOPS`, which is symmetric about zero; None for the range of the values.
-    """
-
-    points_mm: np.ndarray
-    field: CloudField
-    values: np.ndarray | None
-    unit: str
+    points_mm: np.ndarray  # (N, 3); positions, mm
+    field: CloudField  # quantity that is shown by colour
+    values: np.ndarray | None  # (N,) or None; the quantity, NaN where unknown; None for "depth", which is Z
+    unit: str  # unit of the quantity
     limit: float | None
+    """Value at the end of the scale `STOPS`, which is symmetric about zero; None for the range of the values."""
 
     def to_json(self) -> str:
         """Return the text that the page's script reads; steps are 1/16382 of the range of each column."""

@@ -48,34 +48,22 @@ _SPHERE_REACH = 0.25
 
 @dataclass(frozen=True, eq=False)
 class PairEvidence:
-    """Linearised observations of one pair of scans.
-
-    Attributes
-    ----------
-    derivatives : (Q, U) float64
-        Derivatives of the residuals by all unknowns. Rows of surface distances come first, then three for each sphere.
-    residuals, weights, std : (Q,) float64
-        Residuals, their weights and their stated standard deviations.
-    spread : float
-        Ratio of the robust scatter of the distances to their noise; at least 1 if both scans state their noise.
-    spurious : (P, P) float64
-        Information on the poses that noise of the normals alone would produce.
-    ways : tuple of (int, int, PatchDistances)
-        Source, target and distances in both directions, in the order of the rows.
-    places_mm : (patches, 3) float64
-        Positions of the surface distances.
-    patches, spheres : int
-        Numbers of surface distances and of common spheres.
-    """
+    """Linearised observations of one pair of scans."""
 
     derivatives: np.ndarray
+    """(Q, U); derivatives of the residuals by all unknowns. Rows of surface distances come first, then three for
+    each sphere."""
+    # (Q,); residuals, their weights and their stated standard deviations.
     residuals: np.ndarray
     weights: np.ndarray
     std: np.ndarray
     spread: float
-    spurious: np.ndarray
+    """Ratio of the robust scatter of the distances to their noise; at least 1 if both scans state their noise."""
+    spurious: np.ndarray  # (P, P); information on the poses that noise of the normals alone would produce
     ways: tuple[tuple[int, int, PatchDistances], ...]
-    places_mm: np.ndarray
+    """Source, target and distances in both directions, in the order of the rows."""
+    places_mm: np.ndarray  # (patches, 3); positions of the surface distances
+    # Numbers of surface distances and of common spheres.
     patches: int
     spheres: int
 
@@ -95,23 +83,13 @@ class PairEvidence:
 
 @dataclass(frozen=True, eq=False)
 class PoseSolution:
-    """Step of all unknowns in the determined directions.
+    """Step of all unknowns in the determined directions."""
 
-    Attributes
-    ----------
-    step : (U,) float64
-    response : (U, U) float64
-        Derivatives of the step by the negative gradient.
-    by_prior : (U, U) float64
-        Covariance of the step by errors of the initial poses and by the true pattern amplitudes.
-    open_directions : (K, P) float64
-        Undetermined directions of the poses.
-    """
-
-    step: np.ndarray
-    response: np.ndarray
+    step: np.ndarray  # (U,)
+    response: np.ndarray  # (U, U); derivatives of the step by the negative gradient
     by_prior: np.ndarray
-    open_directions: np.ndarray
+    """(U, U); covariance of the step by errors of the initial poses and by the true pattern amplitudes."""
+    open_directions: np.ndarray  # (K, P); undetermined directions of the poses
 
 
 class JointRegistration:

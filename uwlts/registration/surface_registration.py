@@ -28,30 +28,18 @@ class SurfaceRegistrationOptions:
     """Settings of `register_to_surface`.
 
     The history of the values names no data. The reason beside each value follows from the method.
-
-    Attributes
-    ----------
-    rounds : int
-        Largest number of Gauss-Newton rounds, each with new correspondences.
-    most_points : int
-        Number of points above which the cloud is thinned: more points take longer without a benefit.
-    fewest_points : int
-        Least number of points near the surface: about eight for each of the six parameters.
-    open_share : float
-        Information on a direction, relative to the best determined one, below which the direction is undetermined.
-        Noise of the normals alone can produce less.
-    still_mm : float
-        Step, mm, that ends the iteration: far below any measurable change.
-    least_variance_mm2 : float
-        Lower bound of a point's variance along the normal: (0.1 um) squared, so that weights stay finite.
     """
 
-    rounds: int = 40
+    rounds: int = 40  # largest number of Gauss-Newton rounds, each with new correspondences
     most_points: int = 50_000
-    fewest_points: int = 50
+    """Number of points above which the cloud is thinned: more points take longer without a benefit."""
+    fewest_points: int = 50  # least number of points near the surface: about eight for each of the six parameters
     open_share: float = 1e-3
-    still_mm: float = 1e-5
+    """Information on a direction, relative to the best determined one, below which the direction is undetermined.
+    Noise of the normals alone can produce less."""
+    still_mm: float = 1e-5  # step, mm, that ends the iteration: far below any measurable change
     least_variance_mm2: float = 1e-8
+    """Lower bound of a point's variance along the normal: (0.1 um) squared, so that weights stay finite."""
 
 
 _DEFAULTS = SurfaceRegistrationOptions()
@@ -106,34 +94,20 @@ class SampledSurface:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Rigid motion that registers a cloud to a surface.
+    """Rigid motion that registers a cloud to a surface."""
 
-    Attributes
-    ----------
-    transform : (4, 4) float64
-        Transform from the cloud's frame to the reference's, mm.
-    covariance : (6, 6) or (7, 7) float64
-        Covariance of the translation (mm) and rotation (rad) about `middle_mm` after the motion, by the noise of points
-        and the position of images; 0 in undetermined directions. For a fitted shape of unknown size, the radius (mm)
-        comes last.
-    middle_mm : (3,) float64
-        Centroid of the cloud after the motion.
-    open_directions : tuple of str
-        Motions that the surface does not determine. The cloud was not moved along them.
-    rms_mm : float
-        Root-mean-square distance from the surface of the points with a positive weight.
-    points : int
-        Number of these points.
-    by_cloud, by_reference : (M, 6) or (M, 7) float64
-        Change of the estimated motion for one standard deviation of each systematic pattern of cloud or reference.
-    """
-
-    transform: np.ndarray
+    transform: np.ndarray  # (4, 4); transform from the cloud's frame to the reference's, mm
     covariance: np.ndarray
-    middle_mm: np.ndarray
+    """(6, 6) or (7, 7); covariance of the translation (mm) and rotation (rad) about `middle_mm` after the motion, by
+    the noise of points and the position of images; 0 in undetermined directions. For a fitted shape of unknown size,
+    the radius (mm) comes last."""
+    middle_mm: np.ndarray  # (3,); centroid of the cloud after the motion
     open_directions: tuple[str, ...]
-    rms_mm: float
-    points: int
+    """Motions that the surface does not determine. The cloud was not moved along them."""
+    rms_mm: float  # root-mean-square distance from the surface of the points with a positive weight
+    points: int  # number of these points
+    # (M, 6) or (M, 7); change of the estimated motion for one standard deviation of each systematic pattern of cloud or
+    # reference.
     by_cloud: np.ndarray
     by_reference: np.ndarray
 

@@ -76,25 +76,14 @@ class CalibratedItem(Description):
 
 
 class Administration(Description):
-    """Administrative data of a digital calibration certificate, read from TOML.
+    """Administrative data of a digital calibration certificate, read from TOML."""
 
-    Attributes
-    ----------
-    identifier : str
-        Unique identifier of the certificate.
-    begin, end : date
-        First and last day of the calibration.
-    location : str
-        Place of the calibration: laboratory, customer, laboratoryBranch, customerBranch or other.
-    laboratory, customer : Contact
-    item : CalibratedItem
-    persons : tuple of ResponsiblePerson
-    """
-
-    identifier: Text
+    identifier: Text  # unique identifier of the certificate
+    # First and last day of the calibration.
     begin: datetime.date
     end: datetime.date
     location: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = "laboratory"
+    """Place of the calibration: laboratory, customer, laboratoryBranch, customerBranch or other."""
     laboratory: Contact
     customer: Contact
     item: CalibratedItem

@@ -35,41 +35,21 @@ _SHOWN_MM = 1e-4
 
 
 class MeasuredValue(Description):
-    """Value measured by hand.
-
-    Attributes
-    ----------
-    number : int
-        Number of the value in its list.
-    name : str
-        Name given by the user.
-    quantity : str
-        Measured quantity, such as "distance" or "diameter".
-    value_mm : float
-    expanded_mm : float or None
-        Expanded uncertainty (k = 2); None if it is unknown.
-    without_interval : str
-        Reason why the uncertainty is unknown; empty if it is known.
-    lower_mm, upper_mm : float or None
-        Limits of the value; None: not limited.
-    source : str
-        Cloud or image that was measured.
-    points : int
-        Number of measured points.
-    """
+    """Value measured by hand."""
 
     model_config = ConfigDict(extra="ignore")
 
-    number: int
-    name: Annotated[str, Field(min_length=1, max_length=100)]
-    quantity: str
+    number: int  # number of the value in its list
+    name: Annotated[str, Field(min_length=1, max_length=100)]  # name given by the user
+    quantity: str  # measured quantity, such as "distance" or "diameter"
     value_mm: float
-    expanded_mm: Annotated[float, Field(ge=0)] | None
-    without_interval: str
+    expanded_mm: Annotated[float, Field(ge=0)] | None  # expanded uncertainty (k = 2); None if it is unknown
+    without_interval: str  # reason why the uncertainty is unknown; empty if it is known
+    # Limits of the value; None: not limited.
     lower_mm: float | None = None
     upper_mm: float | None = None
-    source: str
-    points: int
+    source: str  # cloud or image that was measured
+    points: int  # number of measured points
 
     @model_validator(mode="after")
     def _check_limits(self) -> Self:

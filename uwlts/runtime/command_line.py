@@ -120,20 +120,13 @@ def command_from(
 
 @dataclass(frozen=True)
 class Call:
-    """Function of a command with the arguments from the command line.
-
-    Attributes
-    ----------
-    given : dict
-        Arguments by name, in the types of the function's parameters; those for ``*args`` have the name ``*``.
-    title : str
-        Title of the progress bar.
-    """
+    """Function of a command with the arguments from the command line."""
 
     function: Callable[..., Any]
     parameters: Mapping[str, inspect.Parameter]
     given: dict[str, Any]
-    title: str
+    """Arguments by name, in the types of the function's parameters; those for ``*args`` have the name ``*``."""
+    title: str  # title of the progress bar
 
     def __call__(self, **more: Any) -> Any:
         """Call the function with the given and further arguments, and show its progress."""

@@ -24,31 +24,17 @@ Colours = np.ndarray | None
 
 @dataclass(frozen=True)
 class CloudFormat:
-    """Format of files with a cloud.
-
-    Attributes
-    ----------
-    read
-        Reads a file whose numbers are in a unit if it states none. None if files are only written.
-    write
-        Writes a cloud with colours (N, 3) or None to a path that is renamed to the second one afterwards. None if files
-        are only read.
-    libraries
-        Optional libraries that writing needs.
-    coloured
-        Whether points can have colours.
-    unit
-        Unit that the format prescribes, or None if files can be in any unit.
-    ambiguous
-        Whether files with this ending usually contain something else.
-    """
+    """Format of files with a cloud."""
 
     read: Callable[[Path, Unit | None], PointCloud] | None = None
+    """Reads a file whose numbers are in a unit if it states none. None if files are only written."""
     write: Callable[[Path, PointCloud, Colours, Path], object] | None = None
-    libraries: tuple[Literal["laspy", "lazrs", "copclib", "pye57"], ...] = ()
-    coloured: bool = False
-    unit: Unit | None = None
-    ambiguous: bool = False
+    """Writes a cloud with colours (N, 3) or None to a path that is renamed to the second one afterwards. None if
+    files are only read."""
+    libraries: tuple[Literal["laspy", "lazrs", "copclib", "pye57"], ...] = ()  # optional libraries that writing needs
+    coloured: bool = False  # whether points can have colours
+    unit: Unit | None = None  # unit that the format prescribes, or None if files can be in any unit
+    ambiguous: bool = False  # whether files with this ending usually contain something else
 
 
 def find_format(path: str | os.PathLike[str]) -> CloudFormat | None:

@@ -22,23 +22,19 @@ class CircleGridTarget(Target):
     The origin is the centre of the top left circle. Circles may be bright on dark or dark on bright. A rectangular
     grid, and an asymmetric one with an even number of rows, look the same after half a turn, square ones after a
     quarter turn. Of these, the orientation with X pointing most to the right in the image is used.
-
-    Attributes
-    ----------
-    columns, rows : number of circles in a row, and number of rows (OpenCV's pattern size)
-    pitch_mm : distance between neighbours along X and along Y, or these distances [along X, along Y]. In an asymmetric
-        grid, it is the distance between rows, and half the distance between the circles of a row
-    diameter_mm : diameter of the circles
-    asymmetric : True if every second row, from the second one on, is shifted by half the distance of its circles
-        (OpenCV's CALIB_CB_ASYMMETRIC_GRID)
     """
 
     kind: Literal["circle grid"] = "circle grid"
+    # Number of circles in a row, and number of rows (OpenCV's pattern size).
     columns: Annotated[int, Field(ge=2)]
     rows: Annotated[int, Field(ge=2)]
     pitch_mm: Positive | tuple[Positive, Positive]
-    diameter_mm: Positive
+    """Distance between neighbours along X and along Y, or these distances [along X, along Y]. In an asymmetric grid,
+    it is the distance between rows, and half the distance between the circles of a row."""
+    diameter_mm: Positive  # diameter of the circles
     asymmetric: bool = False
+    """True if every second row, from the second one on, is shifted by half the distance of its circles (OpenCV's
+    CALIB_CB_ASYMMETRIC_GRID)."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

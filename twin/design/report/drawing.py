@@ -54,40 +54,20 @@ class Module:
 
 @dataclass(frozen=True, eq=False)
 class SideView:
-    """Sensor in the plane of the camera's axis and the baseline; points are (baseline, depth) from the pupil, in mm.
-
-    Attributes
-    ----------
-    camera, laser : Module
-    pupil_mm : float
-        Diameter of the pupil.
-    baseline_mm : float
-        Distance of the fan's origin from the camera's axis.
-    edges : tuple of (K, 2)
-        Rays at the image's edges: pupil, both faces of the window if there is one, and an end in the medium.
-    sheet : (K, 2)
-        The laser's axis.
-    volume : (2, 2)
-        Points of the sheet at the ends of the measuring volume.
-    in_view : (2, 2), optional
-        Ends of the part that both camera and laser reach.
-    crossing : (2,)
-        Intersection of the sheet with the camera's axis, at the angle ``angle_rad``.
-    outer_mm : float
-        Depth of the window's outer face.
-    angle_rad : float
-    """
+    """Sensor in the plane of the camera's axis and the baseline; points are (baseline, depth) from the pupil, in mm."""
 
     camera: Module
     laser: Module
-    pupil_mm: float
-    baseline_mm: float
+    pupil_mm: float  # diameter of the pupil
+    baseline_mm: float  # distance of the fan's origin from the camera's axis
     edges: tuple[np.ndarray, ...]
-    sheet: np.ndarray
-    volume: np.ndarray
-    in_view: np.ndarray | None
-    crossing: np.ndarray
-    outer_mm: float
+    """(K, 2) each; rays at the image's edges: pupil, both faces of the window if there is one, and an end in the
+    medium."""
+    sheet: np.ndarray  # (K, 2); the laser's axis
+    volume: np.ndarray  # (2, 2); points of the sheet at the ends of the measuring volume
+    in_view: np.ndarray | None  # (2, 2), optional; ends of the part that both camera and laser reach
+    crossing: np.ndarray  # (2,); intersection of the sheet with the camera's axis, at the angle ``angle_rad``
+    outer_mm: float  # depth of the window's outer face
     angle_rad: float
 
     def outlines(self) -> list[np.ndarray]:
@@ -97,26 +77,15 @@ class SideView:
 
 @dataclass(frozen=True, eq=False)
 class FrontView:
-    """Sheet from the front; points are (along the stripe, along the laser's axis) from the fan's origin, in mm.
-
-    Attributes
-    ----------
-    laser : Module
-    fan : tuple of (K, 2)
-        Edges of the fan.
-    borders : tuple of (N, 2)
-        The image's four sides, projected onto the sheet; NaN if a ray misses the sheet.
-    lines : (3, 2, 2)
-        Ends of the line at near end, middle and far end of the volume in view; NaN if nothing is in view.
-    region : (N, 2)
-        Outline of the region that both camera and laser reach; can be empty.
-    """
+    """Sheet from the front; points are (along the stripe, along the laser's axis) from the fan's origin, in mm."""
 
     laser: Module
-    fan: tuple[np.ndarray, ...]
+    fan: tuple[np.ndarray, ...]  # (K, 2) each; edges of the fan
     borders: tuple[np.ndarray, ...]
+    """(N, 2) each; the image's four sides, projected onto the sheet; NaN if a ray misses the sheet."""
     lines: np.ndarray
-    region: np.ndarray
+    """(3, 2, 2); ends of the line at near end, middle and far end of the volume in view; NaN if nothing is in view."""
+    region: np.ndarray  # (N, 2); outline of the region that both camera and laser reach; can be empty
 
     def outlines(self) -> list[np.ndarray]:
         """Return lines (K, 2) for drawing the design behind another one; they enclose the whole view."""

@@ -99,34 +99,23 @@ class LensCandidate:
 
 @dataclass(frozen=True, eq=False)
 class LensCalibration:
-    """Calibrated lens and its evidence.
+    """Calibrated lens and its evidence."""
 
-    Attributes
-    ----------
-    solution : solution for the used images, in their order; its covariance assumes independent points
-    used, images : numbers (F,) of the used images, and these images without outliers
-    left_out : number of each rejected image, and the reason
-    moved : (F,); largest change of a parameter without each used image, in its standard deviations without it (for
-        points that scatter by at least 0.05 px); NaN if the parameters are then not determined
-    rejected_share : fraction of rejected points in the used images
-    halves : (2,); solutions from every second image and from the others; None if not determined
-    without : (F,); solutions from all used images except one; None if not determined
-    candidates : compared models; empty if the model was given
-    options : selected model
-    covariance : (P, P); of the parameters, with correlated errors in each image
-    """
-
-    solution: CameraSolution
+    solution: CameraSolution  # solution for the used images, in their order; its covariance assumes independent points
+    # Numbers (F,) of the used images, and these images without outliers.
     used: np.ndarray
     images: list[TargetImage]
-    left_out: dict[int, str]
+    left_out: dict[int, str]  # number of each rejected image, and the reason
     moved: np.ndarray
-    without: list[CameraSolution | None]
+    """(F,); largest change of a parameter without each used image, in its standard deviations without it (for points
+    that scatter by at least 0.05 px); NaN if the parameters are then not determined."""
+    without: list[CameraSolution | None]  # (F,); solutions from all used images except one; None if not determined
     halves: list[CameraSolution | None]
-    rejected_share: float
-    candidates: list[LensCandidate]
-    options: CameraOptions
-    covariance: np.ndarray
+    """(2,); solutions from every second image and from the others; None if not determined."""
+    rejected_share: float  # fraction of rejected points in the used images
+    candidates: list[LensCandidate]  # compared models; empty if the model was given
+    options: CameraOptions  # selected model
+    covariance: np.ndarray  # (P, P); of the parameters, with correlated errors in each image
 
     @property
     def name(self) -> str:

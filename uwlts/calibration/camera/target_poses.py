@@ -135,35 +135,24 @@ _X, _Y = np.eye(3)[:2]
 
 @dataclass(frozen=True, eq=False)
 class CameraSolution:
-    """Calibrated camera with its uncertainty.
-
-    Attributes
-    ----------
-    target_poses : (F, 4, 4); ``T_camera_target`` of every image
-    residuals_px : list of (N, 2); found minus calculated pixel, for every image
-    parameters : names of the estimated camera parameters
-    covariance : (P, P); of these parameters
-    sigma_px : standard deviation of one coordinate, corrected for the degrees of freedom
-    stage_direction : (3,) or None; unit direction of the sensor's motion by the stage, camera frame; None if free poses
-        do not follow a stage
-    stage_tilt_rad, stage_tilt_std_rad : angle between that direction and the target's normal, and its standard
-        deviation, for poses "stage"; the largest of all placements
-    stopped : reason why the iteration ended
-    bias_px : list of (N, 2) or None; corrected offsets of the circle images' centres
-    """
+    """Calibrated camera with its uncertainty."""
 
     model: CameraModel
-    target_poses: np.ndarray
-    residuals_px: list[np.ndarray]
-    parameters: tuple[str, ...]
-    covariance: np.ndarray
-    sigma_px: float
+    target_poses: np.ndarray  # (F, 4, 4); ``T_camera_target`` of every image
+    residuals_px: list[np.ndarray]  # list of (N, 2); found minus calculated pixel, for every image
+    parameters: tuple[str, ...]  # names of the estimated camera parameters
+    covariance: np.ndarray  # (P, P); of these parameters
+    sigma_px: float  # standard deviation of one coordinate, corrected for the degrees of freedom
     stage_direction: np.ndarray | None
+    """(3,) or None; unit direction of the sensor's motion by the stage, camera frame; None if free poses do not
+    follow a stage."""
+    # Angle between that direction and the target's normal, and its standard deviation, for poses "stage"; the largest
+    # of all placements.
     stage_tilt_rad: float | None
     stage_tilt_std_rad: float | None
     rounds: int
-    stopped: str
-    bias_px: list[np.ndarray] | None = None
+    stopped: str  # reason why the iteration ended
+    bias_px: list[np.ndarray] | None = None  # list of (N, 2) or None; corrected offsets of the circle images' centres
 
     def values(self) -> dict[str, float]:
         """Return every estimated parameter."""

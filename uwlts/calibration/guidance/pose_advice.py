@@ -255,20 +255,15 @@ _SAME_DISTANCE = 0.1  # the same for the distance, relative to it
 
 @dataclass(frozen=True)
 class CompletionLimits:
-    """Limits of a complete calibration.
+    """Limits of a complete calibration."""
 
-    Attributes
-    ----------
-    focal_std_px, centre_std_px : standard deviations of the focal length and of the principal point
-    coverage : fraction of the image's cells with points
-    tilt_rad : for free poses, tilt that each of the target's four sides must reach once. It reveals a target that is
-        not flat or not as described.
-    """
-
+    # Standard deviations of the focal length and of the principal point.
     focal_std_px: float = 0.5
     centre_std_px: float = 0.5
-    coverage: float = 0.85
+    coverage: float = 0.85  # fraction of the image's cells with points
     tilt_rad: float = float(np.radians(12))
+    """For free poses, tilt that each of the target's four sides must reach once. It reveals a target that is not
+    flat or not as described."""
     fewest_images: int = 8
 
     def std_px(self) -> dict[LensParameter, float]:

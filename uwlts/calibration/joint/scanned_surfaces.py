@@ -201,25 +201,20 @@ class SurfaceScanEvidence(StripeEvidence):
 
     The local parameters are those of the surface (camera frame at the stage position 0), and an error of each of the F
     stage positions ``stage_mm``.
-
-    Attributes
-    ----------
-    beside_mm : (3, N); offset of the light's origin from the sheet's middle, camera frame (`uwlts.optics.brightness`)
-    common_px : (N,); standard uncertainty of remaining brightness and blur errors, common to all points of a body
-    frame : (N,) int; image number of each pixel, from 0
-    direction, across_stage : (3,), (2, 3); described direction of the sensor at increasing positions, and two
-        perpendicular directions, orthonormal, camera frame
-    image : number of the scan's first image among those of all scans
     """
 
     beside_mm: np.ndarray
+    """(3, N); offset of the light's origin from the sheet's middle, camera frame (`uwlts.optics.brightness`)."""
     common_px: np.ndarray
+    """(N,); standard uncertainty of remaining brightness and blur errors, common to all points of a body."""
     surface: Surface
-    frame: np.ndarray
+    frame: np.ndarray  # (N,) int; image number of each pixel, from 0
     stage_mm: np.ndarray
+    # (3,), (2, 3); described direction of the sensor at increasing positions, and two perpendicular directions,
+    # orthonormal, camera frame.
     direction: np.ndarray
     across_stage: np.ndarray
-    image: int
+    image: int  # number of the scan's first image among those of all scans
 
     def scan(self) -> str:
         """Return the name of the scan's capture."""

@@ -19,20 +19,13 @@ class PlausibilityRule:
 
     Chosen on views of the as-built thesis sensor without drawn pixels, two draws of each fault; judged on other draws
     and on drawn images of a coarse sensor.
-
-    Attributes
-    ----------
-    rough : float
-        Least relative error for a doubt: the usual error of sizes that are stated without an uncertainty.
-    sigmas : float
-        Least error for a doubt in standard uncertainties: one normal error in 16,000 is larger.
-    fewest_steps : int
-        Step images for an estimate of the height: fewer leave no scatter beside distance and height.
     """
 
     rough: float = 2e-3
-    sigmas: float = 4.0
+    """Least relative error for a doubt: the usual error of sizes that are stated without an uncertainty."""
+    sigmas: float = 4.0  # least error for a doubt in standard uncertainties: one normal error in 16,000 is larger
     fewest_steps: int = 4
+    """Step images for an estimate of the height: fewer leave no scatter beside distance and height."""
 
     def exceeds(self, error: float, std: float) -> bool:
         """Return whether a relative error with its standard uncertainty is a doubt."""

@@ -86,45 +86,30 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Calibration with the data of its report.
-
-    Attributes
-    ----------
-    steps : step images used for the window, in the order of its figures
-    """
+    """Calibration with the data of its report."""
 
     calibration: Calibration
     air: AirEvidence
     camera: CameraSolution
     stripe_points: StripePoints
     sheet: SheetSolution
-    steps: Sequence[StepEvidence]
+    steps: Sequence[StepEvidence]  # step images used for the window, in the order of its figures
     window: WindowSolution | None
     warnings: list[str]
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Evidence from the captures of a calibration.
+    """Evidence from the captures of a calibration."""
 
-    Attributes
-    ----------
-    sensor : as described by the captures of the target
-    medium_kind : kind of the medium of the target's images
-    stage_direction : (3,); nominal direction of the stage for the target, in the OCS
-    approaching : whether the stage moves the sensor towards the target; None if irrelevant
-    window : description of the camera's window for the step standard; None without step captures
-    sources : origin of the captures, for the calibration's provenance
-    """
-
-    sensor: Sensor
-    medium_kind: Literal["air", "fresh", "sea", "custom"]
-    stage_direction: np.ndarray
-    approaching: bool | None
+    sensor: Sensor  # as described by the captures of the target
+    medium_kind: Literal["air", "fresh", "sea", "custom"]  # kind of the medium of the target's images
+    stage_direction: np.ndarray  # (3,); nominal direction of the stage for the target, in the OCS
+    approaching: bool | None  # whether the stage moves the sensor towards the target; None if irrelevant
     air: AirEvidence
-    window: Window | None
+    window: Window | None  # description of the camera's window for the step standard; None without step captures
     steps: list[StepEvidence]
-    sources: dict[str, JsonValue]
+    sources: dict[str, JsonValue]  # origin of the captures, for the calibration's provenance
     warnings: list[str]
 
 

@@ -26,37 +26,26 @@ _AT_BOUND = 1e-3  # fraction of the range; least squares with bounds stop this c
 
 @dataclass(frozen=True, eq=False)
 class WindowSolution:
-    """Window at the distance that fits the steps best.
-
-    Attributes
-    ----------
-    heights_mm, errors_mm, height_std_mm : (S,); height of the step in every image, its error, and its standard
-        deviation from the scatter of the points
-    slopes : (S,); derivative of each height by the distance
-    std_mm : standard deviation of the distance from the remaining height errors; None with a single image
-    scatter_std_mm : standard deviation from the scatter of the points only
-    per_height : derivative of the distance by the calibrated height, if all images use the same step
-    per_index : derivative of the distance by the index, if all images are taken in the same medium
-    uncertainty_mm : standard uncertainty of the distance, from the remaining errors (or the scatter of a single image),
-        the calibrated height and the medium's index, which are common to all images
-    image_distances_mm : (S,); distance from each single image (thesis, Table 4); NaN outside the bounds
-    curve_mm : (C, 2); tested distances and root mean square height error, NaN if a point cannot be reconstructed
-    bounds_mm : (2,)
-    """
+    """Window at the distance that fits the steps best."""
 
     model: WindowModel
+    # (S,); height of the step in every image, its error, and its standard deviation from the scatter of the points.
     heights_mm: np.ndarray
     errors_mm: np.ndarray
     height_std_mm: np.ndarray
-    slopes: np.ndarray
+    slopes: np.ndarray  # (S,); derivative of each height by the distance
     std_mm: float | None
-    scatter_std_mm: float
-    per_height: float
-    per_index: float
+    """Standard deviation of the distance from the remaining height errors; None with a single image."""
+    scatter_std_mm: float  # standard deviation from the scatter of the points only
+    per_height: float  # derivative of the distance by the calibrated height, if all images use the same step
+    per_index: float  # derivative of the distance by the index, if all images are taken in the same medium
     uncertainty_mm: float
-    image_distances_mm: np.ndarray
+    """Standard uncertainty of the distance, from the remaining errors (or the scatter of a single image), the
+    calibrated height and the medium's index, which are common to all images."""
+    image_distances_mm: np.ndarray  # (S,); distance from each single image (thesis, Table 4); NaN outside the bounds
     curve_mm: np.ndarray
-    bounds_mm: tuple[float, float]
+    """(C, 2); tested distances and root mean square height error, NaN if a point cannot be reconstructed."""
+    bounds_mm: tuple[float, float]  # (2,)
 
     def figures(self, steps: Sequence[StepImage]) -> dict[str, JsonValue]:
         """Return step heights with errors, standard deviations of the distance, and the curve, for files."""

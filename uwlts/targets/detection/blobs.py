@@ -20,32 +20,23 @@ class BlobRule:
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
     plates of tests/uwlts/targets and on real photographs (tests/system/test_real_images.py).
-
-    Attributes
-    ----------
-    windows_px : tuple of int
-        Sides of the square window for the two local grey levels, px. A window serves blobs from a tenth to three
-        quarters of its side, so that factors of four cover 4 to 380 px with overlap.
-    least_area_px : float
-        Least area of a blob, px^2: the shape of smaller blobs is unknown (a disc of 4 px diameter covers 12.6 px^2).
-    contrast_over_noise : float
-        Least contrast in standard deviations of the noise. Noise after the median filter, which more than halves it,
-        gives a contrast of 0.7.
-    contrast_over_range : float
-        Least contrast as a fraction of the image's grey range; less is dirt or compression noise.
-    smooth_share : float
-        Fraction of the pixels that determine the noise: even a fine pattern leaves them without an edge.
-    ellipse_departure : float
-        Largest difference of a blob's area from that of the ellipse with its moments, as a fraction. Rectangles, at
-        0.05, pass; the fit to the edge rejects them.
     """
 
     windows_px: tuple[int, ...] = (32, 128, 512)
+    """Sides of the square window for the two local grey levels, px. A window serves blobs from a tenth to three
+    quarters of its side, so that factors of four cover 4 to 380 px with overlap."""
     least_area_px: float = 10.0
+    """Least area of a blob, px^2: the shape of smaller blobs is unknown (a disc of 4 px diameter covers 12.6 px^2)."""
     contrast_over_noise: float = 3.0
+    """Least contrast in standard deviations of the noise. Noise after the median filter, which more than halves it,
+    gives a contrast of 0.7."""
     contrast_over_range: float = 0.04
+    """Least contrast as a fraction of the image's grey range; less is dirt or compression noise."""
     smooth_share: float = 0.2
+    """Fraction of the pixels that determine the noise: even a fine pattern leaves them without an edge."""
     ellipse_departure: float = 0.12
+    """Largest difference of a blob's area from that of the ellipse with its moments, as a fraction. Rectangles, at
+    0.05, pass; the fit to the edge rejects them."""
 
 
 _RULE = BlobRule()
@@ -53,18 +44,11 @@ _RULE = BlobRule()
 
 @dataclass(frozen=True)
 class Blobs:
-    """Blobs of one polarity, each with the ellipse that has the blob's moments.
+    """Blobs of one polarity, each with the ellipse that has the blob's moments."""
 
-    Attributes
-    ----------
-    centres : (N, 2) float64, px, (u, v)
-    shapes : (N, 2, 2) float64, px, symmetric positive; ``centre + shape @ (cos t, sin t)`` is the ellipse
-    bright : True if the blobs are brighter than their surroundings
-    """
-
-    centres: np.ndarray
-    shapes: np.ndarray
-    bright: bool
+    centres: np.ndarray  # (N, 2) float64, px, (u, v)
+    shapes: np.ndarray  # (N, 2, 2) float64, px, symmetric positive; ``centre + shape @ (cos t, sin t)`` is the ellipse
+    bright: bool  # True if the blobs are brighter than their surroundings
 
     def __len__(self):
         return len(self.centres)

@@ -15,55 +15,32 @@ class GridRule:
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
     boards of tests/uwlts/targets and on real photographs (tests/system/test_real_images.py).
-
-    Attributes
-    ----------
-    sigma_px : float
-        Blur before squares are compared, px.
-    residual : float
-        Largest rms distance of the corners from even grids of `neighbourhood` corners, in side lengths of a square.
-    neighbourhood : int
-        Corners along each side of a part of the board that must be an even grid in perspective. Over two squares of
-        11 deg each, an equidistant lens departs from perspective by less than 1 % of a square.
-    alternating : float
-        Least fraction of neighbouring squares that are dark and bright as expected.
-    reaches : tuple of float
-        Distances from a corner of the places where its squares are compared, in side lengths, tried in order: near the
-        middles of whole squares, and within outer squares that the board's rim cuts to half or a fifth of their width.
-    far : float
-        Distance beyond a side's corners, in side lengths, where outer squares that are not cut still alternate.
-    unlike : float
-        Largest difference between opposite squares, as a fraction of that between dark and bright squares.
-    window : float
-        Half side of the window for the refinement of a corner, in reaches: its own corners are within the squares too.
-    least_window_px : int
-        Least half side, px: five pixels contain an edge in focus.
-    most_window_px : int
-        Largest half side, px: the time increases with the window's area.
-    smoothing_px : float
-        Sigma of the blur before the refinement, px: about that of a lens in focus.
-    cut_off : float
-        Distance of the clipping levels from the middle grey level, as a fraction of the contrast.
-    passes : int
-        Most passes of the refinement.
-    settled_px : float
-        Change of a corner that ends the refinement, px.
     """
 
-    sigma_px: float = 1.5
+    sigma_px: float = 1.5  # blur before squares are compared, px
     residual: float = 1 / 30
+    """Largest rms distance of the corners from even grids of `neighbourhood` corners, in side lengths of a square."""
     neighbourhood: int = 3
-    alternating: float = 0.9
+    """Corners along each side of a part of the board that must be an even grid in perspective. Over two squares of
+    11 deg each, an equidistant lens departs from perspective by less than 1 % of a square."""
+    alternating: float = 0.9  # least fraction of neighbouring squares that are dark and bright as expected
     reaches: tuple[float, ...] = (0.45, 0.3, 0.15)
+    """Distances from a corner of the places where its squares are compared, in side lengths, tried in order: near
+    the middles of whole squares, and within outer squares that the board's rim cuts to half or a fifth of their
+    width."""
     far: float = 0.85
+    """Distance beyond a side's corners, in side lengths, where outer squares that are not cut still alternate."""
     unlike: float = 0.6
+    """Largest difference between opposite squares, as a fraction of that between dark and bright squares."""
     window: float = 2 / 3
-    least_window_px: int = 2
-    most_window_px: int = 20
-    smoothing_px: float = 0.8
-    cut_off: float = 0.3
-    passes: int = 100
-    settled_px: float = 1e-4
+    """Half side of the window for the refinement of a corner, in reaches: its own corners are within the squares
+    too."""
+    least_window_px: int = 2  # least half side, px: five pixels contain an edge in focus
+    most_window_px: int = 20  # largest half side, px: the time increases with the window's area
+    smoothing_px: float = 0.8  # sigma of the blur before the refinement, px: about that of a lens in focus
+    cut_off: float = 0.3  # distance of the clipping levels from the middle grey level, as a fraction of the contrast
+    passes: int = 100  # most passes of the refinement
+    settled_px: float = 1e-4  # change of a corner that ends the refinement, px
 
 
 _RULE = GridRule()

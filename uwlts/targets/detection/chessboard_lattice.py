@@ -18,63 +18,29 @@ class BoardSearchRule:
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
     boards of tests/uwlts/targets and on real photographs (tests/system/test_real_images.py).
-
-    Attributes
-    ----------
-    scales : tuple of float
-        Scales of the image: in a blurred or large image, corners are sharper at a smaller scale.
-    sigma_px : float
-        Blur before derivatives, px.
-    ring_px : float
-        Radius of the circle around a corner, px: within squares of more than 6 px.
-    inner_ring : float
-        Radius of a second circle, as a fraction of the first one.
-    ring_places : int
-        Places on a circle: one every 1.6 px.
-    two_fold : float
-        Least fraction of the variation around a corner that has two periods per turn, as from two dark and two bright
-        sectors.
-    in_phase : float
-        Least cosine of the phase between both circles: the edges of the sectors are radial.
-    contrast : float
-        Least contrast around a corner, grey levels: above rounding.
-    edge_contrast : float
-        Least contrast of an edge between neighbours, as a fraction of theirs.
-    edge_offset : float
-        Distance of samples from an edge, in lengths of the edge: beyond the blur, within the squares.
-    edge_places : tuple of float
-        Sampled places along an edge, in lengths of the edge.
-    contrast_ratio : float
-        Largest ratio of the contrasts of neighbours.
-    opposite : float
-        Largest cosine between the phases of neighbours, which are opposite except for perspective.
-    neighbours : int
-        Nearest corners that contain the neighbours: two rings of a square lattice.
-    most_seeds : int
-        Most seeds that are tried, corners with the clearest edges first.
-    seed_sine : float
-        Least sine of the angle between both edges of a seed.
-    rim_px : float
-        Least distance of a certainly found corner from the image border, px, minus `ring_px`.
     """
 
     scales: tuple[float, ...] = (1.0, 0.5, 0.25)
-    sigma_px: float = 1.5
-    ring_px: float = 6.0
-    inner_ring: float = 0.6
-    ring_places: int = 24
+    """Scales of the image: in a blurred or large image, corners are sharper at a smaller scale."""
+    sigma_px: float = 1.5  # blur before derivatives, px
+    ring_px: float = 6.0  # radius of the circle around a corner, px: within squares of more than 6 px
+    inner_ring: float = 0.6  # radius of a second circle, as a fraction of the first one
+    ring_places: int = 24  # places on a circle: one every 1.6 px
     two_fold: float = 0.7
-    in_phase: float = 0.9
-    contrast: float = 2.0
-    edge_contrast: float = 0.4
+    """Least fraction of the variation around a corner that has two periods per turn, as from two dark and two bright
+    sectors."""
+    in_phase: float = 0.9  # least cosine of the phase between both circles: the edges of the sectors are radial
+    contrast: float = 2.0  # least contrast around a corner, grey levels: above rounding
+    edge_contrast: float = 0.4  # least contrast of an edge between neighbours, as a fraction of theirs
     edge_offset: float = 0.12
-    edge_places: tuple[float, ...] = (0.25, 0.5, 0.75)
-    contrast_ratio: float = 4.0
-    opposite: float = -0.5
-    neighbours: int = 24
-    most_seeds: int = 40
-    seed_sine: float = 0.3
-    rim_px: float = 6.0
+    """Distance of samples from an edge, in lengths of the edge: beyond the blur, within the squares."""
+    edge_places: tuple[float, ...] = (0.25, 0.5, 0.75)  # sampled places along an edge, in lengths of the edge
+    contrast_ratio: float = 4.0  # largest ratio of the contrasts of neighbours
+    opposite: float = -0.5  # largest cosine between the phases of neighbours, which are opposite except for perspective
+    neighbours: int = 24  # nearest corners that contain the neighbours: two rings of a square lattice
+    most_seeds: int = 40  # most seeds that are tried, corners with the clearest edges first
+    seed_sine: float = 0.3  # least sine of the angle between both edges of a seed
+    rim_px: float = 6.0  # least distance of a certainly found corner from the image border, px, minus `ring_px`
 
 
 _RULE = BoardSearchRule()
@@ -82,23 +48,12 @@ _RULE = BoardSearchRule()
 
 @dataclass(frozen=True)
 class _Corners:
-    """Candidates for corners in an image.
+    """Candidates for corners in an image."""
 
-    Attributes
-    ----------
-    pixels : (N, 2) float64
-    contrast : (N,) float64
-        Contrast of the sectors around each candidate, grey levels.
-    phase : (N,) float64
-        Orientation of the sectors, rad.
-    grey : (H, W) float32
-        Blurred image.
-    """
-
-    pixels: np.ndarray
-    contrast: np.ndarray
-    phase: np.ndarray
-    grey: np.ndarray
+    pixels: np.ndarray  # (N, 2)
+    contrast: np.ndarray  # (N,); contrast of the sectors around each candidate, grey levels
+    phase: np.ndarray  # (N,); orientation of the sectors, rad
+    grey: np.ndarray  # (H, W) float32; blurred image
 
     @classmethod
     def from_image(cls, image: np.ndarray) -> "_Corners":

@@ -21,71 +21,44 @@ class EllipseRule(NamedTuple):
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
     plates of tests/uwlts/targets and on real photographs (tests/system/test_real_images.py).
-
-    Attributes
-    ----------
-    passes : int
-        Passes of both fits; the second pass samples along the normals of the first one.
-    reaches_px : tuple of float
-        Reaches of an edge profile on either side of the ellipse, px, tried in order. 2.5 px cover the edge of a lens in
-        focus, 6 px that of a lens out of focus.
-    reach_over_minor_axis : float
-        Largest inner reach, in minor semi-axes: beyond it a small blob shows its opposite edge.
-    missed_share : float
-        Fraction of blobs without a sharp edge above which the next reach is tried.
-    residual_over_reach : float
-        Largest rms distance of the edge from its ellipse, as a fraction of the reach: 0.15 px of 2.5 px.
-    residual_over_radius : float
-        The same as a fraction of the mean radius; the larger limit applies.
-    residual_over_noise : float
-        The same, relative to the effect of a pixel's noise on an edge; the larger limit applies.
-    residual_over_median : float
-        The same, relative to the median of all blobs, which have similar noise and blur.
-    residual_floor_px : float
-        Residual that always satisfies the limit relative to the median, px.
-    sharpness_times_reach : float
-        Least slope of an edge divided by its contrast, times the reach: at a reach of 2.5 px, a Gaussian blur of 4 px.
-    contrast_departure : float
-        Largest difference of a profile's contrast from its smooth variation around the blob, as a fraction.
-    contrast_departure_if_small : float
-        The same for small blobs: with blur, their inside level differs between the ends and flanks of the ellipse.
-    reach_times_slope : float
-        Reach of the centroid's band, times the edge's slope divided by its contrast. A Gaussian blur s gives a slope of
-        0.4 / s, so that the reach is three s.
-    least_reach_px, most_reach_px : float
-        Range of this reach, px: three s of a lens in focus, and of a blur of 2.7 px.
-    relative_contrast : float
-        Least contrast between the level planes, as a fraction of that in the middle; planes may intersect.
-    neighbours : int
-        Neighbouring blobs that determine the shading.
-    level_departure : float
-        Largest relative difference of a neighbour's level: others have a different print, or are no circles.
-    on_a_line : float
-        Ratio of squares across and along a line below which places are collinear.
-    shift_px : float
-        Largest distance of a centroid from its ellipse's centre, px; beyond it the band contains other objects.
     """
 
-    passes: int = 2
+    passes: int = 2  # passes of both fits; the second pass samples along the normals of the first one
     reaches_px: tuple[float, ...] = (2.5, 6.0)
+    """Reaches of an edge profile on either side of the ellipse, px, tried in order. 2.5 px cover the edge of a lens
+    in focus, 6 px that of a lens out of focus."""
     reach_over_minor_axis: float = 0.5
-    missed_share: float = 0.2
+    """Largest inner reach, in minor semi-axes: beyond it a small blob shows its opposite edge."""
+    missed_share: float = 0.2  # fraction of blobs without a sharp edge above which the next reach is tried
     residual_over_reach: float = 0.06
-    residual_over_radius: float = 0.01
+    """Largest rms distance of the edge from its ellipse, as a fraction of the reach: 0.15 px of 2.5 px."""
+    residual_over_radius: float = 0.01  # the same as a fraction of the mean radius; the larger limit applies
     residual_over_noise: float = 1.5
+    """The same, relative to the effect of a pixel's noise on an edge; the larger limit applies."""
     residual_over_median: float = 2.5
-    residual_floor_px: float = 0.03
+    """The same, relative to the median of all blobs, which have similar noise and blur."""
+    residual_floor_px: float = 0.03  # residual that always satisfies the limit relative to the median, px
     sharpness_times_reach: float = 0.25
+    """Least slope of an edge divided by its contrast, times the reach: at a reach of 2.5 px, a Gaussian blur of 4
+    px."""
     contrast_departure: float = 0.2
+    """Largest difference of a profile's contrast from its smooth variation around the blob, as a fraction."""
     contrast_departure_if_small: float = 0.4
+    """The same for small blobs: with blur, their inside level differs between the ends and flanks of the ellipse."""
     reach_times_slope: float = 1.2
+    """Reach of the centroid's band, times the edge's slope divided by its contrast. A Gaussian blur s gives a slope
+    of 0.4 / s, so that the reach is three s."""
+    # Range of this reach, px: three s of a lens in focus, and of a blur of 2.7 px.
     least_reach_px: float = 2.5
     most_reach_px: float = 8.0
     relative_contrast: float = 0.25
-    neighbours: int = 12
+    """Least contrast between the level planes, as a fraction of that in the middle; planes may intersect."""
+    neighbours: int = 12  # neighbouring blobs that determine the shading
     level_departure: float = 0.25
-    on_a_line: float = 1e-3
+    """Largest relative difference of a neighbour's level: others have a different print, or are no circles."""
+    on_a_line: float = 1e-3  # ratio of squares across and along a line below which places are collinear
     shift_px: float = 0.5
+    """Largest distance of a centroid from its ellipse's centre, px; beyond it the band contains other objects."""
 
 
 RULE = EllipseRule()
@@ -253,18 +226,11 @@ def _row_extent(q, centre_u, dv):
 
 @dataclass(frozen=True)
 class Ellipses(Blobs):
-    """Ellipses fitted to the edges of blobs.
+    """Ellipses fitted to the edges of blobs."""
 
-    Attributes
-    ----------
-    residual_px : (N,) float64, rms distance of the edge points from the ellipse
-    contrast : (N,) float64, grey levels, inside minus outside
-    sharpness : (N,) float64, 1/px, slope of the edge divided by its contrast
-    """
-
-    residual_px: np.ndarray
-    contrast: np.ndarray
-    sharpness: np.ndarray
+    residual_px: np.ndarray  # (N,), rms distance of the edge points from the ellipse
+    contrast: np.ndarray  # (N,), grey levels, inside minus outside
+    sharpness: np.ndarray  # (N,), 1/px, slope of the edge divided by its contrast
 
     def __getitem__(self, select):
         own = vars(self).items()

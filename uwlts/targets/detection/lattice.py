@@ -18,53 +18,29 @@ class LatticeRule:
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
     plates and boards of tests/uwlts/targets and on real photographs (tests/system/test_real_images.py).
-
-    Attributes
-    ----------
-    neighbourhood : int
-        Half the side of the square of neighbours: 24 neighbours determine the six terms of a quadratic, even with gaps.
-    fewest_neighbours : int
-        Fewest neighbours for a check of a place.
-    over_median : float
-        Largest distance from the prediction, in median distances; wrong points are off by a large part of a step.
-    model_error : float
-        Error of a quadratic over two steps by perspective and distortion, in steps.
-    affine_error : float
-        Error of an affine prediction, in steps: perspective alone contributes up to 0.1.
-    least_eigenvalue : float
-        Eigenvalue of normal equations, in steps, below which neighbours do not determine the terms.
-    candidates : int
-        Nearest circles that contain the next ones along both axes, for sides of up to 1 : 7.
-    tolerance : float
-        Largest distance of a neighbour from its predicted place, in steps. In strong perspective a step changes by up
-        to 0.1 from one circle to the next; half a step would reach the neighbour's neighbour.
-    size_ratio : float
-        Largest ratio of the radii of neighbouring circles.
-    seed_sine : float
-        Least sine of the angle between the steps of a seed, in the metric of its circle. An ellipse 20 % too round
-        changes a right angle by up to 12 deg (sine 0.98); the diagonal of a lattice with sides 1 : 3 has a sine of
-        0.95.
-    cell_ratio : float
-        Largest ratio of a seed's cell to the median cell, halfway between one and two cells.
-    fewest_labelled : int
-        Fewest circles of a lattice: one cell.
-    most_seeds : int
-        Most seeds that are tried, the most regular ones first.
     """
 
     neighbourhood: int = 2
-    fewest_neighbours: int = 3
+    """Half the side of the square of neighbours: 24 neighbours determine the six terms of a quadratic, even with
+    gaps."""
+    fewest_neighbours: int = 3  # fewest neighbours for a check of a place
     over_median: float = 8.0
-    model_error: float = 0.002
-    affine_error: float = 0.15
+    """Largest distance from the prediction, in median distances; wrong points are off by a large part of a step."""
+    model_error: float = 0.002  # error of a quadratic over two steps by perspective and distortion, in steps
+    affine_error: float = 0.15  # error of an affine prediction, in steps: perspective alone contributes up to 0.1
     least_eigenvalue: float = 1e-6
-    candidates: int = 16
+    """Eigenvalue of normal equations, in steps, below which neighbours do not determine the terms."""
+    candidates: int = 16  # nearest circles that contain the next ones along both axes, for sides of up to 1 : 7
     tolerance: float = 0.25
-    size_ratio: float = 1.5
+    """Largest distance of a neighbour from its predicted place, in steps. In strong perspective a step changes by up
+    to 0.1 from one circle to the next; half a step would reach the neighbour's neighbour."""
+    size_ratio: float = 1.5  # largest ratio of the radii of neighbouring circles
     seed_sine: float = 0.95
-    cell_ratio: float = 1.4
-    fewest_labelled: int = 4
-    most_seeds: int = 20
+    """Least sine of the angle between the steps of a seed, in the metric of its circle. An ellipse 20 % too round
+    changes a right angle by up to 12 deg (sine 0.98); the diagonal of a lattice with sides 1 : 3 has a sine of 0.95."""
+    cell_ratio: float = 1.4  # largest ratio of a seed's cell to the median cell, halfway between one and two cells
+    fewest_labelled: int = 4  # fewest circles of a lattice: one cell
+    most_seeds: int = 20  # most seeds that are tried, the most regular ones first
 
 
 LATTICE_RULE = LatticeRule()
@@ -134,21 +110,13 @@ def _relative_errors(points, around, present, terms, valid):
 
 @dataclass(frozen=True)
 class Lattice:
-    """Circles with their places in a lattice.
-
-    Attributes
-    ----------
-    circles : Ellipses
-    indices : (N, 2) int64
-        Steps (i, j) from an arbitrary circle. The rotation from i to j has the direction from u to v; otherwise the
-        choice of the axes is arbitrary.
-    found : int
-        Number of circles found in the image, with or without a place.
-    """
+    """Circles with their places in a lattice."""
 
     circles: Ellipses
     indices: np.ndarray
-    found: int
+    """(N, 2) int64; steps (i, j) from an arbitrary circle. The rotation from i to j has the direction from u to v;
+    otherwise the choice of the axes is arbitrary."""
+    found: int  # number of circles found in the image, with or without a place
 
 
 def detect_lattice(image):
