@@ -165,20 +165,9 @@ class Options:
     def from_names(
         cls, *, spp: int, seed: int, effects: Sequence[str], without: Sequence[str], ideal: bool
     ) -> "Options":
-        """Make options from the names of effects, as in commands.
+        """Make options from the names of effects to omit (``without``) and flaws to add (``effects``), as in commands.
 
-        Parameters
-        ----------
-        spp
-            Samples per lit pixel.
-        seed
-            Seed of noise and random walks.
-        effects
-            Names of flaws to add.
-        without
-            Names of effects to omit.
-        ideal
-            Omit all effects.
+        ``spp`` is the number of samples per lit pixel; ``ideal`` omits all effects.
         """
         return cls(spp, seed, (NONE if ideal else ALL).remove(*without), Flaws.parse(*effects))
 

@@ -164,16 +164,9 @@ def stripe_quality(
     ``informative`` pixels (Kay, Fundamentals of Statistical Signal Processing: Estimation Theory, 1993, Eq. 3.14, with
     a variance for each pixel).
 
-    Parameters
-    ----------
-    direct : (A, L)
-        Direct light of the stripe in electrons: A pixels across the stripe, L profile lines.
-    noise : (A, L)
-        Standard deviation of the noise in electrons.
-    centre : (L,)
-        True centres, NaN without one.
-    informative, clipped : (A, L) bool
-        Pixels that count for the bound, and saturated pixels.
+    ``direct`` and ``noise`` (A, L) are the direct light of the stripe and the standard deviation of the noise in
+    electrons: A pixels across the stripe, L profile lines. ``centre`` (L,) is NaN without a true centre; ``clipped``
+    (A, L) are saturated pixels.
     """
     lines, across = np.flatnonzero(np.isfinite(centre)), len(direct)
     columns = np.arange(len(lines))

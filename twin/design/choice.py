@@ -45,16 +45,11 @@ from uwlts.errors import DesignError, Error, EvaluationError, RangeError
 
 
 def find_pareto_front(values: np.ndarray) -> np.ndarray:
-    """Return a mask (N,) of the designs on the Pareto front of M values to minimise.
+    """Return a mask (N,) of the designs on the Pareto front of M values (N, M) to minimise.
 
     A design is on the front if no other design is at least as good in all values and better in one. Equal designs have
     the same result. A design with a NaN is neither on the front nor compared with others. Up to two values need one
     sort; more values need a pass over the designs for each design of the front (Kung et al. 1975).
-
-    Parameters
-    ----------
-    values : (N, M)
-        Values of the designs; smaller is better.
 
     Raises
     ------

@@ -99,22 +99,7 @@ def model_stripe(
     shifts the image by b / a - ds/dP b. Here a is the focus distance and ds/dP the derivative of the image with respect
     to the point. In one direction, a pupil of radius R has the standard deviation R / 2. Scattered light is lost.
 
-    Parameters
-    ----------
-    xp : module
-        NumPy or Dr.Jit.
-    p : SensorArrays
-        Parameters of the designs.
-    pose : LaserFan
-        Pose of the laser.
-    window : WindowGeometry
-        The camera's window.
-    point : Vector
-        Points of the sheet, camera frame.
-    view : ImagePoints
-        Images of the points.
-    reflectance : float
-        Diffuse reflectance of the plate.
+    ``xp`` is NumPy or Dr.Jit, ``point`` is in the camera frame.
     """
     xa, xb, ya, yb = view.jacobian
     across = p.across((xa, ya)), p.across((xb, yb))
@@ -271,18 +256,8 @@ def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Arr
     An error d of the stripe's centre on its profile line causes the error (dY, dZ) = J^-1 (d, 0) of the point. J is the
     Jacobian of the pixel across and along the stripe with respect to Y and Z.
 
-    Parameters
-    ----------
-    xp
-        Array library: NumPy, or Dr.Jit for derivatives.
-    p
-        Parameters of the designs.
-    depth_mm
-        Depths from the window's outer face.
-    places
-        Positions along the stripe, from -1 to 1 between its ends.
-    reflectance
-        Reflectance of the object.
+    ``xp`` is NumPy, or Dr.Jit for derivatives. Depths count from the window's outer face; places along the stripe are
+    -1 to 1 between its ends.
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff = standoff_mm(pose)

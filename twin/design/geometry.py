@@ -63,18 +63,8 @@ def place_laser(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_ra
 
     The result is that of `uwlts.model.placement.laser_pose`, but differentiable.
 
-    Parameters
-    ----------
-    xp
-        Array library: NumPy or Dr.Jit.
-    baseline_mm
-        Distance of the laser's origin from the pupil.
-    angle_rad
-        Triangulation angle between the axes of laser and camera.
-    roll_rad
-        Rotation of the fan about the laser's axis.
-    towards
-        Direction (x, y, 0) of the baseline.
+    ``xp`` is NumPy or Dr.Jit, ``towards`` the direction (x, y, 0) of the baseline, and ``roll_rad`` the rotation of the
+    fan about the laser's axis.
     """
     sine, cosine = xp.sin(angle_rad), xp.cos(angle_rad)
     axis = (-sine * towards[0], -sine * towards[1], cosine)

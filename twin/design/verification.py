@@ -303,21 +303,6 @@ def verify_candidates(
 
     Results of an earlier run are read from their files; failed ones are rendered again.
 
-    Parameters
-    ----------
-    study : Study
-        The study.
-    folder : Path
-        Folder of the results.
-    candidates : sequence of HighlightedDesign
-        Designs to render.
-    workers : Workers
-        Processes.
-    variant : str
-        Mitsuba variant.
-    progress : callable
-        Called with the number of verified candidates and the total.
-
     Raises
     ------
     OutputError

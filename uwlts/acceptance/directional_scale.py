@@ -98,14 +98,7 @@ def fit_directional_scale(
     stage's scale therefore changes only the component XX, and an error of its direction only XY and XZ. A wrong tilt of
     the sheet changes XY and XZ, too. All other components are those of the sensor.
 
-    Parameters
-    ----------
-    values
-        Measured values; those without a length are ignored.
-    artefacts
-        Artefact of each value. Its calibration error is common to its lengths.
-    stage_directions
-        Direction of the stage of each value.
+    Each value comes with its artefact, whose calibration error is common to its lengths, and its stage direction.
     """
     rows = [
         (value, name, stage)

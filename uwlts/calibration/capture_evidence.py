@@ -143,12 +143,7 @@ def step_evidence(
 ) -> tuple[list[StepEvidence], list[str]]:
     """Find stripes on the step standard in all images with the laser on; return them with warnings.
 
-    Parameters
-    ----------
-    captures, stripe, progress
-        Captures, stripe settings, and progress listener.
-    medium_index
-        Replaces the index of the captures' medium at the laser's wavelength.
+    ``medium_index`` replaces the index of the captures' medium at the laser's wavelength.
 
     Raises
     ------

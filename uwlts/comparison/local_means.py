@@ -48,18 +48,9 @@ def average_locally(
     The variance is the larger of the propagated variance (noise of points, position of images) and the empirical
     scatter. The scatter is corrected for correlation within an image, and by Student's t for the number of points.
 
-    Parameters
-    ----------
-    places, normals : (P, 3)
-        Centres of the discs, mm, and unit normals there.
-    points : (N, 3)
-        Points, mm.
-    distance_mm : (N,), optional
-        Distances of the points from the reference; by default from each place along its normal.
-    uncertainty, frame
-        Uncertainty of the points, and the image (N,) of each point.
-    disc_mm, deep_mm
-        Diameter of the discs, and largest distance along the normal.
+    ``places`` and ``normals`` (P, 3) are the centres of the discs and unit normals there, ``points`` (N, 3) those to
+    average. ``distance_mm`` (N,) is by default measured from each place along its normal. Points farther than
+    ``deep_mm`` along the normal are left out.
     """
     count, mean, rough, stated, other = (np.zeros(len(places)) for _ in range(5))
     together, alone = np.zeros(len(places)), np.zeros(len(places))

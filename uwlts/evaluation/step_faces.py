@@ -57,28 +57,12 @@ class StepMeasurement:
 
 
 def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, seed: int = 0) -> np.ndarray:
-    """Label the face of each point as `StepFace`.
+    """Label the face of each point (N, 2) of a profile or (N, 3) of a scan, mm, as `StepFace` (N,) int8.
 
     Random pairs (triples) of points propose directions of two parallel lines (planes) at the distance of the height,
     within a quarter. The faces may have any inclination and several parts (base - block - base). A point belongs to a
     face if its distance is at most five robust standard deviations, limited to 1 to 30 % of the height. It must also be
     farther than ``edge_mm`` from all points off the face, which excludes rounded edges and the riser.
-
-    Parameters
-    ----------
-    points : (N, 2) or (N, 3)
-        Points of a profile or a scan, mm.
-    height_mm
-        Approximate height of the step.
-    edge_mm
-        Width of the excluded border of a face.
-    seed
-        Seed of the random proposals.
-
-    Returns
-    -------
-    (N,) int8
-        Labels.
 
     Raises
     ------
@@ -123,14 +107,8 @@ def step_height(
     Thesis, section 3.2.2. If the sheet of a profile is inclined to the step's normal, the result is the height divided
     by the cosine of the angle. Labels remain valid for small changes of the points, for example in a calibration.
 
-    Parameters
-    ----------
-    points : (N, 2) or (N, 3)
-        Points of a profile or a scan, mm.
-    labels : (N,)
-        Labels from `label_step_faces`.
-    reference
-        Face to which the line or plane is fitted.
+    ``points`` are (N, 2) or (N, 3), ``labels`` (N,) those of `label_step_faces`. The line or plane is fitted to the
+    ``reference``.
 
     Raises
     ------

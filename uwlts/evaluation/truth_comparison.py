@@ -54,18 +54,9 @@ def compare_with_truth(
 ) -> TruthComparison:
     """Compare points with the true surface by their signed distances (p - p_true) . n.
 
-    Parameters
-    ----------
-    points : (N, 3)
-        Measured points, mm.
-    frame, line : (N,)
-        Image and row (or column) of each point.
-    point_mm, normal : (F, L, 3)
-        True point and unit normal of each line of each frame, in the frame of the points.
-    status : (F, L)
-        0 for a visible stripe; points and normals elsewhere are ignored.
-    tolerance_mm
-        Tolerance for the fraction of accurate points.
+    ``points`` (N, 3) in mm come with their image and row or column (N,). ``point_mm`` and ``normal`` (F, L, 3) are the
+    true point and unit normal of each line of each frame, in the frame of the points. They count where ``status`` (F,
+    L) is 0, a visible stripe.
 
     Raises
     ------

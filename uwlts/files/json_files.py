@@ -97,18 +97,8 @@ def read_model(
 ) -> AnyModel:
     """Read a JSON file of the program as a model.
 
-    Parameters
-    ----------
-    path
-        File to read.
-    model
-        Type of the content.
-    file_format, version
-        Expected values of the keys "format" and "version".
-    called
-        Name of the expected content in messages.
-    advice
-        End of the message about content that is not valid.
+    The keys "format" and "version" must have the given values. ``called`` names the expected content in messages;
+    ``advice`` ends that about content that is not valid.
 
     Raises
     ------
@@ -155,18 +145,7 @@ def validate_content(model: type[AnyModel], content: object, complaint: str, *, 
 
 
 def write_model(path: str | Path, model: BaseModel, *, file_format: str, version: int, overwrite: bool) -> None:
-    """Write a model as indented JSON with a seal, completely or not at all.
-
-    Parameters
-    ----------
-    path
-        File to write.
-    model
-        Content.
-    file_format, version
-        Values of the keys "format" and "version".
-    overwrite
-        Replace an existing file.
+    """Write a model as indented JSON with the keys "format" and "version" and a seal, completely or not at all.
 
     Raises
     ------

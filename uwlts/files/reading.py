@@ -145,18 +145,8 @@ def read_text(
 
     Raises ``error`` like `open_regular`, or if the content is not text.
 
-    Parameters
-    ----------
-    path
-        File to read.
-    most_bytes
-        Largest permitted size.
-    error
-        Type of the exceptions.
-    called
-        Name of the expected content in messages.
-    foreign
-        Beginning of the message for other content; by default "is not a" and ``called``.
+    ``called`` names the expected content in messages. ``foreign`` begins the message for other content; by default it
+    is "is not a" and ``called``.
     """
     content = read_bytes(path, most_bytes=most_bytes, error=error, called=called)
     try:

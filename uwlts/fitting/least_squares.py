@@ -75,14 +75,7 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
     deviation is 1.4826 times the median absolute deviation. A rejected point returns if a later fit passes within the
     limit. The rule suits a few outliers on one surface; it does not separate surfaces.
 
-    Parameters
-    ----------
-    fit
-        Function that fits a shape to points (M, D), such as `fit_sphere` or `fit_plane`.
-    points : (N, D)
-        Points, mm.
-    k
-        Limit in robust standard deviations.
+    ``fit`` fits a shape to points (M, D), such as `fit_sphere`; ``points`` (N, D) are in mm.
 
     Raises
     ------
@@ -135,21 +128,9 @@ def biweight(relative: np.ndarray) -> np.ndarray:
 def fit_biweight(design: np.ndarray, values: np.ndarray, counted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit a linear model by iteratively reweighted least squares with Tukey's biweight.
 
-    Parameters
-    ----------
-    design : (N, K)
-        Design matrix.
-    values : (N,)
-        Observations.
-    counted : (N,) bool
-        Rows used for the fit; all others have zero weight.
-
-    Returns
-    -------
-    rows : (K, N)
-        Matrix whose product with ``values`` gives the coefficients. To first order it propagates errors of the values.
-    weights : (N,)
-        Final weights.
+    ``design`` is (N, K), ``values`` (N,); rows outside the mask ``counted`` (N,) have zero weight. Returns rows (K, N),
+    whose product with the values gives the coefficients and to first order propagates their errors, and the final
+    weights (N,).
     """
     weights, inverse = counted.astype(float), np.zeros((design.shape[1],) * 2)
     # Lower bound of the scale, so that rounding of exact values produces no outliers.

@@ -145,14 +145,8 @@ def surface_patches(
     Errors of an image's position and pose average only over the images of a disc, and are common to all patches along
     the image.
 
-    Parameters
-    ----------
-    points_mm : (N, 3)
-        Points of the cloud.
-    uncertainty, frame
-        Uncertainty of the points, and the image (N,) of each point.
-    radius_mm
-        Radius of the discs; by default the smallest one with enough points on several profiles (`find_disc_radius`).
+    ``points_mm`` is (N, 3), ``frame`` (N,) the image of each point. The radius is by default the smallest one with
+    enough points on several profiles (`find_disc_radius`).
 
     Raises
     ------
@@ -329,14 +323,7 @@ def distances_between(
     A patch is used if the nearest target patch has a similar normal and a lateral offset below one radius, so that no
     surface is extrapolated.
 
-    Parameters
-    ----------
-    source, target
-        Patches of both clouds.
-    source_pose, target_pose : (4, 4)
-        Transforms from the frame of each cloud to the common frame.
-    reach_mm
-        Largest distance.
+    The poses (4, 4) transform the frame of each cloud to the common frame; ``reach_mm`` is the largest distance.
     """
     places = source.places_mm @ source_pose[:3, :3].T + source_pose[:3, 3]
     inverse = target_pose[:3, :3].T
@@ -427,14 +414,8 @@ def slope_information(
 ) -> np.ndarray:
     """Return the information (K, K) on motions that noise of the normals alone would produce.
 
-    Parameters
-    ----------
-    normals : (Q, 3)
-        Normals of the distances.
-    noise : (Q,)
-        Weight of each distance times its slope variance.
-    derivatives
-        Function that returns the derivatives (Q, K) of distances by the motions, for directions (Q, 3) as normals.
+    ``noise`` (Q,) is the weight of each distance times its slope variance. ``derivatives`` returns the derivatives (Q,
+    K) of distances by the motions, for directions (Q, 3) in place of the normals.
     """
     across = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -447,19 +428,9 @@ def decompose_motions(information: np.ndarray, of_slopes: np.ndarray) -> tuple[n
 
     A motion with less than `LEAST_INFORMATION` is undetermined.
 
-    Parameters
-    ----------
-    information, of_slopes : (K, K)
-        Information of the distances, and that of slope noise (`slope_information`).
-
-    Returns
-    -------
-    values : (K,)
-        Relative information on each motion, ascending.
-    motions : (K, K)
-        Motions in columns, orthonormal in the metric.
-    metric : (K, K)
-        Regularised slope information.
+    ``information`` and ``of_slopes`` (K, K) are those of the distances and of slope noise (`slope_information`).
+    Returns the relative information (K,), ascending; the motions (K, K) in columns, orthonormal in the metric; and the
+    metric (K, K), the regularised slope information.
     """
     rounding = _ROUNDING / LEAST_INFORMATION * float(np.linalg.eigvalsh(information)[-1])
     metric = of_slopes + max(rounding, np.finfo(float).tiny) * np.eye(len(information))

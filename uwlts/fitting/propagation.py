@@ -97,14 +97,8 @@ class PointErrors:
         To first order, the parameters of a fitted shape are such sums (GUM, Eq. 13). The noise covariance is at least
         that of the residuals, correlated in groups (sandwich estimator: Liang and Zeger, Biometrika 73, 1986).
 
-        Parameters
-        ----------
-        weights : (K, N)
-            Weights of the distances in each sum.
-        residuals : (N,)
-            Residual distances of the fit, mm.
-        groups : (N,) int
-            Neighbourhood of each point; errors in a neighbourhood may be correlated.
+        ``weights`` (K, N) are those of the distances in each sum, ``residuals`` (N,) in mm. ``groups`` (N,) numbers the
+        neighbourhood of each point, in which errors may be correlated.
         """
         noise = (weights * self.single_mm**2) @ weights.T + grouped_covariance(weights, self.image_mm, self.image)
         seen = grouped_covariance(weights, residuals[None], groups)

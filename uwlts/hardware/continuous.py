@@ -119,32 +119,8 @@ def record_continuously(
 ) -> FramePlaces:
     """Record the passes of a plan and assign positions to its frames. The errors are those of `uwlts.desk.scan.scan`.
 
-    Parameters
-    ----------
-    plan, continuous
-        Plan of the scan, and its settings for a moving stage.
-    out
-        Capture to write.
-    sensor
-        Description of the sensor.
-    camera
-        Open camera.
-    stage
-        Stage with laser, homed.
-    header
-        Header of the capture.
-    exposure_ms
-        Exposure of the laser images.
-    overwrite
-        Replace an existing capture.
-    progress
-        Called as ``progress(done, total)`` after every frame.
-    report, warn
-        Receive lines of output, and warnings.
-    recorded
-        Called with every image that is in the file, and its number.
-    counted
-        Called with the stripe of every frame.
+    ``recorded`` is called with every image that is in the file, and its number; ``counted`` with the stripe of every
+    frame.
     """
     positions, passes = plan.stage.positions_mm(), plan_passes(plan, continuous, stage)
     rate_hz = continuous.speed_mm_per_s / abs(plan.stage.step_mm)

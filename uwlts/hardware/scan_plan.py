@@ -87,20 +87,8 @@ class RigPlan(Description):
     ) -> CaptureHeader:
         """Return the header of a capture.
 
-        Parameters
-        ----------
-        name
-            Name of the capture.
-        sensor
-            Description of the sensor.
-        medium
-            Name of one of its media.
-        direction
-            Unit vector of the stage's motion in the OCS.
-        zero_dn
-            Grey value of zero difference in images with a subtracted background.
-        **shown
-            Description of the ``target`` or ``artefact`` in the images.
+        ``direction`` is the unit vector of the stage's motion in the OCS. ``zero_dn`` is the grey value of zero
+        difference in images with a subtracted background. ``shown`` describes the ``target`` or ``artefact``.
 
         Raises
         ------

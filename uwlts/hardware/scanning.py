@@ -93,28 +93,8 @@ def record_scan(
 ) -> ScanProgress:
     """Record a scan with an open camera and a stage that may move. The errors are those of `uwlts.desk.scan.scan`.
 
-    Parameters
-    ----------
-    plan
-        Plan of the scan.
-    out
-        Capture to write.
-    camera
-        Open camera.
-    stage
-        Stage with laser, homed.
-    resume
-        Continue an interrupted capture.
-    overwrite
-        Replace an existing capture.
-    progress
-        Called as ``progress(done, total)`` after every image.
-    report, warn
-        Receive lines of output, and warnings.
-    between
-        Called before every image, with the laser off. It may wait, or end the scan by an exception.
-    recorded
-        Called with every image that is in the file, and its number.
+    ``between`` is called before every image, with the laser off: it may wait, or end the scan by an exception.
+    ``recorded`` is called with every image that is in the file, and its number.
     """
     positions_mm = plan.stage.positions_mm()
     shots = list(product(positions_mm, plan.images()))

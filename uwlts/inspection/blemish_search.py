@@ -66,14 +66,7 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
     The most significant indications are taken first. Their points are removed before the next round, until no
     indication is left.
 
-    Parameters
-    ----------
-    surface
-        Points on the unrolled surface.
-    false_alarm
-        Probability of any indication, inwards or outwards, on an undamaged surface.
-    largest_mm
-        Limit of the largest radius.
+    ``false_alarm`` is the probability of any indication, inwards or outwards, on an undamaged surface.
 
     Raises
     ------

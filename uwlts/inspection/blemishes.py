@@ -109,24 +109,11 @@ def measure_blemish(
     wall_mm: float | None = None,
     beneath_mm: np.ndarray | None = None,
 ) -> Blemish:
-    """Measure an indication.
+    """Measure an indication of a search on an unrolled surface of N points.
 
-    Parameters
-    ----------
-    surface
-        Unrolled surface of N points.
-    search
-        Result of the search on this surface.
-    indication
-        Indication that is measured.
-    errors
-        Errors of the N points along their normals.
-    diameter_mm
-        Diameter of the pipe, which distinguishes dents from pits.
-    wall_mm
-        Thickness of the undamaged wall, for the remaining wall.
-    beneath_mm : (N,)
-        Heights of a smooth surface, of a dent for example, above which those of ``surface`` count.
+    The pipe's diameter distinguishes dents from pits; ``wall_mm`` is that of the undamaged wall, for the remaining
+    wall. ``beneath_mm`` (N,) is the height of a smooth surface, of a dent for example, above which those of ``surface``
+    count.
 
     Raises
     ------

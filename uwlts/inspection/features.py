@@ -316,16 +316,7 @@ def plain_value(
 ) -> FeatureValue:
     """Return a value with a symmetric interval, cut off at the least possible value.
 
-    Parameters
-    ----------
-    kind, name
-        Kind of the feature, and name of the value.
-    value
-        Measured value.
-    random, systematic
-        Standard uncertainties, in the unit of the value; the systematic one is None if unknown.
-    least
-        Least possible value.
+    Standard uncertainties are in the unit of the value; the systematic one is None if unknown.
     """
     half = COVERAGE_FACTOR * float(np.hypot(random, systematic or 0.0))
     low, high = max(value - half, least), max(value + half, least)
@@ -337,21 +328,12 @@ def plain_value(
 def amplitude_value(
     kind: FeatureKind, name: str, vector: np.ndarray, random: np.ndarray, systematic: np.ndarray | None, *, scale: float
 ) -> FeatureValue:
-    """Return the length of a vector, times a scale.
+    """Return the length of a vector (2,), times a scale.
 
     Noise increases the squared length of a vector by the trace of its covariance, which is subtracted (Rice, Bell
     System Technical Journal 24, 1945, section 3.10). The interval reaches zero if the vector is not significant.
 
-    Parameters
-    ----------
-    kind, name
-        Kind of the feature, and name of the value.
-    vector : (2,)
-        Vector whose length is measured.
-    random, systematic : (2, 2)
-        Covariances of the vector; the systematic one is None if unknown.
-    scale
-        Factor of the length.
+    ``random`` and ``systematic`` (2, 2) are its covariances; the systematic one is None if unknown.
     """
     total = random if systematic is None else random + systematic
     length = float(np.linalg.norm(vector))

@@ -206,15 +206,6 @@ def pipe_features(
 
     By default the pipe has twelve sections. Sections of fewer than 60 points are omitted.
 
-    Parameters
-    ----------
-    cloud
-        Cloud of the pipe.
-    form
-        Form fitted to this cloud.
-    section_mm
-        Length of a section.
-
     Raises
     ------
     EvaluationError

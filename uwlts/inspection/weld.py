@@ -170,22 +170,10 @@ def build_bead(
 ) -> Bead:
     """Return a bead with its plates and profiles.
 
-    Parameters
-    ----------
-    cloud
-        Cloud of N points.
-    local : (N, 3)
-        Places of the points along the bead, across it and their heights, mm; not finite for points that do not count.
-    axes : (3, 3)
-        Unit vectors along the bead, across it and outwards in its middle.
-    middle : (3,)
-        Middle of the bead, mm.
-    tangents : (N, 2, 3)
-        Unit vectors along the bead and across it at the points.
-    half_mm
-        Approximate half width of the bead.
-    section_mm
-        Length of a section along the bead.
+    ``local`` (N, 3) are places along the bead, across it and heights, mm; not finite for points that do not count.
+    ``axes`` (3, 3) are unit vectors along the bead, across it and outwards in its ``middle`` (3,); ``tangents`` (N, 2,
+    3) those along and across at the points. ``half_mm`` is the approximate half width, ``section_mm`` the length of a
+    section.
 
     Raises
     ------

@@ -119,12 +119,7 @@ def find_misfits(levels: Sequence[Level], sensor: Sensor) -> list[str]:
     - ``camera.principal_point_px`` does not fit another image size, nor ``camera.distortion`` another lens.
     - Optical constants of a medium do not fit another medium.
 
-    Parameters
-    ----------
-    levels : sequence of Level
-        Chain of bases from the first base to the description itself.
-    sensor : Sensor
-        The validated description.
+    ``levels`` lead from the first base to the description itself.
     """
     if len(levels) == 1:
         return []

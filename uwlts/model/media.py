@@ -16,17 +16,7 @@ from uwlts.errors import DescriptionError, RangeError
 
 
 def check_range(name: str, value: float, lowest: float, highest: float, source: str) -> None:
-    """Raise RangeError unless ``lowest <= value <= highest``.
-
-    Parameters
-    ----------
-    name
-        Name of the quantity, with its unit.
-    value, lowest, highest
-        Value and its permitted range.
-    source
-        Source of the range, such as the formula.
-    """
+    """Raise RangeError unless ``lowest <= value <= highest``; ``name`` has the unit, ``source`` is the range's."""
     if not (math.isfinite(value) and lowest <= value <= highest):
         raise RangeError(f"{name} is {value:g}, but {source} is valid from {lowest:g} to {highest:g}")
 

@@ -76,19 +76,7 @@ class Stripe:
         status: np.ndarray,
         stripe_along: str,
     ) -> Stripe:
-        """Make a stripe from centres on M of L lines.
-
-        Parameters
-        ----------
-        lines : (M,) int
-            Lines with a centre.
-        centre_px, amplitude, width_px : (M,)
-            Values of these lines.
-        status : (L,) uint8
-            Status of all lines.
-        stripe_along : str
-            As in `Stripe`.
-        """
+        """Make a stripe from values (M,) of centres on ``lines`` (M,), and the status (L,) uint8 of all lines."""
         centre = np.full(len(status), np.nan)
         height, width = np.full((2, len(status)), np.nan, np.float32)
         centre[lines], height[lines], width[lines] = centre_px, amplitude, width_px

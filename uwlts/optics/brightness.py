@@ -93,22 +93,10 @@ class IlluminatedPoints:
         medium_index: float,
         digest: str | None = None,
     ) -> IlluminatedPoints:
-        """Locate stripe centres on the sheet.
+        """Locate stripe centres (N,) on profile lines (N,) on the sheet.
 
-        Parameters
-        ----------
-        calibration : Calibration
-            Camera, window and sheet. The window is ignored if the sensor's window is not mounted.
-        sensor : Sensor
-            Description of the laser: thickness and origin of the sheet.
-        line : (N,) int
-            Profile lines.
-        centre_px : (N,)
-            Stripe centres.
-        medium_index : float
-            Refractive index of the medium, relative to air.
-        digest : str, optional
-            Digest of the calibration. If given, interpolation tables are kept for the next scan.
+        The window is ignored if the sensor's window is not mounted. With the calibration's ``digest``, interpolation
+        tables are kept for the next scan.
         """
         if not sensor.camera.window.mounted:
             calibration = calibration.model_copy(update={"window": None})
@@ -134,14 +122,8 @@ class IlluminatedPoints:
 
         The sheet's thickness is the described one, limited by the median stripe width.
 
-        Parameters
-        ----------
-        width_px : (N,)
-            Full width of each stripe at half maximum; NaN where unknown.
-        slopes : (N,)
-            Slopes by `fit_brightness_slopes`, per mm of the stage.
-        stage_direction : Vector
-            Stage direction as the capture describes it.
+        ``width_px`` (N,) is the full width at half maximum, NaN where unknown; ``slopes`` (N,) are those of
+        `fit_brightness_slopes`; the direction is as the capture describes it.
         """
         direction = np.array(self.calibration.stage_direction_of(stage_direction))
         across = float(
@@ -165,10 +147,7 @@ class IlluminatedPoints:
         position u. A surface height h(u) changes the image by -S' h, and the centroid by the integral of
         -u S' h = (u / s)^2 S h. These weights of h have the variance 3 s^2, whereas the light has s^2.
 
-        Parameters
-        ----------
-        width_px : (N,)
-            Full width of each stripe at half maximum; NaN where unknown.
+        ``width_px`` (N,) is the full width of each stripe at half maximum; NaN where unknown.
         """
         chosen = np.flatnonzero(np.isfinite(width_px) & (self.found.status == RayStatus.OK))
         chosen = chosen[:: max(1, len(chosen) // _MOST_FOR_FOOTPRINT)]

@@ -258,16 +258,7 @@ def speckle_limit_um(
     The uncertainty along the laser's axis is larger by 1 / sin theta_t. The thesis's 16 um at 250 mm is the value
     across the axis for a contrast of 1; its value in depth is 28 um.
 
-    Parameters
-    ----------
-    wavelength_nm
-        Wavelength of the laser.
-    focal_length_mm, f_number
-        Lens of the camera.
-    distance_mm
-        Distance of the object from the pupil; behind a window, the apparent distance.
-    contrast
-        Speckle contrast C.
+    Behind a window, ``distance_mm`` is the apparent distance from the pupil.
     """
     _require_positive(
         wavelength_nm=wavelength_nm,
@@ -294,18 +285,8 @@ def window_thickness_mm(
     f_s = 4, the diameter A is then 49.5 mm if clamped and 40.4 mm if not. The bore of 63 mm would need 7.0 mm if
     clamped.
 
-    Parameters
-    ----------
-    pressure_mpa
-        Pressure difference dP.
-    unsupported_diameter_mm
-        Diameter A of the opening.
-    strength_mpa
-        Fracture strength S_f of the glass.
-    support
-        Factor K_w of the edge: clamped or simply supported.
-    safety
-        Safety factor f_s.
+    A is ``unsupported_diameter_mm``, dP ``pressure_mpa``, S_f ``strength_mpa``, f_s ``safety``; K_w follows from the
+    edge's ``support``.
     """
     _require_positive(
         pressure_mpa=pressure_mpa,

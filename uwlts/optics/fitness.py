@@ -16,16 +16,7 @@ _OTHER_LENS = 1.1
 
 
 def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: str) -> list[str]:
-    """Compare the header of a recording with a calibration, and return warnings about differences.
-
-    Parameters
-    ----------
-    header : CaptureHeader
-        Header of the recording.
-    calibration : AnyCalibration
-        Calibration by models or by polynomials.
-    source : str
-        Name of the recording, for messages.
+    """Compare the header of a recording, named ``source``, with a calibration, and return warnings about differences.
 
     Raises
     ------

@@ -99,17 +99,8 @@ class LineTable:
 
         Return None also if there are fewer than 5000 centres, or if a centre is not finite.
 
-        Parameters
-        ----------
-        exact, tolerance, share
-            As for `from_function`.
-        line : (N,) int
-            Profile lines.
-        place_px : (N,)
-            Stripe centres on the lines.
-        key : Hashable, optional
-            Key that determines the function completely. If given, tables are cached under it. Their limits are rounded
-            outwards, so that a table depends only on its limits and the key.
+        Lines and centres are (N,). Tables are cached under the ``key``, which determines the function completely. Their
+        limits are rounded outwards, so that a table depends only on its limits and the key.
         """
         if len(line) < _WORTH or line.dtype.kind not in "iu" or not np.isfinite(place_px).all():
             return None

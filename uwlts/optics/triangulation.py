@@ -46,22 +46,10 @@ def reconstruct_profile(
     stage_mm: np.ndarray | float,
     stage_direction: np.ndarray,
 ) -> MeasuredPoints:
-    """Reconstruct points in the OCS from the stripe centres of one profile, or of several joined profiles.
+    """Reconstruct points (N, 3) in the OCS from stripe centres (N,) on lines (N,) of one or several profiles.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Camera, window, sheet and transform to the OCS.
-    lines : (N,) int
-        Image columns if the stripe runs along the width, else image rows.
-    centres_px : (N,)
-        Stripe centre on each line.
-    medium_index : float
-        Refractive index of the medium, relative to air; ignored without a window.
-    stage_mm : float or (N,)
-        Stage position of all points or of each.
-    stage_direction : (3,)
-        Unit vector in the OCS: direction of the sensor's motion.
+    Lines are image columns if the stripe runs along the width, else rows. The index is relative to air, and ignored
+    without a window. ``stage_mm`` is one position or (N,); ``stage_direction`` (3,) is the sensor's motion in the OCS.
 
     Raises
     ------
@@ -99,20 +87,9 @@ def reconstruct_pixels(
     stage_mm: np.ndarray | float,
     stage_direction: np.ndarray,
 ) -> MeasuredPoints:
-    """Reconstruct points in the OCS at stage position 0 from pixels. Errors are those of `reconstruct_profile`.
+    """Reconstruct points in the OCS at stage position 0 from pixels (N, 2). Errors are those of `reconstruct_profile`.
 
-    Parameters
-    ----------
-    calibration
-        Calibration of the sensor.
-    pixels : (N, 2)
-        Image positions (u, v), px.
-    medium_index
-        Refractive index of the medium relative to air.
-    stage_mm : float or (N,)
-        Stage position of each pixel.
-    stage_direction : (3,)
-        Direction of the sensor at growing positions, in the OCS.
+    Stage, direction and index are those of `reconstruct_profile`, too.
     """
     found = points_on_sheet(calibration, pixels, medium_index=medium_index)
     points = to_object(calibration, found.points_mm, stage_mm=stage_mm, stage_direction=stage_direction)
@@ -220,18 +197,7 @@ def reconstruct_by_polynomials(
     X is 0 plus the stage's travel. The status is OUTSIDE_CALIBRATION if a line is not calibrated, or if a centre is
     outside the calibrated range of its line.
 
-    Parameters
-    ----------
-    calibration
-        Polynomials of each profile line.
-    lines : (N,)
-        Profile lines.
-    centres_px : (N,)
-        Stripe centres on these lines.
-    stage_mm : float or (N,)
-        Stage position of each centre.
-    stage_direction : (3,)
-        Direction of the sensor at growing positions, in the OCS.
+    Lines and centres are (N,); stage and direction are those of `reconstruct_profile`.
 
     Raises
     ------

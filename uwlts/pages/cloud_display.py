@@ -22,25 +22,11 @@ _HEIGHT_PX = 600
 def choose_points(
     points_mm: np.ndarray, field: CloudField, values: np.ndarray | None, *, most: int
 ) -> tuple[CloudPoints, str]:
-    """Choose points for a view, and describe them.
+    """Choose points (N, 3) for a view, and return them with a caption.
 
-    Parameters
-    ----------
-    points_mm : (N, 3) float64
-        Positions in the OCS, mm.
-    field : str
-        Quantity that is shown by colour.
-    values : (N,) float or None
-        The quantity, NaN where unknown: mm, or grey values for "intensity". None if all of it is unknown.
-    most : int
-        Largest number of points; of more points that many are drawn at random, always the same.
-
-    Returns
-    -------
-    points : CloudPoints
-        The points; lengths of a fraction of a millimetre in µm.
-    caption : str
-        Number of points, range of the colours, and directions of the axes.
+    ``values`` (N,) are those of the ``field``, in mm or grey values; NaN where unknown, None if all of it is. Of more
+    than ``most`` points that many are drawn at random, always the same. Lengths of a fraction of a millimetre are in
+    µm. The caption states their number, the range of the colours, and the directions of the axes.
     """
     count, chosen, caption = len(points_mm), slice(None), f"All {len(points_mm):,} points."
     if count > most:

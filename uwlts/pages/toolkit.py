@@ -75,16 +75,8 @@ _SVG: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "page"}
 def render_page(package: str, template: str, /, *, interactive: FigureCollector | None = None, **values: Any) -> str:
     """Render the text of a page from a template and values.
 
-    Parameters
-    ----------
-    package
-        Package whose folder, or whose ``templates`` folder, holds the template.
-    template
-        File name of the template, which extends ``base.html.j2``.
-    interactive
-        The page's interactive figures and clouds; scripts are allowed and embedded only if there are any.
-    **values
-        Variables of the template.
+    The ``package``'s folder, or its folder ``templates``, holds the template, which extends ``base.html.j2``. Scripts
+    are embedded only if there are interactive figures.
     """
     templates = Path(__file__).with_name("templates")
     own = Path(str(files(package)))
@@ -115,20 +107,7 @@ HTML = (".html", ".htm")
 def write_page(
     path: str | Path, text: str, *, beside: str | None = None, kind: str = "", overwrite: bool = False
 ) -> None:
-    """Write a page, and optionally a JSON text beside it, each completely or not at all.
-
-    Parameters
-    ----------
-    path
-        Page to write.
-    text
-        Content of the page.
-    beside
-        Content of the JSON file (`json_beside`); None: no such file.
-    kind
-        Kind in the name of the JSON file.
-    overwrite
-        Replace existing files.
+    """Write a page, and optionally a JSON text ``beside`` it (`json_beside`), each completely or not at all.
 
     Raises
     ------
@@ -246,16 +225,8 @@ def new_figure(
 ) -> tuple[Figure, list[Axes]]:
     """Return a matplotlib figure in the pages' style, and its axes row by row.
 
-    Parameters
-    ----------
-    width, height
-        Size of the figure, inches.
-    rows, columns
-        Number of axes.
-    height_ratios, width_ratios
-        Relative heights of the rows and widths of the columns; by default equal.
-    shown
-        Whether `pyplot.show` and notebooks show the figure.
+    Sizes are in inches, ratios relative heights of rows and widths of columns. ``shown``: `pyplot.show` and notebooks
+    show the figure.
     """
     import matplotlib
 

@@ -40,14 +40,7 @@ def estimate_coarse_poses(
 ) -> np.ndarray:
     """Estimate poses (N, 4, 4) in the frame of the first scan, accurate to about one patch radius.
 
-    Parameters
-    ----------
-    points_mm : sequence of (K, 3)
-        Points of each scan.
-    patches, markers, names
-        Patches, marker spheres and name of each scan.
-    sphere_mm
-        Diameter of the marker spheres; None without spheres.
+    ``points_mm`` holds (K, 3) of each scan; ``sphere_mm`` is the diameter of the marker spheres, None without.
 
     Raises
     ------

@@ -132,26 +132,14 @@ def register_to_surface(
     datums: np.ndarray | None = None,
     options: SurfaceRegistrationOptions = _DEFAULTS,
 ) -> Registration:
-    """Register points to a surface, starting from their current position.
+    """Register points (N, 3) to a surface, starting from their current position.
 
     Minimise the squared distances along the surface normals (Chen and Medioni, Image and Vision Computing 10, 1992),
     weighted by each point's variance along the normal and by Tukey's biweight. Undetermined motions, such as a shift
     along a plane, stay zero.
 
-    Parameters
-    ----------
-    points_mm : (N, 3)
-        Points of the cloud.
-    surface
-        Reference surface.
-    reach_mm
-        Points farther than this from the surface are ignored.
-    uncertainty, frame
-        Uncertainty of the points, and the image (N,) of each point.
-    datums : (K, 4), optional
-        Centres and radii, mm, of spheres: points outside all of them are ignored.
-    options
-        Settings of the iteration.
+    Points farther than ``reach_mm`` from the surface are ignored, and those outside all spheres of ``datums`` (K, 4),
+    centres and radii in mm, if given.
 
     Raises
     ------
@@ -231,18 +219,8 @@ def shape_registration(
 ) -> Registration:
     """Return the uncertainty of a shape that was fitted to points by least squares, as a zero registration.
 
-    Parameters
-    ----------
-    points_mm : (N, 3)
-        Points to which the shape was fitted.
-    near
-        Distances of the points from the shape, and its normals.
-    sized
-        True if the radius was fitted too.
-    uncertainty
-        Uncertainty of the points; None if unknown.
-    frame : (N,) or None
-        Image of each point.
+    ``near`` are the distances of the points (N, 3) from the shape, and its normals; ``sized``: the radius was fitted,
+    too. The uncertainty of the points may be unknown (None).
     """
     middle = points_mm.mean(axis=0)
     by = _motion_derivatives(points_mm, near.normals, middle, sized=sized)

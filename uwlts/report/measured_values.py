@@ -165,18 +165,7 @@ class MeasuredValues(Description):
 
 
 def write_measured(page: str | Path, measured: MeasuredValues, *, title: str, overwrite: bool = False) -> list[Path]:
-    """Write a list as a page, and beside it as JSON and CSV; return the paths.
-
-    Parameters
-    ----------
-    page
-        Page to write, NAME.measured.html; the others are NAME.measured.json and NAME.measured.csv.
-    measured
-        Values.
-    title
-        Title of the page.
-    overwrite
-        Replace existing files.
+    """Write a list as a page NAME.measured.html, and beside it as JSON and CSV; return the paths.
 
     Raises
     ------

@@ -92,20 +92,9 @@ def command_from(
     The body takes a `Call`, and the command's additional options as parameters. Parameters without an annotation are
     taken from ``function`` or ``also``, with default and description.
 
-    Parameters
-    ----------
-    app
-        Program that gets the command.
-    package, function
-        Package and name of the public function. It is imported when the command is run or its own help is shown.
-    job
-        Group of the command in the help.
-    also
-        Further functions (package, name) whose parameters the body may have.
-    shortcuts
-        Annotations of options, by the names of parameters.
-    summary
-        Replacement of the prose of the function's docstring in the help.
+    The function is imported when the command is run or its own help is shown. ``job`` is the group in the help,
+    ``also`` lists further functions (package, name) whose parameters the body may have. ``summary`` replaces the prose
+    of the docstring in the help.
     """
 
     def register(body: Callable[..., None]) -> DerivedCommand:

@@ -38,20 +38,8 @@ def write_e57(
     Coordinates and real numbers have 32 bits, times 64. A time is the sum of ``acquisitionStart``, the whole second
     before all of them, and a positive ``timeStamp``.
 
-    Parameters
-    ----------
-    path
-        File to write.
-    points_mm : (N, 3)
-        Points.
-    columns
-        Columns (N,) by their names in the standard.
-    to
-        Final name of the file.
-    time_s : (N,), optional
-        Times of the points.
-    further
-        Further fields (N,), stored as ``uwlts:NAME``.
+    ``columns`` and ``further`` hold columns (N,) by their names: those of the standard, and others that are stored as
+    ``uwlts:NAME``. ``to`` is the final name of the file.
 
     Raises
     ------

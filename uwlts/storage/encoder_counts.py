@@ -13,12 +13,8 @@ _PLAIN = 3.0
 def unwrap_counts(counts: np.ndarray, bits: int | None = None) -> np.ndarray:
     """Return counts (N,) that continue where the counter passes the end of its range.
 
-    Parameters
-    ----------
-    counts
-        Counts in the order of time.
-    bits
-        Width of the counter. By default that for which the steps at its overflows are like the other steps.
+    Counts are in the order of time. The width ``bits`` is by default that for which the steps at overflows are like the
+    others.
 
     Raises
     ------

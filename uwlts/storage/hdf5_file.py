@@ -45,18 +45,7 @@ def read_label(
 ) -> AnyHeader:
     """Return the header of a file.
 
-    Parameters
-    ----------
-    file
-        Open file.
-    model
-        Type of the header.
-    path
-        Name of the file in messages.
-    file_format
-        Expected format.
-    version
-        Newest version that can be read.
+    ``version`` is the newest one that can be read.
 
     Raises
     ------

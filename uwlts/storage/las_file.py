@@ -40,22 +40,9 @@ def encode_las(
     colours: np.ndarray | None = None,
     compressed: bool,
 ) -> bytes:
-    """Return the content of a LAS or LAZ file.
+    """Return the content of a LAS or LAZ file (``compressed``) of points (N, 3).
 
-    Parameters
-    ----------
-    points_mm : (N, 3)
-        Points.
-    intensity : (N,)
-        Intensities; stored as integers of 16 bits.
-    fields
-        Extra fields (N,) by name.
-    time_s : (N,), optional
-        Times of the points.
-    colours : (N, 3) uint8, optional
-        Red, green and blue.
-    compressed
-        Make a LAZ file.
+    Intensities (N,) are stored as integers of 16 bits, ``fields`` (N,) by name as extra fields.
     """
     laspy = load_library("laspy", "LAZ" if compressed else "LAS")
     if compressed:

@@ -60,18 +60,7 @@ def evaluate_campaign(
 
     Saved results without the Monte-Carlo propagation, or with another number of trials, are completed.
 
-    Parameters
-    ----------
-    folder
-        Folder of the campaign.
-    trials
-        Number of trials of the Monte-Carlo propagation.
-    workers
-        Number of processes (default: number of processors).
-    overwrite
-        Evaluate again, also without newer recordings.
-    progress
-        Called as ``progress(done, total)``.
+    ``overwrite`` evaluates again, also without newer recordings.
 
     Raises
     ------

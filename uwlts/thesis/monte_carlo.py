@@ -69,26 +69,8 @@ def propagate(
 ) -> list[Propagated]:
     """Propagate the uncertainties of the inputs to the sphere spacing of every scan.
 
-    Parameters
-    ----------
-    evidence
-        Evidence of a calibration with step images.
-    scans
-        Scans of spheres.
-    medium
-        Medium of the step and the spheres.
-    knowledge
-        Standard deviations and half widths by the names of the campaign's imperfections; missing ones are 0.
-    options
-        Settings of the calibration.
-    trials
-        Number of trials, at least 20.
-    seed
-        Seed of the random numbers.
-    workers
-        Number of trials in parallel. Default: number of processors.
-    progress
-        Called with the number of trials done and the total.
+    ``knowledge`` holds standard deviations and half widths by the names of the campaign's imperfections; missing ones
+    are 0. At least 20 trials are needed.
 
     Raises
     ------

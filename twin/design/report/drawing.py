@@ -225,16 +225,8 @@ class _ModuleGeometry:
     ) -> _ModuleGeometry:
         """Make the module of a described sensor.
 
-        Parameters
-        ----------
-        sensor
-            Description of the sensor, for its wavelength.
-        window, medium
-            Window of the module, and the medium outside.
-        origin : (3,)
-            Entrance pupil or origin of the rays, in the camera frame.
-        rotation : (3, 3)
-            Rotation from the module's frame, with z along its axis, to the camera frame.
+        ``origin`` (3,) is the entrance pupil or origin of the rays, ``rotation`` (3, 3) turns the module's frame, with
+        z along its axis, to the camera frame. The medium is outside the window.
         """
         flat = (
             WindowGeometry.from_description(window, medium, sensor.laser.wavelength_nm, rotation)

@@ -36,18 +36,8 @@ def page_text(
 ) -> str:
     """Return the page of a study as HTML.
 
-    Parameters
-    ----------
-    study : Study
-        The study.
-    columns : Columns
-        All evaluated designs; can be empty.
-    marked : sequence of HighlightedDesign
-        Designs to highlight, the chosen one last.
-    agreements : sequence of Agreement
-        Comparison of formulas and rendering for each rendered design.
-    notes : sequence of str
-        Sentences for the top of the page.
+    Highlighted designs (``marked``) end with the chosen one; each rendered design has an agreement. Notes are sentences
+    for the top of the page.
 
     Raises
     ------

@@ -76,21 +76,7 @@ class StripeQuality:
 def judge_target(
     image: np.ndarray, view: TargetView, target: Target, *, full_dn: int, limits: QualityLimits = QualityLimits()
 ) -> TargetQuality:
-    """Assess an image in which the target was found.
-
-    Parameters
-    ----------
-    image : (H, W)
-        Image of the target.
-    view
-        Target points that were found in it.
-    target
-        Description of the target.
-    full_dn
-        Grey value of a saturated pixel.
-    limits
-        Limits of acceptable images.
-    """
+    """Assess an image (H, W) in which the points of ``view`` were found; ``full_dn`` is the value of saturation."""
     count, of_all = len(view.pixels), len(target.indices)
     share = count / of_all
     blur = edge_blur_px(image, view.pixels, half_px=_spacing_px(view, target) / 2)
@@ -187,26 +173,11 @@ def judge_stripe(
     options: StripeOptions = StripeOptions(),
     limits: QualityLimits = QualityLimits(),
 ) -> StripeQuality:
-    """Assess a laser image of the target.
+    """Assess a laser image (H, W) of the target.
 
     A stripe that misses the target is not an error: the result then has no lines and no reasons.
 
-    Parameters
-    ----------
-    image : (H, W)
-        Laser image.
-    view
-        Target points in the lamp image of the same pose.
-    target
-        Description of the target.
-    stripe_along
-        Side of the image along which the stripe runs.
-    full_dn
-        Grey value of a saturated pixel.
-    options
-        Options of the stripe search.
-    limits
-        Limits of acceptable images.
+    ``view`` holds the points in the lamp image of the same pose, ``full_dn`` is the grey value of saturation.
     """
     try:
         stripe = extract_stripe(image, stripe_along=stripe_along, options=options, saturation=full_dn)

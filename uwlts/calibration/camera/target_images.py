@@ -108,14 +108,8 @@ def observe(
 ) -> Observation | None:
     """Return residuals (found minus calculated) of a placement with derivatives; None for points behind the camera.
 
-    Parameters
-    ----------
-    placement, intrinsics
-        Images of the target, and parameterisation of the camera.
-    global_values
-        Camera parameters (P,), as `Intrinsics` names them.
-    local
-        Rotation vector and translation in mm (6,), followed by the tilt (a, b) of a free stage direction (8,).
+    ``global_values`` (P,) are camera parameters as `Intrinsics` names them. ``local`` is the rotation vector and
+    translation in mm (6,), followed by the tilt (a, b) of a free stage direction (8,).
     """
     direction = placement.direction(local[6:])
     points = placement.displace(direction)

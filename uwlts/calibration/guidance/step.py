@@ -73,24 +73,10 @@ def judge_step(
     full_dn: int,
     options: StripeOptions = StripeOptions(),
 ) -> StepQuality:
-    """Assess a laser image of the step standard.
+    """Assess a laser image (H, W) of the step standard.
 
-    Parameters
-    ----------
-    image : (H, W)
-        Laser image of the step standard.
-    calibration
-        Calibration of camera and sheet in air.
-    window
-        Nominal window.
-    standard
-        Step standard in the image.
-    medium_index
-        Refractive index of the medium relative to air.
-    full_dn
-        Grey value of a saturated pixel.
-    options
-        Options of the stripe search.
+    ``calibration`` is that of camera and sheet in air, the window is the nominal one, and the index is relative to air.
+    ``full_dn`` is the grey value of saturation.
     """
     along = calibration.stripe_along
     try:

@@ -149,19 +149,6 @@ def gather_jointly(
 ) -> Gathered:
     """Find the target, the stripes on it, and the stripes on steps and scanned surfaces in all images.
 
-    Parameters
-    ----------
-    targets
-        Captures of the target.
-    steps
-        Captures of step standards.
-    scans
-        Scans of surfaces of known shape.
-    options
-        Options of the calibration.
-    progress
-        Called as ``progress(done, total)`` in images.
-
     Raises
     ------
     CalibrationError
@@ -274,18 +261,7 @@ def build_priors(
 ) -> dict[ParameterKey, Prior]:
     """Return priors of all global parameters except lens parameters without prior knowledge.
 
-    Parameters
-    ----------
-    gathered
-        Images and their sensor.
-    window
-        Window as described; None without a window.
-    turns : (3,)
-        Initial values of the sheet's rotations and shift.
-    heights
-        Priors of the heights of step standards.
-    options
-        Options of the calibration.
+    ``turns`` (3,) are initial values of the sheet's rotations and shift; the window is as described, None without one.
     """
     sensor, known = gathered.sensor, gathered.sensor.uncertainty
     priors: dict[ParameterKey, Prior] = {}

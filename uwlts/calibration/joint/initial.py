@@ -128,18 +128,7 @@ def estimate_series_start(
     The window has the distance d, thickness t and index g; the medium has the index n. In the paraxial approximation,
     they act like a pinhole at d + t - n (d + t / g) on the axis, with n times the focal length.
 
-    Parameters
-    ----------
-    series
-        Target images of each medium, with or without window.
-    sensor
-        Description of the sensor.
-    window
-        Window as described; None without a window.
-    indices
-        Refractive index of each medium relative to air.
-    options
-        Options of the calibration.
+    ``series`` are target images of each medium, with or without window; indices are relative to air.
 
     Raises
     ------
@@ -372,18 +361,7 @@ def build_all_scan_evidence(
 ) -> tuple[list[tuple[SurfaceScanEvidence, np.ndarray]], list[str]]:
     """Return the evidence of every scan with the start of its local parameters, and warnings about rejected scans.
 
-    Parameters
-    ----------
-    scans
-        Stripes of each scan.
-    start
-        Initial calibration.
-    sensor
-        Description of the sensor.
-    indices
-        Refractive index of each medium relative to air.
-    sizes_known
-        Use the stated sizes of the surfaces.
+    Indices are relative to air; ``sizes_known`` uses the stated sizes of the surfaces.
 
     Raises
     ------

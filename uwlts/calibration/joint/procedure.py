@@ -260,19 +260,10 @@ def calibrate_jointly(
 ) -> JointResult:
     """Calibrate a sensor from all captures at once.
 
-    Parameters
-    ----------
-    targets
-        Captures of a target in air or in a medium, with or without the camera's window. Each capture is a separate
-        placement, unless the poses are free. Images with the laser on at the same stage positions show the sheet too.
-    steps
-        Captures of a step standard in a medium.
-    scans
-        Scans of spheres, a plane or a pipe that stand still while the stage moves the sensor.
-    options
-        Options. ``refractions`` is ignored: windows are glass plates as described.
-    progress
-        Called with the number of images done, the total, and the name of the stage.
+    Each capture of a target, in air or in a medium, with or without the camera's window, is a separate placement,
+    unless the poses are free. Its images with the laser on at the same stage positions show the sheet, too. In scans of
+    spheres, a plane or a pipe the stage moves the sensor. The option ``refractions`` is ignored: windows are glass
+    plates as described.
 
     Raises
     ------

@@ -31,21 +31,7 @@ def build_calibration(
     media: Sequence[Medium],
     provenance: dict[str, JsonValue],
 ) -> Calibration:
-    """Build the calibration of a joint estimate, with its evidence.
-
-    Parameters
-    ----------
-    result
-        Joint estimate.
-    evidence
-        Evidence of all images.
-    sensor
-        Description of the sensor.
-    media
-        Media other than air.
-    provenance
-        Origin of the calibration.
-    """
+    """Build the calibration of a joint estimate, with its evidence; ``media`` are those other than air."""
     parameters, values = result.parameters, result.values
     sheet = parameters.sheet_model(values)
     frame = object_frame(sheet, laser_axis=parameters.sheet.axis)

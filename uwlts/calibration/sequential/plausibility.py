@@ -38,14 +38,8 @@ _RULE = PlausibilityRule()
 def doubt_target_size(images: Sequence[TargetImage], free: CameraSolution, *, known: Uncertainty) -> list[str]:
     """Compare distances between target poses with the travel of the stage; return a warning if they contradict.
 
-    Parameters
-    ----------
-    images
-        Target points in each image, with stage positions.
-    free
-        Camera from the same images with one free pose per image: its lengths are those of the target's spacing.
-    known
-        Uncertainties of the stage's scale and of the target's spacing.
+    ``free`` is the camera from the same images with one free pose per image: its lengths are those of the target's
+    spacing.
     """
     placement = np.array([image.placement for image in images])
     stage, places = np.array([image.stage_mm for image in images]), free.target_poses[:, :3, 3].copy()

@@ -122,19 +122,10 @@ def calibrate_sequentially(
 ) -> CalibrationResult:
     """Calibrate a sensor from its captures; without step captures, for the medium of the target's images only.
 
-    Parameters
-    ----------
-    air
-        Captures of a target in air, moved by the stage; each capture is a separate placement. Images with the laser off
-        show the target, those with the laser on, at the same stage positions, the stripe on it. In another medium
-        through the window and without step captures, they give a single-viewpoint calibration: refraction is included
-        in focal length and distortion.
-    steps
-        Captures of a step standard in the medium of use.
-    options
-        Settings of the calibration.
-    progress
-        Called with the number of images done, the total, and the name of the stage.
+    Each capture of a target is a separate placement, moved by the stage. Its images with the laser off show the target,
+    those with the laser on, at the same stage positions, the stripe on it. In another medium through the window and
+    without step captures, they give a single-viewpoint calibration: refraction is included in focal length and
+    distortion.
 
     Raises
     ------

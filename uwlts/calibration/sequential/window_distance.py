@@ -82,18 +82,9 @@ def solve_window(
 
     A coarse scan finds the valley, and Gauss-Newton steps within the bounds find the minimum.
 
-    Parameters
-    ----------
-    calibration
-        Calibration in air; only its camera, sheet and OCS are used.
-    window
-        Window with all parameters except the distance.
-    steps
-        Images of step standards.
-    bounds_mm
-        Lowest and highest distance to search; by default 0.2 to 2.5 times the nominal one.
-    known
-        Uncertainty of heights without a certificate.
+    Of the ``calibration`` in air only camera, sheet and OCS are used, of the ``window`` all but its distance. The
+    bounds are by default 0.2 and 2.5 times the nominal distance. ``known`` states the uncertainty of heights without a
+    certificate.
 
     Raises
     ------

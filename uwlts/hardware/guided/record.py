@@ -55,24 +55,9 @@ def guide(
 ) -> GuidedRecording:
     """Lead through the images of a calibration on a screen. The errors are those of `uwlts.record_guided`.
 
-    Parameters
-    ----------
-    plan
-        Plan of the images, with camera and stage.
-    out
-        File of the calibration; the captures are written beside it.
-    screen
-        Display and buttons for the operator.
-    refractions, distortion
-        Window model and lens coefficients of the calibration that judges the images.
-    resume
-        Continue interrupted captures.
-    overwrite
-        Replace existing captures, unless they are continued.
-    report
-        Receives each line of output.
-    answers
-        File descriptor of the operator's answers; by default standard input.
+    The captures are written beside ``out``, the calibration; ``resume`` continues interrupted ones. ``refractions`` and
+    ``distortion`` are those of the calibration that judges the images. ``answers`` is the file descriptor of the
+    operator's answers, by default standard input.
     """
     camera = plan.camera_address()
     options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=CameraOptions(distortion=distortion))

@@ -26,16 +26,8 @@ def convert_equidistant(coefficients: np.ndarray, *, corner: float, focal_px: fl
     Kannala and S. S. Brandt, PAMI 28 (2006), 1335). The rational one is a function of tan a. Its six coefficients are
     fitted by linear least squares, weighted with the denominator of the previous pass.
 
-    Parameters
-    ----------
-    coefficients : (4,) array
-        k1 to k4.
-    corner : float
-        Distance of the image's farthest corner from the principal point, in focal lengths.
-    focal_px : float
-        Focal length in px, for the limit of the difference.
-    source : str
-        The file's name, for messages.
+    ``coefficients`` are k1 to k4. ``corner`` is the distance of the image's farthest corner from the principal point,
+    in focal lengths; ``source`` names the file in messages.
 
     Raises
     ------

@@ -137,20 +137,7 @@ def capture_header(
 ) -> CaptureHeader:
     """Return the header of an imported capture.
 
-    Parameters
-    ----------
-    given
-        Description of the folder.
-    sensor
-        Description of the sensor.
-    beside
-        Folder of the files that the description names.
-    name
-        Name of the capture, if the description has none.
-    saturation_dn
-        Grey value of a saturated pixel.
-    remarks
-        Provenance, if the description has none.
+    ``beside`` is the folder of the files that the description names; ``name`` and ``remarks`` are used if it has none.
 
     Raises
     ------
