@@ -179,10 +179,7 @@ class Options:
 def use_variant(name: str = CPU) -> str:
     """Select a monochromatic variant, ``llvm_ad_mono`` or ``cuda_ad_mono``, and return its name.
 
-    Raises
-    ------
-    SetupError
-        libLLVM is missing or too old, no CUDA device is available, or the variant is not supported.
+    Raises SetupError if libLLVM is missing or too old, no CUDA device is available, or the variant is not supported.
     """
     if name not in (CPU, GPU):
         raise SetupError(f"variant '{name}' is not supported; use {CPU} or {GPU}")

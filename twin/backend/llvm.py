@@ -65,10 +65,7 @@ def prepare_llvm() -> LlvmLibrary:
 
     If Dr.Jit has already been imported, check its library, which can no longer be exchanged.
 
-    Raises
-    ------
-    SetupError
-        There is no suitable libLLVM, or Dr.Jit was imported without one.
+    Raises SetupError if there is no suitable libLLVM, or Dr.Jit was imported without one.
     """
     if "drjit" in sys.modules:
         major, minor, patch = sys.modules["drjit"].detail.llvm_version()
@@ -102,10 +99,7 @@ def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
     ``folders`` (default: `search_folders`) are searched in order. A library named by the environment variable
     DRJIT_LIBLLVM_PATH is the only one considered: it is used or refused, never replaced.
 
-    Raises
-    ------
-    SetupError
-        No library is suitable; the message lists what was found and how to install one.
+    Raises SetupError if no library is suitable; the message lists what was found and how to install one.
     """
     chosen, faults = os.environ.get(VARIABLE), ""
     for path in [Path(chosen)] if chosen else list_candidates(folders):
@@ -137,10 +131,7 @@ def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
 def check_library(path: Path) -> LlvmLibrary:
     """Load a library and query its version, as the file name is not reliable.
 
-    Raises
-    ------
-    SetupError
-        The library does not load, is no libLLVM, or is too old.
+    Raises SetupError if the library does not load, is no libLLVM, or is too old.
     """
     try:
         library = ctypes.CDLL(str(path))

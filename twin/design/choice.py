@@ -51,10 +51,7 @@ def find_pareto_front(values: np.ndarray) -> np.ndarray:
     the same result. A design with a NaN is neither on the front nor compared with others. Up to two values need one
     sort; more values need a pass over the designs for each design of the front (Kung et al. 1975).
 
-    Raises
-    ------
-    RangeError
-        The values are not a table with at least one column.
+    Raises RangeError if the values are not a table with at least one column.
     """
     values = np.asarray(values, dtype=np.float64)
     if values.ndim != 2 or values.shape[1] == 0:

@@ -174,14 +174,8 @@ def evaluate_study(
 ) -> None:
     """Evaluate all remaining designs of a study and write the parts below ``folder``.
 
-    Raises
-    ------
-    DescriptionError
-        The folder contains another study.
-    OutputError
-        A part cannot be written.
-    SetupError
-        The workers' cluster does not respond.
+    Raises DescriptionError if the folder contains another study; OutputError if a part cannot be written; SetupError if
+    the workers' cluster does not respond.
     """
     make_folder(folder)
     # Hidden files are temporary files of another machine, running or stopped.

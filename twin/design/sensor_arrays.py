@@ -265,14 +265,8 @@ def _columns(values: Sequence[Array]) -> Array:
 def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
     """Return the parameters of one sensor in a medium as numbers.
 
-    Raises
-    ------
-    DescriptionError
-        A window is not mounted although the medium is not air.
-    RangeError
-        The wavelength is outside the tables of a medium or glass.
-    DesignError
-        The axis of a laser runs along the baseline.
+    Raises DescriptionError if a window is not mounted although the medium is not air; RangeError if the wavelength is
+    outside the tables of a medium or glass; DesignError if the axis of a laser runs along the baseline.
     """
     camera, laser, detector, exposure = sensor.camera, sensor.laser, sensor.detector, sensor.exposure
     window, wavelength = camera.window, laser.wavelength_nm

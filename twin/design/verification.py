@@ -303,12 +303,7 @@ def verify_candidates(
 
     Results of an earlier run are read from their files; failed ones are rendered again.
 
-    Raises
-    ------
-    OutputError
-        A file cannot be written.
-    SetupError
-        The workers' cluster does not respond.
+    Raises OutputError if a file cannot be written; SetupError if the workers' cluster does not respond.
     """
     make_folder(folder)
     paths = []

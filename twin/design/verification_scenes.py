@@ -164,12 +164,8 @@ def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recor
     With refraction at a window, the target is recorded in air without the camera's window, and the step standard in the
     medium. Without refraction, only the target is recorded, under the conditions of use.
 
-    Raises
-    ------
-    DescriptionError
-        The medium is unknown, or the reflectance is not from 0 to 1.
-    DesignError
-        The sensor cannot work in the medium.
+    Raises DescriptionError if the medium is unknown, or the reflectance is not from 0 to 1; DesignError if the sensor
+    cannot work in the medium.
     """
     of_use = sensor.medium(medium)
     near, far = find_measured_range(sensor, of_use)
@@ -205,11 +201,8 @@ def plan_recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recor
 def find_measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
     """Return the smallest and largest Z in mm, OCS, of the line in view within the measuring volume, with a margin.
 
-    Raises
-    ------
-    DesignError
-        As for `uwlts.model.placement.check_design`; or the laser points back towards the camera; or no part of the
-        line in the volume is in view.
+    Raises DesignError as for `uwlts.model.placement.check_design`; or the laser points back towards the camera; or no
+    part of the line in the volume is in view.
     """
     standoff = check_design(sensor, medium).standoff_mm
     sight, volume = LineOfSight.from_sensor(sensor, medium), sensor.volume

@@ -80,12 +80,8 @@ def find_air_evidence(
 ) -> AirEvidence:
     """Find the target in images with the laser off, and the stripe in images with it on at the same positions.
 
-    Raises
-    ------
-    CalibrationError
-        The captures describe no target, or different ones, or no image shows it.
-    DescriptionError
-        A target's description cannot be read.
+    Raises CalibrationError if the captures describe no target, or different ones, or no image shows it;
+    DescriptionError if a target's description cannot be read.
     """
     targets = [parse_target(capture.header.target) for capture in captures if capture.header.target is not None]
     if len(targets) < len(captures) or not captures:
@@ -145,10 +141,7 @@ def step_evidence(
 
     ``medium_index`` replaces the index of the captures' medium at the laser's wavelength.
 
-    Raises
-    ------
-    DescriptionError
-        A capture does not describe its step standard.
+    Raises DescriptionError if a capture does not describe its step standard.
     """
     total, done = sum(int(np.count_nonzero(capture.laser_on)) for capture in captures), 0
     found, warnings = [], []

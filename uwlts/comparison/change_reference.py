@@ -62,12 +62,8 @@ class _Datums(Description):
 def read_datums(datums: np.ndarray | str | os.PathLike[str]) -> np.ndarray:
     """Read or check centres and radii (K, 4), mm, from a TOML file with tables [[datum]] or from an array.
 
-    Raises
-    ------
-    CaptureError, DescriptionError
-        The file cannot be read or is not valid.
-    EvaluationError
-        The array has another shape, is not finite, or has a radius that is not positive.
+    Raises CaptureError, DescriptionError if the file cannot be read or is not valid; EvaluationError if the array has
+    another shape, is not finite, or has a radius that is not positive.
     """
     if isinstance(datums, str | os.PathLike):
         text = read_text(Path(datums), most_bytes=MOST_TOML_BYTES, called="datums", foreign="is not valid TOML")

@@ -64,10 +64,7 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
     face if its distance is at most five robust standard deviations, limited to 1 to 30 % of the height. It must also be
     farther than ``edge_mm`` from all points off the face, which excludes rounded edges and the riser.
 
-    Raises
-    ------
-    EvaluationError
-        There are too few points, or no two such faces.
+    Raises EvaluationError if there are too few points, or no two such faces.
     """
     points = check_points(points, least=20, what="a step", dimensions=(2, 3))
     least = 10 if points.shape[1] == 2 else 40
@@ -110,10 +107,7 @@ def step_height(
     ``points`` are (N, 2) or (N, 3), ``labels`` (N,) those of `label_step_faces`. The line or plane is fitted to the
     ``reference``.
 
-    Raises
-    ------
-    EvaluationError
-        A face has too few points.
+    Raises EvaluationError if a face has too few points.
     """
     base = StepFace[reference.upper()]
     points = np.asarray(points, dtype=np.float64)

@@ -58,11 +58,8 @@ def compare_with_truth(
     true point and unit normal of each line of each frame, in the frame of the points. They count where ``status`` (F,
     L) is 0, a visible stripe.
 
-    Raises
-    ------
-    EvaluationError
-        Points have no frame and line or ones outside the truth, visible truth is not finite or has no unit normals, or
-        no point matches.
+    Raises EvaluationError if points have no frame and line or ones outside the truth, visible truth is not finite or
+    has no unit normals, or no point matches.
     """
     points, point_mm, normal = (np.asarray(values, dtype=np.float64) for values in (points, point_mm, normal))
     frame, line = np.asarray(frame), np.asarray(line)

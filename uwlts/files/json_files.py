@@ -100,10 +100,7 @@ def read_model(
     The keys "format" and "version" must have the given values. ``called`` names the expected content in messages;
     ``advice`` ends that about content that is not valid.
 
-    Raises
-    ------
-    CaptureError
-        The file is missing, foreign, newer or damaged.
+    Raises CaptureError if the file is missing, foreign, newer or damaged.
     """
     content = read_json(path, called=called)
     return model_from_json(content, path, model, file_format=file_format, version=version, called=called, advice=advice)
@@ -147,10 +144,7 @@ def validate_content(model: type[AnyModel], content: object, complaint: str, *, 
 def write_model(path: str | Path, model: BaseModel, *, file_format: str, version: int, overwrite: bool) -> None:
     """Write a model as indented JSON with the keys "format" and "version" and a seal, completely or not at all.
 
-    Raises
-    ------
-    OutputError
-        The file exists and ``overwrite`` is not set, or cannot be written.
+    Raises OutputError if the file exists and ``overwrite`` is not set, or cannot be written.
     """
     require_ending(Path(path), (".json",))
     content = {"format": file_format, "version": version} | model.model_dump(mode="json")

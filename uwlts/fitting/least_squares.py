@@ -77,10 +77,7 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
 
     ``fit`` fits a shape to points (M, D), such as `fit_sphere`; ``points`` (N, D) are in mm.
 
-    Raises
-    ------
-    EvaluationError
-        The points or the inliers do not determine the shape.
+    Raises EvaluationError if the points or the inliers do not determine the shape.
     """
     points = check_points(points, least=1, what="a robust fit", dimensions=(2, 3))
     # Lower bound of the limit, so that rounding of exact points produces no outliers.

@@ -148,10 +148,7 @@ def surface_patches(
     ``points_mm`` is (N, 3), ``frame`` (N,) the image of each point. The radius is by default the smallest one with
     enough points on several profiles (`find_disc_radius`).
 
-    Raises
-    ------
-    EvaluationError
-        There are too few points, or they form no surface.
+    Raises EvaluationError if there are too few points, or they form no surface.
     """
     if len(points_mm) < 10 * _FEWEST:
         raise EvaluationError(f"the cloud has {len(points_mm)} points; at least {10 * _FEWEST} are needed")

@@ -230,10 +230,8 @@ def invert_block(matrix: np.ndarray, *, least: float | None = None) -> np.ndarra
 
     The diagonal part is eliminated (Schur complement): only the size of the leading part enters with its third power.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The matrix is singular, or its smallest eigenvalue, after elimination of a diagonal part, is below ``least``.
+    Raises numpy.linalg.LinAlgError if the matrix is singular, or its smallest eigenvalue, after elimination of a
+    diagonal part, is below ``least``.
     """
     coupled = np.arange(len(matrix))
     if len(matrix) > _SMALL_BLOCK:

@@ -120,11 +120,8 @@ class SphereFit:
 def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
     """Fit a sphere of free or known radius to points (N, 3), mm, by least squares; a cap suffices.
 
-    Raises
-    ------
-    EvaluationError
-        There are too few points (fewer than 5, or 4 with known radius), points are not finite or in one plane, or the
-        standard uncertainty of the centre exceeds a fifth of the radius.
+    Raises EvaluationError if there are fewer than 5 points (4 with known radius), or they are not finite or in one
+    plane. The same if the standard uncertainty of the centre exceeds a fifth of the radius.
     """
     unit, known = _prepare_round(points, radius_mm, least=5, what="a sphere fit")
 
@@ -191,11 +188,8 @@ def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = 
     principal axes, the direction most nearly normal to all local surface normals, and an even grid over the half
     sphere. Each is scored by a circle fit to the projected points, and the best few are refined on a subset.
 
-    Raises
-    ------
-    EvaluationError
-        There are too few points (fewer than 6, or 5 with known radius), points are not finite or in one plane, or the
-        axis is not determined.
+    Raises EvaluationError if there are too few points (fewer than 6, or 5 with known radius), points are not finite or
+    in one plane, or the axis is not determined.
     """
     unit, known = _prepare_round(points, radius_mm, least=6, what="a cylinder fit")
     thinned = thin_evenly(unit.points, _THINNED)

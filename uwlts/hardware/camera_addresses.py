@@ -18,12 +18,8 @@ def open_camera(address: str) -> CameraDevice:
 
     The camera is open but not configured. Use it as a context manager, which closes it.
 
-    Raises
-    ------
-    HardwareError
-        The address has an unknown form, or no camera answers to it; the message lists the cameras found.
-    SetupError
-        A library is missing; the message says how to install it.
+    Raises HardwareError if the address has an unknown form, or no camera answers to it; the message lists the cameras
+    found; SetupError if a library is missing; the message says how to install it.
     """
     kind, colon, rest = address.partition(":")
     camera: CameraDevice

@@ -90,10 +90,7 @@ class RigPlan(Description):
         ``direction`` is the unit vector of the stage's motion in the OCS. ``zero_dn`` is the grey value of zero
         difference in images with a subtracted background. ``shown`` describes the ``target`` or ``artefact``.
 
-        Raises
-        ------
-        DescriptionError
-            Target or artefact is not valid.
+        Raises DescriptionError if target or artefact is not valid.
         """
         table = {
             "name": name,

@@ -68,10 +68,7 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
 
     ``false_alarm`` is the probability of any indication, inwards or outwards, on an undamaged surface.
 
-    Raises
-    ------
-    EvaluationError
-        The surface has too few points.
+    Raises EvaluationError if the surface has too few points.
     """
     places, tree = surface.places, KDTree(surface.places)
     if len(places) < 20 * SEARCH_RULE.points_in_smallest:

@@ -115,10 +115,7 @@ def measure_blemish(
     wall. ``beneath_mm`` (N,) is the height of a smooth surface, of a dent for example, above which those of ``surface``
     count.
 
-    Raises
-    ------
-    EvaluationError
-        Too few points around the indication to determine the undamaged surface.
+    Raises EvaluationError if too few points around the indication determine the undamaged surface.
     """
     field = _Field.about(surface, search, indication)
     sign = float(np.sign(indication.height_mm))

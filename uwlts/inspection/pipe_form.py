@@ -206,10 +206,7 @@ def pipe_features(
 
     By default the pipe has twelve sections. Sections of fewer than 60 points are omitted.
 
-    Raises
-    ------
-    EvaluationError
-        `section_mm` is not positive.
+    Raises EvaluationError if `section_mm` is not positive.
     """
     used = form.used
     errors = PointErrors.along_normals(cloud, used, form.outwards[used])

@@ -175,10 +175,7 @@ def build_bead(
     3) those along and across at the points. ``half_mm`` is the approximate half width, ``section_mm`` the length of a
     section.
 
-    Raises
-    ------
-    EvaluationError
-        The points do not show the plates on both sides of the bead.
+    Raises EvaluationError if the points do not show the plates on both sides of the bead.
     """
     half, reach = half_mm, half_mm * (1 + 2 * _RULE.plate_width)
     chosen = np.flatnonzero(np.isfinite(local).all(axis=1) & (np.abs(local[:, 1]) < reach))

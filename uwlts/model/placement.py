@@ -115,11 +115,8 @@ def view_of_sheet(sensor: Sensor, medium: Medium) -> SheetView:
 def check_design(sensor: Sensor, medium: Medium) -> SheetView:
     """Check a sensor's design in a medium and return its view of the sheet.
 
-    Raises
-    ------
-    DesignError
-        A window is smaller than the camera's cone of view or the laser's fan, or the camera does not see the sheet in
-        the measuring volume.
+    Raises DesignError if a window is smaller than the camera's cone of view or the laser's fan. The same if the sheet
+    is not seen in the measuring volume.
     """
     camera, laser = sensor.camera, sensor.laser
     window = camera.window

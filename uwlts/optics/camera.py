@@ -34,10 +34,7 @@ def directions(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
     The distortion is inverted to rounding by Newton's method in two dimensions. The inverse exists in the image of the
     domain, the largest disc about the principal point where the distortion is one-to-one. Rows outside are NaN.
 
-    Raises
-    ------
-    RangeError
-        A pixel is not finite.
+    Raises RangeError if a pixel is not finite.
     """
     pixels = _require_finite("pixels", pixels)
     x, y = (pixels[:, 0] - camera.cx_px) / camera.fx_px, (pixels[:, 1] - camera.cy_px) / camera.fy_px
@@ -78,10 +75,7 @@ def project_through_window(
 
     A row is NaN if the camera cannot see the point: as for `project`, or in front of the window's outer face.
 
-    Raises
-    ------
-    RangeError
-        A coordinate is not finite, or as for `uwlts.optics.window.trace_window`.
+    Raises RangeError if a coordinate is not finite, or as for `uwlts.optics.window.trace_window`.
     """
     points = _require_finite("points", points)
     check_index("medium_index", medium_index)

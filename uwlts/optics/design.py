@@ -143,10 +143,7 @@ def pixel_of_depth(setup: Triangulation, z_mm: ArrayLike, v_px: ArrayLike = 0.0)
     In air, u = f (tan theta_t - B / Z) / s. Behind a window, Newton's method solves for p. The lateral offset p M is a
     concave function of p, so that steps from a start below the solution never overshoot.
 
-    Raises
-    ------
-    RangeError
-        A depth is not finite, is not beyond the window's outer face, or appears too far from the axis.
+    Raises RangeError if a depth is not finite, is not beyond the window's outer face, or appears too far from the axis.
     """
     depth = np.asarray(z_mm, dtype=np.float64)
     if not ((depth > setup.window.outer_mm) & (depth < math.inf)).all():
@@ -204,10 +201,7 @@ def measuring_volume(setup: Triangulation, *, side_px: float) -> MeasuringVolume
     ``side_px`` is the image side across the stripe. The near limit is not below the window's outer face. The far limit
     is infinite if the ray at the image's edge does not meet the sheet.
 
-    Raises
-    ------
-    RangeError
-        The camera does not see the sheet beyond the window.
+    Raises RangeError if the camera does not see the sheet beyond the window.
     """
     _require_positive(side_px=side_px)
     near, far = _depth_or_inf(setup, *setup.slopes(np.array([-0.5, 0.5]) * side_px, 0.0))

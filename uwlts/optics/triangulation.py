@@ -51,10 +51,7 @@ def reconstruct_profile(
     Lines are image columns if the stripe runs along the width, else rows. The index is relative to air, and ignored
     without a window. ``stage_mm`` is one position or (N,); ``stage_direction`` (3,) is the sensor's motion in the OCS.
 
-    Raises
-    ------
-    RangeError
-        As for `points_on_sheet` and `stage_travel`.
+    Raises RangeError as for `points_on_sheet` and `stage_travel`.
     """
     found = _profile_points(calibration, lines, centres_px, medium_index=medium_index)
     points = to_object(calibration, found.points_mm, stage_mm=stage_mm, stage_direction=stage_direction)
@@ -101,10 +98,7 @@ def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_inde
 
     The pixels may belong to several frames. The medium's index, relative to air, is ignored without a window.
 
-    Raises
-    ------
-    RangeError
-        A pixel is not finite, or the index is not finite and positive.
+    Raises RangeError if a pixel is not finite, or the index is not finite and positive.
     """
     return rays_on_sheet(calibration, pixels, medium_index=medium_index)[0]
 
@@ -131,10 +125,7 @@ def to_object(
     The result is ``T_object_camera p_camera + stage_mm * stage_direction``. Rows of NaN stay NaN. ``stage_mm`` is one
     position for all points or one for each; ``stage_direction`` is a unit vector in the OCS.
 
-    Raises
-    ------
-    RangeError
-        As for `stage_travel`.
+    Raises RangeError as for `stage_travel`.
     """
     travel = stage_travel(stage_mm, stage_direction)
     object_from_camera = np.linalg.inv(calibration.object_transform())
@@ -146,10 +137,7 @@ def to_object(
 def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> np.ndarray:
     """Return the shift of points in the OCS by the stage: (3, N), or (3, 1) for a single position.
 
-    Raises
-    ------
-    RangeError
-        A stage position is not finite, or the direction is not a unit vector.
+    Raises RangeError if a stage position is not finite, or the direction is not a unit vector.
     """
     stage_mm, stage_direction = np.asarray(stage_mm, dtype=float), np.asarray(stage_direction, dtype=float)
     if not np.isfinite(stage_mm).all():
@@ -199,10 +187,7 @@ def reconstruct_by_polynomials(
 
     Lines and centres are (N,); stage and direction are those of `reconstruct_profile`.
 
-    Raises
-    ------
-    RangeError
-        A centre is not finite, or as for `stage_travel`.
+    Raises RangeError if a centre is not finite, or as for `stage_travel`.
     """
     lines, centres_px = np.asarray(lines), np.asarray(centres_px, dtype=float)
     if not np.isfinite(centres_px).all():

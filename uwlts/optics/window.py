@@ -148,10 +148,7 @@ def trace_window(directions: np.ndarray, window: WindowModel | None, *, medium_i
 
     ``directions`` (N, 3) are unit vectors in air, camera frame. Rows that are not finite get the status NO_DIRECTION.
 
-    Raises
-    ------
-    RangeError
-        The index is not finite and positive, or the camera's axis runs along the glass.
+    Raises RangeError if the index is not finite and positive, or the camera's axis runs along the glass.
     """
     check_index("medium_index", medium_index)
     directions = np.asarray(directions, dtype=float)

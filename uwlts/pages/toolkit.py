@@ -109,10 +109,7 @@ def write_page(
 ) -> None:
     """Write a page, and optionally a JSON text ``beside`` it (`json_beside`), each completely or not at all.
 
-    Raises
-    ------
-    OutputError
-        A file exists and ``overwrite`` is not set, or cannot be written.
+    Raises OutputError if a file exists and ``overwrite`` is not set, or cannot be written.
     """
     with ExitStack() as stack:
         if beside is not None:

@@ -42,12 +42,7 @@ def estimate_coarse_poses(
 
     ``points_mm`` holds (K, 3) of each scan; ``sphere_mm`` is the diameter of the marker spheres, None without.
 
-    Raises
-    ------
-    EvaluationError
-        A scan matches no other scan.
-    SetupError
-        KISS-Matcher is not installed.
+    Raises EvaluationError if a scan matches no other scan; SetupError if KISS-Matcher is not installed.
     """
     edges = []
     for a, b in combinations(range(len(patches)), 2):

@@ -141,10 +141,7 @@ def register_to_surface(
     Points farther than ``reach_mm`` from the surface are ignored, and those outside all spheres of ``datums`` (K, 4),
     centres and radii in mm, if given.
 
-    Raises
-    ------
-    EvaluationError
-        Fewer than 50 points are near the surface and within the datums.
+    Raises EvaluationError if fewer than 50 points are near the surface and within the datums.
     """
     counted = (
         np.arange(len(points_mm)) if datums is None else np.flatnonzero(_select_within(points_mm, datums, reach_mm))

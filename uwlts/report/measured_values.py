@@ -167,12 +167,8 @@ class MeasuredValues(Description):
 def write_measured(page: str | Path, measured: MeasuredValues, *, title: str, overwrite: bool = False) -> list[Path]:
     """Write a list as a page NAME.measured.html, and beside it as JSON and CSV; return the paths.
 
-    Raises
-    ------
-    DescriptionError
-        The list is empty.
-    OutputError
-        A file exists and ``overwrite`` is not set, or cannot be written.
+    Raises DescriptionError if the list is empty; OutputError if a file exists and ``overwrite`` is not set, or cannot
+    be written.
     """
     if not measured.values:
         raise DescriptionError("the list of measured values is empty: measure something first")

@@ -24,10 +24,7 @@ or let the environment variable {ARAVIS_VARIABLE} name the library."""
 def load_aravis() -> ctypes.CDLL:
     """Load Aravis 0.8: the library named by the environment variable UWLTS_LIBARAVIS, otherwise the system's.
 
-    Raises
-    ------
-    SetupError
-        The library is missing or does not load; the message says how to install it.
+    Raises SetupError if the library is missing or does not load; the message says how to install it.
     """
     chosen = os.environ.get(ARAVIS_VARIABLE)
     called = f"the environment variable {ARAVIS_VARIABLE} names {chosen}" if chosen else ARAVIS

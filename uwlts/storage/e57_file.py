@@ -41,12 +41,7 @@ def write_e57(
     ``columns`` and ``further`` hold columns (N,) by their names: those of the standard, and others that are stored as
     ``uwlts:NAME``. ``to`` is the final name of the file.
 
-    Raises
-    ------
-    OutputError
-        Writing fails.
-    SetupError
-        pye57 is not installed.
+    Raises OutputError if writing fails; SetupError if pye57 is not installed.
     """
     pye57 = load_library("pye57", "E57")
     lib = pye57.libe57

@@ -16,10 +16,8 @@ def unwrap_counts(counts: np.ndarray, bits: int | None = None) -> np.ndarray:
     Counts are in the order of time. The width ``bits`` is by default that for which the steps at overflows are like the
     others.
 
-    Raises
-    ------
-    DescriptionError
-        The counts exceed the counter, or a jump may be an overflow of a counter of unknown width.
+    Raises DescriptionError if the counts exceed the counter, or a jump may be an overflow of a counter of unknown
+    width.
     """
     counts = np.asarray(counts, np.float64)
     steps, extent = np.diff(counts), np.ptp(counts) if len(counts) else 0.0

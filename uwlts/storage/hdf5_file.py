@@ -47,10 +47,7 @@ def read_label(
 
     ``version`` is the newest one that can be read.
 
-    Raises
-    ------
-    CaptureError
-        The file is foreign, newer or damaged.
+    Raises CaptureError if the file is foreign, newer or damaged.
     """
     found = _text(file, "format")
     if found != file_format:

@@ -32,12 +32,8 @@ def mcap_content(cloud: PointCloud, *, foxglove: bool) -> bytes:
     Points have the fields x, y, z (m) and intensity as 32-bit floating point numbers, which viewers expect; frame and
     line as 32-bit integers; time (s, 64 bits) if known; and the covariance in mm2 (`covariance_columns`).
 
-    Raises
-    ------
-    OutputError
-        A time is negative: messages cannot be earlier than the clock's zero.
-    SetupError
-        A library is not installed.
+    Raises OutputError if a time is negative: messages cannot be earlier than the clock's zero; SetupError if a library
+    is not installed.
     """
     if cloud.time_s is not None and cloud.time_s.min() < 0:
         raise OutputError(f"a point has the time {cloud.time_s.min():g} s: messages have no time before 0")

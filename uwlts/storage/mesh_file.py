@@ -157,10 +157,7 @@ def read_mesh(path: str | Path, *, unit: Unit | None = None) -> SurfaceMesh:
     The standard uncertainties are those of a PLY file written by `SurfaceMesh.save`, otherwise 0. Normals that are not
     in the file are averages over the adjacent triangles.
 
-    Raises
-    ------
-    CaptureError
-        The file is missing, damaged or without triangles, or vertices are not finite.
+    Raises CaptureError if the file is missing, damaged or without triangles, or vertices are not finite.
     """
     path = Path(path)
     loaded = load_triangles(path)

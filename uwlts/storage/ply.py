@@ -50,10 +50,7 @@ def read_ply(path: Path, element: str, *, called: str) -> tuple[np.ndarray | Non
     Lists are fields of objects, without values. Numbers in binary files without lists are read from the disk on use.
     The whole file is examined, also after the element.
 
-    Raises
-    ------
-    CaptureError
-        The file is missing, damaged or truncated.
+    Raises CaptureError if the file is missing, damaged or truncated.
     """
     header = _read_header(path, called=called)
     content = np.memmap(path, np.uint8, "r")[header.size :]

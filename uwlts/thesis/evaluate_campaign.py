@@ -62,12 +62,8 @@ def evaluate_campaign(
 
     ``overwrite`` evaluates again, also without newer recordings.
 
-    Raises
-    ------
-    CaptureError
-        A recording for the calibration is missing, or a file is damaged.
-    CalibrationError
-        The recordings do not determine a calibration.
+    Raises CaptureError if a recording for the calibration is missing, or a file is damaged; CalibrationError if the
+    recordings do not determine a calibration.
     """
     path = folder.path / RESULTS
     if not overwrite and up_to_date(path):

@@ -66,12 +66,8 @@ def joint_calibration(folder: CampaignFolder, method: JointMethod) -> tuple[Cali
     The scans of spheres were recorded in another water than the calibration, whose index follows from their roundness.
     Their sizes are not used.
 
-    Raises
-    ------
-    CaptureError
-        A recording is missing or damaged.
-    CalibrationError
-        The recordings do not determine a calibration, or contradict each other.
+    Raises CaptureError if a recording is missing or damaged; CalibrationError if the recordings do not determine a
+    calibration, or contradict each other.
     """
     options = CalibrationOptions(poses="stage", same_water=False, sizes_known=False)
     same = method == "joint_same_evidence"
@@ -106,12 +102,8 @@ def compare_campaigns(
     The results of each campaign are saved in its folder, and read from there unless ``again`` is set or a recording is
     newer. ``progress(done, total)`` counts scans.
 
-    Raises
-    ------
-    CaptureError, CalibrationError, EvaluationError
-        A recording is missing or damaged, does not determine a calibration, or does not show its artefact.
-    SetupError
-        A worker process was ended from outside.
+    Raises CaptureError, CalibrationError, EvaluationError if a recording is missing or damaged, does not determine a
+    calibration, or does not show its artefact; SetupError if a worker process was ended from outside.
     """
     total, numbers = sum(len(_list_compared_scans(folder)) for folder in folders), count(1)
     return run_jobs(
@@ -273,10 +265,7 @@ _WORDS: dict[Method, str] = {
 def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, overwrite: bool = False) -> JointSummary:
     """Write report.html and summary.json into a folder, each atomically.
 
-    Raises
-    ------
-    OutputError
-        A file cannot be written.
+    Raises OutputError if a file cannot be written.
     """
     summary = joint_summary(results)
     media = [

@@ -72,12 +72,8 @@ def propagate(
     ``knowledge`` holds standard deviations and half widths by the names of the campaign's imperfections; missing ones
     are 0. At least 20 trials are needed.
 
-    Raises
-    ------
-    RangeError
-        There are fewer than 20 trials.
-    CalibrationError
-        The unperturbed evidence gives no calibration, or more than a tenth of the trials fail.
+    Raises RangeError if there are fewer than 20 trials; CalibrationError if the unperturbed evidence gives no
+    calibration, or more than a tenth of the trials fail.
     """
     if trials < LEAST_TRIALS:
         raise RangeError(f"{trials} trials give no 95 % interval; expected at least {LEAST_TRIALS}")

@@ -150,10 +150,7 @@ def write_comparison(
 ) -> list[TableRow]:
     """Write all four files into a folder, each atomically; return the rows of the tables.
 
-    Raises
-    ------
-    OutputError
-        A file exists and ``overwrite`` is not given, or it cannot be written.
+    Raises OutputError if a file exists and ``overwrite`` is not given, or it cannot be written.
     """
     rows = all_rows(results, published)
     plain, lines = [row.as_dict() for row in rows], io.StringIO()

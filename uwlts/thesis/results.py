@@ -27,13 +27,7 @@ class _Kept(BaseModel):
 
     @classmethod
     def read_file(cls, path: Path) -> Self:
-        """Read the file.
-
-        Raises
-        ------
-        CaptureError
-            It cannot be read, is damaged or has another version.
-        """
+        """Read the file; raises CaptureError if it cannot be read, is damaged or has another version."""
         advice = "; remove it to evaluate the campaign again"
         try:
             content = read_json(path, called="file of results")

@@ -50,10 +50,7 @@ class SphereScan:
 def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str) -> SphereScan:
     """Assign the stripes of a scan to two spheres, with a calibration.
 
-    Raises
-    ------
-    EvaluationError
-        The scan shows no spheres.
+    Raises EvaluationError if the scan shows no spheres.
     """
     standard = SphereStandard.model_validate(capture.header.artefact)
     stripes = find_stripes(capture)
@@ -112,12 +109,7 @@ def window_choices(
 
     The profiles are those of one step at several window distances.
 
-    Raises
-    ------
-    CaptureError
-        A recording is missing or damaged.
-    CalibrationError
-        The calibration has no window.
+    Raises CaptureError if a recording is missing or damaged; CalibrationError if the calibration has no window.
     """
     nominal = window_of(calibration)
     images: dict[str, list[StepImage]] = {}

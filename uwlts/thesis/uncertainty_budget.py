@@ -53,10 +53,7 @@ def combine(sources: Iterable[UncertaintySource], *, coverage_probability: float
     The thesis's U of 0.37 mm (Table 9) has a coverage of 95.45 %, the probability of two normal standard deviations; 95
     % gives 0.36.
 
-    Raises
-    ------
-    RangeError
-        No source has an uncertainty.
+    Raises RangeError if no source has an uncertainty.
     """
     sources = tuple(sources)
     parts = [source.standard_uncertainty for source in sources]

@@ -95,12 +95,8 @@ class FrontView:
 def make_views(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     """Return the side view and front view of a sensor in a medium.
 
-    Raises
-    ------
-    DesignError
-        The sheet does not cross the camera's axis in front of the window, or the laser points back to the camera.
-    Error
-        As for `twin.design.sensor_arrays.extract_numbers`.
+    Raises DesignError if the sheet does not cross the camera's axis in front of the window, or the laser points back to
+    the camera; Error as for `twin.design.sensor_arrays.extract_numbers`.
     """
     pose, p, camera = laser_pose(sensor), extract_parameters([sensor], [medium]), sensor.camera
     outer = float(p.outer_mm(np).item())

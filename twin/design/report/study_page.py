@@ -39,10 +39,7 @@ def page_text(
     Highlighted designs (``marked``) end with the chosen one; each rendered design has an agreement. Notes are sentences
     for the top of the page.
 
-    Raises
-    ------
-    EvaluationError
-        The columns belong to another study.
+    Raises EvaluationError if the columns belong to another study.
     """
     judged, collected = StudyResults(study, columns), FigureCollector()
     over_free_title, over_free = _over_what_is_free(judged, marked)

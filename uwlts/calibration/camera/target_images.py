@@ -77,10 +77,7 @@ def pose_values(pose: np.ndarray) -> np.ndarray:
 def placements(images: Sequence[TargetImage], *, approaching: bool | None) -> list[Placement]:
     """Group images by placement number, or use single images if ``approaching`` is None.
 
-    Raises
-    ------
-    CalibrationError
-        The target appears mirrored in some images of a placement.
+    Raises CalibrationError if the target appears mirrored in some images of a placement.
     """
     numbers = [index if approaching is None else image.placement for index, image in enumerate(images)]
     joined = []

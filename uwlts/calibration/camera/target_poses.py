@@ -31,10 +31,7 @@ def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray
     points (N, 3) in mm, in any frame, and pixels (N, 2): camera matrix K (3, 3), rotation (3, 3) and translation (3,)
     in mm from the points' frame to the camera's.
 
-    Raises
-    ------
-    CalibrationError
-        The points are coplanar or too few, or the image is mirrored relative to them.
+    Raises CalibrationError if the points are coplanar or too few, or the image is mirrored relative to them.
     """
     if len(points_mm) < 6:
         raise CalibrationError(f"the linear start needs at least 6 target points; there are {len(points_mm)}")
@@ -297,10 +294,7 @@ def centre_offsets(
     The circles are in the plane of a target at ``T_camera_target`` (4, 4); ``project`` maps points (M, 3) of the camera
     frame to pixels (M, 2).
 
-    Raises
-    ------
-    RangeError
-        A circle's image is not an ellipse.
+    Raises RangeError if a circle's image is not an ellipse.
     """
 
     def project_target(points: np.ndarray) -> np.ndarray:

@@ -61,10 +61,7 @@ def nominal_camera(setting: Setting) -> CameraModel:
 def estimate_pose(view: TargetView, camera: CameraModel) -> np.ndarray:
     """Estimate ``T_camera_target`` (4, 4) of a view with a known camera.
 
-    Raises
-    ------
-    CalibrationError
-        No pose fits the points.
+    Raises CalibrationError if no pose fits the points.
     """
     found, rotation, translation = cv2.solvePnP(view.points_mm, view.pixels, camera.matrix(), camera.coefficients())
     if not found or not np.isfinite(translation).all():
@@ -331,10 +328,7 @@ def solve_state(
 ) -> State:
     """Solve the calibration with the recorded poses and return its state.
 
-    Raises
-    ------
-    CalibrationError
-        No pose of the target fits one of its images.
+    Raises CalibrationError if no pose of the target fits one of its images.
     """
     image, camera, solution, undetermined = setting.sensor.camera, nominal_camera(setting), None, "no image yet"
     if recorded:

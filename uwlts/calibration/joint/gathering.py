@@ -192,14 +192,8 @@ def _remain_enough(kept: int, images: int) -> bool:
 def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) -> ScanStripes:
     """Find the stripes of a scan.
 
-    Raises
-    ------
-    DescriptionError
-        The capture does not describe spheres, a plane or a pipe.
-    CaptureError
-        No image shows a stripe.
-    CalibrationError
-        The images contain poses.
+    Raises DescriptionError if the capture does not describe spheres, a plane or a pipe; CaptureError if no image shows
+    a stripe; CalibrationError if the images contain poses.
     """
     wanted = "a scan for calibration must describe spheres, a plane or a pipe as its artefact"
     if capture.header.artefact is None:

@@ -130,11 +130,8 @@ def estimate_series_start(
 
     ``series`` are target images of each medium, with or without window; indices are relative to air.
 
-    Raises
-    ------
-    CalibrationError
-        A camera without a window in air does not approximately fit the images, or they are rotated or mirrored against
-        the stage.
+    Raises CalibrationError if a camera without a window in air does not approximately fit the images, or they are
+    rotated or mirrored against the stage.
     """
     width_px, height_px, free = sensor.camera.width_px, sensor.camera.height_px, options.poses == "free"
     camera = options.camera.with_described_pixels(sensor.camera)
@@ -301,10 +298,7 @@ def build_scan_evidence(
 ) -> tuple[SurfaceScanEvidence, np.ndarray]:
     """Return the evidence of a scan and the start of its local parameters, from an approximate calibration.
 
-    Raises
-    ------
-    EvaluationError
-        The points do not show the described object.
+    Raises EvaluationError if the points do not show the described object.
     """
     line, centre, direction = stripes.line, stripes.centre_px, stripes.stage_direction
     across = 1 if start.stripe_along == "width" else 0
@@ -363,10 +357,7 @@ def build_all_scan_evidence(
 
     Indices are relative to air; ``sizes_known`` uses the stated sizes of the surfaces.
 
-    Raises
-    ------
-    CalibrationError
-        The scans move along different directions.
+    Raises CalibrationError if the scans move along different directions.
     """
     found, warnings, image = [], [], 0
     if any(not np.allclose(scan.stage_direction, scans[0].stage_direction) for scan in scans):
@@ -391,10 +382,7 @@ def _fit_surface(
 ) -> tuple[np.ndarray, Surface, np.ndarray]:
     """Select the points (N, 3) (OCS) on the surface; return mask (N,), surface in the camera frame, and start (k,).
 
-    Raises
-    ------
-    EvaluationError
-        The points do not show the described object.
+    Raises EvaluationError if the points do not show the described object.
     """
     rotation = transform[:3, :3]
 

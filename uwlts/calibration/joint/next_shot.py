@@ -90,10 +90,7 @@ _Shot = tuple[StoredEstimate, Evidence, np.ndarray]
 def rank_next_shots(calibration: Calibration) -> list[ShotForecast]:
     """Return possible further images, the most helpful one first; empty if the evidence covers no area.
 
-    Raises
-    ------
-    CalibrationError
-        The calibration contains no joint estimate, or a damaged one.
+    Raises CalibrationError if the calibration contains no joint estimate, or a damaged one.
     """
     region = next(iter(list_regions(calibration)), None)
     if region is None or not region.has_area():
@@ -118,10 +115,7 @@ def rank_next_shots(calibration: Calibration) -> list[ShotForecast]:
 def advice_lines(calibration: Calibration) -> list[str]:
     """Describe weak directions and the most helpful image.
 
-    Raises
-    ------
-    CalibrationError
-        The calibration contains no joint estimate, or a damaged one.
+    Raises CalibrationError if the calibration contains no joint estimate, or a damaged one.
     """
     region = next(iter(list_regions(calibration)), None)
     if region is None or not region.has_area():

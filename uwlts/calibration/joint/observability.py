@@ -94,10 +94,7 @@ class Lengths:
 def list_regions(calibration: Calibration) -> list[SheetRegion]:
     """Return the regions that a joint calibration's evidence covers, that of its medium of use first.
 
-    Raises
-    ------
-    CalibrationError
-        The covered volume is damaged.
+    Raises CalibrationError if the covered volume is damaged.
     """
     found = []
     for covered in require_joint(calibration).covered:
@@ -120,10 +117,7 @@ def read_region_estimate(calibration: Calibration, region: SheetRegion) -> Store
 def sample_sheet(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
     """Return points of the sheet at Y and Z (N, 2) of the OCS.
 
-    Raises
-    ------
-    CalibrationError
-        A point is outside the camera's view.
+    Raises CalibrationError if a point is outside the camera's view.
     """
     pixels = project_sheet_points(known, at_mm)
     found = None

@@ -265,12 +265,8 @@ def calibrate_jointly(
     spheres, a plane or a pipe the stage moves the sensor. The option ``refractions`` is ignored: windows are glass
     plates as described.
 
-    Raises
-    ------
-    CalibrationError
-        No target is among the captures; the evidence does not determine the calibration or contradicts it.
-    DescriptionError, CaptureError
-        As for `gather_jointly`.
+    Raises CalibrationError if no target is among the captures; the evidence does not determine the calibration or
+    contradicts it; DescriptionError, CaptureError as for `gather_jointly`.
     """
     options = CalibrationOptions() if options is None else options
     return solve_jointly(gather_jointly(targets, steps, scans, options=options, progress=progress), options=options)

@@ -200,13 +200,7 @@ def covariance_root(covariance: np.ndarray) -> np.ndarray:
 
 
 def require_joint(calibration: Calibration) -> JointEstimate:
-    """Return the joint estimate of a calibration.
-
-    Raises
-    ------
-    CalibrationError
-        It contains none.
-    """
+    """Return the joint estimate of a calibration; raises CalibrationError if it contains none."""
     if calibration.joint is None:
         raise CalibrationError("the calibration has no uncertainty: calibrate jointly (`water` or `joint`)")
     return calibration.joint
@@ -218,10 +212,7 @@ def read_stored_estimate(calibration: Calibration, sensor: Sensor, medium: Mediu
     In a calibrated medium, the uncertainty of the index includes its drift. In another medium, the index follows from
     the medium's description, independent of all other parameters.
 
-    Raises
-    ------
-    CalibrationError
-        The calibration contains no joint estimate, or a damaged one.
+    Raises CalibrationError if the calibration contains no joint estimate, or a damaged one.
     """
     return _read_estimate(calibration, medium, mounted=sensor.camera.window.mounted, uncertainty=sensor.uncertainty)
 

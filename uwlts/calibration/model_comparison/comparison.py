@@ -169,10 +169,7 @@ def score_polynomials(
 ) -> PolynomialScore | None:
     """Return the score of polynomials in the held-out images of a series, or None without such an image.
 
-    Raises
-    ------
-    CalibrationError
-        Polynomials cannot be fitted to the series.
+    Raises CalibrationError if polynomials cannot be fitted to the series.
     """
     if not images:
         return None

@@ -128,10 +128,7 @@ def split_images(problem: JointProblem) -> dict[str, frozenset[Image]]:
     in the outer sixths of the depth range. Of few images larger shares are held out. Images without a stripe are never
     held out.
 
-    Raises
-    ------
-    CalibrationError
-        There are too few images.
+    Raises CalibrationError if there are too few images.
     """
     views = list(_sort_by_depth(problem).values())
     inside = _first_large_enough([_hold_out_inside(views, every) for every in _EVERY])

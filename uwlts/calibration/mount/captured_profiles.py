@@ -54,10 +54,7 @@ def reconstruct_profiles(
 ) -> CapturedProfiles:
     """Reconstruct the profiles of all laser images of a capture; ``poses`` replace the capture's own poses.
 
-    Raises
-    ------
-    DescriptionError
-        Images have no pose and ``poses`` is None.
+    Raises DescriptionError if images have no pose and ``poses`` is None.
     """
     check_fits(capture.header, calibration, source=capture.path.name)
     mounted = capture.header.sensor.camera.window.mounted

@@ -418,10 +418,7 @@ class BoardEvidence(GroupedEvidence[_State]):
 def select_agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State], np.ndarray]:
     """Estimate the mount from the images that agree; return it with their mask.
 
-    Raises
-    ------
-    CalibrationError
-        Too few images agree.
+    Raises CalibrationError if too few images agree.
     """
     rng, count = np.random.default_rng(0), len(evidence.images)
     # A wrong image spoils the closed form, so start from random triples of images too.

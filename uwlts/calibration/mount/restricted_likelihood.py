@@ -199,10 +199,7 @@ class RestrictedEstimate(Generic[State]):
 def settle(evidence: GroupedEvidence[State], starts: Sequence[tuple[State, np.ndarray]]) -> RestrictedEstimate[State]:
     """Iterate from several states and components; return the likeliest converged estimate.
 
-    Raises
-    ------
-    CalibrationError
-        The iteration converges from none of the starts.
+    Raises CalibrationError if the iteration converges from none of the starts.
     """
     found, failed = [], None
     for state, scatter in starts:

@@ -49,10 +49,7 @@ def start(
     ``whole`` contains all points of the profiles; ``sheet`` (4, 4) maps the sheet's frame to the sensor's. ``towards``
     (3,) is the direction of the sensor's frame nearest to the axis of a rotary table.
 
-    Raises
-    ------
-    CalibrationError
-        Too few profiles show a wall of the ring.
+    Raises CalibrationError if too few profiles show a wall of the ring.
     """
     arcs = [each for each in seen if isinstance(each, ProfileArc)]
     lines = [each for each in seen if isinstance(each, ProfileLine)]

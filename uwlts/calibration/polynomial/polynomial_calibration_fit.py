@@ -54,10 +54,7 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
     polynomials P on scaled ranges. The index j runs to ``degree``, i to `MOST_SMOOTH`. Data beyond five robust standard
     deviations are rejected, and the fit is repeated until convergence.
 
-    Raises
-    ------
-    CalibrationError
-        The data do not determine the polynomials.
+    Raises CalibrationError if the data do not determine the polynomials.
     """
     span = int(np.ptp(lines)) + 1 if len(lines) else 0
     smooth = min(MOST_SMOOTH, (span - 1) // _LINES_PER_DEGREE)

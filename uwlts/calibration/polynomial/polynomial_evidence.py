@@ -71,12 +71,8 @@ def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None
     For circles, the pixels are centres of the circles' images. The offsets from the images of the circles' centres are
     corrected with the map itself, as refraction can shift the centres as much as perspective.
 
-    Raises
-    ------
-    CalibrationError
-        There are too few points, or they determine no homography.
-    RangeError
-        A circle's image is not an ellipse.
+    Raises CalibrationError if there are too few points, or they determine no homography; RangeError if a circle's image
+    is not an ellipse.
     """
     points, pixels = image.points_mm, image.pixels
     if circle_diameter_mm is not None:
@@ -90,10 +86,7 @@ def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None
 def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
     """Fit a smooth map from points (N, 2) to points (N, 2) by least squares.
 
-    Raises
-    ------
-    CalibrationError
-        There are too few points, or they determine no homography.
+    Raises CalibrationError if there are too few points, or they determine no homography.
     """
     counts = {d: (d + 1) * (d + 2) // 2 for d in range(_LOWEST_DEGREE, _HIGHEST_DEGREE + 1)}
     degree = max((d for d, count in counts.items() if _POINTS_PER_TERM * count <= len(start)), default=None)
@@ -144,11 +137,8 @@ class PlateStripes:
 def common_header(captures: Sequence[Capture]) -> CaptureHeader:
     """Return the first capture's header.
 
-    Raises
-    ------
-    CalibrationError
-        There is no capture, one has no target, the captures differ in their arrangement, or the stage does not move
-        along Z.
+    Raises CalibrationError if there is no capture, one has no target, the captures differ in their arrangement, or the
+    stage does not move along Z.
     """
     if not captures:
         raise CalibrationError("no capture of a target is given: polynomials are fitted to these")
@@ -191,10 +181,7 @@ def stripes_on_plate(
     Points are used up to one spacing outside the hull of the target's points in the image, and up to half a spacing
     outside the pattern. Images without such points have no map.
 
-    Raises
-    ------
-    CalibrationError
-        There are fewer positions than coefficients of a polynomial of this degree.
+    Raises CalibrationError if there are fewer positions than coefficients of a polynomial of this degree.
     """
     target = evidence.target
     spacing, extent = target.spacing_mm, target.extent_mm

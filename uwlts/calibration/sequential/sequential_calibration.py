@@ -127,12 +127,8 @@ def calibrate_sequentially(
     without step captures, they give a single-viewpoint calibration: refraction is included in focal length and
     distortion.
 
-    Raises
-    ------
-    CalibrationError
-        The evidence does not determine the calibration or contradicts it.
-    DescriptionError
-        A capture does not describe its target or its step standard.
+    Raises CalibrationError if the evidence does not determine the calibration or contradicts it; DescriptionError if a
+    capture does not describe its target or its step standard.
     """
     options = CalibrationOptions() if options is None else options
     return solve(gather(air, steps, options=options, progress=progress), options=options)
@@ -341,10 +337,7 @@ def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonVa
 def common_sensor(captures: Sequence[Capture]) -> Sensor:
     """Return the first capture's sensor.
 
-    Raises
-    ------
-    CalibrationError
-        Another capture has other optics, or there is no capture.
+    Raises CalibrationError if another capture has other optics, or there is no capture.
     """
     if not captures:
         raise CalibrationError("no capture is given: a calibration needs one of a target")
@@ -506,10 +499,7 @@ def _uncertainty_warnings(camera: CameraSolution, sheet: SheetSolution, sensor: 
 def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = ()) -> dict[str, JsonValue]:
     """Return captures, software and date of a calibration, for its provenance.
 
-    Raises
-    ------
-    CalibrationError
-        A capture is given twice, so its noise would count twice.
+    Raises CalibrationError if a capture is given twice, so its noise would count twice.
     """
     kinds = {"air_captures": air, "step_captures": steps, "scan_captures": scans}
     sources = {kind: [describe_source(capture) for capture in captures] for kind, captures in kinds.items()}

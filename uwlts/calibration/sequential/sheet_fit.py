@@ -69,12 +69,8 @@ def points_on_target(
     ``stripes`` (N, 2) are the pixels (u, v) of each image, ``target_poses`` (F, 4, 4) its ``T_camera_target``. Points
     outside the convex hull of ``plate_mm`` (V, 2), points (x, y) of the target's plane, are not on the target.
 
-    Raises
-    ------
-    CalibrationError
-        No stripe pixel is on the target, or a pose is not finite.
-    RangeError
-        A pixel is not finite.
+    Raises CalibrationError if no stripe pixel is on the target, or a pose is not finite; RangeError if a pixel is not
+    finite.
     """
     if not np.isfinite(target_poses).all():
         raise CalibrationError("a pose of the target is not finite")
@@ -186,10 +182,8 @@ def object_frame(sheet: SheetModel, *, laser_axis: np.ndarray) -> np.ndarray:
     X is the sheet's normal, Z the laser's axis (3,), camera frame, made perpendicular to X, and Y = Z x X. The origin
     is the intersection of the camera's axis with the sheet.
 
-    Raises
-    ------
-    CalibrationError
-        The laser's axis is parallel to the normal, or the camera's axis does not meet the sheet in front of the camera.
+    Raises CalibrationError if the laser's axis is parallel to the normal, or the camera's axis does not meet the sheet
+    in front of the camera.
     """
     x = np.array(sheet.normal)
     z = laser_axis - (laser_axis @ x) * x

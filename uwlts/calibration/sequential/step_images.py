@@ -59,10 +59,7 @@ def step_profile(
 def label_step(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
     """Separate the faces with the window's nominal distance: the profile is accurate to a few percent.
 
-    Raises
-    ------
-    EvaluationError
-        The profile does not show two faces.
+    Raises EvaluationError if the profile does not show two faces.
     """
     points = step_profile(calibration, window, step.pixels, medium_index=step.medium_index)
     found = np.isfinite(points).all(axis=1)

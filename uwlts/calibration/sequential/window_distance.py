@@ -86,13 +86,8 @@ def solve_window(
     bounds are by default 0.2 and 2.5 times the nominal distance. ``known`` states the uncertainty of heights without a
     certificate.
 
-    Raises
-    ------
-    CalibrationError
-        There is no step image, a height is not positive, the best distance is at a bound, or the heights depend too
-        little on the distance.
-    RangeError
-        A pixel or the medium's index is not finite.
+    Raises CalibrationError if there is no step image, or a height is not positive. The same if the best distance is at
+    a bound, or the heights depend too little on it; RangeError if a pixel or the medium's index is not finite.
     """
     if not steps:
         raise CalibrationError("the window's distance needs at least one image of a step standard")

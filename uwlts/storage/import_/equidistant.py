@@ -29,10 +29,7 @@ def convert_equidistant(coefficients: np.ndarray, *, corner: float, focal_px: fl
     ``coefficients`` are k1 to k4. ``corner`` is the distance of the image's farthest corner from the principal point,
     in focal lengths; ``source`` names the file in messages.
 
-    Raises
-    ------
-    DescriptionError
-        The lens does not image the corner, or its angle is too wide for the rational model.
+    Raises DescriptionError if the lens does not image the corner, or its angle is too wide for the rational model.
     """
     angle = np.linspace(0.0, _WIDEST, 50 * _SAMPLES)
     radius = _image_radius(coefficients, angle)

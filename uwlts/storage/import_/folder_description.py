@@ -139,12 +139,8 @@ def capture_header(
 
     ``beside`` is the folder of the files that the description names; ``name`` and ``remarks`` are used if it has none.
 
-    Raises
-    ------
-    DescriptionError
-        Medium, target, direction or header are missing, unknown or not valid.
-    EvaluationError
-        The artefact is not valid.
+    Raises DescriptionError if medium, target, direction or header are missing, unknown or not valid; EvaluationError if
+    the artefact is not valid.
     """
     # A description with its own provenance must not hide that there is no stage.
     mark: Table = {"stage": NO_STAGE} if given.stage.free else {}
