@@ -17,7 +17,6 @@ from twin.datasets.coco import write_coco
 from twin.datasets.data_set import Constant, DataSetDescription, LineStatus, LogUniform, Mask, Normal, OneOf, Uniform
 from twin.datasets.labels import MEANINGS
 from twin.scene.paths import Value
-from uwlts._version import __version__
 from uwlts.files.json_files import write_model
 from uwlts.files.writing import hash_file, write_atomically
 from uwlts.pages.toolkit import BLUE, figure_svg, new_figure, plain_text, png_data_uri, render_page, write_page
@@ -247,7 +246,6 @@ def _page(card: DataCard, description: DataSetDescription, found: _Collected, sa
         status=[[name, f"{count}", f"{100 * count / lines:.1f} %"] for name, count in status.items()],
         labels=[[name, words] for name, words in card.labels.items()],
         shards=[[one.name, one.split, f"{one.frames}", one.sha256[:16]] for one in card.shards],
-        version=__version__,
     )
 
 

@@ -6,7 +6,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from uwlts.errors import OutputError, SetupError
+from uwlts.errors import SetupError
 from uwlts.files.writing import write_atomically
 
 BROWSERS = ("chromium", "chromium-headless-shell", "google-chrome", "google-chrome-stable", "msedge")
@@ -51,10 +51,3 @@ def find_browser() -> str:
         "a PDF needs Chromium, Chrome or Edge, and none is on PATH: install one (Debian: apt-get install chromium), "
         "let the environment variable CHROMIUM name one, or print the page from a browser"
     )
-
-
-def refuse_unsuitable_pdf(path: Path) -> None:
-    """Raise an error if a PDF cannot be made; called before the work."""
-    if path.suffix.lower() != ".pdf":
-        raise OutputError(f"{path} is to be a PDF; give a name like findings.pdf")
-    find_browser()

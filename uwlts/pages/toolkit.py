@@ -32,8 +32,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
+from uwlts._version import __version__
 from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.pages.cloud_figure import CloudPoints, view_scripts
+from uwlts.pages.pdf import find_browser, print_pdf
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -76,7 +78,7 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     """Render the text of a page from a template and values.
 
     The ``package``'s folder, or its folder ``templates``, holds the template, which extends ``base.html.j2``. Scripts
-    are embedded only if there are interactive figures.
+    are embedded only if there are interactive figures. Every template knows the ``software`` and its version.
     """
     templates = Path(__file__).with_name("templates")
     own = Path(str(files(package)))
@@ -96,6 +98,7 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
         page_plotly=plotly,
         page_clouds=clouds,
         page_cloud_scripts=view_scripts() if clouds else {},
+        software=f"uwlts {__version__}",
         **values,
     )
 
@@ -105,12 +108,20 @@ HTML = (".html", ".htm")
 
 
 def write_page(
-    path: str | Path, text: str, *, beside: str | None = None, kind: str = "", overwrite: bool = False
+    path: str | Path,
+    text: str,
+    *,
+    beside: str | None = None,
+    kind: str = "",
+    pdf: bool = False,
+    overwrite: bool = False,
 ) -> None:
-    """Write a page, and optionally a JSON text ``beside`` it (`json_beside`), each completely or not at all.
+    """Write a page, and optionally as PDF and a JSON text ``beside`` it (`json_beside`), each completely or not at all.
 
     Raises OutputError if a file exists and ``overwrite`` is not set, or cannot be written.
     """
+    if pdf:
+        print_pdf(text, Path(path).with_suffix(".pdf"), overwrite=overwrite)
     with ExitStack() as stack:
         if beside is not None:
             aside = stack.enter_context(write_atomically(json_beside(Path(path), kind), overwrite=overwrite))
@@ -128,8 +139,11 @@ def json_beside(page: Path, kind: str = "") -> Path:
     return page.with_suffix(".json" if page.stem.rpartition(".")[2] == kind or not kind else f".{kind}.json")
 
 
-def refuse_unsuitable_page(page: Path, *, kind: str = "", overwrite: bool) -> None:
-    """Raise OutputError if a page, or the JSON beside it (`json_beside`), cannot be written."""
+def refuse_unsuitable_page(page: Path, *, kind: str = "", pdf: bool = False, overwrite: bool) -> None:
+    """Raise OutputError or SetupError if a page, its PDF, or the JSON beside it (`json_beside`) cannot be written."""
+    if pdf:
+        find_browser()
+        refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
     refuse_unsuitable(page, overwrite=overwrite, endings=HTML)
     refuse_unsuitable(json_beside(page, kind), overwrite=overwrite)
 

@@ -11,10 +11,8 @@ from uwlts.acceptance.acceptance_plan import SYMBOLS, CertifiedArtefact, Symbol
 from uwlts.acceptance.characteristics import NAMES, Characteristic, CharacteristicValue
 from uwlts.acceptance.directional_scale import DirectionalScale, ScaleComponent
 from uwlts.files.json_files import json_text
-from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.artefacts import SphereStandard, StepStandard
 from uwlts.pages.numbers import format_fixed
-from uwlts.pages.pdf import print_pdf, refuse_unsuitable_pdf
 from uwlts.pages.toolkit import (
     BLUE,
     COLOURS,
@@ -61,15 +59,10 @@ def write_acceptance(path: str | Path, acceptance: Acceptance, *, pdf: bool = Fa
         A PDF is requested, but no browser is installed.
     """
     page = Path(path)
-    refuse_unsuitable_page(page, kind=KIND, overwrite=overwrite)
-    if pdf:
-        refuse_unsuitable_pdf(page.with_suffix(".pdf"))
-        refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
+    refuse_unsuitable_page(page, kind=KIND, pdf=pdf, overwrite=overwrite)
     text = acceptance_page(acceptance)
     content = {"format": FORMAT, "version": VERSION} | acceptance.model_dump(mode="json")
-    if pdf:
-        print_pdf(text, page.with_suffix(".pdf"), overwrite=overwrite)
-    write_page(page, text, beside=json_text(content, indent=2), kind=KIND, overwrite=overwrite)
+    write_page(page, text, beside=json_text(content, indent=2), kind=KIND, pdf=pdf, overwrite=overwrite)
 
 
 def acceptance_page(acceptance: Acceptance) -> str:

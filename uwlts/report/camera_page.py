@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from markupsafe import Markup
 
-from uwlts._version import __version__
 from uwlts.calibration.camera.camera_parameters import DISTORTION
 from uwlts.calibration.camera.photographs import CameraCalibration, Photograph
 from uwlts.errors import Error
@@ -62,7 +61,6 @@ def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool
         "uwlts.report",
         "camera.html.j2",
         name=camera.folder.resolve().name,
-        software=f"uwlts {__version__}",
         summary=_summary(camera),
         models=models,
         rows=rows,

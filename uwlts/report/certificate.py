@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, JsonValue, PlainSerializer
+from pydantic import JsonValue, PlainSerializer
 
 from uwlts._version import __version__
 from uwlts.calibration.joint.next_shot import ShotForecast, rank_next_shots
@@ -24,7 +24,7 @@ from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parse_parameter
-from uwlts.model.sensor import Medium
+from uwlts.model.sensor import Description, Medium
 from uwlts.pages.numbers import format_to_scale, numbers_in
 from uwlts.pages.toolkit import MISSING
 from uwlts.report.certificate_volume import (
@@ -91,13 +91,7 @@ _Pair = tuple[float, float]
 _Medium = Annotated[Medium, PlainSerializer(lambda medium: medium.model_dump(mode="json", exclude_none=True))]
 
 
-class _Stored(BaseModel):
-    """Base of the content of a certificate's file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class CertifiedFile(_Stored):
+class CertifiedFile(Description):
     """The calibration file: name, SHA-256, the digest stored in clouds, date, and software."""
 
     file: str
@@ -107,7 +101,7 @@ class CertifiedFile(_Stored):
     software: JsonValue
 
 
-class ParameterRow(_Stored):
+class ParameterRow(Description):
     """A parameter: words, unit, value, and standard uncertainties after and before calibration (None: unknown)."""
 
     name: str
@@ -124,14 +118,14 @@ class ParameterRow(_Stored):
         return format_to_scale(self.value, self.std, digits=2), format_to_scale(self.std, self.std, digits=2)
 
 
-class CalibratedMedium(_Stored):
+class CalibratedMedium(Description):
     """A medium and its refractive index."""
 
     medium: _Medium
     index: float
 
 
-class Validity(_Stored):
+class Validity(Description):
     """A region covered by the evidence: its medium, refractive index and extent."""
 
     name: str
@@ -146,7 +140,7 @@ class Validity(_Stored):
     stripe_points: int
 
 
-class NextShot(_Stored):
+class NextShot(Description):
     """A recommended shot: description, standard uncertainty of lengths before and after, and advice."""
 
     words: str
@@ -155,7 +149,7 @@ class NextShot(_Stored):
     advice: str
 
 
-class Certificate(_Stored):
+class Certificate(Description):
     """Common content of all certificates. Fields that are not set are omitted from the file."""
 
     format: str

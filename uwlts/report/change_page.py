@@ -7,7 +7,6 @@ from markupsafe import Markup
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 
-from uwlts._version import __version__
 from uwlts.comparison.change import SurfaceChange
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import require_ending, write_atomically
@@ -71,7 +70,6 @@ def write_change(
         "uwlts.report",
         "change.html.j2",
         title=title,
-        software=f"uwlts {__version__}",
         summary=change.lines(),
         columns=_COLUMNS,
         regions=_rows(change)[:_MOST_ROWS],

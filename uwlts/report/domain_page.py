@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwlts._version import __version__
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.json_files import json_text
 from uwlts.pages.toolkit import (
@@ -92,7 +91,6 @@ def write_domain_gap(
         "uwlts.report",
         "domain.html.j2",
         title=title,
-        software=f"uwlts {__version__}",
         gaps=found.gap_table() if found.real else None,
         covered=found.covered_table() if found.real and found.generated else None,
         statistics=found.statistics_table(),

@@ -17,7 +17,7 @@ from uwlts.evaluation.decision import VERDICTS
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.json_files import EDITED, json_text, trusting
-from uwlts.files.writing import hash_file, refuse_unsuitable
+from uwlts.files.writing import hash_file
 from uwlts.inspection.features import (
     COVERAGE,
     COVERAGE_FACTOR,
@@ -31,7 +31,6 @@ from uwlts.inspection.inspect import InspectionKind, inspect_cloud
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.sensor import Table
 from uwlts.pages.numbers import format_to_scale
-from uwlts.pages.pdf import print_pdf, refuse_unsuitable_pdf
 from uwlts.pages.toolkit import (
     INK,
     MISSING,
@@ -163,10 +162,7 @@ def write_findings(
         A PDF is requested, but no browser is installed.
     """
     page, path = Path(out), Path(cloud)
-    refuse_unsuitable_page(page, kind=FINDINGS, overwrite=overwrite)
-    if pdf:
-        refuse_unsuitable_pdf(page.with_suffix(".pdf"))
-        refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
+    refuse_unsuitable_page(page, kind=FINDINGS, pdf=pdf, overwrite=overwrite)
     stated = load_order(order)
     points = read_cloud(path, unit=unit)
     by_hand = None if measured is None else read_measured(measured)
@@ -193,9 +189,7 @@ def write_findings(
         "measured": [] if by_hand is None else by_hand.model_dump(mode="json")["values"],
         "inspection": found.record(),
     }
-    if pdf:
-        print_pdf(text, page.with_suffix(".pdf"), overwrite=overwrite)
-    write_page(page, text, beside=json_text(record, indent=1), kind=FINDINGS, overwrite=overwrite)
+    write_page(page, text, beside=json_text(record, indent=1), kind=FINDINGS, pdf=pdf, overwrite=overwrite)
     return found
 
 
@@ -283,7 +277,6 @@ def _page(
         "findings.html.j2",
         title=title,
         made=made,
-        software=f"uwlts {__version__}",
         tiles=[tile for tile in _tiles(whole, parts) if tile.accent],
         facts=_facts(order, cloud, sources, found),
         conclusion=_conclude(listed, order),

@@ -8,10 +8,10 @@ import numpy as np
 from pydantic import JsonValue
 from scipy.spatial.transform import Rotation
 
-from uwlts.acceptance.accept import FORMAT as ACCEPTANCE_FORMAT, read_acceptance
-from uwlts.errors import CaptureError, DescriptionError
-from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT, EvaluationRecord, TruthComparisons, read_evaluation
-from uwlts.files.json_files import read_json, trusting
+from uwlts.acceptance.accept import Acceptance
+from uwlts.errors import CaptureError
+from uwlts.evaluation.evaluate import EvaluationRecord, TruthComparisons
+from uwlts.files.json_files import trusting
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import BoardFound, Mount, RingFound, SphereFound, StepFound
@@ -19,23 +19,18 @@ from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.pages.numbers import numbers_in
-from uwlts.storage.calibration_file import (
-    FORMAT as CALIBRATION_FORMAT,
-    POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT,
-    read_calibration,
-    read_polynomials,
-)
+from uwlts.report.any_file import read
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_readable_cloud, read_cloud
-from uwlts.storage.mount_files import FORMAT as MOUNT_FORMAT, read_mount
+from uwlts.storage.mesh_file import SurfaceMesh
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 
 @trusting
 def describe(path: str | Path, *, unit: Unit | None = None, trust_edited: bool = False) -> str:
-    """Describe a file: a capture, cloud, calibration, mount, evaluation, or a sensor description (by name or path).
+    """Describe a file that `read` reads, or a sensor description (by name or path).
 
     Parameters
     ----------
@@ -57,39 +52,38 @@ def describe(path: str | Path, *, unit: Unit | None = None, trust_edited: bool =
         The file is missing, damaged, or of another kind.
     """
     name, path = str(path), Path(path)
-    match [s for s in path.suffixes if s != ".part"]:
-        case [*_, ".truth", ".h5"]:
-            lines = truth_lines(*read_truth(path))
-        case _ if is_readable_cloud(path):
-            lines = cloud_lines(read_cloud(path, unit=unit))
-        case [*_, ".h5"]:
-            with Capture(path) as capture:
-                lines = capture_lines(capture)
-        case [*_, ".json"]:
-            lines = _json_lines(path)
-        case [] | [*_, ".toml"]:
-            lines = sensor_lines(load_sensor(name))
-        case _:
-            raise DescriptionError(f"{path}: expected a capture, cloud, .json or .toml file, or the name of a sensor")
+    endings = [each for each in path.suffixes if each != ".part"]
+    if not endings or endings[-1] == ".toml":
+        lines = sensor_lines(load_sensor(name))
+    elif endings[-2:] == [".truth", ".h5"]:
+        lines = truth_lines(*read_truth(path))
+    elif is_readable_cloud(path):
+        lines = cloud_lines(read_cloud(path, unit=unit))
+    else:
+        try:
+            lines = _lines_of(read(path, unit=unit))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise CaptureError(f"{path} is damaged: a value is missing or not a number ({error})") from error
     return "\n".join(lines)
 
 
-def _json_lines(path: Path) -> list[str]:
-    found = read_json(path, called="file of this program").get("format")
-    try:
-        if found == CALIBRATION_FORMAT:
-            return calibration_lines(read_calibration(path))
-        if found == POLYNOMIAL_FORMAT:
-            return polynomial_lines(read_polynomials(path))
-        if found == EVALUATION_FORMAT:
-            return evaluation_lines(read_evaluation(path))
-        if found == ACCEPTANCE_FORMAT:
-            return read_acceptance(path).lines()
-        if found == MOUNT_FORMAT:
-            return mount_lines(read_mount(path))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CaptureError(f"{path} is damaged: a value is missing or not a number ({error})") from error
-    raise CaptureError(f"{path} is no calibration, mount, evaluation or acceptance test: format is {found!r}")
+def _lines_of(found: object) -> list[str]:
+    match found:
+        case Capture():
+            with found:
+                return capture_lines(found)
+        case Calibration():
+            return calibration_lines(found)
+        case PolynomialCalibration():
+            return polynomial_lines(found)
+        case EvaluationRecord():
+            return evaluation_lines(found)
+        case Mount():
+            return mount_lines(found)
+        case Acceptance() | SurfaceMesh():
+            return found.lines()
+        case _:
+            return repr(found).splitlines()
 
 
 def capture_lines(capture: Capture) -> list[str]:

@@ -10,7 +10,6 @@ from typing import Annotated, Self
 
 from pydantic import ConfigDict, Field, computed_field, model_validator
 
-from uwlts._version import __version__
 from uwlts.errors import DescriptionError
 from uwlts.evaluation.decision import Verdict, judge_interval
 from uwlts.files.json_files import read_model, write_model
@@ -176,9 +175,7 @@ def write_measured(page: str | Path, measured: MeasuredValues, *, title: str, ov
     for path, ending in zip(paths, MEASURED_ENDINGS, strict=True):
         refuse_unsuitable(path, overwrite=overwrite, endings=(ending,))
     rows = [each.row() for each in measured.values]
-    text = render_page(
-        "uwlts.report", "measured.html.j2", title=title, software=f"uwlts {__version__}", columns=COLUMNS, rows=rows
-    )
+    text = render_page("uwlts.report", "measured.html.j2", title=title, columns=COLUMNS, rows=rows)
     write_model(paths[1], measured, file_format=FORMAT, version=VERSION, overwrite=overwrite)
     with write_atomically(paths[2], overwrite=overwrite) as aside:
         aside.write_text(measured.table(), encoding="utf-8")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 from markupsafe import Markup
-from pydantic import BaseModel, ConfigDict
 
 from uwlts._version import __version__
 from uwlts.calibration.model_comparison.comparison import (
@@ -28,14 +27,11 @@ from uwlts.calibration.model_comparison.held_out import (
     describe_distortion,
 )
 from uwlts.files.json_files import json_text
+from uwlts.model.sensor import Description
 from uwlts.pages.numbers import format_fixed, format_length
 from uwlts.pages.toolkit import MISSING, figure_svg, legend_below, new_figure, render_page, write_page
 
 _WAYS = (INSIDE, OUTSIDE)
-
-
-class _Content(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,7 @@ class HeldOutScore(Score):
     adds_std_mm: float | None
 
 
-class ModelRow(_Content):
+class ModelRow(Description):
     """The scores of a model, or the reason why it cannot be calibrated."""
 
     model: str
@@ -64,7 +60,7 @@ class ModelRow(_Content):
         return self.inside if where == INSIDE else self.outside
 
 
-class ModelComparisonContent(_Content):
+class ModelComparisonContent(Description):
     """All figures of a comparison as stored in its file, lengths in mm."""
 
     format: Literal["uwlts-models"]

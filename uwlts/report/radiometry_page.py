@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from uwlts._version import __version__
 from uwlts.errors import CaptureError
 from uwlts.pages.toolkit import (
     BLUE,
@@ -68,7 +67,6 @@ def write_radiometry(
             "uwlts.report",
             "radiometry.html.j2",
             title=title,
-            software=f"uwlts {__version__}",
             names=names,
             summary=radiometry.lines(),
             significant=f"{SIGNIFICANT:g}",

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from uwlts._version import __version__
 from uwlts.files.json_files import json_text
 from uwlts.pages.toolkit import BLUE, COLOURS, RED, figure_svg, new_figure, png_data_uri, render_page, write_page
 from uwlts.registration.register import RegisteredScans
@@ -47,7 +46,6 @@ def write_registration(
         "uwlts.report",
         "registration.html.j2",
         title=title,
-        software=f"uwlts {__version__}",
         first=registered.names[0],
         summary=[line for line in registered.lines() if not line.startswith("  open")],
         open_movements=[(registered.names[each.scan], each.describe()) for each in registered.open_movements],

@@ -4,11 +4,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from uwlts.evaluation.evaluate import TruthComparisons, TruthFigures
 from uwlts.evaluation.figures import Quantity
 from uwlts.files.json_files import write_record
+from uwlts.model.sensor import Description
 from uwlts.report.gather import CALIBRATION, GatheredCampaign, GatheredMeasurement, Reference
 
 KEY_FIGURES = {
@@ -22,20 +22,14 @@ KEY_FIGURES = {
 """Key figures by name: heading, kind of artefact (None: any) and quantity; details are excluded."""
 
 
-class _Stored(BaseModel):
-    """Base of the summary's content; values that were not measured are None or empty."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class KeyFigure(_Stored):
+class KeyFigure(Description):
     """The largest error or the published errors of every measurement, and the mean of their absolute values."""
 
     mean_abs: float | None
     by_measurement: Mapping[str, float | tuple[float, ...]]
 
 
-class _KeyFigures(_Stored):
+class _KeyFigures(Description):
     """The figures of `KEY_FIGURES`."""
 
     sphere_spacing_error_mm: KeyFigure
@@ -50,7 +44,7 @@ class _KeyFigures(_Stored):
         return getattr(self, key)
 
 
-class PooledTruth(_Stored):
+class PooledTruth(Description):
     """Fraction within the tolerance and rms distance over all points; None without points or if tolerances differ."""
 
     tolerance_mm: float | None = None
@@ -65,14 +59,14 @@ class TruthSummary(PooledTruth):
     by_measurement: dict[str, TruthComparisons]
 
 
-class WindowDistance(_Stored):
+class WindowDistance(Description):
     """Distance of the camera's window in mm as calibrated, and as set in the twin."""
 
     estimated: float | None
     true: float | None
 
 
-class PointCount(_Stored):
+class PointCount(Description):
     """Numbers of points of an evaluation."""
 
     total: int
@@ -86,28 +80,22 @@ class CalibrationSummary(_KeyFigures):
     truth: TruthSummary
 
 
-class _Title(_Stored):
-    title: str
-
-
-class PublishedSummary(_KeyFigures, _Title):
+class PublishedSummary(_KeyFigures):
     """Published key figures of the measurements, by the names used in the reference."""
 
+    title: str
     window_distance_mm: tuple[float, ...]
 
 
-class _Names(_Stored):
-    campaign: str
-    calibration: str | None
-
-
-class Summary(_KeyFigures, _Names):
+class Summary(_KeyFigures):
     """Key figures of a campaign.
 
     Top-level figures are for measurements made with the campaign's main ``calibration``; others are in
     ``other_calibrations``. ``seconds`` is the time of each stage.
     """
 
+    campaign: str
+    calibration: str | None
     window_distance_mm: WindowDistance
     truth: TruthSummary
     points: dict[str, PointCount]

@@ -76,12 +76,14 @@ class SurfaceMesh(Brief):
 
     def lines(self) -> list[str]:
         """Return the summary as lines of text."""
-        std = np.quantile(self.std_mm, [0.5, 0.95])
         lines = [
             f"mesh                      {len(self.vertices_mm)} vertices, {len(self.faces)} triangles, "
-            f"{self.area_mm2():.5g} mm2",
-            f"standard uncertainty, mm  {std[0]:.4f} (median), {std[1]:.4f} (95 % of the vertices)",
+            f"{self.area_mm2():.5g} mm2"
         ]
+        # Meshes of other programs state none.
+        if self.std_mm.any():
+            std = np.quantile(self.std_mm, [0.5, 0.95])
+            lines.append(f"standard uncertainty, mm  {std[0]:.4f} (median), {std[1]:.4f} (95 % of the vertices)")
         if math.isfinite(self.cube_mm):
             lines.insert(1, f"cubes, patches            {self.cube_mm:.3g} mm, radius {self.radius_mm:.3g} mm")
             lines.append(f"points without a surface  {100 * self.left_out:.2f} %")

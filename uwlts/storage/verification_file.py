@@ -3,11 +3,12 @@
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict
+from pydantic import AwareDatetime
 
 from uwlts.files.json_files import read_model, write_model
 from uwlts.files.reading import is_regular_file
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest
+from uwlts.model.sensor import Description
 
 FORMAT, VERSION = "uwlts-verification", 1
 ENDING = ".verification.json"
@@ -15,10 +16,8 @@ _VALID = timedelta(days=1)
 """Validity of a verification, and of a new calibration: one day of use. Chosen by hand."""
 
 
-class VerificationRecord(BaseModel):
+class VerificationRecord(Description):
     """Verdict on a calibration, given by its digest, from a capture at a date; ``lines`` are the results as text."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     calibration: str
     date: AwareDatetime

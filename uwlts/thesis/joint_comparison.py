@@ -17,7 +17,6 @@ from typing import NamedTuple, get_args
 import numpy as np
 from matplotlib.figure import Figure
 
-from uwlts._version import __version__
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
@@ -272,8 +271,7 @@ def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, ove
         (medium, part, _rows(part), figure_svg(_errors_figure(results, medium)))
         for medium, part in summary.media().items()
     ]
-    software = f"uwlts {__version__}"
-    text = render_page("uwlts.thesis", "joint.html.j2", software=software, summary=summary, media=media, words=_WORDS)
+    text = render_page("uwlts.thesis", "joint.html.j2", summary=summary, media=media, words=_WORDS)
     with (
         write_atomically(folder / "report.html", overwrite=overwrite) as page,
         write_atomically(folder / "summary.json", overwrite=overwrite) as aside,

@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from uwlts._version import __version__
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.pages.toolkit import (
@@ -224,7 +223,6 @@ def report_page(
         held_by_budget=sum(abs(each.observed_mm) <= results[n].budget.get("expanded", -1.0) for n, each in intervals),
         failures=[(number, m) for number, result in enumerate(results) for m in result.measurements if m.failure],
         pictures=_pictures(folder),
-        version=__version__,
     )
 
 

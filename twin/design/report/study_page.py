@@ -12,7 +12,6 @@ from twin.design.designs import Columns, HighlightedDesign
 from twin.design.report import charts, drawing, study_tables as tables
 from twin.design.study import Study
 from twin.design.verification import Agreement
-from uwlts._version import __version__
 from uwlts.errors import Error
 from uwlts.pages.toolkit import FigureCollector, figure_svg, render_page
 
@@ -70,7 +69,6 @@ def page_text(
         failures=tables.failure_counts(judged),
         misses=tables.miss_counts(judged),
         working=int(judged.works.sum()),
-        version=__version__,
     )
 
 
