@@ -133,7 +133,7 @@ def find_exposure(
 
 _TRIES = 3
 _RETRIED_S = 5.0
-"""An image whose frame is lost in transfer is taken again until both are exceeded: so many attempts, and this time. A
+"""An image whose frame is lost in transfer is taken again until both limits are exceeded, in attempts and in s. A
 busy computer can lose several frames in a fraction of a second; the stage is at rest, so a later image is as good."""
 _PATIENCE_S = 3.0
 """Longest wait for a frame beyond its exposure, long enough for several repetitions of a lost GigE command. The laser
