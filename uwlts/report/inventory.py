@@ -23,9 +23,10 @@ from uwlts.report.any_file import read
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_readable_cloud, read_cloud
+from uwlts.storage.hdf5_file import read_format
 from uwlts.storage.mesh_file import SurfaceMesh
 from uwlts.storage.number_tables import Unit
-from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
+from uwlts.storage.truth import FORMAT as TRUTH, Truth, TruthHeader, TruthStatus, read_truth
 
 
 @trusting
@@ -55,7 +56,7 @@ def describe(path: str | Path, *, unit: Unit | None = None, trust_edited: bool =
     endings = [each for each in path.suffixes if each != ".part"]
     if not endings or endings[-1] == ".toml":
         lines = sensor_lines(load_sensor(name))
-    elif endings[-2:] == [".truth", ".h5"]:
+    elif endings[-2:] == [".truth", ".h5"] or (endings[-1] == ".h5" and read_format(path) == TRUTH):
         lines = truth_lines(*read_truth(path))
     elif is_readable_cloud(path):
         lines = cloud_lines(read_cloud(path, unit=unit))
