@@ -104,7 +104,7 @@ def light() -> list[Row]:
 
 def campaign() -> list[Row]:
     """Speed of a campaign of the thesis: record it, calibrate jointly from it, and measure with it on one core."""
-    from tests.bench.calibration import joint_calibration, measuring_rate
+    from tests.bench.calibration import joint_calibration, measuring_rate, stripes_scaling
     from tests.bench.floors import connected_parts_seconds, line_maxima_seconds, stock_frame_seconds
     from tests.bench.light import campaign as recorded
     from uwlts.storage.capture import Capture
@@ -116,6 +116,7 @@ def campaign() -> list[Row]:
         calibration, images, finding, estimating = joint_calibration([target, in_water], steps)
         cv2.setNumThreads(1)
         by_stage, by_path = measuring_rate([folder / "13.h5", folder / "14.h5"], calibration)
+        scaling = stripes_scaling(folder / "13.h5")
         with Capture(target) as capture:
             labelled = connected_parts_seconds(capture.image(0))
         with Capture(folder / "13.h5") as capture:
@@ -130,6 +131,7 @@ def campaign() -> list[Row]:
         at_most("joint calibration: the estimate", estimating, "s", 3),
         at_least("spheres in water: stripes, points and their covariance", by_stage, "frames/s", 1000, of_lines),
         at_least("the same along a trajectory", by_path, "frames/s", 1000, of_lines),
+        at_least(f"stripes of a scan: speed of {CORES} processors relative to one", scaling, "times", 1.9),
     ]
 
 
