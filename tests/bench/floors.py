@@ -27,7 +27,7 @@ WINDOW_PX = 20
 """Pixels on either side of a line's brightest block in a plain centroid: the extraction's window."""
 
 BLOCK_PX = 8
-"""Pixels of a block, of which only the brightest is searched: the extraction's blocks."""
+"""Pixels of a block along a line: the extraction's blocks."""
 
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 
