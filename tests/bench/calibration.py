@@ -1,11 +1,14 @@
 """Time of the joint calibration and of measuring with it, on the captures of a campaign of `tests.bench.light`."""
 
+import os
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 
+from tests.bench.rows import median_seconds
 from tests.uwlts.mount_views import known_mount
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
@@ -55,14 +58,35 @@ def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibrati
         return calibration, images, found - start, time.perf_counter() - found
 
 
+@contextmanager
+def one_processor() -> Iterator[None]:
+    """Restrict this thread, and the threads that it starts, to one processor."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def stripes_scaling(scan: Path) -> float:
+    """Return the speed of finding the stripes of a scan's images in memory, relative to that of one processor."""
+    with Capture(scan) as capture:
+        images = _InMemory(capture, AS_OFTEN)
+        with one_processor():
+            alone = median_seconds(lambda k: find_stripes(images))
+        return alone / median_seconds(lambda k: find_stripes(images))
+
+
 def measuring_rate(scans: list[Path], calibration: Calibration) -> tuple[float, float]:
-    """Return frames per second from images in memory to points with covariance, for scans after a first one.
+    """Return frames per second on one processor, from images in memory to points with covariance, after a first scan.
 
     The two values are medians over the scans: with the stage's positions, and with `AS_OFTEN` times as many images
     along a trajectory of known covariance with a mount.
     """
     mount = known_mount(np.eye(4), time_offset_s=0.0, time_offset_std_s=1e-4)
     with ExitStack() as stack:
+        stack.enter_context(one_processor())
         opened = [stack.enter_context(Capture(path)) for path in scans]
         by_stage, by_path = [], []
         for images in [_InMemory(each) for each in opened] * 12:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import cv2
@@ -22,36 +23,65 @@ from twin.rendering_options import Options
 from twin.scene.description import load_scene
 from uwlts.model.library import load_sensor
 
-WINDOW_PX = 16
-"""Pixels on either side of a line's maximum in a plain centroid."""
+WINDOW_PX = 20
+"""Pixels on either side of a line's brightest block in a plain centroid: the extraction's window."""
+
+BLOCK_PX = 8
+"""Pixels of a block along a line: the extraction's blocks."""
+
+_FASTMATH = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 
 
 def line_maxima_seconds(image: np.ndarray, stripe_along: str) -> float:
-    """Median seconds of NumPy's maximum along the profile lines of an image (H, W)."""
+    """Median seconds of processor time of NumPy's maximum along the profile lines of an image (H, W)."""
     axis = 1 if stripe_along == "height" else 0
-    return median_seconds(lambda k: image.max(axis=axis), runs=101)
+    return median_seconds(lambda k: image.max(axis=axis), runs=101, clock=time.process_time)
 
 
 def plain_centroid_seconds(image: np.ndarray, stripe_along: str) -> float:
-    """Median seconds of a compiled centroid about the maximum of each profile line of an image (H, W)."""
-    lines = np.ascontiguousarray(image if stripe_along == "height" else image.T)
-    return median_seconds(lambda k: _centroids(lines, WINDOW_PX), runs=101)
+    """Median seconds of processor time of a compiled centroid about the maximum of each line of an image (H, W).
+
+    It returns what an extraction returns: centre, amplitude, width, and whether there is a stripe. But it assumes one
+    stripe on each line and a constant background, and estimates no noise.
+    """
+    count = image.shape[0 if stripe_along == "height" else 1]
+    result = np.empty((3, count), np.float32), np.empty(count, np.bool_)
+
+    def run(k: int) -> None:
+        profiles = cv2.transpose(image) if stripe_along == "height" else image
+        highest = np.empty((-(-len(profiles) // BLOCK_PX), count), image.dtype)
+        _centroids(profiles, highest, BLOCK_PX, WINDOW_PX, *result)
+
+    return median_seconds(run, runs=101, clock=time.process_time)
 
 
-@njit(nogil=True)
-def _centroids(lines: np.ndarray, reach: int) -> np.ndarray:
-    result = np.empty(lines.shape[0])
-    for line in range(lines.shape[0]):
-        pixels, highest = lines[line], 0
+@njit(nogil=True, error_model="numpy", fastmath=_FASTMATH)
+def _centroids(
+    profiles: np.ndarray, highest: np.ndarray, block: int, reach: int, measured: np.ndarray, found: np.ndarray
+) -> None:
+    """Measure lines of profiles (N, L): maxima of blocks in the order of memory, then moments about the best block."""
+    for n in range(profiles.shape[0]):
+        row, pixels = highest[n // block], profiles[n]
         for k in range(pixels.size):
-            if pixels[k] > pixels[highest]:
-                highest = k
-        total, moment = 0.0, 0.0
-        for k in range(max(highest - reach, 0), min(highest + reach + 1, pixels.size)):
-            total += pixels[k]
-            moment += k * pixels[k]
-        result[line] = moment / max(total, 1.0)
-    return result
+            row[k] = pixels[k] if n % block == 0 else max(row[k], pixels[k])
+    best, place = np.zeros(found.size, profiles.dtype), np.zeros(found.size, np.uint16)
+    for number in range(highest.shape[0]):
+        row = highest[number]
+        for k in range(row.size):
+            place[k] = np.uint16(number) if row[k] > best[k] else place[k]
+            best[k] = max(best[k], row[k])
+    for k in range(found.size):
+        first = max(int(place[k]) * block + block // 2 - reach, 0)
+        end = min(first + 2 * reach, profiles.shape[0])
+        ground = np.float32(0.5) * (np.float32(profiles[first, k]) + np.float32(profiles[end - 1, k]))
+        total, moment, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for n in range(first, end):
+            light, u = np.float32(profiles[n, k]) - ground, np.float32(n - first)
+            total, moment, square = total + light, moment + light * u, square + light * u * u
+        middle = moment / max(total, np.float32(1.0))
+        variance = max(square / max(total, np.float32(1.0)) - middle * middle, np.float32(0.0))
+        measured[0, k], measured[1, k], measured[2, k] = first + middle, best[k] - ground, np.sqrt(variance)
+        found[k] = best[k] > ground + np.float32(10.0)
 
 
 def stored_image_seconds(image: np.ndarray) -> float:

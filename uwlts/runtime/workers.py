@@ -133,9 +133,12 @@ def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) ->
     """Iterate over items and ``function(item)``, in order, computed in one thread per processor.
 
     For functions that spend their time outside the interpreter, in OpenCV, NumPy or compiled code. Items are taken in
-    this thread, shortly before their turn. Exceptions of the function are raised here.
+    this thread, shortly before their turn. Exceptions of the function are raised here. With one processor, this thread
+    does all the work.
     """
-    threads = count_processors()
+    if (threads := count_processors()) == 1:
+        yield from ((item, function(item)) for item in items)
+        return
     with ThreadPoolExecutor(threads) as pool:
         waiting: deque[tuple[Item, Future[Result]]] = deque()
         for item in items:

@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 
 from uwlts.errors import CaptureError, ImageError
-from uwlts.model.stripe import CaptureStripes, StripeStatus
+from uwlts.model.stripe import CaptureStripes, Stripe, StripeStatus
 from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.runtime.workers import map_in_threads
 from uwlts.stripe.exposures import BracketImages, fuse_brackets
 from uwlts.stripe.extract import direct_stripe_in
 from uwlts.stripe.options import StripeOptions, StripeSettings
@@ -48,6 +49,9 @@ def find_stripes(
     longest exposure, and amplitudes in its grey levels. Under the default rule `PeakRule.DIRECT`, reflections are
     removed (`uwlts.stripe.direct`).
 
+    One thread reads the images, and one thread per processor extracts stripes. A few images are in memory at a time,
+    and the result does not depend on the number of processors.
+
     Parameters
     ----------
     capture
@@ -67,8 +71,10 @@ def find_stripes(
     found: list[tuple[np.ndarray, ...]] = []
     numbers: list[int] = []
 
-    for number, seen, saturation in fuse_brackets(capture):
-        stripe = direct_stripe_in(seen, stripe_along=along, options=chosen, saturation=saturation)
+    def extract(place: tuple[int, np.ndarray | Stripe, float]) -> Stripe:
+        return direct_stripe_in(place[1], stripe_along=along, options=chosen, saturation=place[2])
+
+    for (number, _, _), stripe in map_in_threads(extract, fuse_brackets(capture)):
         numbers.append(number)
         good = stripe.lines
         of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))

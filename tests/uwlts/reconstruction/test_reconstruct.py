@@ -106,6 +106,18 @@ def test_stripes_are_those_of_the_laser_images(path):
     assert stripes.lines_by_status["ok"] == len(stripes.line)
 
 
+def test_stripes_do_not_depend_on_the_number_of_threads(path, monkeypatch):
+    found = []
+    for processors in (1, 4):
+        monkeypatch.setattr("uwlts.runtime.workers.count_processors", lambda count=processors: count)
+        with Capture(path) as capture:
+            found.append(find_stripes(capture))
+    alone, together = found
+    assert len(alone.line) > 3 * (WIDTH - 20) and alone.lines_by_status == together.lines_by_status
+    for name in ("frame", "line", "centre_px", "amplitude", "width_px"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(together, name), strict=True)
+
+
 def test_options_reach_the_extraction(path):
     with Capture(path) as capture:
         assert len(find_stripes(capture).line) > 400

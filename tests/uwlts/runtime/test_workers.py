@@ -14,7 +14,7 @@ import pytest
 from uwlts.errors import CaptureError, SetupError
 from uwlts.files.writing import write_atomically
 from uwlts.runtime import workers
-from uwlts.runtime.workers import run_jobs
+from uwlts.runtime.workers import map_in_threads, run_jobs
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -186,3 +186,33 @@ def test_workers_do_linear_algebra_in_one_thread_unless_set_otherwise(monkeypatc
     assert run_jobs(threads, [0, 1], workers=2) == [("1", "3")] * 2
     assert "OPENBLAS_NUM_THREADS" not in os.environ
     assert os.environ["OMP_NUM_THREADS"] == "3"
+
+
+@pytest.mark.parametrize("processors", [1, 3])
+def test_threads_take_few_items_ahead_and_end_at_an_interrupt(monkeypatch, processors: int):
+    """A capture of any length must not be read into memory while its first images are processed."""
+    monkeypatch.setattr(workers, "count_processors", lambda: processors)
+    taken, begun = [], []
+
+    def items():
+        for number in range(1000):
+            taken.append(number)
+            yield number
+
+    def work(number):
+        begun.append(number)
+        if number == 20:
+            raise CaptureError("20")
+        return number * number
+
+    for number, result in (results := map_in_threads(work, items())):
+        assert result == number * number
+        assert len(taken) <= number + 2 + processors
+        if number == 10:
+            break
+    with pytest.raises(KeyboardInterrupt):
+        results.throw(KeyboardInterrupt)
+    assert set(begun) <= set(taken) and len(taken) <= 12 + processors
+    with pytest.raises(CaptureError, match="20"):
+        list(map_in_threads(work, range(1000)))
+    assert 30 not in begun
