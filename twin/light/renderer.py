@@ -199,7 +199,7 @@ class Renderer:
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
         # Pose, and cells of the first laser's stripe and of all lit pixels in the last frame, for the ground truth.
         self._last_stripe: tuple[SensorPose, np.ndarray, np.ndarray] | None = None
-        # What the nodes of that pose showed, until its frame is rendered, and the light of its lines afterwards.
+        # Light at the nodes of that pose until its frame is rendered, and afterwards the light of its lines.
         self._nodes: _Nodes | None = None
         self._last_lines: tuple[SensorPose, SurfaceLines, int, LineLight] | None = None
 
