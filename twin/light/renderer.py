@@ -100,8 +100,8 @@ class SurfaceLines:
 
     def planes(self, line: np.ndarray) -> np.ndarray:
         """Return normals and offsets (N, 4) of the planes through the points of lines (N,)."""
-        offset = np.sum(self.normals[line] * self.points_mm[line], axis=1, keepdims=True)
-        return np.concatenate([self.normals[line], offset], axis=1)
+        offset = np.sum(self.normals * self.points_mm, axis=1, keepdims=True)
+        return np.concatenate([self.normals, offset], axis=1).astype(np.float32)[line]
 
 
 class LineLight(NamedTuple):
