@@ -564,7 +564,8 @@ class Renderer:
     ) -> Callable[[], np.ndarray]:
         """Render the stripe; return a function that fetches the means (K, P) of `_stripe_sums` over pixels.
 
-        Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples.
+        Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples. These are too few for the
+        light of ``lines``.
         """
         count = _STRIPE_SUMS if lines is None else _STRIPE_SUMS + _LINE_SUMS
 
@@ -578,7 +579,7 @@ class Renderer:
             return lambda: np.concatenate([np.zeros((count, 0), np.float32), *(means() for means in found)], axis=1)
 
         everywhere, all_lines = np.arange(len(rows)), self.sensor.camera.lines()
-        if len(rows) < _WIDE_PX * all_lines or spp < _LEAST_SPP * _FEWER_SAMPLES:
+        if lines is not None or len(rows) < _WIDE_PX * all_lines or spp < _LEAST_SPP * _FEWER_SAMPLES:
             return start(everywhere, spp)
         sums = start(everywhere, spp // _FEWER_SAMPLES)()
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
