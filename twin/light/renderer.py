@@ -564,8 +564,8 @@ class Renderer:
     ) -> Callable[[], np.ndarray]:
         """Render the stripe; return a function that fetches the means (K, P) of `_stripe_sums` over pixels.
 
-        Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples. These are too few for the
-        light of ``lines``.
+        Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples, unless the light of
+        ``lines`` needs all.
         """
         count = _STRIPE_SUMS if lines is None else _STRIPE_SUMS + _LINE_SUMS
 
