@@ -1,8 +1,11 @@
 """Speed of making data sets."""
 
+import resource
 import tempfile
 import time
 from pathlib import Path
+
+import numpy as np
 
 import twin
 
@@ -10,16 +13,22 @@ FEW, MANY = 32, 96
 """Scenes of two runs: the difference leaves out the start of the processes."""
 
 
-def rate_hz(*, workers: int) -> float:
-    """Frames per second of the preset `stripe-clean`."""
+def measure_frames(*, workers: int) -> tuple[float, float]:
+    """Return frames per second of the preset `stripe-clean`, and the processor time of a frame in s."""
     with tempfile.TemporaryDirectory() as name:
-        runs = [_made(Path(name, str(scenes)), scenes, workers) for scenes in (FEW, MANY)]
-    seconds, frames = zip(*runs, strict=True)
-    return (frames[1] - frames[0]) / (seconds[1] - seconds[0])
+        few, many = (_make(Path(name, str(scenes)), scenes, workers) for scenes in (FEW, MANY))
+    seconds, processor_s, frames = np.subtract(many, few)
+    return frames / seconds, processor_s / frames
 
 
-def _made(folder: Path, scenes: int, workers: int) -> tuple[float, int]:
-    """Record ``scenes`` scenes; return the seconds taken and the number of frames."""
-    start = time.perf_counter()
+def _make(folder: Path, scenes: int, workers: int) -> tuple[float, float, int]:
+    """Record ``scenes`` scenes; return the time taken and the processor time in s, and the number of frames."""
+    start = time.perf_counter(), _processor_s()
     twin.dataset("stripe-clean", out=folder, scenes=scenes, workers=workers)
-    return time.perf_counter() - start, len(twin.load_dataset(folder))
+    return time.perf_counter() - start[0], _processor_s() - start[1], len(twin.load_dataset(folder))
+
+
+def _processor_s() -> float:
+    """Return the processor time of this process and its ended children in s."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in used)

@@ -33,20 +33,24 @@ def stripe_noise(images: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(np.mean((images - truth)[:, stripe] ** 2)) / truth.max())
 
 
-def recorded_frame(water: str) -> float:
-    """Median seconds from one recorded frame of two spheres to the next: all effects, detector, truth and disk."""
+def recorded_frame(water: str) -> tuple[float, float]:
+    """Return the median seconds from one recorded frame of two spheres to the next, and of processor time.
+
+    The frames have all effects, detector, truth and disk.
+    """
     sensor = in_named_water(water)
     motion = {"start_mm": -0.5 * SEEDS, "step_mm": 1.0, "count": SEEDS + 2}
-    moments: list[float] = []
+    moments: list[tuple[float, float]] = []
     with tempfile.TemporaryDirectory() as folder:
         record_scene(
             load_scene("spheres", motion=motion),
             sensor,
             Path(folder, "spheres.h5"),
             options=Options(spp=SPP),
-            progress=lambda done, total: moments.append(time.perf_counter()),
+            progress=lambda done, total: moments.append((time.perf_counter(), time.process_time())),
         )
-    return float(np.median(np.diff(moments)[1:]))
+    seconds, processor_s = np.median(np.diff(moments, axis=0)[1:], axis=0)
+    return float(seconds), float(processor_s)
 
 
 def in_named_water(water: str) -> Sensor:

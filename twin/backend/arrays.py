@@ -22,6 +22,7 @@ Int32: TypeAlias = Any
 Point2f: TypeAlias = Any
 Point3f: TypeAlias = Any
 Vector3f: TypeAlias = Any
+Vector4f: TypeAlias = Any
 SurfaceInteraction3f: TypeAlias = Any
 PCG32: TypeAlias = Any
 BSDFPtr: TypeAlias = Any

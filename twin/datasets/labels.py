@@ -87,22 +87,15 @@ def _line_labels(
     studio: SensorSimulator, shot: Shot, taken: SimulatedImage, noise: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return all labels of the profile lines of a shot."""
-    from twin.recording.frame_truth import (
-        find_crossings,
-        make_empty_truth,
-        measure_line_light,
-        select_brightest,
-        sort_lit_crossings,
-    )
+    from twin.recording.frame_truth import make_empty_truth, select_brightest, sort_lit_crossings
 
     camera, detector = studio.sensor.camera, studio.sensor.detector
     count, truth, number = camera.lines(), make_empty_truth(camera.lines()), np.full(camera.lines(), -1, np.int16)
     status = np.full(count, LineStatus.LASER_OFF, np.uint8)
     if studio.shows(shot, "laser"):
-        pose, travel = studio.pose(shot), studio.travel(shot)
-        found = find_crossings(studio.renderer, pose, travel=travel)
+        found = studio.crossings(shot)
         truth, order = select_brightest(found, count), sort_lit_crossings(found)
-        truth = measure_line_light(studio.renderer, pose, truth, spp=studio.options.spp, travel=travel)
+        truth = studio.measure_line_light(shot, truth)
         number[found.line[order]] = found.thing[order]
         status[:] = LineStatus.NOT_CROSSED
         status[found.line] = LineStatus.SHADOWED

@@ -15,13 +15,14 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, Point3f, begin_kernels, opaque, to_jit
+from twin.backend.arrays import Float, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
 from twin.light.caustics import CELLS, PATCH_MM, Caustics
 from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
@@ -72,8 +73,48 @@ _DRIFTING_STREAM = 7
 """Random number stream of particles and bubbles, separate from those of walks and noise."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor moves, lit pixels are located at positions of this spacing."""
+_STRIPE_SUMS, _LINE_SUMS = 3, 3
+"""Numbers of means of the stripe, and of the lines' light."""
 _REACH_SHARE = 1.5
 """Largest distance of visible surfaces from the OCS's origin, divided by the stand-off (approximate)."""
+
+
+class _Nodes(NamedTuple):
+    """Haze (H, W) in W/mm2 and images of lit surfaces (`LightSources`) that the nodes of a pose show."""
+
+    haze: np.ndarray
+    surfaces: list[np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceLines:
+    """Surface point in scene coordinates of each profile line, NaN for none, and the unit normal there, (L, 3)."""
+
+    points_mm: np.ndarray
+    normals: np.ndarray
+
+    def equals(self, other: SurfaceLines) -> bool:
+        """Return whether points and normals equal those of ``other``."""
+        pairs = (self.points_mm, other.points_mm), (self.normals, other.normals)
+        return all(np.array_equal(mine, theirs, equal_nan=True) for mine, theirs in pairs)
+
+    def planes(self, line: np.ndarray) -> np.ndarray:
+        """Return normals and offsets (N, 4) of the planes through the points of lines (N,)."""
+        offset = np.sum(self.normals * self.points_mm, axis=1, keepdims=True)
+        return np.concatenate([self.normals, offset], axis=1).astype(np.float32)[line]
+
+
+class LineLight(NamedTuple):
+    """Direct light of the first laser in the pixels of profile lines with a point.
+
+    ``rows`` and ``columns`` (P,) are the pixels. ``means`` (3, P) are means over each pixel: irradiance in W/mm2 from
+    all surfaces, and from others than the line's; and the density of the sheet's normalised profile on the line's
+    surface, in 1/mm of distance from the sheet.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    means: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -158,6 +199,9 @@ class Renderer:
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
         # Pose, and cells of the first laser's stripe and of all lit pixels in the last frame, for the ground truth.
         self._last_stripe: tuple[SensorPose, np.ndarray, np.ndarray] | None = None
+        # Light at the nodes of that pose until its frame is rendered, and afterwards the light of its lines.
+        self._nodes: _Nodes | None = None
+        self._last_lines: tuple[SensorPose, SurfaceLines, int, LineLight] | None = None
 
     def irradiance(
         self,
@@ -207,22 +251,29 @@ class Renderer:
         seed: int = 0,
         travel: Travel | None = None,
         through_water: Travel | None = None,
+        lines: SurfaceLines | None = None,
     ) -> LaserFrame:
         """Return the light of the laser on the image sensor; see `irradiance`.
 
-        ``through_water`` is the motion of the sensor relative to the water and its particles; None: at rest.
+        ``through_water`` is the motion of the sensor relative to the water and its particles; None: at rest. ``lines``
+        are the points and normals of `line_light`, which is then measured in the same pass and needs no time later.
         """
-        begin_kernels()
         pose = SensorPose(scene_from_object, travel)
+        _, lit = self._locate_stripe(pose, again=self._nodes is None)
+        assert self._nodes is not None
+        haze, surfaces = self._nodes
+        self._nodes = None
+        begin_kernels()
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
-        lit, haze, surfaces = self._laser_nodes(pose, direct, mirrored)
         rows, columns = find_marked(self._expand_cells(lit))
-        stripe_means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp)
+        stripe_means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp, lines=lines)
         walker, walked = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm), None
         if walker.finds_light:
             walks = math.ceil(spp * self._walks_per_sample)
             walked = IndirectLight(self.view, walker, lit, seed=seed, walks=walks)
-        stripe, polarised, rough = stripe_means()
+        stripe, polarised, rough, *of_lines = stripe_means()
+        if lines is not None:
+            self._last_lines = pose, lines, spp, self._select_lines(lines, rows, columns, np.array(of_lines))
         longer = None
         if walked is not None:
             image = np.zeros_like(haze)
@@ -264,11 +315,15 @@ class Renderer:
         """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
         return find_marked(self._expand_cells(self._locate_stripe(pose)[0]))
 
-    def _locate_stripe(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
-        """Return cells that the first laser's stripe meets, and cells that light of any stripe reaches."""
-        if self._last_stripe is None or not pose.equals(self._last_stripe[0]):
-            self._laser_nodes(pose, *make_lights(self._sheets, pose, self._mirrors))
-        assert self._last_stripe is not None
+    def _locate_stripe(self, pose: SensorPose, *, again: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Return cells that the first laser's stripe meets, and cells that light of any stripe reaches.
+
+        They are known for the last pose, unless the nodes are wanted ``again``.
+        """
+        if again or self._last_stripe is None or not pose.equals(self._last_stripe[0]):
+            begin_kernels()
+            own, lit, self._nodes = self._laser_nodes(pose, *make_lights(self._sheets, pose, self._mirrors))
+            self._last_stripe = pose, own, lit
         return self._last_stripe[1:]
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
@@ -277,55 +332,38 @@ class Renderer:
         segment = next(self._segments(pose, bundle, after_s))
         return segment.weight * self._radiance(pose, segment, direct, after_s), segment
 
-    def render_line_light(
-        self, pose: SensorPose, points_mm: np.ndarray, normals: np.ndarray, *, spp: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Render the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
+    def render_line_light(self, pose: SensorPose, lines: SurfaceLines, *, spp: int) -> LineLight:
+        """Return the first laser's light on directly visible surfaces, and how much of it is on the lines' surfaces.
 
         Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet
-        of the plane through its point.
+        of the plane through its point. It is known if the last frame was rendered with the same arguments.
 
         Parameters
         ----------
         pose
             Pose of the sensor, with its motion.
-        points_mm, normals : (L, 3)
-            Surface point of each profile line in scene coordinates, NaN for none, and the unit normal there.
+        lines
+            Surface points and normals of the profile lines.
         spp
             Number of samples per pixel.
-
-        Returns
-        -------
-        ndarray, ndarray
-            Rows and columns (P,) of pixels on lines with a point.
-        ndarray
-            Means (3, P) over each pixel: irradiance in W/mm2 from all surfaces, and from others than the line's; and
-            the density of the sheet's normalised profile on the line's surface, in 1/mm of distance from the sheet.
         """
+        if self._last_lines is not None:
+            known_pose, known_lines, known_spp, light = self._last_lines
+            if known_spp == spp and pose.equals(known_pose) and known_lines.equals(lines):
+                return light
         rows, columns = find_marked(self._expand_cells(self._locate_stripe(pose)[1]))
-        along_width = self.sensor.camera.stripe_along == "width"
-        known = np.isfinite(points_mm[columns if along_width else rows, 0])
-        rows, columns, found = rows[known], columns[known], [np.zeros((3, 0), np.float32)]
-        (light, *_), _ = make_lights(self._sheets[:1], pose)
+        direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
+        means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp, lines=lines)()
+        return self._select_lines(lines, rows, columns, means[_STRIPE_SUMS:])
 
-        def sums(pose: SensorPose, bundle: Rays, after_s: Float | None, planes: Float) -> tuple[Float, ...]:
-            segment = next(self._segments(pose, bundle, after_s))
-            here = light.evaluate(segment.end(), after_s)
-            value = segment.weight * self._radiance(pose, segment, [light], after_s, lobes=False)
-            pixel = dr.arange(mi.UInt32, dr.width(value)) // dr.opaque(mi.UInt32, spp)
-            plane = dr.gather(mi.Vector4f, planes, pixel)
-            away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
-            same = dr.abs(away) <= here.sigma_mm
-            profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm))
-            profile /= here.sigma_mm * math.sqrt(2 * math.pi)
-            return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
+    def _select_lines(self, lines: SurfaceLines, rows: np.ndarray, columns: np.ndarray, means: np.ndarray) -> LineLight:
+        """Return the light (3, P) of pixels on lines with a point."""
+        known = np.isfinite(lines.points_mm[self._line_numbers(rows, columns), 0])
+        return LineLight(rows[known], columns[known], means[:, known])
 
-        for part in _split_pixels(rows, columns, spp=spp):
-            line = part[along_width]
-            offset = np.sum(normals[line] * points_mm[line], axis=1, keepdims=True)
-            planes = to_jit(mi.Float, np.concatenate([normals[line], offset], axis=1))
-            found.append(self._render_pixels(sums, pose, *part, planes, spp=spp)())
-        return rows, columns, np.concatenate(found, axis=1)
+    def _line_numbers(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the profile lines (P,) of pixels."""
+        return columns if self.sensor.camera.stripe_along == "width" else rows
 
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
@@ -364,8 +402,8 @@ class Renderer:
 
     def _laser_nodes(
         self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
-    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Return cells (rows, columns) near the stripe, the haze (H, W) in W/mm2, and lit surfaces (`LightSources`)."""
+    ) -> tuple[np.ndarray, np.ndarray, _Nodes]:
+        """Return the cells (rows, columns) of the first laser's stripe and of all stripes, haze and lit surfaces."""
         bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
         lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
         own, reach = lit.copy(), np.zeros_like(lit, np.float32)
@@ -402,9 +440,7 @@ class Renderer:
                 lit |= near
             if moment is pose and dr.width(scattered) > 1:
                 image = self._expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)))
-        lit = dilate_cells(lit, reach)
-        self._last_stripe = pose, own, lit
-        return lit, image, [each.numpy().reshape(shape) for each in surfaces]
+        return own, dilate_cells(lit, reach), _Nodes(image, [each.numpy().reshape(shape) for each in surfaces])
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
@@ -461,7 +497,7 @@ class Renderer:
             changes[:] = True  # motion may change any pixel
         image = 0.25 * combine_corners(np.add, nodes)
 
-        def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None) -> tuple[Float]:
+        def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None, pixel: UInt32) -> tuple[Float]:
             return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
 
         for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
@@ -517,23 +553,33 @@ class Renderer:
     # --- pixels -------------------------------------------------------------------------------------------------------
 
     def _render_stripe(
-        self, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, sources: list[Light], *, spp: int
+        self,
+        pose: SensorPose,
+        rows: np.ndarray,
+        columns: np.ndarray,
+        sources: list[Light],
+        *,
+        spp: int,
+        lines: SurfaceLines | None = None,
     ) -> Callable[[], np.ndarray]:
-        """Render the stripe; return a function that fetches the means (3, P) of `_stripe_sums` over pixels.
+        """Render the stripe; return a function that fetches the means (K, P) of `_stripe_sums` over pixels.
 
-        Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples.
+        Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples, unless the light of
+        ``lines`` needs all.
         """
+        count = _STRIPE_SUMS if lines is None else _STRIPE_SUMS + _LINE_SUMS
 
         def start(where: np.ndarray, spp: int) -> Callable[[], np.ndarray]:
             found: list[Callable[[], np.ndarray]] = []
             for part in _split_pixels(rows[where], columns[where], spp=spp):
                 if found:
                     dr.sync_thread()  # limits memory to the samples of one part
-                found.append(self._render_pixels(self._stripe_sums, pose, *part, sources, spp=spp))
-            return lambda: np.concatenate([np.zeros((3, 0), np.float32), *(means() for means in found)], axis=1)
+                planes = None if lines is None else to_jit(mi.Float, lines.planes(self._line_numbers(*part)))
+                found.append(self._render_pixels(self._stripe_sums, pose, *part, sources, planes, spp=spp))
+            return lambda: np.concatenate([np.zeros((count, 0), np.float32), *(means() for means in found)], axis=1)
 
-        everywhere, lines = np.arange(len(rows)), self.sensor.camera.lines()
-        if len(rows) < _WIDE_PX * lines or spp < _LEAST_SPP * _FEWER_SAMPLES:
+        everywhere, all_lines = np.arange(len(rows)), self.sensor.camera.lines()
+        if lines is not None or len(rows) < _WIDE_PX * all_lines or spp < _LEAST_SPP * _FEWER_SAMPLES:
             return start(everywhere, spp)
         sums = start(everywhere, spp // _FEWER_SAMPLES)()
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
@@ -547,19 +593,49 @@ class Renderer:
         return lambda: sums
 
     def _stripe_sums(
-        self, pose: SensorPose, bundle: Rays, after_s: Float | None, sources: list[Light]
-    ) -> tuple[Float, Float, Float]:
+        self,
+        pose: SensorPose,
+        bundle: Rays,
+        after_s: Float | None,
+        pixel: UInt32,
+        sources: list[Light],
+        planes: Float | None,
+    ) -> tuple[Float, ...]:
         """Return irradiance per ray of surfaces seen directly or in mirrors, plain and weighted for speckle.
 
-        The weights are polarisation and roughness of the surfaces.
+        The weights are polarisation and roughness of the surfaces. With ``planes`` of the pixels' lines, `LineLight`
+        follows.
         """
         total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
-        for segment in self._segments(pose, bundle, after_s):
+        of_line: tuple[Float, ...] = ()
+        for index, segment in enumerate(self._segments(pose, bundle, after_s)):
             value = segment.weight * self._radiance(pose, segment, sources, after_s)
             total += value
             polarised += value * self.objects.polarisation(segment.si)
             rough += value * self.objects.roughness_um(segment.si)
-        return total, polarised, rough
+            if planes is not None and index == 0:
+                of_line = self._line_sums(pose, segment, after_s, sources, value, dr.gather(mi.Vector4f, planes, pixel))
+        return total, polarised, rough, *of_line
+
+    def _line_sums(
+        self,
+        pose: SensorPose,
+        segment: RaySegment,
+        after_s: Float | None,
+        sources: list[Light],
+        value: Float,
+        plane: Vector4f,
+    ) -> tuple[Float, Float, Float]:
+        """Return the samples of `LineLight`; ``value`` is the light of all ``sources`` on the segments' ends."""
+        light = sources[0]
+        if len(sources) > 1 or len(light.sheet.parts) > 1:
+            value = segment.weight * self._radiance(pose, segment, [light], after_s, lobes=False)
+        here = light.evaluate(segment.end(), after_s)
+        away = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), mi.Vector3f(segment.si.p)) - plane.w
+        same = dr.abs(away) <= here.sigma_mm
+        profile = dr.exp(-0.5 * dr.square(here.distance_mm / here.sigma_mm))
+        profile /= here.sigma_mm * math.sqrt(2 * math.pi)
+        return value, dr.select(same, 0.0, value), dr.select(same & (value > 0), profile, 0.0)
 
     def _render_pixels(
         self,
@@ -597,7 +673,7 @@ class Renderer:
         if pose.travel is not None:
             after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
         bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
-        values = light(pose, bundle, after_s, *rest)
+        values = light(pose, bundle, after_s, pixel, *rest)
         dr.eval(values)  # together: separate sums would trace the rays again
         sums = [dr.block_sum(value, spp) for value in values]
         dr.eval(sums)

@@ -9,7 +9,7 @@ import numpy as np
 from twin.backend.arrays import Float, UInt32, to_jit, to_numpy
 from twin.light.image_sampling import find_marked
 from twin.light.pose import SensorPose, Travel
-from twin.light.renderer import Renderer
+from twin.light.renderer import Renderer, SurfaceLines
 from uwlts.model.placement import camera_from_object
 from uwlts.storage.truth import TruthStatus
 
@@ -44,6 +44,10 @@ class FrameTruth:
     centroid_px: np.ndarray
     visible_fraction: np.ndarray
     mixed_fraction: np.ndarray
+
+    def surface_lines(self) -> SurfaceLines:
+        """Return points and normals of the profile lines."""
+        return SurfaceLines(self.point_mm, self.normal)
 
 
 def make_empty_truth(lines: int) -> FrameTruth:
@@ -91,7 +95,7 @@ def measure_line_light(
     if len(lines) == 0:
         return truth
     pose, centre = SensorPose(scene_from_object, travel), truth.centre_px[lines]
-    *pixels, values = renderer.render_line_light(pose, truth.point_mm, truth.normal, spp=spp)
+    *pixels, values = renderer.render_line_light(pose, truth.surface_lines(), spp=spp)
     line, across = pixels[::-1] if renderer.sensor.camera.stripe_along == "width" else pixels
     # Pixels across the stripe from its centre, of the visible lines only.
     offset, column = across - np.rint(truth.centre_px[line]).astype(int), np.searchsorted(lines, line)

@@ -112,8 +112,8 @@ def render(
     from twin.recording.sensor_simulator import SensorSimulator
 
     studio = SensorSimulator(built, described, options)
-    taken = [studio.frame(shot, number) for number, shot in shots]
-    truths = [studio.truth(shot) for _, shot in shots]
+    # The truth of each frame after its light, which it uses.
+    taken, truths = zip(*((studio.frame(shot, number), studio.truth(shot)) for number, shot in shots), strict=True)
     return Recording(
         np.stack([frame.image for frame in taken]),
         *(np.array([getattr(frame, name) for frame in taken]) for name in FRAME_DATA),

@@ -10,7 +10,14 @@ from twin.light.caustics import Caustics
 from twin.light.lamp_ring import reflect_ring
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
-from twin.recording.frame_truth import FrameTruth, find_true_stripe, make_empty_truth, measure_line_light
+from twin.recording.frame_truth import (
+    Crossings,
+    FrameTruth,
+    find_crossings,
+    make_empty_truth,
+    measure_line_light,
+    select_brightest,
+)
 from twin.rendering_options import Options
 from twin.scene.description import PrintedPlate, Scene, medium_of, replace_values
 from twin.scene.finish import shift_points
@@ -150,6 +157,7 @@ class SensorSimulator:
         self.peak_finder = None
         if flaws.camera_3d:
             self.peak_finder = PeakFinder(camera, self.sensor.detector.full_scale_dn(), flaws.camera_3d)
+        self._crossings: tuple[Shot, Crossings] | None = None
         self._pattern = None
         if options.effects.fixed_pattern:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
@@ -266,6 +274,7 @@ class SensorSimulator:
         through_water: Travel | None = None,
         time_s: float = 0.0,
         exposure_s: float = 0.0,
+        with_truth: bool = False,
     ) -> ShotLight:
         others, pose = "lamp" if self.shows(shot, "lamp") else "day", self.pose(shot)
         even = self.renderer.irradiance(others, pose, spp=spp, travel=travel, time_s=time_s, exposure_s=exposure_s)
@@ -273,7 +282,11 @@ class SensorSimulator:
             even = even + self._lamp_ring
         if not self.shows(shot, "laser"):
             return even, None
-        return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel, through_water=through_water)
+        lines = self._true_stripe(shot).surface_lines() if with_truth else None
+        laser = self.renderer.laser_frame(
+            pose, spp=spp, seed=seed, travel=travel, through_water=through_water, lines=lines
+        )
+        return even, laser
 
     def _electrons_per_ms(
         self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
@@ -317,6 +330,7 @@ class SensorSimulator:
     def light(self, shot: Shot, index: int) -> ShotLight:
         """Return the light of image number ``index`` before the lens."""
         self._shift_points(shot, index)
+        self._crossings = None
         seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
         return self._light(
             shot,
@@ -326,6 +340,7 @@ class SensorSimulator:
             through_water=self.through_water(shot),
             time_s=self._time_s(shot, index),
             exposure_s=1e-3 * self.exposure_ms[shot.light] * shot.exposure,
+            with_truth=True,
         )
 
     def _time_s(self, shot: Shot, index: int) -> float:
@@ -404,9 +419,22 @@ class SensorSimulator:
         """Return the ground truth of every profile line of a shot."""
         if not self.shows(shot, "laser"):
             return make_empty_truth(self.sensor.camera.lines())
+        return self.measure_line_light(shot, self._true_stripe(shot))
+
+    def crossings(self, shot: Shot) -> Crossings:
+        """Return all crossings of the sheet with surfaces in a shot; those of the last light are known."""
+        if self._crossings is None or self._crossings[0] != shot:
+            self._crossings = shot, find_crossings(self.renderer, self.pose(shot), travel=self.travel(shot))
+        return self._crossings[1]
+
+    def measure_line_light(self, shot: Shot, truth: FrameTruth) -> FrameTruth:
+        """Return the truth of a shot with the light of its lines; see `twin.recording.frame_truth`."""
         pose, travel = self.pose(shot), self.travel(shot)
-        truth = find_true_stripe(self.renderer, pose, travel=travel)
         return measure_line_light(self.renderer, pose, truth, spp=self.options.spp, travel=travel)
+
+    def _true_stripe(self, shot: Shot) -> FrameTruth:
+        """Return the truth of a shot without its light."""
+        return select_brightest(self.crossings(shot), self.sensor.camera.lines())
 
     def _shift_points(self, shot: Shot, index: int) -> None:
         """Displace the points of a target by its detection errors in this image."""

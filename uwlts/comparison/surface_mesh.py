@@ -115,10 +115,9 @@ def mesh(
     cube = cube_mm or max(min(radius / _CUBES_OF_RADIUS, _thinnest_wall(points, radius) / _CUBES_OF_WALL), radius / 16)
     surface = LocalSurface(points, radius_mm=radius)
     low = points.points_mm.min(axis=0) - 4 * cube
-    corners = _corners_near(np.floor((points.points_mm - low) / cube).astype(np.int64))
-    distance, known = _signed_distances(surface, low + cube * corners, progress)
-    vertices, faces = _march_cubes(corners, distance / cube, known)
+    vertices, faces = _march_cubes(*_signed_distances(surface, points.points_mm, low, cube, progress))
     places = low + cube * vertices
+    del vertices
     patches = surface.patches(places, with_uncertainty=True)
     kept = patches.found & (np.abs(patches.height_mm) < _FARTHEST_CUBES * cube)
     places = places + np.where(kept, patches.height_mm, 0.0)[:, None] * patches.normals
@@ -216,7 +215,10 @@ def _corners_near(cells: np.ndarray) -> np.ndarray:
     for axis in range(3):
         step = int(np.prod(shape[axis + 1 :]))
         keys = _sort_unique((keys + step * np.arange(-2, 4)[:, None]).ravel())
-    return np.stack(np.unravel_index(keys, tuple(shape)), axis=1) - 3
+    corners = np.empty((len(keys), 3), np.int32)
+    for axis, place in enumerate(np.unravel_index(keys, tuple(shape))):
+        corners[:, axis] = place - 3
+    return corners
 
 
 def _sort_unique(keys: np.ndarray) -> np.ndarray:
@@ -226,29 +228,33 @@ def _sort_unique(keys: np.ndarray) -> np.ndarray:
 
 
 def _signed_distances(
-    surface: LocalSurface, places: np.ndarray, progress: ProgressListener
+    surface: LocalSurface, points_mm: np.ndarray, low: np.ndarray, cube: float, progress: ProgressListener
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return signed distances (P,) of places from the surface, positive outside, and a mask (P,) of known ones."""
-    distance, known = np.zeros(len(places)), np.zeros(len(places), bool)
-    for start in range(0, len(places), _PLACES_AT_A_TIME):
+    """Return corners (C, 3) of cubes near points, from ``low`` on, and their distances (C,) in cubes from the surface.
+
+    Distances are positive outside. Only corners with a patch are returned.
+    """
+    corners = _corners_near(np.floor((points_mm - low) / cube).astype(np.int64))
+    distance, known = np.zeros(len(corners)), np.zeros(len(corners), bool)
+    for start in range(0, len(corners), _PLACES_AT_A_TIME):
         here = slice(start, start + _PLACES_AT_A_TIME)
-        patches = surface.patches(places[here])
-        distance[here], known[here] = -patches.height_mm, patches.found
-        progress(min(start + _PLACES_AT_A_TIME, len(places)), len(places))
-    return distance, known
+        patches = surface.patches(low + cube * corners[here])
+        distance[here], known[here] = -patches.height_mm / cube, patches.found
+        progress(min(start + _PLACES_AT_A_TIME, len(corners)), len(corners))
+    return corners[known], distance[known]
 
 
-def _march_cubes(corners: np.ndarray, distance: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _march_cubes(corners: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Extract vertices (V, 3), in cubes, and triangles (F, 3) of the zero surface of distances at corners (C, 3)."""
     from skimage.measure import marching_cubes
 
-    corners, distance = corners[known], distance[known]
     # A block has one more corner than cubes along each edge. Adjacent blocks share corners.
     block = np.floor_divide(corners, _BLOCK)
     low = block.min(axis=0, initial=0)
     size = block.max(axis=0, initial=0) - low + 1
     keys = np.asarray(np.ravel_multi_index(tuple((block - low).T), tuple(size)))
     members = {tuple(block[each[0]].tolist()): each for each in group_rows(keys).values()}
+    del block, keys
     vertices, faces, first = [], [], 0
     for each in members:
         volume = np.zeros((_BLOCK + 1,) * 3, np.float32)
@@ -275,11 +281,12 @@ def _march_cubes(corners: np.ndarray, distance: np.ndarray, known: np.ndarray) -
             # scikit-image raises these for a block without a zero crossing.
             continue
         vertices.append(found.astype(np.float64) + _BLOCK * np.array(each))
-        faces.append(triangles + first)
+        faces.append((triangles + first).astype(np.int32))
         first += len(found)
     if not vertices:
         return np.empty((0, 3)), np.empty((0, 3), np.int64)
-    return _weld_vertices(np.concatenate(vertices), np.concatenate(faces).astype(np.int64))
+    del members
+    return _weld_vertices(np.concatenate(vertices), np.concatenate(faces))
 
 
 def _weld_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
