@@ -191,7 +191,7 @@ def test_laser_off_does_not_need_the_program(operated):
         assert operated.press() == 204
         assert operated.dark_after_s() is not None
         # Earlier commands of the program may switch it on again; resets are repeated.
-        # Without them the light would stay. On an overloaded machine they may be late; the press has its time limit above.
+        # Without resets the light would stay. On an overloaded machine one may be late; the press is timed above.
         light(controller, steady_s=0.0)
         assert operated.dark_after_s(20.0) is not None
     finally:
