@@ -12,8 +12,9 @@ WITH_LLVM = $(call with_packages,$(PYTHON) -m twin.backend.llvm,libatomic1$(if $
 WITH_ARAVIS = $(call with_packages,$(PYTHON) -m uwlts.runtime.shared_library,libaravis-0.8-0)
 WITH_BROWSER = $(call with_packages,$(PYTHON) -m tests.browser,chromium-headless-shell fonts-dejavu-core)
 
-# An activated environment, or settings that redirect Python or pip, must not reach into .venv.
-unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
+# An activated environment, or settings that redirect Python or pip, must not reach into .venv. Without bytecode each
+# process would compile the project and the tests again.
+unexport PYTHONDONTWRITEBYTECODE PYTHONPATH PYTHONHOME VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
 

@@ -92,28 +92,65 @@ SERVING = {
     "test_documented_hardware.py",
 }
 
+# These tests check times of some tenths of a second, and mostly wait.
+TIMED = {"test_grbl.py", "test_laser_guard.py", "test_laser_off_attacked.py"}
+
+# The longest of the others, which start first: at the end no process waits for a long file.
+LONG = (
+    "test_documented_commands.py",
+    "test_sweep.py",
+    "test_thesis_edition.py",
+    "test_real_images.py",
+    "test_fuzz.py",
+    "test_mount.py",
+    "test_desk_measured.py",
+    "test_align.py",
+    "test_page_access.py",
+)
+
 NICE = 15
-"""Niceness of test processes other than the serving one, which checks times."""
+"""Niceness of test processes that check no times."""
+
+
+def group(path: Path) -> str:
+    """Return the group of a file: groups run in one process each. Only files that serve or check times share one."""
+    return "serving" if path.name in SERVING else "timed" if path.name in TIMED else str(path)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest groups."""
+    first = ["serving", "timed", *LONG]
+    ranks = {name: number for number, name in enumerate(first)}
+    items.sort(key=lambda item: ranks.get(Path(group(item.path)).name, len(first)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """Distribute whole files to processes; all files that serve run in the same one, so that they do not wait."""
+    """Distribute groups of files to processes, so that none waits for another one's cameras."""
     from xdist.scheduler import LoadFileScheduling
 
-    class ByFile(LoadFileScheduling):
+    class ByGroup(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            file = super()._split_scope(nodeid)
-            return "serving" if Path(file).name in SERVING else file
+            return group(Path(super()._split_scope(nodeid)))
 
-    return ByFile(config, log)
+        def remove_node(self, node: Any) -> str | None:
+            # Without this, the test that ended a process would run again, and end the next one.
+            units = self.assigned_work[node].values()
+            ended_by = next(((unit, test) for unit in units for test, done in unit.items() if not done), None)
+            if ended_by is not None:
+                unit, test = ended_by
+                unit[test] = True
+            super().remove_node(node)
+            return ended_by and ended_by[1]
+
+    return ByGroup(config, log)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def serving_alone(request: pytest.FixtureRequest) -> Iterator[None]:
     """Let only one test process serve cameras and pages; the others run at lower priority."""
     if request.path.name not in SERVING:
-        if "PYTEST_XDIST_WORKER" in os.environ:
+        if "PYTEST_XDIST_WORKER" in os.environ and request.path.name not in TIMED:
             os.nice(max(0, NICE - os.nice(0)))
         yield
         return

@@ -96,10 +96,10 @@ class Operated(Place):
         connection.close()
         return status
 
-    def dark_after_s(self) -> float | None:
-        """Return the time in s until the light is off; None if it stays on for longer than `OFF_S`."""
+    def dark_after_s(self, at_most_s: float = OFF_S) -> float | None:
+        """Return the time in s until the light is off; None if it stays on for longer than ``at_most_s``."""
         began = time.monotonic()
-        return time.monotonic() - began if within(OFF_S, lambda: not self.controller.state().laser_on) else None
+        return time.monotonic() - began if within(at_most_s, lambda: not self.controller.state().laser_on) else None
 
     def go_on(self) -> str:
         """Let the program continue to its next output."""
@@ -191,8 +191,9 @@ def test_laser_off_does_not_need_the_program(operated):
         assert operated.press() == 204
         assert operated.dark_after_s() is not None
         # Earlier commands of the program may switch it on again; resets are repeated.
+        # Without resets the light would stay. On an overloaded machine one may be late; the press is timed above.
         light(controller, steady_s=0.0)
-        assert operated.dark_after_s() is not None
+        assert operated.dark_after_s(20.0) is not None
     finally:
         os.kill(operated.program.pid, signal.SIGCONT)
     # After the program's answer nothing more is sent.

@@ -30,7 +30,7 @@ _ESCAPE_S = 0.2
 _AGAIN_S = 0.2
 """Interval between repetitions of Ctrl-X: a command in progress may have switched the laser on again."""
 _GIVE_UP_S = 2.0
-"""A press has failed if no port is lent and the program does not answer in this time."""
+"""A press has failed if no port has accepted Ctrl-X and the program has not answered for this time."""
 _WATCH_S = 0.2  # period in which its state is looked at
 
 
@@ -87,6 +87,7 @@ class LaserListener:
         while not await _wait_within(wait_s, answered):
             if self._reset():
                 request.answer(HTTPStatus.NO_CONTENT)
+                deadline = time.monotonic() + _GIVE_UP_S
             elif time.monotonic() > deadline:
                 break
             wait_s = _AGAIN_S
