@@ -21,8 +21,8 @@ def test_the_spacing_is_that_of_most_places():
 
 
 def test_discs_must_be_small_relative_to_the_cloud():
-    """Ten points need a radius of 1.8 spacings; discs begin with 4.5, more than a tenth of 12 by 12 points."""
-    many, few = (np.column_stack([grid(count), np.zeros(count**2)]) for count in (80, 12))
+    """Ten points need a radius of 1.8 spacings; discs begin with 4.5, more than a tenth of 30 by 30 points."""
+    many, few = (np.column_stack([grid(count), np.zeros(count**2)]) for count in (80, 30))
     assert 1.8 < find_disc_radius(many) < 0.1 * 80 * np.sqrt(2)
     with pytest.raises(EvaluationError, match="spacing of the points is too large"):
         find_disc_radius(few)
