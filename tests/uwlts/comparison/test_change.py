@@ -11,8 +11,10 @@ from scipy.spatial.transform import Rotation
 
 import uwlts
 from uwlts.cli import app
+from uwlts.comparison.change import _thin_points
 from uwlts.comparison.comparison_options import ComparisonOptions
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
+from uwlts.fitting.point_groups import number_cubes
 from uwlts.registration.surface_registration import SampledSurface, register_to_surface
 from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty
 from uwlts.storage.ply import read_ply
@@ -365,3 +367,16 @@ def test_all_regions_are_listed_whatever_the_size_of_the_cloud(monkeypatch, tmp_
     assert "more regions of smaller volume" in (tmp_path / "change.html").read_text(encoding="utf-8")
     assert len(json.loads((tmp_path / "change.json").read_text())["regions"]) == len(change.regions())
     assert any(line.startswith("regions of change") for line in change.lines())
+
+
+def test_thinning_needs_few_rounds(monkeypatch):
+    """One place too many at a side of half the spacing: 36 rounds of 2 %, 1,400 if the side grew by the excess."""
+    rounds = []
+    monkeypatch.setattr("uwlts.comparison.change.OPTIONS", ComparisonOptions(most_places=1000))
+    monkeypatch.setattr(
+        "uwlts.comparison.change.number_cubes", lambda *given: rounds.append(given) or number_cubes(*given)
+    )
+    points = np.column_stack([np.arange(1001.0), np.zeros((1001, 2))])
+    chosen, apart = _thin_points(points, 0.5)
+    assert len(chosen) <= 1000 and 1.0 < apart < 1.03
+    assert 10 < len(rounds) < 50

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import sparse
+from scipy.linalg import block_diag
 
 from uwlts.fitting.schur_least_squares import LocalPrior, Observation, invert_block, schur_least_squares
 
@@ -65,3 +66,21 @@ def test_prior_knowledge_of_local_parameters_counts_as_an_observation(soft_limit
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-7, atol=1e-9)
     assert one.rounds == other.rounds
     assert one.sigma == pytest.approx(other.sigma)
+
+
+def test_a_linear_problem_has_the_solution_and_covariance_of_the_normal_equations():
+    """Two groups with two parameters each and three common ones, of very different sizes."""
+    rng = np.random.default_rng(7)
+    by_global, by_local = rng.normal(size=(2, 30, 3)) * [1e-3, 1.0, 50.0], rng.normal(size=(2, 30, 2)) * [0.2, 7.0]
+    values = rng.normal(size=(2, 30))
+
+    def model(group, global_values, local):
+        off = values[group] - by_global[group] @ global_values - by_local[group] @ local
+        return Observation(off[:, None], -by_global[group], -by_local[group])
+
+    found = schur_least_squares(model, np.zeros(3), [np.zeros(2)] * 2)
+    whole = np.hstack([by_global.reshape(60, 3), block_diag(*by_local)])
+    solution = np.linalg.lstsq(whole, values.ravel())[0]
+    np.testing.assert_allclose(np.r_[found.global_values, *found.local], solution, rtol=1e-6)
+    inverse = np.linalg.inv(whole.T @ whole)
+    np.testing.assert_allclose(found.covariance / found.sigma**2, inverse[:3, :3], rtol=1e-6)

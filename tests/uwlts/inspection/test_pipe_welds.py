@@ -10,6 +10,7 @@ import pytest
 import uwlts
 from tests.oracles.pipes import Bump, WeldBead, scan_pipe
 from uwlts.inspection.features import FeatureKind
+from uwlts.inspection.pipe_welds import _find_ridges
 from uwlts.storage.cloud import PointCloud
 
 GATE, RADIUS_MM = 4.5, 80.0
@@ -48,3 +49,12 @@ def test_a_weld_of_a_pipe_is_a_weld(kind: str, seed: int) -> None:
     (own,) = found.select(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
     assert pipe.distance_mm(pit, own.place_mm) < 1.5
     assert own["depth"].value == pytest.approx(0.6, abs=GATE * own["depth"].uncertainty)
+
+
+def test_a_ridge_of_a_single_cell_stands_out_from_its_neighbours() -> None:
+    """Nine cells, each with a hundred points: their surroundings are three cells, whose median is that of the pipe."""
+    rng = np.random.default_rng(8)
+    across, length = (each.ravel() for each in np.meshgrid(np.arange(9) + 0.5, np.arange(100.0), indexing="ij"))
+    heights = np.where(np.abs(across - 4.5) < 0.5, 1.0, 0.0) + 0.01 * rng.standard_normal(len(across))
+    ((middle, half),) = _find_ridges(across, length, heights, 1.0)
+    assert middle == pytest.approx(4.5 + 0.5, abs=1e-6) and 0.5 <= half <= 1.0

@@ -10,6 +10,7 @@ from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lens_of, step_
 from tests.uwlts.drawn_target import drawn_lamp, drawn_laser, target_pose
 from uwlts.calibration.camera.image_quality import (
     QualityLimits,
+    edge_blur_px,
     explain_missing_target,
     judge_motion,
     judge_novelty,
@@ -395,3 +396,13 @@ def test_a_depth_that_is_skipped_gives_way_to_the_next_in_turn(thesis):
     assert asked == pytest.approx([200 + third, 200 + 5 * third, 200 + 3 * third, 200 + third])
     assert len({next_depth_mm([], thesis, skipped=count) for count in range(3)}) == 3
     assert next_depth_mm([282.0, 319.0, 381.0], thesis, skipped=1) is None
+
+
+def test_blur_does_not_depend_on_which_side_of_a_point_is_bright() -> None:
+    """An image, mirrored, and upside down: the window about a point reaches as far on every side."""
+    rng = np.random.default_rng(9)
+    image = rng.integers(0, 255, (61, 81)).astype(np.uint8)
+    u, v = np.array([20, 40, 61]), np.array([30, 17, 44])
+    blur = edge_blur_px(image, np.column_stack([u, v]), half_px=4.0)
+    assert edge_blur_px(image[:, ::-1], np.column_stack([80 - u, v]), half_px=4.0) == pytest.approx(blur, rel=1e-5)
+    assert edge_blur_px(image[::-1], np.column_stack([u, 60 - v]), half_px=4.0) == pytest.approx(blur, rel=1e-5)
