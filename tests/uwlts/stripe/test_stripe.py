@@ -694,6 +694,6 @@ def test_narrow_stripes_are_not_chosen_by_their_place_in_the_pixel():
     found = rows((20 + light + 2 * rng.standard_normal(light.shape)).astype(np.float32)).centre_px
     good = np.isfinite(found)
     assert np.mean(good) > 0.97
-    # The method's own error with the pixel phase is 0.01 px, a standard error of the mean 0.002 px; a choice of the wide
+    # The method's own error with the pixel phase is 0.01 px, a standard error of the mean 0.002 px; a choice of wide
     # lines (87 %) adds 0.014 px.
     assert abs(np.mean(found[good]) - centre[0]) < 0.018
