@@ -149,8 +149,9 @@ def show_laser(page: "Page", *, reload: bool = False) -> None:
         if reload:
             page.reload()
             page.get_by_role("tab", name="Connect").wait_for()
-            page.wait_for_timeout(1000)
-        if "laser ON for images" in page.locator("header").inner_text():
+        header = page.locator("header").filter(has_text=re.compile("laser ON for images|has to be homed"))
+        header.wait_for()
+        if "laser ON for images" in header.inner_text():
             return
     raise AssertionError("live images with the laser do not last")
 

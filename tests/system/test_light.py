@@ -152,6 +152,16 @@ def test_a_camera_that_fails_is_waited_for_in_the_dark(scan, fault):
     assert scan.program.returncode == 2 and re.search(says, errors), errors
 
 
+def test_a_scan_survives_several_frames_lost_in_a_row(scan):
+    """A busy computer loses them within a fraction of a second."""
+    scan.camera.fault = lambda: scan.camera.inject("cut", 6)
+    assert watched(scan) <= ALLOWED_S
+    _, errors = scan.program.communicate(timeout=20)
+    assert scan.program.returncode == 0, errors
+    lost = re.search(r"(\d+) images were lost between camera and computer", errors)
+    assert lost and int(lost[1]) >= 6, errors
+
+
 @pytest.mark.parametrize("guard", [False, True], ids=["program", "program and guard"])
 @pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGSTOP])
 def test_processes_that_are_gone_or_stand_still_leave_no_light(scan, stop, guard):

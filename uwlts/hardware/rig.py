@@ -132,7 +132,9 @@ def find_exposure(
 
 
 _TRIES = 3
-"""Attempts to get an image whose frame was lost in transfer."""
+_RETRIED_S = 5.0
+"""An image whose frame is lost in transfer is taken again until both limits are exceeded, in attempts and in s. A
+busy computer can lose several frames in a fraction of a second; the stage is at rest, so a later image is as good."""
 _PATIENCE_S = 3.0
 """Longest wait for a frame beyond its exposure, long enough for several repetitions of a lost GigE command. The laser
 is off for the last part."""
@@ -289,8 +291,9 @@ class Rig:
 
     def _grab(self, light: Light) -> GrabbedFrame:
         """Take one frame, repeated if it is lost, as the stage is at rest; the laser is off between attempts."""
-        last = None
-        for _ in range(_TRIES):
+        deadline, tries = time.monotonic() + _RETRIED_S, 0
+        while True:
+            tries += 1
             self._laser(light == "laser")
             try:
                 frame = self._one()
@@ -301,13 +304,13 @@ class Rig:
                 # If the camera's driver hangs, the guard switches the laser off; the fault to report is the camera's.
                 if self._stage.faulty or not self._camera.running:
                     raise
-                last = error
+                if tries >= _TRIES and time.monotonic() > deadline:
+                    raise HardwareError(f"{error} (tried {tries} times)") from error
                 self.repeated += 1
             else:
                 # Also checks whether the laser was on all the time.
                 self._rest()
                 return frame
-        raise HardwareError(f"{last} (tried {_TRIES} times)")
 
     def _one(self) -> GrabbedFrame:
         """Trigger and wait; every step sends a beat to the laser guard, in case a driver hangs."""
