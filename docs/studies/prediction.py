@@ -1,7 +1,7 @@
 """Predictions for drawn sensors, against the errors and detection limits of campaigns that they have not seen.
 
     python -m docs.studies.prediction runs/prediction --sensors 30 --write
-    python -m docs.studies.prediction runs/pits --sensors 4 --first-seed 8030 --pit-scans 8 --write
+    python -m docs.studies.prediction runs/pits --sensors 5 --first-seed 8030 --pit-scans 8 --write
     python -m docs.studies.prediction detection runs/detection --write
 
 Lens, baseline, angle, window and water of each sensor are drawn, and the deviations of the built sensor. Two campaigns
