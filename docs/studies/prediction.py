@@ -1,6 +1,7 @@
 """Predictions for drawn sensors, against the errors and detection limits of campaigns that they have not seen.
 
     python -m docs.studies.prediction runs/prediction --sensors 30 --write
+    python -m docs.studies.prediction runs/pits --sensors 5 --first-seed 8030 --pit-scans 8 --write
     python -m docs.studies.prediction detection runs/detection --write
 
 Lens, baseline, angle, window and water of each sensor are drawn, and the deviations of the built sensor. Two campaigns
@@ -130,8 +131,11 @@ def draw(seed: int) -> tuple[Sensor, Sensor, float]:
     return sensor, validate_description(Sensor, merge_tables(sensor.model_dump(), deviations), "built"), turbidity
 
 
-def predict(folder: Path, seed: int) -> dict[str, Any]:
-    """Render and evaluate the campaigns of a drawn sensor; return a prediction of each, or why one failed."""
+def predict(folder: Path, seed: int, pit_scans: int) -> dict[str, Any]:
+    """Render and evaluate the campaigns of a drawn sensor; return a prediction of each, or why one failed.
+
+    With several scans of pits, each with its own pits, the campaigns contain nothing else but their calibration.
+    """
     place = folder / f"sensor-{seed}"
     place.mkdir(parents=True, exist_ok=True)
     sensor, built, turbidity = draw(seed)
@@ -141,7 +145,14 @@ def predict(folder: Path, seed: int) -> dict[str, Any]:
     for name, scene in SCENES.items():
         (place / f"{name}.toml").write_text(tomli_w.dumps(scene), encoding="utf-8")
     campaign = {"base": "thesis", "title": f"drawn {seed}", "sensor": "sensor.toml", "as_built": "built.toml"}
-    campaign |= {"water": turbidity, "imperfections": IMPERFECTIONS, "recordings": RECORDINGS}
+    recordings = RECORDINGS
+    if pit_scans > 1:
+        (pits,) = (each for each in RECORDINGS if each.get("name") == "pits")
+        evidence = [
+            each for each in RECORDINGS if "target" in each["scene"] or ("placements" in each and not each.get("name"))
+        ]
+        recordings = evidence + [pits | {"name": f"pits-{number}"} for number in range(1, pit_scans + 1)]
+    campaign |= {"water": turbidity, "imperfections": IMPERFECTIONS, "recordings": recordings}
     (place / "campaign.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
     drawn = {"seed": seed, "sensor": sensor.model_dump(mode="json"), "turbidity": turbidity}
     try:
@@ -211,14 +222,14 @@ def detection_rows(sensors: list[list[PredictedUncertainty]]) -> list[list[str]]
     return rows
 
 
-def main(folder: Path, *, sensors: int = 30, first_seed: int = 8000, write: bool = False) -> None:
+def main(folder: Path, *, sensors: int = 30, first_seed: int = 8000, pit_scans: int = 1, write: bool = False) -> None:
     """Render and compare; with `--write`, put the tables into their page."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
     for seed in range(first_seed, first_seed + sensors):
         path = folder / f"{seed}.json"
         if not path.exists():
-            path.write_text(json.dumps(predict(folder, seed)), encoding="utf-8")
+            path.write_text(json.dumps(predict(folder, seed, pit_scans)), encoding="utf-8")
         found.append(json.loads(path.read_text(encoding="utf-8")))
         print(seed, found[-1].get("failure", "done"), flush=True)
     done = [
@@ -227,9 +238,10 @@ def main(folder: Path, *, sensors: int = 30, first_seed: int = 8000, write: bool
         if "failure" not in sensor
     ]
     head = ["figure", "errors", "U predicted, mm", "twice the rms error, mm", "error / stated, rms", "within U"]
-    tables = {"prediction": table(head, error_rows(compare_errors(done)))}
+    tables = {} if pit_scans > 1 else {"prediction": table(head, error_rows(compare_errors(done)))}
     head = ["sensor", "pits found, 1st campaign", "2nd", "a90 predicted, mm", "a90 found, mm", "found / predicted"]
-    publish(tables | {"prediction of a90": table(head, detection_rows(done))}, write=write)
+    name = "prediction of a90, more pits" if pit_scans > 1 else "prediction of a90"
+    publish(tables | {name: table(head, detection_rows(done))}, write=write)
 
 
 def detect(folder: Path, *, every: int = 2, write: bool = False) -> None:

@@ -25,6 +25,7 @@ from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors, group_neighbours
 from uwlts.fitting.shapes import fit_plane
 from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, FeatureValue, Inspection, plain_value
+from uwlts.inspection.noisy_extremes import BIAS_FACTOR
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
 
@@ -400,7 +401,8 @@ def _note_omission(face: _Face, place: np.ndarray, reason: str) -> str:
 def _measure_flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
     """Return the range of the cell means of a face.
 
-    Noise increases the range. This bias is estimated by drawing the noise again, and subtracted.
+    Noise increases the range. The bias follows from adding the noise once more (`uwlts.inspection.noisy_extremes`), and
+    is subtracted. The uncertainty contains this increase.
     """
     inner = _mask_inner_points(cloud, used)
     local = (cloud.points_mm[used] - face.point_mm) @ face.axes[:2].T
@@ -423,10 +425,10 @@ def _measure_flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> Featu
         return float(np.ptp(found + means(moves))) - value
 
     drawn = [changed(moves) for moves in noisy.draw(_RULE.draws)]
-    bias, common = max(float(np.mean(drawn)), 0.0), errors.by_patterns(changed)
-    random = float(np.hypot(np.std(drawn), bias))
+    increase, common = max(float(np.mean(drawn)), 0.0), errors.by_patterns(changed)
+    flatness, random = max(value - BIAS_FACTOR * increase, 0.0), float(np.hypot(np.std(drawn), increase))
     shared = None if common is None else float(common)
-    return plain_value(FeatureKind.FLANGE, "flatness", max(value - bias, 0.0), random, shared, least=0.0)
+    return plain_value(FeatureKind.FLANGE, "flatness", flatness, random, shared, least=0.0)
 
 
 def _mask_inner_points(cloud: PointCloud, used: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, SEED
 
 _DRAWS = 2000
 """Noise draws: fifty exceed the 97.5 % quantile, which is then known to a tenth of a standard deviation."""
-_BIAS_FACTOR = 1 / (np.sqrt(2) - 1)
+BIAS_FACTOR = 1 / (np.sqrt(2) - 1)
 """Bias by the noise divided by the increase when the noise is added once more, for a bias proportional to its std."""
 
 
@@ -60,7 +60,7 @@ def largest_mean(profiles: Sequence[np.ndarray], count: int, *, noise: float | N
     tail = 0.5 * (1 - COVERAGE)
     low = seen - float(np.quantile(alone, 1 - tail))
     high = seen + COVERAGE_FACTOR * max(float(each.std(axis=0).max()) for each in drawn)
-    value = float(np.clip(seen - _BIAS_FACTOR * (again.mean() - seen), low, high))
+    value = float(np.clip(seen - BIAS_FACTOR * (again.mean() - seen), low, high))
     for number, own in enumerate(k for k in range(len(profiles)) if len(known[k])):
         if float(means[number].max()) == seen:
             first = int(np.argmax(means[number]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from glob import glob
 from pathlib import Path
@@ -43,7 +43,7 @@ class ImageSet:
     count : int
         Number of images.
     read : callable
-        Returns an image (H, W), uint8 or uint16, by its number, without marks of clipped pixels; None for an image
+        Yields images (H, W), uint8 or uint16, by their numbers, without marks of clipped pixels; None for an image
         without the laser.
     """
 
@@ -52,13 +52,12 @@ class ImageSet:
     full_dn: float
     options: StripeOptions
     count: int
-    read: Callable[[int], np.ndarray | None]
+    read: Callable[[Sequence[int]], Iterator[np.ndarray | None]]
 
     def images(self, most: int) -> Iterator[np.ndarray]:
-        """Yield up to a number of laser images (H, W), evenly chosen."""
-        for number in np.unique(np.linspace(0, self.count - 1, min(most, self.count)).astype(int)).tolist():
-            if (image := self.read(number)) is not None:
-                yield image
+        """Return up to a number of laser images (H, W), evenly chosen."""
+        numbers = np.unique(np.linspace(0, self.count - 1, min(most, self.count)).astype(int)).tolist()
+        return (image for image in self.read(numbers) if image is not None)
 
 
 def open_image_set(source: str | Path, *, stripe: StripeSettings = None) -> ImageSet:
@@ -91,9 +90,9 @@ def _open_data_set(folder: Path, stripe: StripeSettings) -> ImageSet:
     if "bits" not in samples.card.image:
         raise CaptureError(f"{folder / CARD} is damaged: it does not state the number of bits of the images")
 
-    def read(number: int) -> np.ndarray | None:
-        sample = samples[number]
-        return sample["image"] if sample["info"].get("light") != "lamp" else None
+    def read(numbers: Sequence[int]) -> Iterator[np.ndarray | None]:
+        for sample in map(samples.__getitem__, numbers):
+            yield sample["image"] if sample["info"].get("light") != "lamp" else None
 
     full = 2.0 ** samples.card.image["bits"] - 1
     options = StripeOptions.resolve(sensor, stripe)
@@ -103,16 +102,17 @@ def _open_data_set(folder: Path, stripe: StripeSettings) -> ImageSet:
 def _open_capture(path: Path, stripe: StripeSettings) -> ImageSet:
     with Capture(path) as capture:
         header = capture.header
-        numbers = np.flatnonzero(capture.laser_on & capture.has_image).tolist()
-    if not numbers:
+        lit = np.flatnonzero(capture.laser_on & capture.has_image).tolist()
+    if not lit:
         raise CaptureError(f"{path} has no laser image; statistics of the stripe need images")
 
-    def read(number: int) -> np.ndarray:
+    def read(numbers: Sequence[int]) -> Iterator[np.ndarray]:
         with Capture(path) as again:
-            return split_clipped(again.image(numbers[number]), header.saturation_dn)[0]
+            for number in numbers:
+                yield split_clipped(again.image(lit[number]), header.saturation_dn)[0]
 
     options = StripeOptions.resolve(header.sensor, stripe)
-    return ImageSet(path.name, header.sensor.camera.stripe_along, header.saturation_dn, options, len(numbers), read)
+    return ImageSet(path.name, header.sensor.camera.stripe_along, header.saturation_dn, options, len(lit), read)
 
 
 def _open_files(path: Path, stripe: StripeSettings) -> ImageSet:
@@ -142,14 +142,15 @@ def _open_files(path: Path, stripe: StripeSettings) -> ImageSet:
         raise ImageError(f"no stripe is found in {files[0]}; expected images with the laser on")
     channel, along, options = tried[int(np.argmax(lengths))]
 
-    def read(number: int) -> np.ndarray:
-        image = read_image(files[number])
-        if image.dtype != first.dtype or image.max() > full:
-            raise ImageError(
-                f"{files[number]} is {image.dtype} with grey values up to {image.max()}, {files[0]} is of {bits} bits: "
-                "give images of one camera in a folder"
-            )
-        return np.ascontiguousarray(image if image.ndim == 2 else image[:, :, channel])
+    def read(numbers: Sequence[int]) -> Iterator[np.ndarray]:
+        for file in (files[number] for number in numbers):
+            image = read_image(file)
+            if image.dtype != first.dtype or image.max() > full:
+                raise ImageError(
+                    f"{file} is {image.dtype} with grey values up to {image.max()}, {files[0]} is of {bits} bits: "
+                    "give images of one camera in a folder"
+                )
+            yield np.ascontiguousarray(image if image.ndim == 2 else image[:, :, channel])
 
     name = path.name if path.is_dir() else f"{path.parent.name}/{path.name}"
     return ImageSet(name, along, full, options, len(files), read)

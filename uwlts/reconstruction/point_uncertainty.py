@@ -104,8 +104,9 @@ def point_uncertainty(
         Applied shift of the points to the origin of their light (`uwlts.optics.brightness`); its relative error is
         common to all points.
     mount_by : (6, P), optional
-        Derivatives of the mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), for frames
-        with poses of a platform. They correlate the errors of points and mount.
+        Derivatives of a calibrated mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), for
+        frames with poses of a platform. They correlate the errors of points and mount. By default poses and described
+        mount place the true OCS, from which the calibrated one differs by the errors of camera axis and sheet.
     digest
         Digest of the calibration, if known.
 
@@ -137,11 +138,10 @@ def point_uncertainty(
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     by_stage = stage_components(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
-    rigid = (
-        np.zeros((6, root.shape[1]))
-        if mount_by is None
-        else _rotate_to_sensor(mount_by, header) @ root[: mount_by.shape[1]]
-    )
+    if mount_by is not None:
+        rigid = _rotate_to_sensor(mount_by, header) @ root[: mount_by.shape[1]]
+    else:
+        rigid = -known.frame_by() @ root if posed.any() else np.zeros((6, root.shape[1]))
     exact = partial(_derivatives, known, root, rigid)
     of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
     key = None if digest is None else ("uncertainty", digest, known.view, *of_estimate)

@@ -137,6 +137,9 @@ def reconstruct(
         stripes = find_stripes(scan, options=stripe, progress=progress)
         table = add_platform_poses(scan, ride, mount)
         apart, common = (None, None) if mount is None else mount.independent_covariance(calibration_digest(calibration))
+        if mount is not None and common is None:
+            # The mount of another calibration: its covariance contains the errors of the OCS.
+            common = np.zeros((6, 0))
         cloud = reconstruct_stripes(
             table, stripes, calibration, index=index, with_uncertainty=known, mount_by=common if known else None
         )

@@ -81,7 +81,7 @@ class StripeOptions:
     smoothing_lines: int = 1
     threshold_sigmas: float = 6.0
     threshold_floor: float = 3.0
-    min_fwhm_px: float = 1.3
+    min_fwhm_px: float = 1.0
     ambiguous_ratio: float = 0.6
     end_lines: int = 2
 

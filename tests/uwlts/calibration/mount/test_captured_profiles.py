@@ -16,6 +16,7 @@ from tests.uwlts.sensor_profiles import RADIUS_MM, captured_by, half_way, joint_
 from uwlts.calibration.joint.stored_estimate import covariance_root
 from uwlts.calibration.mount.hand_eye import BoardEvidence
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate, solve_step
+from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.reconstruction.moving import PlatformPoses, add_platform_uncertainty
 from uwlts.reconstruction.point_uncertainty import point_uncertainty
@@ -107,10 +108,25 @@ def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
     np.testing.assert_allclose(by_patterns, expected, rtol=0.02, atol=2e-4)
     ride, base = PlatformPoses(poses, None, np.zeros(2)), points(known.values, np.zeros(6))
     together = add_platform_uncertainty(shared, base, frame, ride, mount, mount_covariance=apart).std_mm()
-    alone = point_uncertainty(table, known.calibration, frame, line, noisy)
+    alone = point_uncertainty(table, known.calibration, frame, line, noisy, mount_by=np.zeros((6, 0)))
     twice = add_platform_uncertainty(alone, base, frame, ride, mount).std_mm()
     # At the place of the mount's calibration, the mount compensates the change of the calibration: the sphere stays.
     assert np.median(together) < 0.5 * np.median(twice)
+
+    def points_from_true_frame(values):
+        """Return the points that a described mount and the poses place by the sensor's frame of other parameters."""
+        in_camera = replace(known, values=values).triangulate(line, noisy)[0] @ here[:3, :3].T + here[:3, 3]
+        sheet = known.parameters.sheet_model(values)
+        there = object_frame(sheet, laser_axis=known.parameters.sheet.axis)
+        on_platform = (in_camera - there[:3, 3]) @ there[:3, :3] @ mount.transform()[:3, :3].T
+        return on_platform @ pose[:3, :3].T
+
+    here, moved = known.calibration.object_transform(), []
+    for part in covariance_root(known.covariance).T:
+        moved.append(np.subtract(*(points_from_true_frame(known.values + sign * part) for sign in (1, -1))) / 2)
+    described = point_uncertainty(table, known.calibration, frame, line, noisy).patterns_mm.astype(float)
+    expected = np.sqrt(np.sum(np.square(moved), axis=0))
+    np.testing.assert_allclose(np.sqrt(np.sum(described**2, axis=0)), expected, rtol=0.02, atol=2e-4)
 
 
 def test_a_mount_by_a_target_follows_its_images():
