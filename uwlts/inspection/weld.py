@@ -344,7 +344,9 @@ def measure_bead(bead: Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, .
         return values
 
     seen = values_of(first)
-    drawn = [values_of(each) - seen for each in noisy]
+    # An unknown value stays unknown.
+    drawn = np.array([values_of(each) - seen for each in noisy])
+    drawn[:, np.isnan(seen)] = 0
     random, bias = np.nanstd(drawn, axis=0), np.zeros(len(seen))
     # Noise biases the extremes of a profile outwards. Doubling the noise shows the size of this bias.
     extremes = ["undercut" in name or "height" in name for name in _NAMES]
