@@ -10,6 +10,7 @@ from twin.scene import scene_object
 from twin.scene.forms import Head, PittedPipe, Weld
 from twin.scene.forms.head import head_depth
 from twin.scene.forms.pitted_pipe import pit_depths, pit_places, pitted_radius
+from twin.scene.forms.triangles import bowed_plate
 from twin.scene.forms.weld import undercut_depths, weld_height
 from uwlts.errors import DescriptionError
 
@@ -251,3 +252,11 @@ def test_undercuts_of_drawn_depths_differ_on_both_sides():
     mesh = mesh_of(weld.surface())
     x, y, z = np.moveaxis(inner_points(mesh), -1, 0)
     assert np.abs(weld_height(weld, x, y) + z).max() < 0.015
+
+
+def test_a_bowed_plate_is_a_paraboloid_between_its_corners():
+    vertices, _, _ = bowed_plate(np.array([10.0, 0.0]), np.array([210.0, 100.0]), bow_mm=2.0)
+    away_mm = np.hypot(*(vertices[:, :2] - (110.0, 50.0)).T)
+    corner_mm = np.hypot(100.0, 50.0)
+    np.testing.assert_allclose(vertices[:, 2], 2.0 * (away_mm / corner_mm) ** 2, atol=1e-12)
+    assert away_mm.min() == 0 and away_mm.max() == pytest.approx(corner_mm)

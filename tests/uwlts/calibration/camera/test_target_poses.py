@@ -365,3 +365,9 @@ def test_grouped_least_squares_against_one_big_system():
     np.testing.assert_allclose(fit.local_covariances[2], covariance[7:9, 7:9], rtol=1e-6, atol=1e-9)
     with pytest.raises(CalibrationError, match="behind"):
         schur_least_squares(lambda *_: None, np.zeros(3), [np.zeros(2)])
+
+
+def test_start_values_are_those_of_the_camera_matrix():
+    matrix = np.array([[1000.0, 0.0, 640.0], [0.0, 1010.0, 500.0], [0.0, 0.0, 1.0]])
+    intrinsics = Intrinsics(CameraOptions(pixel_aspect=None), 1280, 1024)
+    np.testing.assert_array_equal(intrinsics.matrix(intrinsics.from_matrix(matrix)), matrix)
