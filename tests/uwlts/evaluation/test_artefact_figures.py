@@ -115,6 +115,8 @@ def test_a_wrong_scale_shows_as_spacing_and_diameter_error():
     points = dumbbell(np.random.default_rng(2)) * 1.002
     result = evaluate_cloud(cloud_of(points), DUMBBELL)
     assert result.sse_mm == pytest.approx(0.002 * 99.18, abs=0.02)
+    errors_mm = [figure.error_mm for figure in result.figures if figure.key.calibrated is not None]
+    assert result.sse_mm in errors_mm and result.spheres[0].diameter_error_mm in errors_mm
     assert result.spheres[0].diameter_error_mm == pytest.approx(0.002 * 50.12, abs=0.05)
 
 

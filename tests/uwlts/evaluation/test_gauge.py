@@ -46,6 +46,7 @@ def test_aiags_example():
     assert study.components["gauge (GRR)"].share_percent == pytest.approx(27.9, abs=0.05)
     assert study.components["gauge (GRR)"].tolerance_percent == pytest.approx(100 * 6 * 0.302373 / 8, abs=1e-3)
     assert study.distinct == 4
+    assert any("pooled with the repeatability" in line for line in study.lines())
 
 
 @pytest.mark.parametrize("interaction", [0.0, 0.5])
@@ -69,7 +70,8 @@ def test_a_reference_measured_again_and_again():
     assert study.bias == pytest.approx(values.mean() - 50.0) and abs(study.bias) > study.bias_half_interval
     assert study.cg == pytest.approx(0.02 / (6 * values.std(ddof=1)))
     assert study.cgk == pytest.approx((0.01 - study.bias) / (3 * values.std(ddof=1)))
-    assert "significant" in "\n".join(study.lines())
+    text = "\n".join(study.lines())
+    assert "significant" in text and f"Cg, Cgk                   {study.cg:.3f}, {study.cgk:.3f}" in text
 
 
 def write(path, rows, head="part;operator;value"):

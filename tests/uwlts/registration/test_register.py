@@ -221,6 +221,8 @@ def test_spheres_tell_what_a_pipe_does_not():
     scans = with_spheres(rng, [scan_from(pose, rng, radius=plain) for pose in true], true, 25.0)
     found = uwlts.register(scans, search=True, sphere_mm=25.0)
     assert found.open_movements == () and found.pairs[0].spheres == 4
+    # The pose takes up to six of the twelve differences of four pairs of centres.
+    assert 0.3 < found.pairs[0].sphere_rms < 1.5
     errors = pose_errors(found.poses, np.linalg.inv(true[0]) @ true, found.middles_mm)
     assert np.abs(errors[:, :3]).max() < 0.1 and np.degrees(np.abs(errors[:, 3:]).max()) < 0.1
 
