@@ -138,10 +138,11 @@ def test_frames_lost_on_their_way_are_taken_again(board, sensor, folder, tmp_pat
 
 
 def test_a_camera_that_loses_every_frame_ends_the_scan(board, sensor, folder, tmp_path):
-    with serving(board, sensor, "cut:3@3") as served:
+    with serving(board, sensor, "cut:10000@3") as served:
         plan, out = written(folder, served, count=4), tmp_path / "scan.h5"
-        ended(scan(plan, out), "incomplete: packets were lost.* 3 times")
+        ended(scan(plan, out), r"incomplete: packets were lost.* \d+ times")
         assert dark(served)
+        served.camera.inject("cut", 0)
         np.testing.assert_allclose(positions(part_path(out)), planned(served, 1), atol=0.011)
         assert scan(plan, out, "--resume").returncode == 0
         np.testing.assert_allclose(positions(out), planned(served, 4), atol=0.011)
