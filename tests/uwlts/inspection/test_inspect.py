@@ -101,6 +101,12 @@ def test_the_form_of_a_pipe_is_within_its_intervals():
         assert pipe["ovality"].uncertainty < 0.03
     assert min(inside.values()) >= 14, inside
     assert len(sections) == 12
+    # The length from -20 to 20 mm in twelve parts, about the axis in the origin; the bow has its means here.
+    middles = (np.arange(12) + 0.5) * 40 / 12 - 20
+    places = np.array([section.place_mm for section in sections])
+    order = np.argsort(places[:, 0])
+    bow = 0.001 * (middles**2 + (40 / 12) ** 2 / 12)
+    np.testing.assert_allclose(places[order], np.column_stack([middles, 0 * middles, bow]), atol=0.05)
     for section in sections:
         assert section["ovality"].value == pytest.approx(1.5, abs=GATE * section["ovality"].uncertainty + 0.05)
 
@@ -219,6 +225,11 @@ def test_pits_are_found_and_measured():
     assert not any("no uncertainty" in note for note in found.notes)
     blemishes = found.select(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
     assert len(blemishes) == len(places)
+    # Numbers descend with depth, by kind.
+    pits = [feature.values[0].value for feature in found.select(FeatureKind.PIT)]
+    assert pits == sorted(pits, reverse=True) and [feature.name for feature in found.select(FeatureKind.PIT)] == [
+        f"pit {number}" for number in range(1, 5)
+    ]
     for feature in blemishes:
         x, y, z = feature.place_mm
         at = min(places, key=lambda place: np.hypot(place[0] - x, place[1] - RADIUS_MM * np.arctan2(y, -z)))
@@ -350,6 +361,7 @@ def test_a_flange_is_measured():
     assert len(holes) == 6
     for hole in holes:
         within(hole, {"diameter": 12.0})
+        np.testing.assert_allclose(hole.extent_mm, [hole["diameter"].value] * 2 + [0.0])
         assert hole["position"].low < 0.01
     # A parabola from the bore to the rim; the outermost cells average over a twenty-fourth of the face.
     assert flange["flatness"].value == pytest.approx(0.1 * (1 - np.square(18 / 55)), abs=0.01)
