@@ -14,6 +14,7 @@ from uwlts.cli import app
 from uwlts.comparison.change import SurfaceChange, _estimate_areas, _thin_points
 from uwlts.comparison.change_reference import read_reference, sample_mesh
 from uwlts.comparison.comparison_options import ComparisonOptions
+from uwlts.comparison.ideal_shapes import IdealCylinder, IdealPlane, IdealSphere, place_shape
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
 from uwlts.fitting.point_groups import number_cubes
 from uwlts.registration.surface_registration import SampledSurface, register_to_surface
@@ -457,7 +458,29 @@ def test_regions_and_figures_are_those_of_the_places():
     assert record["mean_mm"] == pytest.approx((-12.4 + 1.5 + 1.4) / 239)
     assert record["rms_mm"] == pytest.approx(np.sqrt((23 * 0.25 + 0.81 + 5 * 0.09 + 2 * 0.49) / 239))
     assert (record["largest_loss_mm"], record["largest_rise_mm"], record["level_median_mm"]) == (-0.9, 0.7, 0.1)
-    assert "2 places are in no region" in "\n".join(change.lines())
+    assert change.lines() == [
+        "reference                 cloud",
+        "places compared           239 of 240, means over 4 mm",
+        f"distance, mm              mean {-9.5 / 239:+.4f}, rms {record['rms_mm']:.4f}",
+        "level of detection, mm    0.1000 (median; 95 %)",
+        "significant change        13.0 % of the area, -0.900 to +0.700 mm",
+        "regions of change         2 with at least 4 places, spacing 2 mm; 2 places are in no region",
+    ]
+
+
+def test_ideal_shapes_have_their_distances_and_normals():
+    """Signed distances along unit normals; also in the centre of a sphere, where no normal is defined."""
+    places = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]])
+    sphere = place_shape(IdealSphere(diameter_mm=6.0, point_mm=(0, 0, 0)), places).nearest(places)
+    np.testing.assert_allclose(sphere.distance_mm, [2.0, -1.0, -3.0])
+    np.testing.assert_allclose(sphere.normals, [[0.6, 0.8, 0], [0, 0, 1], [0, 0, 0]])
+    pipe = IdealCylinder(diameter_mm=6.0, point_mm=(0, 0, 7), axis=(0, 0, -3))
+    found = place_shape(pipe, places).nearest(places, reach_mm=2.5)
+    np.testing.assert_allclose(found.distance_mm, [2.0, np.nan, np.nan])
+    np.testing.assert_allclose(found.normals[0], [0.6, 0.8, 0])
+    plane = place_shape(IdealPlane(point_mm=(0, 0, 1), normal=(0, 3, 4)), places).nearest(places)
+    np.testing.assert_allclose(plane.distance_mm, [2.4 - 0.8, 0.8, -0.8])
+    np.testing.assert_allclose(plane.normals, [[0, 0.6, 0.8]] * 3)
 
 
 def test_areas_of_places_add_up_to_the_surface():
