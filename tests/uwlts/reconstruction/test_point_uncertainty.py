@@ -266,6 +266,9 @@ def test_spheres_follow_their_points_as_when_searched_for_again(spheres):
         assert np.abs(change).max() > 1e-3
         followed = np.array(list(moved.figures_mm(move).values())) - list(evaluation.figures_mm.values())
         np.testing.assert_allclose(followed, change, atol=2e-4)
+        for name, by_points in moved.gradients().items():
+            expected = again[name] - evaluation.figures_mm[name]
+            assert np.sum(by_points * move) == pytest.approx(expected, abs=2e-4), name
 
 
 def test_figures_of_spheres_have_the_uncertainty_of_monte_carlo(spheres):
