@@ -134,7 +134,7 @@ def test_unknown_base(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[camera]\nwidth = 64\n", ("camera.width: unknown key", "unit suffix")),
+        ("[camera]\nwidth = 64\n", ("camera.width: unknown key", "unit suffix", "width_px, height_px")),
         ("colour = 'red'\n", ("colour: unknown key",)),
         ("[camera]\nwidth_px = 64.5\n", ("camera.width_px", "64.5")),
         ("[camera]\nwidth_px = 4\n", ("camera.width_px", "16", "found 4")),
