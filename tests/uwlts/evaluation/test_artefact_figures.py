@@ -339,6 +339,15 @@ def test_labels_serve_slightly_changed_points():
         assert stretched == pytest.approx(scale * first, rel=1e-6)
 
 
+@pytest.mark.parametrize("share", [0.82, 1.2])
+def test_the_described_height_may_be_wrong_by_a_fifth(share):
+    points, _ = step_profile(np.random.default_rng(1), "base, block, base")
+    right, wrong = (label_step_faces(points, height_mm=height) for height in (HEIGHT, share * HEIGHT))
+    # Limits of a face follow from its scatter: some points of the riser may differ.
+    assert np.mean(right == wrong) > 0.98
+    assert step_height(points, wrong).height_mm == pytest.approx(step_height(points, right).height_mm, abs=0.005)
+
+
 def test_a_step_as_low_as_ten_times_the_noise_is_found():
     points, _ = step_profile(np.random.default_rng(2), "base, block, base", sigma=0.1, height=1.0, outliers=0)
     labels = label_step_faces(points, height_mm=1.0)

@@ -221,7 +221,7 @@ def test_pits_are_found_and_measured():
     rng = np.random.default_rng(5)
     cloud = pipe_scan(rng, half_arc=0.5, along=(-24, 24, 0.5), around_mm=0.3, radius=radius, correlated=True)
     found = uwlts.inspect_pipe(cloud, wall_mm=9.0)
-    assert any("deg of the circumference" in note for note in found.notes)
+    assert any("deg of the circumference" in note and "ovality of up to 2 %" in note for note in found.notes)
     assert not any("no uncertainty" in note for note in found.notes)
     blemishes = found.select(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
     assert len(blemishes) == len(places)
