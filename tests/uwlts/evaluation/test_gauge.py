@@ -50,12 +50,21 @@ def test_aiags_example():
     assert any("pooled with the repeatability" in line for line in study.lines())
 
 
-def test_the_interval_of_the_repeatability_is_that_of_chi_square():
-    """78 degrees of freedom with the pooled interaction; a quantile of 20,000 draws is known to 0.5 %."""
-    found = uwlts.gauge_study(ROWS).components["repeatability (EV)"]
+def test_intervals_of_single_mean_squares_are_those_of_chi_square():
+    """78 degrees of freedom with the pooled interaction; a quantile of 20,000 draws is known to 0.5 %.
+
+    The other mean squares are forty and two hundred times as large, so that nearly they alone count. Upper ends with 2
+    and 9 degrees of freedom are known to 2.3 and 0.7 %.
+    """
+    components = uwlts.gauge_study(ROWS).components
+    found = components["repeatability (EV)"]
     assert found.low == pytest.approx(found.std * np.sqrt(78 / chi2.ppf(0.975, 78)), rel=0.01)
     assert found.high == pytest.approx(found.std * np.sqrt(78 / chi2.ppf(0.025, 78)), rel=0.01)
     assert found.tolerance_percent is None
+    parts, operators = components["parts (PV)"], components["reproducibility (AV)"]
+    assert parts.low == pytest.approx(np.sqrt(9.8180 / chi2.ppf(0.975, 9)), rel=0.01)
+    assert parts.high == pytest.approx(np.sqrt(9.8180 / chi2.ppf(0.025, 9)), rel=0.03)
+    assert operators.high == pytest.approx(np.sqrt(1.5836 / 30 * 2 / chi2.ppf(0.025, 2)), rel=0.1)
 
 
 def test_components_of_chosen_mean_squares():

@@ -21,7 +21,7 @@ from uwlts.errors import EvaluationError
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
-from uwlts.inspection.flat import _fit_circle
+from uwlts.inspection.flat import _fit_circle, _Hole, _measure_bolt_circle
 from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
@@ -368,6 +368,34 @@ def test_a_flange_is_measured():
     # The noise of a perfect face is subtracted: what is left is within twice the stated uncertainty.
     plain = uwlts.inspect_flange(flat_scan(rng, lambda x, y: 0 * x, face, along=(-60, 60, 0.5))).features[0]["flatness"]
     assert plain.value < 2 * plain.uncertainty and plain.value < 0.01
+
+
+def test_a_bolt_circle_is_that_of_its_holes():
+    """Five of six even holes, with 0.05 mm each: the radius has a variance by least squares, offsets of zero."""
+    angles = 0.4 + 2 * np.pi * np.array([0, 1, 2, 3, 5]) / 6
+    units = np.column_stack([np.cos(angles), np.sin(angles)])
+    random, growth = np.diag([0.05**2, 0.05**2, 0.1**2]), 1e-3
+    bolts = [
+        _Hole(
+            np.array([3.0, -7.0]) + 40 * unit, 6.0, random, np.array([[*(growth * 40 * unit), 0.0]]), np.arange(9), 0.01
+        )
+        for unit in units
+    ]
+    circle, offsets = _measure_bolt_circle(bolts)
+    design = np.column_stack([units, np.ones(5)])
+    assert circle.value == pytest.approx(80.0)
+    assert circle.random == pytest.approx(2 * 0.05 * np.sqrt(np.linalg.inv(design.T @ design)[2, 2]))
+    assert circle.systematic == pytest.approx(80 * growth)
+    np.testing.assert_allclose(offsets, 0.0, atol=1e-9)
+    # All six, one of them 0.3 mm outside: the circle follows by a sixth in radius and a third in position.
+    whole = [
+        _Hole(40 * np.array([np.cos(a), np.sin(a)]), 6.0, random, None, np.arange(9), 0.0)
+        for a in 2 * np.pi / 6 * np.arange(6)
+    ]
+    whole[0] = replace(whole[0], middle=whole[0].middle + [0.3, 0.0])
+    circle, offsets = _measure_bolt_circle(whole)
+    assert circle.value == pytest.approx(80.1, abs=1e-3) and circle.systematic is None
+    assert offsets[0] == pytest.approx(0.3 - 0.1 - 0.05, abs=1e-3)
 
 
 def test_a_gap_is_measured():
