@@ -61,13 +61,13 @@ def test_a_stripe_lit_and_seen_by_way_of_a_mirror_shows_at_its_mirrored_points(t
     assert (np.abs(strip.argmax(axis=0) - 30) <= 1).all()
 
 
-def test_lengths_by_way_of_a_mirror_lead_to_the_mirrored_points(thesis):
+def test_lengths_with_a_mirror_lead_to_the_mirrored_points(thesis):
     renderer = Renderer(thesis, clear(), hidden(SHARE), effects=EFFECTS)
     bundle, _ = renderer.view.trace_grid(8)
     _, segment, *_ = renderer._segments(SensorPose(sensor_at()), bundle, None)
     straight = to_numpy(mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t)))
     end, seen = to_numpy(segment.end()), segment.valid.numpy() & (bundle.weight.numpy() > 0)
-    # Of all that is seen by way of the mirror only the small plate's hidden face is lower.
+    # Of all that is seen in the mirror only the small plate's hidden face is lower.
     seen &= np.abs(end[:, 2] - PLATE_Z) < 1e-3
     assert seen.sum() > 50
     normal = np.array([-math.sin(TILT), 0.0, -math.cos(TILT)])
