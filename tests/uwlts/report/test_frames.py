@@ -69,13 +69,19 @@ def test_values_of_an_inspection():
 
 def test_parameters_of_a_calibration():
     nominal = uwlts.nominal("thesis", medium="water")
-    stated = {"camera": {"std": {"f": 0.8, "cx": 0.3, "k1": 0.001}}, "window": {"std_mm": 0.4}}
-    frame = uwlts.report.to_frame(nominal.model_copy(update={"residuals": stated})).set_index("name")
-    assert frame.loc["fx", "value"] == frame.loc["fy", "value"] == nominal.camera.fx_px
+    lens = nominal.camera.distortion.model_copy(update={"k1": 0.01})
+    camera = nominal.camera.model_copy(update={"distortion": lens})
+    stated = {
+        "camera": {"std": {"f": 0.8, "cx": 0.3, "k1": 0.001}},
+        "sheet": {"normal_std_deg": 0.03},
+        "window": {"std_mm": 0.4},
+    }
+    frame = uwlts.report.to_frame(nominal.model_copy(update={"residuals": stated, "camera": camera})).set_index("name")
+    assert frame.loc["f", "value"] == nominal.camera.fx_px
     assert frame.loc["window_distance", "value"] == nominal.window.distance_mm
-    np.testing.assert_allclose(frame.loc[["fx", "fy", "cx", "cy"], "std"], [0.8, 0.8, 0.3, np.nan])
+    np.testing.assert_allclose(frame.loc[["f", "cx", "cy", "sheet_normal"], "std"], [0.8, 0.3, np.nan, 0.03])
     np.testing.assert_allclose(frame.loc[["k1", "window_distance"], "std"], [0.001, 0.4])
-    assert list(frame.loc[["fx", "k1", "window_distance"], "unit"]) == ["px", "", "mm"]
+    assert list(frame.loc[["f", "k1", "window_distance", "sheet_normal"], "unit"]) == ["px", "", "mm", "°"]
 
 
 def test_parameters_of_a_joint_calibration_are_in_the_units_of_the_pages():
