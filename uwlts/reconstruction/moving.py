@@ -40,27 +40,15 @@ _LEAST = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class PlatformPoses:
-    """Poses of a platform at the N images of a capture.
+    """Poses of a platform at the N images of a capture."""
 
-    Attributes
-    ----------
-    poses : (N, 4, 4) float64
-        ``T_base_platform``, mm; NaN for images without a pose.
-    covariance : (N, 6, 6) float64 or None
-        Covariance of each pose, as in `Trajectory`.
-    times_s : (N,) float64
-        Times of the images.
-    rates : (N, 6) float64 or None
-        Velocity (mm/s) and angular velocity (rad/s) in the base frame; None without a trajectory.
-    doubts : tuple of str
-        Warnings about the trajectory.
-    """
-
-    poses: np.ndarray
-    covariance: np.ndarray | None
-    times_s: np.ndarray
+    poses: np.ndarray  # (N, 4, 4); ``T_base_platform``, mm; NaN for images without a pose
+    covariance: np.ndarray | None  # (N, 6, 6); covariance of each pose, as in `Trajectory`
+    times_s: np.ndarray  # (N,); times of the images
     rates: np.ndarray | None = None
-    doubts: tuple[str, ...] = ()
+    """(N, 6); velocity (mm/s) and angular velocity (rad/s) in the base frame; None without a
+    trajectory."""
+    doubts: tuple[str, ...] = ()  # warnings about the trajectory
 
 
 def find_platform_poses(
