@@ -37,20 +37,8 @@ class Caustics:
     The mean square slope is that of a clean sea, 0.003 + 0.00512 U at the wind speed U in m/s (Cox and Munk 1954). It
     is spread evenly over the logarithm of the wave number, from the longest waves to ``_SHORTEST_MM`` (saturated
     spectrum, elevation in proportion to k^-4: Phillips 1958). The patch holds those up to its period. Waves run in all
-    directions with cos^2 of half the angle to the wind, which blows along X.
-
-    Parameters
-    ----------
-    wind_m_s
-        Wind speed.
-    depth_mm
-        Depth below the surface.
-    index
-        Refractive index of the water.
-    scattering_per_mm
-        Scattering coefficient; scattered light counts as even light.
-    seed
-        Seed of the waves.
+    directions with cos^2 of half the angle to the wind, which blows along X. ``index`` is that of the water; light that
+    it scatters counts as even light.
     """
 
     def __init__(self, *, wind_m_s: float, depth_mm: float, index: float, scattering_per_mm: float, seed: int):
@@ -111,16 +99,8 @@ def focus_light(along: np.ndarray, across: np.ndarray, *, depth_mm: float, index
     """Return the irradiance (N, N) below a periodic surface, relative to its mean.
 
     A vertical ray meets the surface at the angle i of its slope and is refracted to r, sin r = sin i / n. It is shifted
-    by the depth times tan(i - r) against the slope. Each ray's light is divided among the four nearest nodes.
-
-    Parameters
-    ----------
-    along, across : (N, N)
-        Slopes of the surface along X (columns) and Y (rows) at nodes of `PATCH_MM` / N.
-    depth_mm
-        Depth below the surface.
-    index
-        Refractive index of the water.
+    by the depth times tan(i - r) against the slope. Each ray's light is divided among the four nearest nodes. Slopes
+    (N, N) are those along X (columns) and Y (rows) at nodes of `PATCH_MM` / N.
     """
     count = len(along)
     steepness = np.hypot(along, across)

@@ -337,15 +337,6 @@ class Renderer:
 
         Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet
         of the plane through its point. It is known if the last frame was rendered with the same arguments.
-
-        Parameters
-        ----------
-        pose
-            Pose of the sensor, with its motion.
-        lines
-            Surface points and normals of the profile lines.
-        spp
-            Number of samples per pixel.
         """
         if self._last_lines is not None:
             known_pose, known_lines, known_spp, light = self._last_lines

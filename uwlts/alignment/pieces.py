@@ -108,18 +108,9 @@ class Piece:
 def fit_piece(
     survey: Survey, part: np.ndarray, corrections: np.ndarray, rates: np.ndarray, options: AlignmentOptions
 ) -> Piece | None:
-    """Fit patches to a part of the points, along the corrected path. Return None if the points form no surface.
+    """Fit patches to points of indices ``part`` along the corrected path; return None if they form no surface.
 
-    Parameters
-    ----------
-    survey
-        Cloud along the path.
-    part : (N,)
-        Indices of the points.
-    corrections, rates : (M, 6)
-        Corrections of the poses of all images, and their time derivatives.
-    options
-        Options of the alignment.
+    ``corrections`` and ``rates`` (M, 6) are corrections of the poses of all images, and their time derivatives.
     """
     known = None if survey.cloud.uncertainty is None else survey.cloud.uncertainty[part]
     # Errors common to all points do not affect differences between passes.

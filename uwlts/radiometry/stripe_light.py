@@ -65,23 +65,10 @@ class StripeLight:
 def stripe_light(
     header: CaptureHeader, calibration: Calibration, stripes: CaptureStripes, stage_mm: np.ndarray
 ) -> StripeLight:
-    """Calculate the light at the stripe centres of a scan by a stage.
+    """Calculate the light at the stripe centres of a scan, from stage positions (F,) of its images.
 
-    Parameters
-    ----------
-    header
-        Description of the capture; its sensor gives laser, lens and detector.
-    calibration
-        Camera, window and sheet.
-    stripes
-        Stripe centres.
-    stage_mm : (F,)
-        Stage position of each image.
-
-    Raises
-    ------
-    CaptureError
-        All laser images are from one position of the stage, which does not show the surface's normals.
+    The sensor of ``header`` gives laser, lens and detector. Raises CaptureError if all laser images are from one
+    position of the stage, which does not show the surface's normals.
     """
     if len(np.unique(stage_mm[stripes.frame])) < _FEWEST_POSITIONS:
         raise CaptureError(

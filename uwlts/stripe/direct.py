@@ -59,18 +59,8 @@ def direct_stripe(
     """Return the stripe of an image without reflections, including its ends.
 
     Lines without a unique choice become AMBIGUOUS. Candidates without a width cannot be measured: two merging stripes,
-    or a stripe too wide. The path may use them, but their lines get no point.
-
-    Parameters
-    ----------
-    stripe
-        Stripe found by the extraction.
-    rivals
-        All candidates on lines with more than one.
-    jump_px
-        Distance between centres on neighbouring lines, px, above which they belong to two stripes.
-    rule
-        Numbers of the rule.
+    or a stripe too wide. The path may use them, but their lines get no point. ``rivals`` are all candidates on lines
+    with more than one. Centres on neighbouring lines that are farther apart than ``jump_px`` belong to two stripes.
     """
     alone = np.setdiff1d(stripe.lines, rivals.line)
     line = np.concatenate([alone, rivals.line])

@@ -54,18 +54,11 @@ _RULE = ScatterRule()
 def least_scattered(
     peak: PeakWindow, centre: np.ndarray, first: ModuleType, others: tuple[ModuleType, ...]
 ) -> np.ndarray:
-    """Return the centres (M,) of the method that scatters least along the stripe.
+    """Return the centres (M,), px from each window's first pixel, of the method that scatters least along the stripe.
 
-    Parameters
-    ----------
-    peak
-        Windows of M lines in their order.
-    centre
-        Centres (M,) of the preferred method, px from the first pixel of each window.
-    first
-        Module of another method. Only if the preferred method lacks its advantage over this one, all are compared.
-    others
-        Modules of further methods. One of all is used if it scatters less by `ScatterRule.gain` and ``gain_px``.
+    ``peak`` are windows of M lines in their order, with centres (M,) of the preferred method. All methods are compared
+    only if that method lacks its advantage over ``first``. Another one is used if it scatters less by
+    `ScatterRule.gain` and ``gain_px``.
     """
     rows = _select_runs(peak.start.size)
     # The median of the lines that are compared, because only their scatter decides; counting is faster than sorting.
