@@ -8,13 +8,15 @@ import math
 
 import numpy as np
 
+from twin.scene.vehicle import GRAVITY_M_S2
+
 PATCH_MM = 512.0
 """Period of the surface; the focus of longer waves is at depths of many metres."""
 CELLS = 1024
 """Number of cells of the pattern along each axis: 0.5 mm each, narrower than the sun's blur 0.2 m below the surface."""
 _SHORTEST_MM = 17.0
 """Shortest wavelength: the slowest waves, between gravity and capillary waves, after which viscosity damps."""
-_GRAVITY_MM_S2 = 9810.0
+_GRAVITY_MM_S2 = 1e3 * GRAVITY_M_S2
 _TENSION_MM3_S2 = 7.3e4
 """Surface tension of water divided by its density (0.073 N/m, 1000 kg/m3)."""
 _PEAK = 0.877
