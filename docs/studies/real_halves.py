@@ -163,7 +163,7 @@ def stripe_residuals(groups: Sequence[np.ndarray], shared: float) -> np.ndarray:
 def stripe_rows(name: str, halves: Sequence[list[np.ndarray]], *, shared: float = 1.0) -> Iterator[Row]:
     """Yield the rows of a stripe from the groups of both halves; the second is empty if it is not known yet."""
     first, *second = (stripe_residuals(half, shared) for half in halves if half)
-    others = len(halves[1]) or len(halves[0])
+    others = len(halves[0])
     for k, residual in enumerate(("centre noise", "centres about parabolas", "means of 8 centres, times root 8")):
         found = second[0][k] if second else ()
         stated = first[0] if k == 0 else first[3]
