@@ -278,7 +278,7 @@ def _search_lines(
     for _ in range(_RULE.looks):
         _find_highest_blocks(board, jobs.highest, jobs.chosen)
         first = -(-end // LANES) * LANES
-        end = first
+        end, looked = first, False
         for line in range(status.size):
             if not jobs.active[line]:
                 continue
@@ -291,7 +291,8 @@ def _search_lines(
             else:
                 chosen = _choose_block(board, line, highest, int(jobs.chosen[line]), least, rules)
                 end += _add_job(profiles, board, chosen, line, line, jobs, end, near, rules)
-        if end == first:
+                looked = True
+        if not looked:
             break
         _measure_jobs(profiles, jobs, first, end, rules)
         _follow_peaks(profiles, jobs, first, end, rules)
@@ -387,15 +388,15 @@ def _search_all(
     for _ in range(2 * _RULE.most_stripes):
         _find_highest_blocks(board, jobs.highest, jobs.chosen)
         first = -(-end // LANES) * LANES
-        end = first
+        end, looked = first, False
         for row in range(lines.size):
             there = jobs.highest[row]
             if own[row, -1] < 0 and there >= rules.coarse and there > 0:
                 added = _add_job(profiles, board, int(jobs.chosen[row]), row, lines[row], jobs, end, near, rules)
                 # Until the windows are measured, the number of the row.
                 jobs.block[end] = row
-                end += added
-        if np.max(jobs.highest) < rules.coarse:
+                end, looked = end + added, True
+        if not looked:
             break
         _measure_jobs(profiles, jobs, first, end, rules)
         _follow_peaks(profiles, jobs, first, end, rules)
