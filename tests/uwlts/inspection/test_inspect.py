@@ -21,7 +21,7 @@ from uwlts.errors import EvaluationError
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
-from uwlts.inspection.flat import _fit_circle, _Hole, _measure_bolt_circle
+from uwlts.inspection.flat import _estimate_step_height, _fit_circle, _Hole, _mask_inner_points, _measure_bolt_circle
 from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
@@ -368,6 +368,33 @@ def test_a_flange_is_measured():
     # The noise of a perfect face is subtracted: what is left is within twice the stated uncertainty.
     plain = uwlts.inspect_flange(flat_scan(rng, lambda x, y: 0 * x, face, along=(-60, 60, 0.5))).features[0]["flatness"]
     assert plain.value < 2 * plain.uncertainty and plain.value < 0.01
+
+
+def test_points_near_edges_of_profiles_are_no_inner_points():
+    """Two profiles of 30 lines, one with a gap of ten lines: four lines beside each edge; single lines may lack."""
+    line = np.concatenate([np.delete(np.arange(30), 15), np.arange(10), np.arange(20, 30)])
+    frame = np.repeat([4, 7], [29, 20])
+    order = np.random.default_rng(1).permutation(49)
+    cloud = PointCloud(np.zeros((49, 3)), np.ones(49), frame[order], line[order])
+    inner = _mask_inner_points(cloud, np.arange(49))
+    expected = np.concatenate(
+        [
+            np.delete((np.arange(30) >= 4) & (np.arange(30) < 26), 15),
+            2 * [False, False, False, False, True, True, False, False, False, False],
+        ]
+    )
+    np.testing.assert_array_equal(inner, expected[order])
+    unknown = PointCloud(np.zeros((49, 3)), np.ones(49), np.full(49, -1), line)
+    assert _mask_inner_points(unknown, np.arange(49)).all()
+
+
+def test_the_height_of_a_step_is_that_between_its_two_most_frequent_levels():
+    rng = np.random.default_rng(2)
+    levels = np.concatenate([rng.normal(3.0, 0.02, 6000), rng.normal(-9.0, 0.02, 3000), rng.uniform(-9, 3, 500)])
+    # Bins of the histogram are wider than the noise.
+    assert _estimate_step_height(levels) == pytest.approx(12.0, rel=0.02)
+    with pytest.raises(EvaluationError, match="only one face found"):
+        _estimate_step_height(np.full(100, 2.0))
 
 
 def test_a_bolt_circle_is_that_of_its_holes():
