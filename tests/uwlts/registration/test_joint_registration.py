@@ -5,6 +5,7 @@ import pytest
 
 from uwlts.fitting.patches import surface_patches
 from uwlts.registration.joint_registration import JointRegistration, PairEvidence
+from uwlts.registration.marker_spheres import MarkerSphere
 from uwlts.registration.register import _closure_rms
 from uwlts.storage.cloud import PointUncertainty
 
@@ -104,3 +105,36 @@ def test_the_closure_of_a_pair_is_what_the_others_leave() -> None:
     # Without the overlap of the last two, nothing determines the third.
     assert _closure_rms(joint, (0, 2), {(0, 1): pairs[0, 1], (0, 2): pair}, solution) is None
     assert _closure_rms(joint, (0, 2), {(0, 2): pair}, solution) is None
+
+
+def test_common_spheres_are_observed_as_their_centres_differ() -> None:
+    """Whitened differences of centres, and their changes by small motions and amplitudes of both scans."""
+    joint = joint_of(3, patterns=1)
+    rng, markers = np.random.default_rng(9), []
+    for _ in range(3):
+        root = 0.1 * np.eye(3) + 0.02 * rng.normal(size=(3, 3))
+        markers.append([MarkerSphere(np.array([30.0, 5.0, 280.0]), root @ root.T, 0.1 * rng.normal(size=(1, 3)))])
+    joint.markers, joint.sphere_mm = markers, 20.0
+    joint.move(np.append(rng.normal(size=12) * np.tile(np.repeat([0.1, 0.01], 3), 2), rng.normal(size=3)))
+    pairs = joint.collect_evidence({})
+    assert set(pairs) == {(0, 1), (0, 2), (1, 2)}
+    pair, centres, roots = pairs[1, 2], [], []
+    for number in (1, 2):
+        pose, own = joint.poses[number], markers[number][0]
+        centres.append(pose[:3, :3] @ (own.centre_mm + joint.patterns[number] @ own.patterns_mm) + pose[:3, 3])
+        roots.append(pose[:3, :3] @ own.covariance @ pose[:3, :3].T)
+    off = centres[0] - centres[1]
+    assert pair.residuals @ pair.residuals == pytest.approx(off @ np.linalg.solve(roots[0] + roots[1], off))
+    # Three views give three pairs, but two independent differences.
+    np.testing.assert_allclose(pair.weights, 2 / 3)
+    assert (pair.patches, pair.spheres) == (0, 1)
+    for seed in range(3):
+        # Turns of 1e-8 rad also turn the covariances, which changes residuals by as much.
+        step = 1e-6 * np.random.default_rng(seed).normal(size=15)
+        step[[3, 4, 5, 9, 10, 11]] *= 0.01
+        before, change = pair.residuals, pair.derivatives @ step
+        joint.move(step)
+        after = joint.collect_evidence({})[1, 2].residuals
+        joint.move(-step)
+        np.testing.assert_allclose(after - before, change, atol=1e-7)
+        assert np.abs(change).max() > 3e-6
