@@ -26,6 +26,7 @@ from uwlts.calibration.guidance.pose_advice import (
     best_pose,
     candidates,
     compute_gain,
+    compute_shortfall,
     coverage_of,
     describe_missing,
     describe_missing_sheet,
@@ -239,6 +240,22 @@ def test_following_the_advice_leads_to_a_good_camera_soon(setting, thesis_as_bui
     assert state.solution.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
     tilts = np.degrees([tilts_rad(pose) for pose in state.poses])
     assert (tilts.max(axis=0) > 12).all() and (tilts.min(axis=0) < -12).all()
+
+
+def test_more_coverage_than_wanted_does_not_replace_other_evidence(setting):
+    """The part of the wanted coverage that is missing counts four, what is beyond it a twentieth of that."""
+    state = solve_state([], setting, CompletionLimits(coverage=0.5))
+    shape = state.coverage.counts.shape
+
+    def shortfall(share: float) -> float:
+        counts = np.zeros(shape, dtype=int)
+        counts.flat[: round(share * counts.size)] = 9
+        return compute_shortfall(replace(state, coverage=replace(state.coverage, counts=counts)))
+
+    size = np.prod(shape)
+    few, half, most = (round(share * size) / size for share in (0.2, 0.5, 0.9))
+    assert shortfall(few) - shortfall(half) == pytest.approx(4 * (1 + 0.05) * (half - few), abs=4 / size)
+    assert shortfall(half) - shortfall(most) == pytest.approx(4 * 0.05 * (most - half), abs=1e-9)
 
 
 def test_advised_poses_beat_as_many_random_ones(setting):

@@ -283,6 +283,16 @@ def test_offset_of_the_position_changes_nothing(evidence):
     assert np.abs(there.coefficients - here.coefficients).max() < 1e-9
 
 
+@pytest.mark.parametrize(("lines", "degree"), [(10, 0), (21, 2), (200, 8)])
+def test_as_many_points_as_coefficients_are_too_few(lines, degree):
+    """One more is fitted: a degree for each 10 lines, up to the eighth, times three coefficients of a parabola."""
+    terms = 3 * (degree + 1)
+    at, x = (each.ravel() for each in np.meshgrid(np.linspace(0, lines - 1, degree + 2).round(), [-1.0, 0.2, 1.0]))
+    with pytest.raises(CalibrationError, match=f"{terms} stripe points .* {terms} coefficients"):
+        fit_line_polynomials(at[-terms:], x[-terms:], x[-terms:] ** 2, degree=2)
+    np.testing.assert_allclose(fit_line_polynomials(at, x, x**2, degree=2).residuals, 0, atol=1e-9)
+
+
 def test_outliers_are_left_out(sensor, evidence, result):
     rng = np.random.default_rng(5)
     stripes, count = [], 0
