@@ -80,20 +80,9 @@ class Light:
         return None if self._mirror is None else self._intersect_mirror(p, -light.direction)[1]
 
     def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, after_s: Float | None, active: Bool):
-        """Return the mask of points with a free path to the laser's window.
+        """Return the mask of points in the OCS, with their ``light``, that have a free path to the laser's window.
 
-        Parameters
-        ----------
-        objects
-            Scene, for shadows.
-        p
-            Points in the sensor's OCS.
-        light
-            Light of the sheet at these points.
-        after_s
-            Times of the points after that of the pose, s; None: at rest.
-        active
-            Mask of the points to test.
+        ``after_s`` are times of the points after that of the pose, s; None: at rest. Only ``active`` points are tested.
         """
         towards = -light.direction
         if self._mirror is None:
