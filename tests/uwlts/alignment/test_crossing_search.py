@@ -11,6 +11,7 @@ from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.crossing_search import (
     _find_hypotheses,
     _has_rival,
+    _is_beside,
     _is_likely,
     _search_range,
     accept_crossings,
@@ -149,6 +150,11 @@ def test_equal_stones_at_equal_distances_are_ambiguous():
     # Nearly the same position, or one with less than half the patches, is no rival.
     assert not _has_rival(before, closed, found[0], [found[0]])
     assert not _has_rival(before, closed, found[0], [replace(each, patches=found[0].patches // 3) for each in rivals])
+
+
+@pytest.mark.parametrize(("pair", "beside"), [((10, 30), True), ((14, 26), True), ((15, 30), False), ((10, 25), False)])
+def test_neighbours_of_a_crossing_are_within_some_pieces_in_both_passes(pair, beside):
+    assert _is_beside(pair, [(50, 70), (10, 30)], 4) == beside and not _is_beside(pair, [], 4)
 
 
 def test_a_surface_that_has_changed_in_part_does_not_agree():
