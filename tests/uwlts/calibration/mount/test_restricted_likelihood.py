@@ -1,12 +1,13 @@
 """Least squares with variance components: steps that oscillate, and estimates that cannot settle."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy.stats import t
+from scipy.optimize import brentq
+from scipy.stats import f, norm, t
 
-from uwlts.calibration.mount.restricted_likelihood import NotSettled, settle
+from uwlts.calibration.mount.restricted_likelihood import NotSettled, settle, settle_agreeing
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,16 @@ class Readings:
 
     size = 1
 
+    @property
+    def groups(self):
+        return len(self.read)
+
+    def select(self, kept):
+        return replace(self, read=self.read[kept])
+
+    def pose_directions(self, state):
+        return [np.eye(1)] * len(self.read)
+
     def bounds(self):
         return np.array([(1e-3, 1e3)])
 
@@ -86,6 +97,23 @@ class Readings:
 
     def pool_repeats(self, state):
         return self.repeats, self.squares
+
+
+@pytest.mark.parametrize(("beyond", "rejected"), [(0.98, []), (1.02, [7])])
+def test_one_of_a_thousand_sets_of_equal_readings_loses_one(beyond, rejected):
+    """A reading's distance from the mean of n - 1 others has the variance s^2 n / (n - 1), and n may be rejected."""
+    count = 40
+    read = norm.ppf((np.arange(count) + 0.5) / count)
+    read = np.random.default_rng(2).permutation(read)
+
+    def squared_distance(value: float) -> float:
+        every = np.append(np.delete(read, 7), value)
+        return (value - every[:-1].mean()) ** 2 / (every.var(ddof=1) * count / (count - 1))
+
+    limit = f.isf(1e-3 / count, 1, count - 1)
+    read[7] = brentq(lambda value: squared_distance(value) - beyond * limit, 2.0, 1e3)
+    _, kept = settle_agreeing(Readings(read, 0, 0.0), [(0.0, np.ones(1))], require=lambda kept: None)
+    assert np.flatnonzero(~kept).tolist() == rejected
 
 
 @pytest.mark.parametrize("repeats", [0, 4])
