@@ -203,7 +203,11 @@ def correlate_heights(
     with np.errstate(invalid="ignore", divide="ignore"):
         similarity = np.where(enough & (spread > options.least_spread * usual), both / np.sqrt(spread), 0.0)
     score = np.where(similarity > options.least_correlation, similarity * np.sqrt(count), -np.inf)
-    steps = [np.where(np.arange(n) > n // 2, np.arange(n) - n, np.arange(n)) for n in sizes]
+    # The largest shift is that of the target's last row onto the source's first one; later rows are negative shifts.
+    steps = [
+        np.where(np.arange(n) < rows, np.arange(n), np.arange(n) - n)
+        for n, rows in zip(sizes, maps[1][0].shape, strict=True)
+    ]
     outside = [np.abs(each * pixel_mm) > reach + pixel_mm for each, reach in zip(steps, reach_mm[:2], strict=True)]
     score[outside[0][:, None] | outside[1]] = -np.inf
     # The width of a peak is that of the compared structures.
