@@ -275,7 +275,7 @@ def test_shifts_of_whole_pixels_are_exact():
     for far in (np.array([300.0, 40.0, 2.5]), np.array([-40.0, -300.0, 2.5])):
         best, *_ = correlate_heights(first - far, second, options, pixel_mm=1.0, reach_mm=np.abs(far) + 1)
         np.testing.assert_allclose(best, far, atol=1e-9)
-    # Shifts with few common pixels are not proposed, though they are alike by chance.
+    # Shifts with few common pixels are not proposed, though these may agree by chance.
     many = replace(options, proposals=100)
     found = correlate_heights(first - shift, second, many, pixel_mm=1.0, reach_mm=np.array([200.0, 200, 10]))
     low, high = (np.array([each - shift[:2] for each in ends]) for ends in ([[0, 0]], [[80, 90]]))
