@@ -395,6 +395,8 @@ def test_the_step_standard_is_judged(thesis):
     assert any("saturated" in reason for reason in judge(step_image(thesis, step_profile(0.0), gain=5.0)).reasons)
     dark = judge(step_image(thesis, step_profile(0.0), gain=0.0))
     assert dark.depth_mm is None and "0 lines only" in dark.reasons[0]
+    other = judge(np.zeros((64, 64)))
+    assert other.pixels.shape == (0, 2) and other.depth_mm is None and "float64" in other.reasons[0]
 
 
 def test_the_step_standard_is_wanted_at_three_depths(thesis):
