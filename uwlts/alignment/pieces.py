@@ -38,19 +38,32 @@ class Survey:
 
     @classmethod
     def from_cloud(cls, cloud: PointCloud, times_s: np.ndarray, trajectory: Trajectory) -> Survey:
-        """Divide a cloud into pieces, given the times (N,) of its points on the trajectory's clock."""
+        """Divide a cloud into pieces, given the times (N,) of its points on the trajectory's clock.
+
+        Raises
+        ------
+        EvaluationError
+            No piece has enough points, or images have a single one.
+        """
         moments, image = np.unique(times_s, return_inverse=True)
         order = np.argsort(image, kind="stable")
         by_image = np.split(cloud.points_mm[order], np.searchsorted(image[order], np.arange(1, len(moments))))
         swath = float(np.median([np.linalg.norm(np.ptp(points, axis=0)) for points in by_image]))
+        if swath == 0:
+            raise EvaluationError("most times of the cloud have a single point: expected the points of a whole stripe")
         middles = np.array([points.mean(axis=0) for points in by_image])
         way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(middles, axis=0), axis=1)))
         count = max(2, round(way[-1] / swath))
         number = np.minimum((way / way[-1] * count).astype(int), count - 1)[image]
         parts = tuple(np.flatnonzero(number == each) for each in range(count))
-        radius = find_disc_radius(cloud.points_mm[parts[count // 2]])
-        platform, velocity = trajectory.poses_at(moments)[:, :3, 3], trajectory.rates_at(moments)[:, :3]
         long_enough = tuple(part for part in parts if len(part) >= _FEWEST_POINTS)
+        if not long_enough:
+            raise EvaluationError(
+                f"no piece of the path as long as the stripe is wide ({swath:.0f} mm) has {_FEWEST_POINTS} points: "
+                "record images with a smaller spacing"
+            )
+        radius = find_disc_radius(cloud.points_mm[long_enough[len(long_enough) // 2]])
+        platform, velocity = trajectory.poses_at(moments)[:, :3, 3], trajectory.rates_at(moments)[:, :3]
         return cls(cloud, moments, image, platform, velocity, long_enough, radius, way[-1] / float(np.ptp(moments)))
 
     def points_along(self, part: np.ndarray, corrections: np.ndarray) -> np.ndarray:
