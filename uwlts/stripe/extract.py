@@ -251,40 +251,18 @@ def _level_clipped(image: np.ndarray, clipped: np.ndarray, along: str) -> np.nda
 
 @dataclass(frozen=True, eq=False)
 class _SearchedImage:
-    """Result of the search with one window size, including the ends of the stripe.
-
-    Attributes
-    ----------
-    stripe : Stripe
-    profiles : (N, L) array
-        Pixels along the L lines.
-    options : StripeOptions
-    several : (L,) bool
-        Lines that may contain more than one stripe.
-    wide : (L,) bool
-        Lines with a bright peak too wide to be measured.
-    white : (L,) bool
-        Lines with a completely saturated block.
-    board : (B + 2 `MARGIN`, L) array
-        Contrasts of the blocks.
-    left : (B + 2 `MARGIN`, L) array
-        Contrasts of the blocks not examined by the search.
-    noise : float
-        Standard deviation of a pixel's noise, grey levels.
-    rules : SearchRules or None
-        None for a network, which finds one stripe only.
-    """
+    """Result of the search with one window size, including the ends of the stripe."""
 
     stripe: Stripe
-    profiles: np.ndarray
+    profiles: np.ndarray  # (N, L); pixels along the L lines
     options: StripeOptions
-    several: np.ndarray
-    wide: np.ndarray
-    white: np.ndarray
-    board: np.ndarray
-    left: np.ndarray
-    noise: float
-    rules: SearchRules | None
+    several: np.ndarray  # (L,) bool; lines that may contain more than one stripe
+    wide: np.ndarray  # (L,) bool; lines with a bright peak too wide to be measured
+    white: np.ndarray  # (L,) bool; lines with a completely saturated block
+    board: np.ndarray  # (B + 2 `MARGIN`, L); contrasts of the blocks
+    left: np.ndarray  # (B + 2 `MARGIN`, L); contrasts of the blocks not examined by the search
+    noise: float  # standard deviation of a pixel's noise, grey levels
+    rules: SearchRules | None  # None for a network, which finds one stripe only
 
     def is_too_wide(self) -> bool:
         """Return True if many lines show a stripe too wide to be measured."""
