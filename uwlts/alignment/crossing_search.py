@@ -21,6 +21,7 @@ from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nodes, refit, solve
 from uwlts.fitting.least_squares import rms_distance
+from uwlts.fitting.shapes import perpendicular_to
 from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -121,9 +122,7 @@ def _find_hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> l
     """
     other, own = (estimate.surface(number) for number in pair)
     normal = np.linalg.eigh(other.normals.T @ other.normals)[1][:, 2]
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    frame = np.stack([first, np.cross(normal, first), normal])
+    frame = np.stack([*perpendicular_to(normal), normal])
     near = [range(max(0, k - 1), min(len(estimate.pieces), k + 2)) for k in pair[::-1]]
     clouds = [np.vstack([estimate.points(k) for k in numbers]) @ frame.T for numbers in near]
     options, drift, part = estimate.options, estimate.prior.drift, 1 / len(estimate.pieces)

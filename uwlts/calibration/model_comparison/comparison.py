@@ -267,10 +267,8 @@ def choose(
 ) -> Choice:
     """Compare the usual model, models that differ from it by one property, and the simplest sufficient one.
 
-    Raises
-    ------
-    CalibrationError
-        There are too few images, or the usual model cannot be calibrated without the held-out images.
+    Raises CalibrationError if there are too few images, or the usual model cannot be calibrated without the held-out
+    images.
     """
     ways, usual, done = split_images(problem), Candidate(), count(1)
     dimensions = select_dimensions(problem.parameters)
