@@ -24,6 +24,8 @@ from tests.uwlts.mount_views import (
     step_campaign,
 )
 from uwlts.calibration.mount import restricted_likelihood
+from uwlts.calibration.mount.artefact_shapes import RingShape
+from uwlts.calibration.mount.profiles import _fit_circle
 from uwlts.cli import main
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, PlaneFound, RingFound, SphereFound, StepFound
@@ -80,6 +82,31 @@ def test_wrong_poses_and_empty_profiles_are_left_out(rng):
     reasons = {number for number, pose in enumerate(mount.poses) if pose.reason is not None}
     assert {3, 7, 11} <= reasons and len(reasons) < 6
     assert "no sphere found" in mount.poses[11].reason
+
+
+def test_a_short_arc_is_fitted_by_its_distances(rng):
+    """The least-squares circle by SciPy; the algebraic one has a smaller radius."""
+    angle = rng.uniform(-0.4, 0.4, 80) + 1.1
+    radius = 20.0 + 0.2 * rng.standard_normal(80)
+    points = np.array([300.0, -70.0]) + radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    fit = least_squares(
+        lambda circle: np.linalg.norm(points - circle[:2], axis=1) - circle[2], [300, -70, 20], xtol=1e-12
+    )
+    centre, found = _fit_circle(points)
+    np.testing.assert_allclose(np.append(centre, found), fit.x, atol=1e-4)
+
+
+def test_points_near_the_edge_of_a_ring_are_on_neither_surface(rng):
+    """A face at z = 0 with a chamfer of 1 mm to a bore; distances are from the planes of both."""
+    face = np.column_stack([np.linspace(26, 42, 60), np.zeros(60)])
+    chamfer = np.column_stack([np.linspace(25, 26, 10), np.linspace(1, 0, 10)])
+    wall = np.column_stack([np.full(60, 25.0), np.linspace(20, 1, 60)])
+    points = np.vstack([wall, chamfer, face]) + 1e-3 * rng.standard_normal((130, 2))
+    off = np.abs(np.column_stack([points[:, 1], points[:, 0] - 25]))
+    found = RingShape(25.0).find_again(points, off, 1.0, rng)
+    assert found is not None
+    np.testing.assert_array_equal(found.part > 0, (points[:, 1] > 2.0))
+    assert found.members[(points[:, 1] > 2) | (points[:, 0] > 26)].mean() > 0.95
 
 
 def least_scatter_mm(campaign: Campaign) -> float:
