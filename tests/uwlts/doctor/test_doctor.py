@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
+from tests.system.in_process import uwlts
 from twin.devices.grbl_controller import BENCH_SETTINGS, GrblController
 from uwlts.doctor import devices, libraries, machine
 from uwlts.doctor.machine import Finding, examine_renderer
@@ -96,8 +97,9 @@ def test_a_broken_library_ends_in_exit_code_1_without_a_traceback(tmp_path):
     assert re.search(r"--force-reinstall --no-deps 'numpy>=.*'$", ended.stdout, re.M)
 
 
-def test_devices_that_are_named_and_missing_end_in_exit_code_1(tmp_path):
-    ended = doctor("--camera", "replay:nothing", "--stage", str(tmp_path / "tty"), folder=tmp_path)
+def test_devices_that_are_named_and_missing_end_in_exit_code_1(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ended = uwlts("doctor", "--camera", "replay:nothing", "--stage", tmp_path / "tty")
     assert ended.returncode == 1 and not other_than_progress(ended.stderr)
     assert "missing: camera, stage; " in ended.stdout
     assert "there is no such port" in re.sub(r"\s+", " ", ended.stdout)
