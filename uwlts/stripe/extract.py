@@ -28,28 +28,17 @@ class ExtractionRule:
     """Numbers of the extraction that are not options.
 
     Chosen by hand with the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes.
-
-    Attributes
-    ----------
-    too_wide : float
-        Ratio of lines with a stripe too wide to be measured to lines with a measured stripe, above which a wider window
-        is tried.
-    coarse_sigmas : float
-        Least contrast of closely examined blocks above the background's median, in standard deviations. A stripe of
-        six standard deviations is rarely missed.
-    least_noise : float
-        Least standard deviation of the noise, grey levels: that of rounding to integers.
-    short_gap : int
-        Most consecutive lines without a centre inside a stripe, as caused by noise.
-    warm_lines : int
-        Lines of the image for `warm_up`: enough for stripes that continue.
     """
 
     too_wide: float = 0.25
+    """Ratio of lines with a stripe too wide to be measured to lines with a measured stripe, above which a wider window
+    is tried."""
     coarse_sigmas: float = 4.0
-    least_noise: float = 0.3
-    short_gap: int = 2
-    warm_lines: int = 200
+    """Least contrast of closely examined blocks above the background's median, in standard deviations. A stripe of six
+    standard deviations is rarely missed."""
+    least_noise: float = 0.3  # least standard deviation of the noise, grey levels: that of rounding to integers
+    short_gap: int = 2  # most consecutive lines without a centre inside a stripe, as caused by noise
+    warm_lines: int = 200  # lines of the image for `warm_up`: enough for stripes that continue
 
 
 _RULE = ExtractionRule()
@@ -278,7 +267,7 @@ class _SearchedImage:
         Lines with a completely saturated block.
     board : (B + 2 `MARGIN`, L) array
         Contrasts of the blocks.
-    left : (L, B + 2 `MARGIN`) array
+    left : (B + 2 `MARGIN`, L) array
         Contrasts of the blocks not examined by the search.
     noise : float
         Standard deviation of a pixel's noise, grey levels.
@@ -322,7 +311,7 @@ class _SearchedImage:
             own = np.intersect1d(lines, stripe.lines)
             columns = (each[own] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
             return StripeCandidates(own, *columns, log_likelihood=np.zeros(len(own)), count=count, stripe_along=along)
-        board = np.ascontiguousarray(self.board[:, lines].T)
+        board = np.ascontiguousarray(self.board[:, lines])
         line, clear, peak = search_all(self.profiles, board, lines, self.rules, fewest=2 if rivals else 1)
         if not rivals:
             line, clear, peak = line[clear], clear[clear], peak.select(clear)
@@ -352,7 +341,7 @@ def _search_profiles(
     noise = noise_from_contrast(block_contrast(high, low, out=board[MARGIN:-MARGIN]), block)
     coarse = max(options.threshold_floor, noise * (_RULE.coarse_sigmas - MEDIAN_SURROUNDINGS))
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
-    left, rules = cv2.transpose(board), search_rules(options, coarse=coarse, fine=fine, clip=clip)
+    left, rules = board.copy(), search_rules(options, coarse=coarse, fine=fine, clip=clip)
     status, wide, several, peak = search_profiles(profiles, left, rules)
     # The contrast of a plateau wider than the window is zero.
     if clipped is not None:

@@ -16,7 +16,7 @@ from importlib import import_module
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
-from uwlts.stripe.peak_window import WINDOW_RULE, PeakWindow, exponential
+from uwlts.stripe.peak_window import LANES, WINDOW_RULE, PeakWindow, exponential
 
 _ONE_PIXEL = 0.3
 """Sigma, px, of light within one pixel (1 / sqrt 12, rounded), the narrowest stripe in an image."""
@@ -48,7 +48,7 @@ def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> N
     """Compute the heights (M,); see `amplitudes`."""
     size = peak.window.shape[1]
     for m in range(centre.size):
-        pixels, ground, middle = peak.window[m], peak.base[m], centre[m]
+        pixels, ground, middle = peak.window[m // LANES, :, m % LANES], peak.base[m], centre[m]
         sigma = max(peak.sigma[m], np.float32(_ONE_PIXEL))
         width = max(peak.sigma[m], np.float32(WINDOW_RULE.least_kernel))
         near = min(max(math.floor(middle + np.float32(0.5)), 0), size - 1)

@@ -14,7 +14,7 @@ import numpy as np
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 from uwlts.stripe.line_scatter import least_scattered
 from uwlts.stripe.methods import centre_of_mass, quadratic, zero_crossing
-from uwlts.stripe.peak_window import FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow, exponential
+from uwlts.stripe.peak_window import LANES as GROUP, FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow, exponential
 
 _STEPS = 5
 """Number of steps of the fit, equal for all lines, which are fitted in parallel."""
@@ -160,7 +160,9 @@ def _measure_flanks(peak: PeakWindow, sampled: np.ndarray, result: np.ndarray) -
         for away in range(-WINDOW_RULE.flank, WINDOW_RULE.flank):
             x = near + away + (int(peak.reach[m]) if away >= 0 else 1 - int(peak.reach[m]))
             x = min(max(x, 0), peak.window.shape[1] - 1)
-            left = peak.window[m, x] - (peak.base[m] + peak.slope[m] * (np.float32(x) - peak.middle[m]))
+            left = peak.window[m // GROUP, x, m % GROUP] - (
+                peak.base[m] + peak.slope[m] * (np.float32(x) - peak.middle[m])
+            )
             result[number] += left * left / np.float32(2 * WINDOW_RULE.flank)
 
 
@@ -189,7 +191,7 @@ def _fit_profiles(
         centre[m] = math.floor(peak.middle[m] + np.float32(0.5)) + known[m // _LANES, _CENTRE + m % _LANES]
         width, plateau, highest = np.float32(FWHM_PER_SIGMA) * peak.sigma[m], 0, np.float32(-np.inf)
         if noise > _SPECKLED_HALO * peak.height[m] and width > _PLATEAU:
-            window = peak.window[m]
+            window = peak.window[m // GROUP, :, m % GROUP]
             for k in range(size):
                 highest = max(highest, window[k])
             for k in range(size):
@@ -203,7 +205,7 @@ def _arrange_lanes(peak: PeakWindow, noise: float, signal: np.ndarray, known: np
 
     Positions are relative to the pixel nearest to each peak's middle. The last group is padded with the last line.
     """
-    count, size = peak.window.shape
+    count, size = peak.start.size, peak.window.shape[1]
     most = signal.shape[1] // (2 * _LANES)
     for group in range(known.shape[0]):
         for k in range(_LANES):
@@ -214,7 +216,7 @@ def _arrange_lanes(peak: PeakWindow, noise: float, signal: np.ndarray, known: np
                 peak.base[m] + peak.slope[m] * (np.float32(near) - peak.middle[m]),
             )
             for x in range(-most, most + 1):
-                pixel = peak.window[m, min(max(near + x, 0), size - 1)]
+                pixel = peak.window[m // GROUP, min(max(near + x, 0), size - 1), m % GROUP]
                 signal[group, (most + x) * _LANES + k] = pixel - (offset + peak.slope[m] * np.float32(x))
             half_width = np.float32(0.5 * FWHM_PER_SIGMA) * peak.sigma[m]
             broad = max(peak.sigma[m], np.float32(_NARROWEST))
