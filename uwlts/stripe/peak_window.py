@@ -132,7 +132,7 @@ class PeakWindow(NamedTuple):
 
 
 class PeakShape(NamedTuple):
-    """What else the search needs of M peaks, as arrays (M,).
+    """Further properties of M peaks for the search, as arrays (M,).
 
     Attributes
     ----------
