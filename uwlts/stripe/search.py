@@ -220,10 +220,10 @@ def _measure_lines(profiles: np.ndarray, jobs: _Jobs, count: int, rules: SearchR
 @compiled_part
 def _measure_jobs(profiles: np.ndarray, jobs: _Jobs, first: int, end: int, rules: SearchRules) -> None:
     """Cut and measure the windows from `first`, the beginning of a group, to `end`."""
+    for m in range(end, -(-end // LANES) * LANES):
+        jobs.peaks.start[m], jobs.line[m] = jobs.peaks.start[end - 1], jobs.line[end - 1]
     for group in range(first // LANES, -(-end // LANES)):
-        lanes = min(end - group * LANES, LANES)
-        _cut_group(profiles, jobs.peaks.start, jobs.line, group, lanes, jobs.peaks.window[group])
-        measure_group(group, lanes, profiles.shape[0], rules, jobs.buffers, jobs.peaks, jobs.shape)
+        _measure_group(profiles, jobs, group, rules)
 
 
 @compiled_part
@@ -231,34 +231,34 @@ def _follow_peaks(profiles: np.ndarray, jobs: _Jobs, first: int, end: int, rules
     """Measure windows again that do not contain a half-height crossing or a flank of their peak, moved to it."""
     size = jobs.peaks.window.shape[1]
     for group in range(first // LANES, -(-end // LANES)):
-        lanes, moved = min(end - group * LANES, LANES), False
-        for m in range(group * LANES, group * LANES + lanes):
+        moved = False
+        for m in range(group * LANES, (group + 1) * LANES):
             offset = _window_offset(jobs, m, size, rules)
             jobs.peaks.start[m] += offset
             moved |= offset != 0
         if moved:
-            _cut_group(profiles, jobs.peaks.start, jobs.line, group, lanes, jobs.peaks.window[group])
-            measure_group(group, lanes, profiles.shape[0], rules, jobs.buffers, jobs.peaks, jobs.shape)
+            _measure_group(profiles, jobs, group, rules)
 
 
 @compiled_part
-def _cut_group(
-    profiles: np.ndarray, start: np.ndarray, line: np.ndarray, group: int, lanes: int, out: np.ndarray
-) -> None:
-    """Copy the pixels of a group of windows; beyond the image the border pixel is repeated.
-
-    Windows of neighbouring lines that start at the same pixel are copied together, in the order of memory.
-    """
-    last, m0, k = profiles.shape[0] - 1, group * LANES, 0
-    while k < lanes:
-        begin, at, end = start[m0 + k], line[m0 + k], k + 1
-        while end < lanes and start[m0 + end] == begin and line[m0 + end] == at + end - k:
-            end += 1
-        for x in range(out.shape[0]):
-            pixels = profiles[min(max(begin + x, 0), last)]
-            for n in range(end - k):
-                out[x, k + n] = pixels[at + n]
-        k = end
+def _measure_group(profiles: np.ndarray, jobs: _Jobs, group: int, rules: SearchRules) -> None:
+    """Cut a group of windows and measure them; beyond the image the border pixel is repeated."""
+    m0, place, out = group * LANES, jobs.buffers.place, jobs.peaks.window[group]
+    last, size, lines = profiles.shape[0] - 1, out.shape[0], profiles.shape[1]
+    pixels, lowest, highest = profiles.reshape(profiles.size), np.intp(0), np.intp(0)
+    for k in range(LANES):
+        lowest, highest = min(lowest, jobs.peaks.start[m0 + k]), max(highest, jobs.peaks.start[m0 + k])
+        place[k] = jobs.peaks.start[m0 + k] * lines + jobs.line[m0 + k]
+    if lowest >= 0 and highest + size - 1 <= last:
+        for x in range(size):
+            row = pixels[x * lines :]
+            for k in range(LANES):
+                out[x, k] = row[place[k]]
+    else:
+        for k in range(LANES):
+            for x in range(size):
+                out[x, k] = profiles[min(max(jobs.peaks.start[m0 + k] + x, 0), last), jobs.line[m0 + k]]
+    measure_group(group, profiles.shape[0], rules, jobs.buffers, jobs.peaks, jobs.shape)
 
 
 @compiled

@@ -14,7 +14,7 @@ import numpy as np
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 from uwlts.stripe.line_scatter import least_scattered
 from uwlts.stripe.methods import centre_of_mass, quadratic, zero_crossing
-from uwlts.stripe.peak_window import LANES as GROUP, FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow, exponential
+from uwlts.stripe.peak_window import FWHM_PER_SIGMA, LANES as GROUP, WINDOW_RULE, PeakWindow, exponential
 
 _STEPS = 5
 """Number of steps of the fit, equal for all lines, which are fitted in parallel."""
