@@ -424,20 +424,46 @@ def noise_gain(sigma: float) -> float:
     return float(np.sqrt(np.sum(low_pass(sigma) ** 2)))
 
 
+def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Return moments M0, M1, M2 (3, M) of the windows above `base`, weighted at `centre`; see `zero_crossing`."""
+    moments = np.empty((3, centre.size), np.float32)
+    _sum_moments(peak, centre, sigma, aligned((7 * LANES,)), moments)
+    return moments
+
+
 @compiled
-def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, moments: np.ndarray) -> None:
-    """Compute moments M0, M1, M2 (3, M) of the windows above `base`, weighted at `centre`; see `zero_crossing`."""
-    half, last = np.float32(0.5), peak.window.shape[1] - 1
-    for m in range(centre.size):
-        ground, middle, inverse = peak.base[m], centre[m], np.float32(1.0) / sigma[m]
-        # The centre may be outside its window.
-        reach, near = math.ceil(np.float32(WINDOW_RULE.tail) * sigma[m]), min(max(math.floor(middle + half), 0), last)
-        m0, m1, m2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for x in range(max(near - reach, 0), min(near + reach, last) + 1):
-            t = (np.float32(x) - middle) * inverse
-            value = exponential(-half * t * t) * (peak.window[m // LANES, x, m % LANES] - ground)
-            m0, m1, m2 = m0 + value, m1 + value * t, m2 + value * t * t
-        moments[0, m], moments[1, m], moments[2, m] = m0, m1, m2
+def _sum_moments(
+    peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, sums: np.ndarray, moments: np.ndarray
+) -> None:
+    """Fill the moments (3, M); `sums` has rows of lanes for them, and for centre, 1 / sigma, background and reach."""
+    half, last = np.float32(0.5), np.int32(peak.window.shape[1] - 1)
+    for group in range(peak.window.shape[0]):
+        m0, window, first, end = group * LANES, peak.window[group], last, np.int32(0)
+        lanes = min(LANES, centre.size - m0)
+        for k in range(LANES):
+            m = m0 + min(k, lanes - 1)
+            sums[k] = sums[LANES + k] = sums[2 * LANES + k] = np.float32(0.0)
+            sums[3 * LANES + k], sums[4 * LANES + k] = centre[m], np.float32(1.0) / sigma[m]
+            # The centre may be outside its window.
+            near = min(max(np.int32(math.floor(centre[m] + half)), np.int32(0)), last)
+            reach = np.int32(math.ceil(np.float32(WINDOW_RULE.tail) * sigma[m]))
+            sums[5 * LANES + k], sums[6 * LANES + k] = (
+                peak.base[m],
+                np.float32(reach) + abs(centre[m] - np.float32(near)),
+            )
+            first, end = min(first, near - reach), max(end, near + reach + np.int32(1))
+        for x in range(max(first, np.int32(0)), min(end, last + np.int32(1))):
+            for k in range(LANES):
+                away = np.float32(x) - sums[3 * LANES + k]
+                t = away * sums[4 * LANES + k]
+                weight = exponential(-half * t * t) if abs(away) <= sums[6 * LANES + k] else np.float32(0.0)
+                value = weight * (window[x, k] - sums[5 * LANES + k])
+                sums[k] += value
+                sums[LANES + k] += value * t
+                sums[2 * LANES + k] += value * t * t
+        for k in range(lanes):
+            moments[0, m0 + k], moments[1, m0 + k] = sums[k], sums[LANES + k]
+            moments[2, m0 + k] = sums[2 * LANES + k]
 
 
 @compiled_part
