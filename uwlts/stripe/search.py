@@ -119,10 +119,9 @@ def search_profiles(
     status = np.full(lines, _NO_STRIPE, np.uint8)
     wide, several = np.zeros((2, lines), np.bool_)
     own, rival = np.full((2, lines), -1, np.intp)
-    _search_lines(profiles, board, jobs, rules, status, wide, several, own, rival)
-    chosen = own[status == _OK]
-    in_order = not chosen.size or chosen[-1] == chosen.size - 1
-    return status, wide, several, jobs.peaks.first(chosen.size) if in_order else jobs.peaks.select(chosen)
+    count = _search_lines(profiles, board, jobs, rules, status, wide, several, own, rival)
+    peaks = jobs.peaks.first(count) if count >= 0 else jobs.peaks.select(own[status == _OK])
+    return status, wide, several, peaks
 
 
 class _Jobs(NamedTuple):
@@ -272,8 +271,11 @@ def _search_lines(
     several: np.ndarray,
     own: np.ndarray,
     rival: np.ndarray,
-) -> None:
-    """Fill `status`, `wide`, `several`, and the numbers of the windows of each line's stripe and a dimmer one."""
+) -> int:
+    """Fill `status`, `wide`, `several`, and the numbers of the windows of each line's stripe and a dimmer one.
+
+    Return the number of lines with a stripe, or -1 if their windows are not the first ones in the lines' order.
+    """
     near, peaks, end = jobs.buffers.values[: rules.block + 2], jobs.peaks, int(np.intp(0))
     for _ in range(_RULE.looks):
         _find_highest_blocks(board, jobs.highest, jobs.chosen)
@@ -318,10 +320,15 @@ def _search_lines(
                 status[line], several[line], jobs.active[line] = _AMBIGUOUS, True, False
             else:
                 rival[line] = m
+    count, in_order = int(np.intp(0)), True
     for line in range(status.size):
+        if status[line] == _OK:
+            in_order &= own[line] == count
+            count += 1
         if rival[line] >= 0:
             # Too dim to make the line ambiguous, but left in the board for a search of all stripes.
             board[jobs.block[rival[line]], line] = jobs.contrast[rival[line]]
+    return count if in_order else -1
 
 
 @compiled_part
