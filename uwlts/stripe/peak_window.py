@@ -166,7 +166,7 @@ class PeakWindow(NamedTuple):
 
 
 class PeakShape(NamedTuple):
-    """What else the search needs of M peaks, as arrays (M,).
+    """Further results for M peaks, which only the search uses, as arrays (M,).
 
     Attributes
     ----------

@@ -287,7 +287,7 @@ def _search_lines(
             highest, least = jobs.highest[line], np.float32(rules.coarse)
             if status[line] == _OK:
                 several[line] |= highest >= _RULE.rival * rules.coarse
-                least = max(least, jobs.contrast[own[line]] * np.float32(rules.share * _RULE.coarse_slack))
+                least = max(least, np.float32(jobs.contrast[own[line]]) * np.float32(rules.share * _RULE.coarse_slack))
             if highest < least or highest <= 0:
                 jobs.active[line] = False
             else:
@@ -313,7 +313,7 @@ def _search_lines(
                 jobs.active[line] = verdict == _OK and rules.order == STRONGEST
                 continue
             # The flank of a wide stripe may have contrast in another block, which leads to the same stripe.
-            stripe = own[line]
+            stripe = int(own[line])
             if _distance(peaks, m, stripe) <= peaks.sigma[stripe] * np.float32(FWHM_PER_SIGMA):
                 continue
             if peaks.height[m] >= rules.share * peaks.height[stripe]:
@@ -472,7 +472,7 @@ def _is_inside(highest: int, count: int) -> bool:
 
 @compiled_part
 def _choose_block(
-    board: np.ndarray, line: int, highest: np.number, chosen: int, least: np.float32, rules: SearchRules
+    board: np.ndarray, line: int, highest: np.number, chosen: int, least: float | np.floating, rules: SearchRules
 ) -> int:
     """Return a line's block by the rule, among those of at least `least` contrast; `chosen` is the highest one.
 
