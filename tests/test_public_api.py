@@ -14,6 +14,7 @@ import twin
 import twin.cli
 import uwlts
 import uwlts.cli
+import uwlts.thesis
 from uwlts.files.inputs import OUTPUTS
 from uwlts.runtime.command_line import DerivedCommand, Job, option_type
 
@@ -22,7 +23,7 @@ HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "op
 LISTENS = {"progress", "report", "warn"}
 """Parameters for callbacks that report progress; commands print the reports instead."""
 APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
-MOST_NAMES = 51
+MOST_NAMES = 45
 """Largest number of public names of `uwlts`: functions of its commands, their savable results, and their arguments."""
 
 
@@ -36,7 +37,7 @@ def commands() -> Iterator[tuple[str, str]]:
 COMMANDS = [pytest.param(*each, id=" ".join(each)) for each in commands()]
 
 
-@pytest.mark.parametrize("package", [uwlts, twin, uwlts.report], ids=["uwlts", "twin", "report"])
+@pytest.mark.parametrize("package", [uwlts, twin, uwlts.report, uwlts.desk, uwlts.thesis])
 def test_every_public_name_is_there_and_documented(package):
     assert set(package.__all__) == set(dir(package))
     for name in package.__all__:
@@ -55,7 +56,7 @@ LEFT_OUT = {
 """Disabled checks of numpydoc, with the reason."""
 
 
-@pytest.mark.parametrize("package", [uwlts, twin, uwlts.report], ids=["uwlts", "twin", "report"])
+@pytest.mark.parametrize("package", [uwlts, twin, uwlts.report, uwlts.desk, uwlts.thesis])
 def test_public_docstrings_are_complete(package):
     """Functions describe all parameters and results. The fields of a class are described beside them."""
     wrong = []

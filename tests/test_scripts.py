@@ -2,6 +2,7 @@
 
 import ast
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -12,9 +13,10 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def _is_script(path: Path) -> bool:
     """Return True if a module has an `if __name__ == "__main__"` block."""
-    return any(
-        isinstance(each, ast.If) and ast.unparse(each.test) == "__name__ == '__main__'"
-        for each in ast.parse(path.read_text(encoding="utf-8")).body
+    text = path.read_text(encoding="utf-8")
+    # Parsing all modules would take a second.
+    return "\nif __name__ ==" in text and any(
+        isinstance(each, ast.If) and ast.unparse(each.test) == "__name__ == '__main__'" for each in ast.parse(text).body
     )
 
 
@@ -30,6 +32,19 @@ SCRIPTS = [
 
 def test_scripts_are_found():
     assert {"coverage.py", "soak.py", "inspection.py"} <= {path.name for path in SCRIPTS}
+
+
+def test_importing_a_script_does_not_load_drjit():
+    """Dr.Jit may be loaded only after its libLLVM has been chosen."""
+    folders = [ROOT, ROOT / "docs" / "studies"]
+    code = (
+        f"import importlib, sys; sys.path[:0] = {[*map(str, folders)]!r}\n"
+        f"for name in {sorted(path.stem for path in folders[1].glob('*.py'))!r}:\n"
+        "    importlib.import_module(name)\n"
+        "    assert 'drjit' not in sys.modules, name\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")

@@ -11,13 +11,14 @@ import pytest
 
 import twin
 import uwlts
+import uwlts.thesis
 from uwlts.argument_types import check_arguments
 from uwlts.errors import ArgumentError
 
 PLOTS = ["cloud", "stripe", "deviation_histogram", "along_stripe", "residuals", "window_curves"]
 SERVERS = {
-    "uwlts.serve_desk",
-    "uwlts.watch",
+    "uwlts.desk.serve_desk",
+    "uwlts.desk.watch",
     "uwlts.examine",
     "twin.demo",
     "twin.predict",
@@ -33,7 +34,7 @@ SEVERAL = {"clouds", "target", "step"}
 
 def functions_of(package: str) -> dict[str, Callable[..., Any]]:
     """Return the public functions of a package, whose modules are imported here."""
-    module = {"uwlts": uwlts, "uwlts.report": uwlts.report, "uwlts.plot": uwlts.plot, "twin": twin}[package]
+    module = {"uwlts": uwlts, "twin": twin}.get(package) or getattr(uwlts, package.removeprefix("uwlts."))
     names = PLOTS if package == "uwlts.plot" else module.__all__
     found = {f"{package}.{name}": getattr(module, name) for name in names}
     return {name: each for name, each in found.items() if inspect.isroutine(each)}
@@ -54,7 +55,10 @@ def call_with(function: Callable[..., Any], parameter: str, value: object) -> No
         function(**named | {parameter: value})
 
 
-@pytest.mark.parametrize(("package", "least"), [("uwlts", 28), ("uwlts.report", 8), ("uwlts.plot", 6), ("twin", 9)])
+@pytest.mark.parametrize(
+    ("package", "least"),
+    [("uwlts", 25), ("uwlts.desk", 4), ("uwlts.thesis", 1), ("uwlts.report", 8), ("uwlts.plot", 6), ("twin", 9)],
+)
 def test_wrong_types_raise_errors_that_name_the_argument(
     package: str, least: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -1,18 +1,13 @@
-from . import report as report
+from . import desk as desk, report as report
 from .acceptance.accept import accept as accept
 from .alignment.align import align_trajectory as align_trajectory
 from .calibration.calibrate import calibrate as calibrate
 from .calibration.camera.photographs import calibrate_camera as calibrate_camera
 from .calibration.joint.refresh import refresh as refresh
-from .calibration.model_comparison.comparison import compare_models as compare_models
 from .calibration.mount.calibrate_mount import calibrate_mount as calibrate_mount
 from .calibration.polynomial.polynomial_calibration_fit import calibrate_polynomials as calibrate_polynomials
 from .comparison.change import compare_clouds as compare_clouds
 from .comparison.surface_mesh import mesh as mesh
-from .desk.guided import record_guided as record_guided
-from .desk.operator_page import serve_desk as serve_desk
-from .desk.recording_view import watch as watch
-from .desk.ros_node import serve_ros as serve_ros
 from .desk.scan import scan as scan
 from .doctor import examine as examine
 from .errors import Error as Error
@@ -37,7 +32,6 @@ from .reconstruction.verify import verify as verify
 from .registration.register import register as register
 from .report import plot as plot
 from .report.any_file import read as read
-from .report.frames import to_frame as to_frame
 from .report.inventory import describe as describe
 from .storage.capture import Capture as Capture
 from .storage.cloud import PointCloud as PointCloud
@@ -45,4 +39,3 @@ from .storage.export_ import export as export
 from .storage.import_.folder import import_images as import_images
 from .storage.mesh_file import SurfaceMesh as SurfaceMesh
 from .stripe import StripeOptions as StripeOptions
-from .thesis.report import evaluate_thesis as evaluate_thesis

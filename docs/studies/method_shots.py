@@ -3,17 +3,21 @@
 import math
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from stripe_cases import FACING, PLATE, Case, step_per_px
 
-from twin.light.renderer import LaserFrame
 from twin.rendering_options import ALL, Options
 from twin.scene.description import Scene, load_scene
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.sensor import Sensor
+
+if TYPE_CHECKING:
+    # It loads Dr.Jit, which needs the library that `use_variant` chooses.
+    from twin.light.renderer import LaserFrame
 
 FINE_SPP = 256
 """Samples of the stripe itself: with 16, the few points in the pupil shift a blurred stripe by up to 0.2 px."""
@@ -45,7 +49,7 @@ class Rendered:
 
     sensor: Sensor
     index: float
-    frame: LaserFrame
+    frame: "LaserFrame"
     truth_px: np.ndarray
     mm_per_px: np.ndarray
     exposure_ms: float

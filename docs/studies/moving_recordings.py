@@ -15,7 +15,6 @@ import numpy as np
 
 import twin
 import uwlts
-from twin.recording.record_scene import record_scene
 from twin.rendering_options import CPU, Options, use_variant
 from twin.scene.campaign import list_takes, load_campaign
 from twin.scene.description import load_scene
@@ -67,6 +66,9 @@ def main() -> None:
                     motion["waypoints"] = denser(motion["waypoints"], given.denser)
                 scene = load_scene(name, motion=motion)
                 use_variant(CPU)
+                # It loads Dr.Jit, which needs the library that `use_variant` chooses.
+                from twin.recording.record_scene import record_scene
+
                 options = Options(spp=16, seed=1000 * number + seed)
                 record_scene(scene, take.sensor, path, as_built=take.built, options=options, overwrite=True)
                 print(f"wrote {path}", flush=True)

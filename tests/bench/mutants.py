@@ -39,8 +39,13 @@ TESTS = {
         for name in ("camera", "guidance", "sequential", "polynomial", "model_comparison", "test_target_stripes.py")
     ],
     "uwlts/reconstruction": ["tests/uwlts/reconstruction", "tests/uwlts/report", "tests/system/test_joint_command.py"],
-    "uwlts/fitting": [f"tests/uwlts/{name}" for name in ("fitting", "evaluation", "registration", "inspection")],
-    "uwlts/evaluation": ["tests/uwlts/evaluation", "tests/uwlts/acceptance"],
+    "uwlts/fitting": [
+        f"tests/uwlts/{name}" for name in ("fitting", "evaluation", "registration", "inspection", "comparison")
+    ],
+    "uwlts/evaluation": [
+        *(f"tests/uwlts/{name}" for name in ("evaluation", "acceptance")),
+        "tests/uwlts/reconstruction/test_point_uncertainty.py",
+    ],
     "uwlts/registration": ["tests/uwlts/registration"],
     "uwlts/alignment": ["tests/uwlts/alignment"],
     "uwlts/inspection": ["tests/uwlts/inspection"],

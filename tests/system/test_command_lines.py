@@ -21,23 +21,16 @@ ROOT = Path(__file__).resolve().parents[2]
 APPS = {"uwlts": uwlts_app, "twin": twin_app}
 
 
-def _commands() -> Iterator[tuple[str, str, App]]:
-    for program, app in APPS.items():
-        for command in app:
-            if not command.startswith("-"):
-                yield program, command, app
+COMMANDS = [(program, command, app) for program, app in APPS.items() for command in app if not command.startswith("-")]
 
 
-def _several() -> Iterator[Any]:
-    """Options of all commands that take a tuple of any length, each with the type of its elements."""
-    for program, command, app in _commands():
-        for argument in app[command].assemble_argument_collection():
-            # With None left out, and whatever a union hides.
-            for kind in (argument.hint, *get_args(argument.hint)):
-                if get_origin(kind) is tuple and argument.name.startswith("--") and get_args(kind)[1:] == (...,):
-                    yield pytest.param(
-                        app, command, argument.name, get_args(kind)[0], id=f"{program} {command} {argument.name}"
-                    )
+def _several(app: App, command: str) -> Iterator[tuple[str, Any]]:
+    """Options of a command that take a tuple of any length, each with the type of its elements."""
+    for argument in app[command].assemble_argument_collection():
+        # With None left out, and whatever a union hides.
+        for kind in (argument.hint, *get_args(argument.hint)):
+            if get_origin(kind) is tuple and argument.name.startswith("--") and get_args(kind)[1:] == (...,):
+                yield argument.name, get_args(kind)[0]
 
 
 def _values(kind: Any) -> list[tuple[list[str], object]]:
@@ -67,25 +60,19 @@ def _parsed(app: App, command: str, option: str, words: list[str]) -> object:
     return bound.arguments[option.removeprefix("--").replace("-", "_")]
 
 
-SEVERAL = list(_several())
-
-
-def test_several_values_are_taken_by_many_options():
-    assert len(SEVERAL) >= 25  # 27 when this was written
-
-
-@pytest.mark.parametrize(("app", "command", "option", "kind"), SEVERAL)
-def test_an_option_may_be_repeated(app, command, option, kind):
-    (one, first), (two, second) = _values(kind)
-    assert _parsed(app, command, option, [option, *one, option, *two]) == (first, second)
-
-
-@pytest.mark.parametrize(
-    ("app", "command", "option", "kind"), [each for each in SEVERAL if get_origin(each.values[3]) is not tuple]
-)
-def test_an_option_takes_several_values_at_once(app, command, option, kind):
-    (one, first), (two, second) = _values(kind)
-    assert _parsed(app, command, option, [option, *one, *two]) == (first, second)
+def test_an_option_may_be_repeated_or_takes_several_values_at_once():
+    parsed = {}
+    for program, command, app in COMMANDS:
+        for option, kind in _several(app, command):
+            (one, first), (two, second) = _values(kind)
+            repeated = _parsed(app, command, option, [option, *one, option, *two]) == (first, second)
+            at_once = get_origin(kind) is tuple or _parsed(app, command, option, [option, *one, *two]) == (
+                first,
+                second,
+            )
+            parsed[f"{program} {command} {option}"] = repeated, at_once
+    assert len(parsed) >= 25  # 27 when this was written
+    assert [name for name, each in parsed.items() if each != (True, True)] == []
 
 
 def test_a_region_takes_its_six_numbers():
@@ -124,15 +111,16 @@ FOLDERS = {
 """Outputs that are folders, whose names need no ending."""
 
 
-def _outputs() -> Iterator[Any]:
-    for program, command, app in _commands():
-        for argument in app[command].assemble_argument_collection():
-            name = f"{program} {command} {argument.name}"
-            if argument.name.removeprefix("--").replace("-", "_") in OUTPUTS and name not in FOLDERS:
-                yield pytest.param(program, app, command, argument.name, id=name)
+def _outputs(program: str, command: str, app: App) -> list[str]:
+    """Options of a command that name files to write."""
+    return [
+        argument.name
+        for argument in app[command].assemble_argument_collection()
+        if argument.name.removeprefix("--").replace("-", "_") in OUTPUTS
+        and f"{program} {command} {argument.name}" not in FOLDERS
+    ]
 
 
-OUTPUT_OPTIONS = list(_outputs())
 ENDINGS = {
     "align": "x.csv",
     "compare": "x.html",
@@ -148,7 +136,7 @@ def test_what_is_described_as_written_counts_as_an_output():
     # Otherwise it would be refused as an input that is to be replaced.
     described = {
         argument.name.lower().removeprefix("--").replace("-", "_")
-        for program, command, app in _commands()
+        for program, command, app in COMMANDS
         for argument in app[command].assemble_argument_collection()
         if program == "uwlts"
         and re.search(r"\bto write\b|^(Also w|W)rite |default: not written", argument.parameter.help)
@@ -158,21 +146,20 @@ def test_what_is_described_as_written_counts_as_an_output():
 
 
 def test_outputs_of_many_commands_are_looked_at():
-    assert len(OUTPUT_OPTIONS) >= 25  # 28 when this was written
+    assert sum(len(_outputs(*each)) for each in COMMANDS) >= 25  # 28 when this was written
 
 
-@pytest.mark.parametrize(("program", "app", "command", "option"), OUTPUT_OPTIONS)
-def test_an_ending_that_names_no_format_is_refused_before_the_work(
-    program, app, command, option, tmp_path, monkeypatch
-):
+@pytest.mark.parametrize(("program", "command", "app"), COMMANDS, ids=[f"{each[0]} {each[1]}" for each in COMMANDS])
+def test_an_ending_that_names_no_format_is_refused_before_the_work(program, command, app, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = [ENDINGS.get(command, "x.h5") if word == "x.h5" else word for word in _required(app, command, option)]
-    # No input exists: reading one first would be reported.
-    words = ["x.ply" if word == "x" and command == "export" else word for word in words]
-    ended = run_program(app, program, command, *words, option, "wrong.ending")
-    assert ended.returncode == 2
-    assert "wrong.ending ends with none of ." in ended.stderr, ended.stderr
-    assert list(tmp_path.iterdir()) == []
+    for option in _outputs(program, command, app):
+        words = [ENDINGS.get(command, "x.h5") if word == "x.h5" else word for word in _required(app, command, option)]
+        # No input exists: reading one first would be reported.
+        words = ["x.ply" if word == "x" and command == "export" else word for word in words]
+        ended = run_program(app, program, command, *words, option, "wrong.ending")
+        assert ended.returncode == 2
+        assert "wrong.ending ends with none of ." in ended.stderr, ended.stderr
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_a_capture_is_not_exported_under_the_name_of_a_cloud(tmp_path):
@@ -181,14 +168,14 @@ def test_a_capture_is_not_exported_under_the_name_of_a_cloud(tmp_path):
     assert "is a capture" in ended.stderr
 
 
-def _blocks() -> Iterator[Any]:
+def _blocks() -> Iterator[tuple[str, list[str]]]:
     """Indented blocks of the documentation with several command lines: what a reader runs one after the other."""
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
         for number, block in enumerate(re.split(r"\n(?!    )", page.read_text(encoding="utf-8"))):
             lines = [line.strip().split(" #")[0] for line in block.splitlines() if line.startswith("    ")]
             lines = [line for line in lines if line.split(" ")[0] in APPS and "..." not in line]
             if len(lines) > 1:
-                yield pytest.param(lines, id=f"{page.relative_to(ROOT)}-{number}")
+                yield f"{page.relative_to(ROOT)}-{number}", lines
 
 
 def _written(line: str) -> list[str]:
@@ -205,10 +192,12 @@ def _written(line: str) -> list[str]:
     return names + beside + ([str(page.with_suffix(".pdf")) for page in pages] if given.get("pdf") else [])
 
 
-@pytest.mark.parametrize("lines", list(_blocks()))
-def test_commands_of_one_block_write_different_files(lines):
-    written = [name for line in lines for name in _written(line) if not name.startswith("runs/")]
-    assert not [name for name, times in Counter(written).items() if times > 1]
+def test_commands_of_one_block_write_different_files():
+    blocks = dict(_blocks())
+    assert len(blocks) >= 15  # 18 when this was written
+    for block, lines in blocks.items():
+        written = [name for line in lines for name in _written(line) if not name.startswith("runs/")]
+        assert not [name for name, times in Counter(written).items() if times > 1], block
 
 
 def test_inspection_and_report_of_one_pipe_write_different_files():

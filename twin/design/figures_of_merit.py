@@ -33,6 +33,7 @@ from twin.design.geometry import (
     trace_to_points,
 )
 from twin.design.sensor_arrays import Follow, SensorArrays, compute_adjustments
+from twin.scene.vehicle import GRAVITY_M_S2
 from twin.sensor.detector import PLANCK_TIMES_LIGHT
 from uwlts.errors import RangeError
 
@@ -586,7 +587,6 @@ _CLASS_2_W = 1e-3
 _CLASS_3R_W = 5e-3
 _CLASS_3B_W = 0.5
 
-_GRAVITY = 9.81  # m/s2
 _WATER_KG_PER_M3 = 1030.0
 """Density of sea water."""
 # As in thesis Eq. 3.2.
@@ -619,6 +619,6 @@ def window_needed_mm(p: SensorArrays, *, water_depth_m: float) -> np.ndarray:
 
     Source: Harris 1999, thesis Eq. 3.2. The strength S is that of the named glass, or of fused silica if it is unknown.
     """
-    pressure_mpa = 1e-6 * _GRAVITY * _WATER_KG_PER_M3 * water_depth_m
+    pressure_mpa = 1e-6 * GRAVITY_M_S2 * _WATER_KG_PER_M3 * water_depth_m
     opening = np.where(np.isfinite(p.window_aperture_mm), p.window_aperture_mm, 0.0)
     return 0.5 * opening * np.sqrt(_CLAMPED * _SAFETY * pressure_mpa / p.window_strength_mpa)

@@ -54,22 +54,11 @@ def image_packets(
     packet_bytes: int,
     chunks: Mapping[int, Sequence[int]] = MappingProxyType({}),
 ) -> list[bytes]:
-    """Return the packets of an image: leader, payload of a region, and trailer.
+    """Return the packets of an image (H, W), uint8 or uint16: leader, payload of a region, and trailer.
 
-    Parameters
-    ----------
-    image : (H, W) uint8 or uint16
-        Image, or profiles as uint16.
-    time_ns : int
-        Time stamp.
-    number : int
-        Number of the frame, 16 bits.
-    region : tuple of int
-        Left, top, width and height in px; pixels outside the image are dark.
-    packet_bytes : int
-        Size of a packet including all headers.
-    chunks : mapping, optional
-        One number per row for each chunk identifier, sent after the image (GigE Vision 2.0, extended chunk mode).
+    ``number`` is that of the frame, 16 bits. ``region`` is left, top, width and height in px; pixels outside the image
+    are dark. ``packet_bytes`` is the size of a packet including all headers. ``chunks`` has one number per row for each
+    chunk identifier, sent after the image (GigE Vision 2.0, extended chunk mode).
     """
     x, y, width, height = region
     seen = np.zeros((height, width), image.dtype)

@@ -18,8 +18,9 @@ import numpy as np
 
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
-from twin.recording.render import AnyScene, AnySensor, choose_scene, choose_sensors
+from twin.recording.render import AnyScene, choose_scene
 from twin.rendering_options import CPU, Options, Variant, use_variant
+from twin.scene.campaign import AnySensor, choose_sensors
 from twin.scene.description import replace_values
 from twin.scene.motion import Light, Motion, Shot
 from uwlts.errors import DescriptionError, DesignError

@@ -264,22 +264,10 @@ class RaySegment:
 def trace_segments(
     objects: Objects, extinction: Float, pose: SensorPose, bundle: Rays, after_s: Float | None, *, mirrors: int
 ) -> Iterator[RaySegment]:
-    """Yield the first segment of camera rays, then one for each of the successive mirrors.
+    """Yield the first segment of camera rays in the medium, then one for each of up to ``mirrors`` mirrors.
 
-    Parameters
-    ----------
-    objects
-        Objects of the scene, mirrors among them.
-    extinction
-        Extinction coefficient of the medium, 1/mm.
-    pose
-        Pose of the sensor.
-    bundle
-        Camera rays in the medium.
-    after_s
-        Times of the rays after that of the pose, s; None: at rest.
-    mirrors
-        Largest number of mirrors in a path.
+    ``extinction`` is that of the medium in 1/mm. ``after_s`` are times of the rays after that of the pose, s; None: at
+    rest.
     """
     o, d, weight, length_before = bundle.origin, bundle.direction, bundle.weight, mi.Float(0.0)
     for met in range(mirrors + 1):

@@ -8,13 +8,15 @@ import math
 
 import numpy as np
 
+from twin.scene.vehicle import GRAVITY_M_S2
+
 PATCH_MM = 512.0
 """Period of the surface; the focus of longer waves is at depths of many metres."""
 CELLS = 1024
 """Number of cells of the pattern along each axis: 0.5 mm each, narrower than the sun's blur 0.2 m below the surface."""
 _SHORTEST_MM = 17.0
 """Shortest wavelength: the slowest waves, between gravity and capillary waves, after which viscosity damps."""
-_GRAVITY_MM_S2 = 9810.0
+_GRAVITY_MM_S2 = 1e3 * GRAVITY_M_S2
 _TENSION_MM3_S2 = 7.3e4
 """Surface tension of water divided by its density (0.073 N/m, 1000 kg/m3)."""
 _PEAK = 0.877
@@ -37,20 +39,8 @@ class Caustics:
     The mean square slope is that of a clean sea, 0.003 + 0.00512 U at the wind speed U in m/s (Cox and Munk 1954). It
     is spread evenly over the logarithm of the wave number, from the longest waves to ``_SHORTEST_MM`` (saturated
     spectrum, elevation in proportion to k^-4: Phillips 1958). The patch holds those up to its period. Waves run in all
-    directions with cos^2 of half the angle to the wind, which blows along X.
-
-    Parameters
-    ----------
-    wind_m_s
-        Wind speed.
-    depth_mm
-        Depth below the surface.
-    index
-        Refractive index of the water.
-    scattering_per_mm
-        Scattering coefficient; scattered light counts as even light.
-    seed
-        Seed of the waves.
+    directions with cos^2 of half the angle to the wind, which blows along X. ``index`` is that of the water; light that
+    it scatters counts as even light.
     """
 
     def __init__(self, *, wind_m_s: float, depth_mm: float, index: float, scattering_per_mm: float, seed: int):
@@ -111,16 +101,8 @@ def focus_light(along: np.ndarray, across: np.ndarray, *, depth_mm: float, index
     """Return the irradiance (N, N) below a periodic surface, relative to its mean.
 
     A vertical ray meets the surface at the angle i of its slope and is refracted to r, sin r = sin i / n. It is shifted
-    by the depth times tan(i - r) against the slope. Each ray's light is divided among the four nearest nodes.
-
-    Parameters
-    ----------
-    along, across : (N, N)
-        Slopes of the surface along X (columns) and Y (rows) at nodes of `PATCH_MM` / N.
-    depth_mm
-        Depth below the surface.
-    index
-        Refractive index of the water.
+    by the depth times tan(i - r) against the slope. Each ray's light is divided among the four nearest nodes. Slopes
+    (N, N) are those along X (columns) and Y (rows) at nodes of `PATCH_MM` / N.
     """
     count = len(along)
     steepness = np.hypot(along, across)

@@ -61,20 +61,8 @@ def compute_haze(
     """Return the haze on the image sensor in W/mm2.
 
     A surface removes the part of the Gaussian behind it. If the surface is in front of the sheet's centre, shadows are
-    tested at the surface: it must not shadow the haze in front of it.
-
-    Parameters
-    ----------
-    crossed
-        Crossings of the camera rays with the sheet.
-    light
-        Light with the sheet.
-    scene
-        Scene, for shadows.
-    segment
-        Segments of the camera rays.
-    at_end
-        Light of the sheet at the surfaces that end the rays.
+    tested at the surface: it must not shadow the haze in front of it. ``at_end`` is the light of the sheet at the
+    surfaces that end the rays.
     """
     end_sigmas = dr.select(segment.valid, crossed.sense * at_end.distance_mm / at_end.sigma_mm, dr.inf)
     scattered = crossed.irradiance * (0.5 * (1 + dr.erf(end_sigmas / math.sqrt(2.0))))

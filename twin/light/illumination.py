@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque, opaque_transform
-from twin.light.pose import CLEAR_MM, Rays, SensorPose
+from twin.light.pose import CLEAR_MM, SensorPose
 from twin.light.sheet import Sheet, SheetLight
 from twin.light.water import AngleTable, one_minus_cosine
 from twin.scene.objects import MirrorFace
@@ -80,20 +80,9 @@ class Light:
         return None if self._mirror is None else self._intersect_mirror(p, -light.direction)[1]
 
     def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, after_s: Float | None, active: Bool):
-        """Return the mask of points with a free path to the laser's window.
+        """Return the mask of points in the OCS, with their ``light``, that have a free path to the laser's window.
 
-        Parameters
-        ----------
-        objects
-            Scene, for shadows.
-        p
-            Points in the sensor's OCS.
-        light
-            Light of the sheet at these points.
-        after_s
-            Times of the points after that of the pose, s; None: at rest.
-        active
-            Mask of the points to test.
+        ``after_s`` are times of the points after that of the pose, s; None: at rest. Only ``active`` points are tested.
         """
         towards = -light.direction
         if self._mirror is None:
@@ -121,12 +110,12 @@ class Light:
         ray.maxt = length - 2 * CLEAR_MM
         return objects.ray_test(ray, active & (length > 2 * CLEAR_MM))
 
-    def sample_rays(self, u: Point3f) -> Rays:
-        """Sample rays of a direct light in the sensor's OCS with a density proportional to power."""
-        rays = self.sheet.sample(u)
+    def sample_rays(self, u: Point3f) -> tuple[Point3f, Vector3f]:
+        """Sample origins and directions of a direct light's rays in the sensor's OCS, in proportion to power."""
+        origin, direction = self.sheet.sample(u)
         if self._from_own is None:
-            return rays
-        return Rays(self._from_own @ mi.Point3f(rays.origin), self._from_own @ rays.direction, rays.weight)
+            return origin, direction
+        return self._from_own @ mi.Point3f(origin), self._from_own @ direction
 
     def intersect(self, origin: Point3f, direction: Vector3f) -> tuple[Float, SheetLight]:
         """Intersect rays in the sheet's frame with its centre; return distances along them, and the light."""

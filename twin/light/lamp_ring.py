@@ -25,18 +25,8 @@ def reflect_ring(
     """Return the irradiance (H, W) in W/mm2 on the image sensor by a lamp ring that the window reflects.
 
     A diffuse ring of radius R and area A has the radiance L. It illuminates a surface on the axis at the distance d
-    with E = L A d^2 / (d^2 + R^2)^2. The camera sees the ring mirrored by the window's inner face.
-
-    Parameters
-    ----------
-    view, sensor
-        View of the camera, and its sensor with a mounted window.
-    irradiance_w_per_m2
-        Irradiance E of the lamp on surfaces.
-    distance_mm
-        Their distance d from the pupil; refraction is neglected.
-    reflectance
-        Reflectance of the window.
+    from the pupil with E = L A d^2 / (d^2 + R^2)^2; refraction is neglected. The camera sees the ring mirrored by the
+    inner face of its mounted window.
     """
     camera, (inner, outer) = sensor.camera, RING_MM
     columns, rows = -(-camera.width_px // _CELL_PX), -(-camera.height_px // _CELL_PX)

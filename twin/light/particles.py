@@ -90,35 +90,12 @@ def sample_spots(
     sparkle: bool,
     rng: np.random.Generator,
 ) -> Spots:
-    """Sample bodies in a light's sheet that the camera sees.
+    """Sample bodies in a light's sheet that the camera sees, without those behind, inside or shadowed by objects.
 
-    Parameters
-    ----------
-    view
-        View of the camera.
-    light
-        Light with the sheet.
-    objects
-        Objects of the scene; bodies behind, inside or shadowed by them are omitted.
-    pose
-        Pose of the sensor.
-    travel
-        Motion of the sensor through the water during the exposure; None: at rest in it.
-    body
-        Kind of the bodies.
-    per_litre
-        Number of bodies larger than 0.1 mm per litre.
-    extinction
-        Extinction coefficient of the medium, 1/mm.
-    wavelength_nm
-        Wavelength of the light.
-    defocus
-        Blur the spots by defocus.
-    sparkle
-        Vary the light of each spot by speckle, with as many independent grains as its disc holds (gamma distribution:
-        Goodman, Speckle Phenomena, Sec. 4.6).
-    rng
-        Source of positions, sizes and speckle.
+    ``travel`` is the motion of the sensor through the water during the exposure; None: at rest in it. ``per_litre`` is
+    the number of bodies larger than 0.1 mm, ``extinction`` that of the medium in 1/mm. With ``sparkle``, speckle varies
+    the light of each spot, with as many independent grains as its disc holds (gamma distribution: Goodman, Speckle
+    Phenomena, Sec. 4.6).
     """
     camera = view.camera
     width, height = camera.width_px + 2 * _MARGIN_PX, camera.height_px + 2 * _MARGIN_PX

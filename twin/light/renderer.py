@@ -117,6 +117,18 @@ class LineLight(NamedTuple):
     means: np.ndarray
 
 
+@dataclass(eq=False)
+class _LocatedStripes:
+    """Stripes of a pose in cells of the nodes' grid, and what else is known of that pose."""
+
+    pose: SensorPose
+    own: np.ndarray  # mask of the cells that the first laser's stripe meets
+    lit: np.ndarray  # mask of the cells that light of any stripe reaches
+    nodes: _Nodes | None  # None once the laser's frame is rendered: the next one may show changed surfaces
+    line_light: tuple[SurfaceLines, int, LineLight] | None = None
+    """Light of lines with a number of samples, if the laser's frame measured it."""
+
+
 @dataclass(frozen=True)
 class LaserFrame:
     """Irradiance of the laser on the image sensor in W/mm2, separated by origin.
@@ -197,11 +209,7 @@ class Renderer:
         self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
         self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
-        # Pose, and cells of the first laser's stripe and of all lit pixels in the last frame, for the ground truth.
-        self._last_stripe: tuple[SensorPose, np.ndarray, np.ndarray] | None = None
-        # Light at the nodes of that pose until its frame is rendered, and afterwards the light of its lines.
-        self._nodes: _Nodes | None = None
-        self._last_lines: tuple[SensorPose, SurfaceLines, int, LineLight] | None = None
+        self._last: _LocatedStripes | None = None
 
     def irradiance(
         self,
@@ -259,10 +267,9 @@ class Renderer:
         are the points and normals of `line_light`, which is then measured in the same pass and needs no time later.
         """
         pose = SensorPose(scene_from_object, travel)
-        _, lit = self._locate_stripe(pose, again=self._nodes is None)
-        assert self._nodes is not None
-        haze, surfaces = self._nodes
-        self._nodes = None
+        located = self._locate_stripes(pose, with_nodes=True)
+        assert located.nodes is not None
+        lit, (haze, surfaces), located.nodes = located.lit, located.nodes, None
         begin_kernels()
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
         rows, columns = find_marked(self._expand_cells(lit))
@@ -273,7 +280,7 @@ class Renderer:
             walked = IndirectLight(self.view, walker, lit, seed=seed, walks=walks)
         stripe, polarised, rough, *of_lines = stripe_means()
         if lines is not None:
-            self._last_lines = pose, lines, spp, self._select_lines(lines, rows, columns, np.array(of_lines))
+            located.line_light = lines, spp, self._select_lines(lines, rows, columns, np.array(of_lines))
         longer = None
         if walked is not None:
             image = np.zeros_like(haze)
@@ -313,18 +320,16 @@ class Renderer:
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
-        return find_marked(self._expand_cells(self._locate_stripe(pose)[0]))
+        return find_marked(self._expand_cells(self._locate_stripes(pose).own))
 
-    def _locate_stripe(self, pose: SensorPose, *, again: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Return cells that the first laser's stripe meets, and cells that light of any stripe reaches.
-
-        They are known for the last pose, unless the nodes are wanted ``again``.
-        """
-        if again or self._last_stripe is None or not pose.equals(self._last_stripe[0]):
+    def _locate_stripes(self, pose: SensorPose, *, with_nodes: bool = False) -> _LocatedStripes:
+        """Locate the stripes; they are known for the last pose, unless its nodes are wanted again."""
+        last = self._last
+        if last is None or not pose.equals(last.pose) or (with_nodes and last.nodes is None):
             begin_kernels()
-            own, lit, self._nodes = self._laser_nodes(pose, *make_lights(self._sheets, pose, self._mirrors))
-            self._last_stripe = pose, own, lit
-        return self._last_stripe[1:]
+            lights = make_lights(self._sheets, pose, self._mirrors)
+            last = self._last = _LocatedStripes(pose, *self._laser_nodes(pose, *lights))
+        return last
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
         """Return the irradiance in W/mm2 per ray of the first laser on directly visible surfaces, and the rays."""
@@ -337,21 +342,13 @@ class Renderer:
 
         Side lobes of the sheet are excluded. A line's surface is what lies within one standard deviation of the sheet
         of the plane through its point. It is known if the last frame was rendered with the same arguments.
-
-        Parameters
-        ----------
-        pose
-            Pose of the sensor, with its motion.
-        lines
-            Surface points and normals of the profile lines.
-        spp
-            Number of samples per pixel.
         """
-        if self._last_lines is not None:
-            known_pose, known_lines, known_spp, light = self._last_lines
-            if known_spp == spp and pose.equals(known_pose) and known_lines.equals(lines):
+        located = self._locate_stripes(pose)
+        if located.line_light is not None:
+            known_lines, known_spp, light = located.line_light
+            if known_spp == spp and known_lines.equals(lines):
                 return light
-        rows, columns = find_marked(self._expand_cells(self._locate_stripe(pose)[1]))
+        rows, columns = find_marked(self._expand_cells(located.lit))
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
         means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp, lines=lines)()
         return self._select_lines(lines, rows, columns, means[_STRIPE_SUMS:])

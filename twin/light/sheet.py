@@ -154,8 +154,8 @@ class Sheet:
         direction = mi.Vector3f(tilt, m, 1.0) / stretch
         return SheetLight(distance, sigma, irradiance, in_middle, direction, normal, exit_mm)
 
-    def sample(self, u: Point3f) -> Rays:
-        """Sample rays of weight 1 behind the window, in proportion to power, from three uniform numbers each.
+    def sample(self, u: Point3f) -> tuple[Point3f, Vector3f]:
+        """Sample origins and directions of rays behind the window, in proportion to power, from uniform numbers.
 
         ``u.x`` selects the fan ray, ``u.y`` its lateral offset and ``u.z`` its tilt. Their standard deviations are w0 /
         2 at the waist and w0 / (2 zR). As both are independent, straight rays spread by w(s) / 2 at every s.
@@ -175,7 +175,7 @@ class Sheet:
         beside, turned = sigma * _standard_normal(u.y), sigma / self._rayleigh * _standard_normal(u.z)
         leaves.x += beside - turned * to_waist
         along.x += turned * stretch
-        return Rays(leaves, dr.normalize(along), mi.Float(1.0))
+        return leaves, dr.normalize(along)
 
     def _normalise(self, m: Float) -> Float:
         return dr.fma(m, self._scale, self._offset)

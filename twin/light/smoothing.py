@@ -155,20 +155,10 @@ class SmoothLight:
 def estimate_light(
     findings: FoundLight, walks: np.ndarray, features: np.ndarray, *, tolerance: float, noise_share: float
 ) -> SmoothLight:
-    """Estimate the light of each cell, with the permitted noise.
+    """Estimate the light of each cell from the findings of ``walks`` (rows, columns), with the permitted noise.
 
-    Parameters
-    ----------
-    findings
-        Light found by all walks.
-    walks : (rows, columns)
-        Number of walks of each cell.
-    features : (J, rows, columns)
-        Features of each cell.
-    tolerance
-        Permitted noise, in the unit of the light.
-    noise_share
-        Permitted noise as a fraction of the light, if this is larger than ``tolerance``.
+    ``features`` (J, rows, columns) may describe the light. The permitted noise is ``tolerance``, in the unit of the
+    light, or the fraction ``noise_share`` of the light if this is larger.
     """
     mean_walks = float(walks.mean())
     exposure = (walks / mean_walks).astype(np.float32)

@@ -19,24 +19,12 @@ from twin.scene.objects import Objects
 def spread_irradiance(
     objects: Objects, si: SurfaceInteraction3f, normal: Vector3f, here: SheetLight, parts: Sequence[Part]
 ) -> Float:
-    """Return the irradiance in W/mm2 that light leaving the bodies at surface points stands for.
+    """Return the irradiance in W/mm2 that light leaving the bodies at surface points ``si`` stands for.
 
     Along the surface, the distance from the sheet changes by the sine of the angle between surface and sheet normal.
-    Each Gaussian of the spread thus adds its variance times the squared sine to that of the sheet. The mean exit point
-    is displaced along the tangential part of the light's direction.
-
-    Parameters
-    ----------
-    objects
-        Objects of the scene.
-    si
-        Surface points hit.
-    normal
-        Unit normals there in the OCS.
-    here
-        Light of the sheet there.
-    parts
-        The Gaussians across the sheet.
+    Each Gaussian of the spread thus adds its variance times the squared sine to that of the sheet, the Gaussians
+    ``parts``. The mean exit point is displaced along the tangential part of the light's direction. ``normal`` is the
+    unit normal in the OCS, ``here`` the light of the sheet there.
     """
     across = dr.dot(normal, here.normal)
     tilted, variance = 1 - dr.square(across), dr.square(here.sigma_mm)

@@ -309,10 +309,10 @@ class Walker:
 
         Lit points are sampled in proportion to power.
         """
-        rays = light.sample_rays(u)
-        ray = self.pose.ray(rays.origin, rays.direction)
+        origin, towards = light.sample_rays(u)
+        ray = self.pose.ray(origin, towards)
         si = self.objects.scene.ray_intersect(ray, active)
-        lit = mi.Point3f(rays.origin + rays.direction * si.t)
+        lit = mi.Point3f(origin + towards * si.t)
         active = active & si.is_valid()
         apart = vertex - lit
         distance = dr.norm(apart)

@@ -117,38 +117,13 @@ def record_campaigns(
 ) -> list[Path]:
     """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; return these folders.
 
-    Parameters
-    ----------
-    campaign
-        Recordings of the campaign.
-    folder
-        Folder of the results.
-    seeds
-        Seeds of the campaigns; each draws its own sensor and noise.
-    every
-        Take only every n-th profile of the scans; calibrations keep all images.
-    spp
-        Samples per lit pixel.
-    variant
-        Variant of the renderer.
-    workers
-        Number of parallel recordings (default: number of processors).
-    overwrite
-        Remove complete recordings of these seeds and render them again. Otherwise they are kept, and interrupted ones
-        are resumed.
-    progress
-        Called as ``progress(done, total)`` in images.
+    Each seed draws its own sensor and noise. ``every`` takes only every n-th profile of the scans; calibrations keep
+    all images. Complete recordings are kept and interrupted ones resumed, unless ``overwrite`` removes those of these
+    seeds. ``progress(done, total)`` counts images.
 
-    Raises
-    ------
-    DescriptionError
-        The folder contains a campaign with other settings, or a description is wrong.
-    DesignError
-        The sensor cannot measure a scene.
-    OutputError
-        A file cannot be written.
-    SetupError
-        A rendering process was terminated from outside.
+    Raises DescriptionError if the folder contains a campaign with other settings or a description is wrong; DesignError
+    if the sensor cannot measure a scene; OutputError if a file cannot be written; SetupError if a rendering process was
+    terminated from outside.
     """
     folders = [folder / f"campaign-{seed}" for seed in seeds]
     jobs = [
@@ -219,27 +194,11 @@ def make_folder(folder: Path) -> Path:
 def keep_to_plan(
     folder: Path, plan: dict[str, JsonValue], files: set[Path], *, recorded: str, called: str, overwrite: bool
 ) -> None:
-    """Write the settings of a folder's contents, or check that they are unchanged.
+    """Write the settings ``plan`` of a folder's contents, or check that they are unchanged.
 
-    Parameters
-    ----------
-    folder
-        Folder with the plan.
-    plan
-        Settings of its contents.
-    files
-        Files that belong to the plan.
-    recorded
-        Glob pattern of such files.
-    called
-        Their name in messages.
-    overwrite
-        Replace the files of another plan.
-
-    Raises
-    ------
-    DescriptionError
-        The folder contains files of another plan, and ``overwrite`` does not replace all of them.
+    ``files`` belong to the plan, and ``recorded`` is the glob pattern of such files, which messages call ``called``.
+    Raises DescriptionError if the folder contains files of another plan, and ``overwrite`` does not replace all of
+    them.
     """
     path = folder / PLAN
     text = json.dumps(plan, indent=2) + "\n"

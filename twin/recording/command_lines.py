@@ -17,23 +17,10 @@ AT_ONCE = 2
 
 
 def run_lines(workers: Workers, lines: Iterable[str], *, quiet: bool = False) -> None:
-    """Run independent command lines in parallel, and print each one and its output.
+    """Run independent command lines of ``uwlts`` and ``twin`` in parallel, and print each one and its output.
 
-    Parameters
-    ----------
-    workers
-        Processes that run the commands.
-    lines
-        Command lines that begin with ``uwlts`` or ``twin``.
-    quiet
-        Print only the output of a command that fails.
-
-    Raises
-    ------
-    CommandFailed
-        A command failed; its output, which has been printed, gives the reason.
-    SetupError
-        A worker process ended unexpectedly.
+    With ``quiet``, only the output of a command that fails is printed. Raises CommandFailed if one fails; its output,
+    which has been printed, gives the reason. Raises SetupError if a worker process ended unexpectedly.
     """
     run = partial(_run, quiet=quiet)
     for line, ended in workers.map_unordered(run, lines if quiet else _announce(lines)):

@@ -39,45 +39,21 @@ _SIGNAL_VALUES = ("undercut left", "undercut right")
 
 
 class ProbabilityOfDetection(BaseModel, frozen=True):
-    """Probability of detection of one kind of flaw against its depth.
+    """Probability of detection of one kind of flaw against its depth."""
 
-    Attributes
-    ----------
-    flaw : str
-        "pit", "dent" or "undercut".
-    width_mm : float
-        Width of the flaws.
-    method : str
-        "hit/miss" or "signal response".
-    checked : str
-        Where the statement was checked: scene, place, profiles and water.
-    depths_mm : tuple of N float
-        True depths.
-    found : tuple of N bool
-        Whether each flaw was found.
-    signals_mm : tuple of N float or None
-        Measured depths of a signal response, 0 where nothing was measured; None for hits and misses.
-    false_calls : int
-        Findings that are no flaw.
-    a90_mm : float or None
-        Depth found with a probability of 90 %; None if the flaws do not determine it.
-    a90_95_mm : float or None
-        Its upper bound with 95 % confidence; None if the flaws do not bound it.
-    location, scale : float or None
-        Parameters of the curve. Hit or miss: logarithm of the depth in mm with 50 %, and inverse slope of the logistic.
-        Signal response: depth with 50 % and standard deviation of a normal distribution, in mm.
-    """
-
-    flaw: Flaw
-    width_mm: float
-    method: Method
-    checked: str
-    depths_mm: tuple[float, ...]
-    found: tuple[bool, ...]
+    flaw: Flaw  # "pit", "dent" or "undercut"
+    width_mm: float  # width of the flaws
+    method: Method  # "hit/miss" or "signal response"
+    checked: str  # where the statement was checked: scene, place, profiles and water
+    depths_mm: tuple[float, ...]  # true depths
+    found: tuple[bool, ...]  # whether each flaw was found
     signals_mm: tuple[float, ...] | None = None
-    false_calls: int = 0
-    a90_mm: float | None = None
-    a90_95_mm: float | None = None
+    """Measured depths of a signal response, 0 where nothing was measured; None for hits and misses."""
+    false_calls: int = 0  # findings that are no flaw
+    a90_mm: float | None = None  # depth found with a probability of 90 %; None if the flaws do not determine it
+    a90_95_mm: float | None = None  # its upper bound with 95 % confidence; None if the flaws do not bound it
+    # Parameters of the curve. Hit or miss: logarithm of the depth in mm with 50 %, and inverse slope of the logistic.
+    # Signal response: depth with 50 % and standard deviation of a normal distribution, in mm.
     location: float | None = None
     scale: float | None = None
 

@@ -59,19 +59,14 @@ def make_empty_truth(lines: int) -> FrameTruth:
 
 @dataclass(frozen=True)
 class Crossings:
-    """Intersections of the sheet's centre with surfaces on K profile lines, lit or in shadow.
+    """Intersections of the sheet's centre with surfaces on K profile lines, lit or in shadow."""
 
-    ``line`` (K,) is the number of the line and ``centre_px`` (K,) the image coordinate across the stripe.
-    ``brightness`` (K,) is the laser's irradiance on the image sensor in W/mm2, 0 in shadow. ``point_mm`` and ``normal``
-    (K, 3) describe the surface in scene coordinates. ``thing`` (K,) is the index of the object in the scene.
-    """
-
-    line: np.ndarray
-    centre_px: np.ndarray
-    brightness: np.ndarray
-    point_mm: np.ndarray
+    line: np.ndarray  # (K,); number of the line
+    centre_px: np.ndarray  # (K,); image coordinate across the stripe
+    brightness: np.ndarray  # (K,); the laser's irradiance on the image sensor in W/mm2, 0 in shadow
+    point_mm: np.ndarray  # (K, 3); in scene coordinates, as the normal
     normal: np.ndarray
-    thing: np.ndarray
+    thing: np.ndarray  # (K,); index of the object in the scene
 
 
 def find_true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> FrameTruth:
@@ -121,16 +116,10 @@ def measure_line_light(
 
 
 def mark_run(light: np.ndarray, centre: np.ndarray, share: float) -> np.ndarray:
-    """Return the mask (A, L) of each line's run of pixels about its centre that exceed ``share`` of the light there.
+    """Return the mask (A, L) of each line's run of pixels that exceed ``share`` of the light at its centre.
 
-    Parameters
-    ----------
-    light : (A, L)
-        Light of A pixels across the stripe on L lines.
-    centre : (L,)
-        Centres in px across the stripe.
-    share
-        Fraction of the light of the three pixels at the centre.
+    ``light`` (A, L) is that of A pixels across the stripe on L lines, ``centre`` (L,) in px across the stripe. The
+    light at a centre is the largest of three pixels.
     """
     across, place = len(light), np.arange(len(light))[:, None]
     middle = np.clip(np.rint(centre).astype(int), 0, across - 1)

@@ -39,31 +39,14 @@ def record_scene(
     resume: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> None:
-    """Render a scene into a capture and its ground truth into a file beside it.
+    """Render a scene into a capture, which states ``sensor``, and its ground truth into a file beside it.
 
-    Parameters
-    ----------
-    scene, sensor
-        Scene, and the sensor that the capture states.
-    path
-        Capture to write. An interrupted run leaves ``path.part`` with all complete frames.
-    as_built
-        Sensor that the images show; by default ``sensor``.
-    options
-        Samples, seed and rendered effects.
-    overwrite
-        Replace existing files.
-    resume
-        Continue an interrupted run, with the same result as an uninterrupted one.
-    progress
-        Called as ``progress(done, total)`` after every frame.
+    The images show the sensor ``as_built``, by default ``sensor``. An interrupted run leaves ``path.part`` with all
+    complete frames; ``resume`` continues it, with the same result as an uninterrupted one. ``progress(done, total)``
+    counts frames.
 
-    Raises
-    ------
-    DesignError, DescriptionError
-        The sensor or the scene cannot work.
-    OutputError
-        A file exists, or cannot be written.
+    Raises DesignError or DescriptionError if sensor or scene cannot work, and OutputError if a file exists or cannot be
+    written.
     """
     path = Path(path)
     if truth_path(path).exists() and not (overwrite or resume):

@@ -13,19 +13,19 @@ from pathlib import Path
 import numpy as np
 
 from twin.rendering_options import CPU, Options, Variant, use_variant
+from twin.scene.campaign import AnySensor, choose_sensors
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import require_ending
 from uwlts.model.brief import Brief
-from uwlts.model.library import load_sensor, validate_description
+from uwlts.model.library import validate_description
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import CAPTURES
 from uwlts.storage.truth import Truth
 
 AnyScene = str | Path | Scene
-AnySensor = str | Path | Sensor
 FRAME_DATA = ("stage_mm", "laser_on", "exposure_ms", "time_s")
 
 
@@ -235,16 +235,3 @@ def choose_scene(scene: AnyScene, *, placement: str | None, medium: str | None, 
     given = {"placement": placement, "medium": medium, "water": water}
     changes = {key: value for key, value in given.items() if value is not None}
     return validate_description(Scene, scene.model_dump() | changes, scene.title)
-
-
-def choose_sensors(sensor: AnySensor, as_built: AnySensor | None) -> tuple[Sensor, Sensor]:
-    """Return the sensor as described and as built; DescriptionError if their image formats differ."""
-    nominal = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
-    if as_built is None:
-        return nominal, nominal
-    built = as_built if isinstance(as_built, Sensor) else load_sensor(as_built)
-    shared = {"width_px", "height_px", "stripe_along"}
-    if built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
-        names = [each.name if isinstance(each, Sensor) else str(each) for each in (as_built, sensor)]
-        raise DescriptionError(f"'{names[0]}' and '{names[1]}' differ in image size or stripe orientation")
-    return nominal, built

@@ -98,24 +98,18 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class SimulatedImage:
-    """A simulated image, and the mean photo-electrons of its exposure by light path.
+    """A simulated image, and the mean photo-electrons (H, W), float32, of its exposure by light path.
 
-    ``image`` (H, W) holds grey values. The other arrays (H, W), float32, contain neither speckle nor noise:
-
-    - ``direct``: laser light from directly lit surfaces;
-    - ``scattered_once``: light that the water scatters once from the sheet into the camera's rays;
-    - ``longer_ways``: light that is scattered several times or reflected between surfaces;
-    - ``particles``: light of particles and bubbles in the sheet;
-    - ``even``: light of lamp and day.
+    The light paths contain neither speckle nor noise.
     """
 
-    image: np.ndarray
+    image: np.ndarray  # (H, W); grey values
     exposure_ms: float
-    direct: np.ndarray
-    scattered_once: np.ndarray
-    indirect: np.ndarray
-    particles: np.ndarray
-    even: np.ndarray
+    direct: np.ndarray  # laser light from directly lit surfaces
+    scattered_once: np.ndarray  # light that the water scatters once from the sheet into the camera's rays
+    indirect: np.ndarray  # light that is scattered several times or reflected between surfaces
+    particles: np.ndarray  # light of particles and bubbles in the sheet
+    even: np.ndarray  # light of lamp and day
 
     def total(self) -> np.ndarray:
         """Return the sum of all light paths (H, W)."""

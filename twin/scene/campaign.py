@@ -12,10 +12,11 @@ from twin.scene.description import Block, PrintedPlate, Scene, load_scene, repla
 from twin.scene.motion import Motion
 from twin.scene.platforms import Platform
 from uwlts.errors import DescriptionError
-from uwlts.model.library import find_description, load_sensor, read_table, validate_description
+from uwlts.model.library import find_description, load_sensor, read_levels, validate_description
 from uwlts.model.sensor import Description, NotNegative, Sensor
 
 FOLDER = "campaigns"
+AnySensor = str | Path | Sensor
 
 
 class Imperfections(Description):
@@ -76,7 +77,7 @@ class CampaignRecording(Description):
 
 
 class Campaign(Description):
-    """Recordings with one sensor. The imperfections are added to the sensor ``as_built``.
+    """Recordings with one sensor. The imperfections are added to ``as_built``; files may omit it, if it is ``sensor``.
 
     Sensors are names or paths; relative paths start at the campaign's folder. ``water`` replaces that of all scenes in
     water, by the name of a water or a turbidity from 0 (pure) to 3 (harbour).
@@ -101,10 +102,27 @@ class Take:
     seed: int
 
 
+def choose_sensors(sensor: AnySensor, as_built: AnySensor | None) -> tuple[Sensor, Sensor]:
+    """Return the sensor as described and as built; DescriptionError if their image formats differ."""
+    nominal = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
+    if as_built is None:
+        return nominal, nominal
+    built = as_built if isinstance(as_built, Sensor) else load_sensor(as_built)
+    shared = {"width_px", "height_px", "stripe_along"}
+    if built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
+        names = [each.name if isinstance(each, Sensor) else str(each) for each in (as_built, sensor)]
+        raise DescriptionError(f"'{names[0]}' and '{names[1]}' differ in image size or stripe orientation")
+    return nominal, built
+
+
 def load_campaign(name_or_path: str | Path) -> Campaign:
     """Read a campaign by name (``thesis``) or path; DescriptionError if it does not exist or is invalid."""
     path = find_description(name_or_path, FOLDER)
-    campaign = validate_description(Campaign, read_table(path, FOLDER), path)
+    levels = read_levels(path, FOLDER)
+    # A base's sensor as built is no variation of another sensor.
+    naming = next((each.own for each in levels[::-1] if {"sensor", "as_built"} & each.own.keys()), {})
+    table = levels[-1].merged | {"as_built": naming.get("as_built", naming.get("sensor", ""))}
+    campaign = validate_description(Campaign, table, path)
 
     def from_folder(name_or_path: str) -> str:
         return str(path.parent / name_or_path) if name_or_path.endswith(".toml") else name_or_path
@@ -178,7 +196,7 @@ class _SampledImperfections:
     def __init__(self, campaign: Campaign, seed: int):
         self.seed, self._size = seed, campaign.imperfections
         size, rng = self._size, np.random.default_rng([seed, 0])
-        self.described, built = load_sensor(campaign.sensor), load_sensor(campaign.as_built)
+        self.described, built = choose_sensors(campaign.sensor, campaign.as_built)
         window = built.camera.window
         tilt_x, tilt_y = (size.window_tilt_std_deg * rng.standard_normal(2)).tolist()
         bow = size.sheet_bow_std_deg * rng.standard_normal()

@@ -14,7 +14,7 @@ from pydantic import model_validator
 from twin.scene.platforms import LEAD_S, PlatformMotion, Route, displace_poses, interpolate_values
 from uwlts.model.sensor import Description, NotNegative, Positive
 
-_GRAVITY = 9.81  # m/s2
+GRAVITY_M_S2 = 9.81
 _COMPONENTS = 24  # sines of a sea state; it does not repeat during a scan
 _STEP_S = 0.05
 """Time step of the navigation errors, far below all their time constants."""
@@ -44,14 +44,14 @@ def sample_waves(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], n
     """
     still = sea.significant_height_mm == 0 and sea.tilt_deg == 0
     height = max(sea.significant_height_mm, 100.0) * 1e-3
-    peak = 0.4 * np.sqrt(_GRAVITY / height)
+    peak = 0.4 * np.sqrt(GRAVITY_M_S2 / height)
     edges = np.linspace(0.5 * peak, 3.0 * peak, _COMPONENTS + 1)
     frequency, band = rng.uniform(edges[:-1], edges[1:]), edges[1] - edges[0]
     spectrum = 5 / 16 * height**2 * peak**4 * frequency**-5 * np.exp(-1.25 * (peak / frequency) ** 4)
     size = 1e3 * np.sqrt(2 * spectrum * band)
     if sea.significant_height_mm == 0:
         size = 0 * size
-    size = sea.share * size * np.exp(-(frequency**2) * sea.depth_mm * 1e-3 / _GRAVITY)
+    size = sea.share * size * np.exp(-(frequency**2) * sea.depth_mm * 1e-3 / GRAVITY_M_S2)
     weight = np.sqrt(spectrum / spectrum.sum() * 2) * np.radians(sea.tilt_deg)
     phases, tilt_phases = rng.uniform(0, 2 * np.pi, _COMPONENTS), rng.uniform(0, 2 * np.pi, (2, _COMPONENTS))
     towards = np.radians(sea.towards_deg)

@@ -35,31 +35,17 @@ Faster rates are like a random walk, slower ones like a constant rate with a ran
 
 @dataclass(frozen=True, eq=False)
 class DriftModel:
-    """Drift of a navigation that starts without error.
-
-    Attributes
-    ----------
-    std : (6,) float64
-        Standard deviation of position (mm) and rotation (rad) at the end, for each axis, without the effect of heading
-        errors on position.
-    walk : (6,) float64
-        Fraction of the random walk in this variance; the rest is due to the rates.
-    correlation : float
-        Correlation time of the rates, relative to the duration of the path; inf for constant rates.
-    smooth : bool
-        Whether the correlation of rates is that of a smooth process, instead of a first-order Gauss-Markov process.
-    dead_reckoned : bool
-        Whether heading errors rotate the direction of travel.
-    stated : bool
-        Whether a covariance states these values; otherwise walk and correlation are estimated.
-    """
+    """Drift of a navigation that starts without error."""
 
     std: np.ndarray
-    walk: np.ndarray
-    correlation: float
+    """(6,); standard deviation of position (mm) and rotation (rad) at the end, for each axis, without the effect of
+    heading errors on position."""
+    walk: np.ndarray  # (6,); fraction of the random walk in this variance; the rest is due to the rates
+    correlation: float  # correlation time of the rates, relative to the duration of the path; inf for constant rates
     smooth: bool
-    dead_reckoned: bool
-    stated: bool
+    """Rates are correlated as in a smooth process, instead of a first-order Gauss-Markov process."""
+    dead_reckoned: bool  # heading errors rotate the direction of travel
+    stated: bool  # a covariance states these values; otherwise walk and correlation are estimated
 
     @classmethod
     def of_size(cls, drift_mm: float, drift_deg: float) -> DriftModel:

@@ -24,31 +24,16 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class PathEstimate:
-    """Correction of a path by its pairs of crossing pieces.
-
-    Attributes
-    ----------
-    survey : Survey
-    options : AlignmentOptions
-    prior : PathPrior
-    pieces : tuple of Piece
-    pairs : tuple of Pair
-    values : (6 C,)
-        Translations and rotations at the nodes of the prior.
-    numbers : (6 C,)
-        The same in whitened coordinates, which have a unit covariance in the prior.
-    factor : (6 C, 6 C)
-        Lower Cholesky factor of the normal matrix of the whitened coordinates.
-    """
+    """Correction of a path by its pairs of crossing pieces."""
 
     survey: Survey
     options: AlignmentOptions
     prior: PathPrior
     pieces: tuple[Piece, ...]
     pairs: tuple[Pair, ...]
-    values: np.ndarray
-    numbers: np.ndarray
-    factor: np.ndarray
+    values: np.ndarray  # (6 C,); translations and rotations at the nodes of the prior
+    numbers: np.ndarray  # (6 C,); the same in whitened coordinates, which have a unit covariance in the prior
+    factor: np.ndarray  # (6 C, 6 C); lower Cholesky factor of the normal matrix of the whitened coordinates
 
     def corrections(self, times_s: np.ndarray) -> np.ndarray:
         """Return translations and rotations (N, 6) at times (N,)."""

@@ -32,25 +32,15 @@ _NEGLIGIBLE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Pose in which the later piece of a pair may coincide with the earlier one.
-
-    Attributes
-    ----------
-    pair : Pair
-    at_mm : (3,)
-        Reference point of the rotation.
-    relative, std : (6,)
-        Translation (mm) and rotation (rad) of the later piece relative to the earlier one at ``at_mm``, and its
-        standard deviation.
-    patches : int
-        Number of agreeing patches.
-    """
+    """Pose in which the later piece of a pair may coincide with the earlier one."""
 
     pair: Pair
-    at_mm: np.ndarray
+    at_mm: np.ndarray  # (3,); reference point of the rotation
+    # (6,); translation (mm) and rotation (rad) of the later piece relative to the earlier one at ``at_mm``, and its
+    # standard deviation.
     relative: np.ndarray
     std: np.ndarray
-    patches: int
+    patches: int  # number of agreeing patches
 
 
 def initial_estimate(survey: Survey, prior: PathPrior, options: AlignmentOptions) -> PathEstimate:

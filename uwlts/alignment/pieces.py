@@ -24,49 +24,46 @@ _ALONE_MM2 = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Points of a scan, with the platform's positions from its navigation.
-
-    Attributes
-    ----------
-    cloud : PointCloud
-    moments_s : (M,)
-        Times of the images.
-    image : (N,) int
-        Image of each point.
-    platform_mm, velocity_mm_s : (M, 3)
-        Position and velocity of the platform at each image.
-    parts : tuple of (K,) int
-        Indices of the points of each piece.
-    radius_mm : float
-        Radius of patches.
-    speed_mm_s : float
-        Speed of the stripe on the surface.
-    """
+    """Points of a scan, with the platform's positions from its navigation."""
 
     cloud: PointCloud
-    moments_s: np.ndarray
-    image: np.ndarray
+    moments_s: np.ndarray  # (M,); times of the images
+    image: np.ndarray  # (N,) int; image of each point
+    # (M, 3); position and velocity of the platform at each image.
     platform_mm: np.ndarray
     velocity_mm_s: np.ndarray
-    parts: tuple[np.ndarray, ...]
-    radius_mm: float
-    speed_mm_s: float
+    parts: tuple[np.ndarray, ...]  # (K,) int; indices of the points of each piece
+    radius_mm: float  # radius of patches
+    speed_mm_s: float  # speed of the stripe on the surface
 
     @classmethod
     def from_cloud(cls, cloud: PointCloud, times_s: np.ndarray, trajectory: Trajectory) -> Survey:
-        """Divide a cloud into pieces, given the times (N,) of its points on the trajectory's clock."""
+        """Divide a cloud into pieces, given the times (N,) of its points on the trajectory's clock.
+
+        Raises
+        ------
+        EvaluationError
+            No piece has enough points, or images have a single one.
+        """
         moments, image = np.unique(times_s, return_inverse=True)
         order = np.argsort(image, kind="stable")
         by_image = np.split(cloud.points_mm[order], np.searchsorted(image[order], np.arange(1, len(moments))))
         swath = float(np.median([np.linalg.norm(np.ptp(points, axis=0)) for points in by_image]))
+        if swath == 0:
+            raise EvaluationError("most times of the cloud have a single point: expected the points of a whole stripe")
         middles = np.array([points.mean(axis=0) for points in by_image])
         way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(middles, axis=0), axis=1)))
         count = max(2, round(way[-1] / swath))
         number = np.minimum((way / way[-1] * count).astype(int), count - 1)[image]
         parts = tuple(np.flatnonzero(number == each) for each in range(count))
-        radius = find_disc_radius(cloud.points_mm[parts[count // 2]])
-        platform, velocity = trajectory.poses_at(moments)[:, :3, 3], trajectory.rates_at(moments)[:, :3]
         long_enough = tuple(part for part in parts if len(part) >= _FEWEST_POINTS)
+        if not long_enough:
+            raise EvaluationError(
+                f"no piece of the path as long as the stripe is wide ({swath:.0f} mm) has {_FEWEST_POINTS} points: "
+                "record images with a smaller spacing"
+            )
+        radius = find_disc_radius(cloud.points_mm[long_enough[len(long_enough) // 2]])
+        platform, velocity = trajectory.poses_at(moments)[:, :3, 3], trajectory.rates_at(moments)[:, :3]
         return cls(cloud, moments, image, platform, velocity, long_enough, radius, way[-1] / float(np.ptp(moments)))
 
     def points_along(self, part: np.ndarray, corrections: np.ndarray) -> np.ndarray:
@@ -77,35 +74,19 @@ class Survey:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Piece of a path with P surface patches.
+    """Piece of a path with P surface patches."""
 
-    Attributes
-    ----------
-    part : (K,) int
-        Indices of its points.
-    patches : Patches
-        Patches along the path that was current when they were fitted.
-    back : (P, 3, 3)
-        Linear map from the surface around each patch to that along the navigated path.
-    places_mm : (P, 3)
-        Positions of the patches along the navigated path.
-    times_s, slopes_s_mm : (P,) and (P, 3)
-        Times of the patches, and the gradient of time over the surface.
-    platform_mm, velocity_mm_s : (P, 3)
-        Position and velocity of the platform at these times.
-    held_out : (P,) bool
-        Patches that validate the estimate.
-    """
-
-    part: np.ndarray
-    patches: Patches
-    back: np.ndarray
-    places_mm: np.ndarray
+    part: np.ndarray  # (K,) int; indices of its points
+    patches: Patches  # patches along the path that was current when they were fitted
+    back: np.ndarray  # (P, 3, 3); linear map from the surface around each patch to that along the navigated path
+    places_mm: np.ndarray  # (P, 3); positions of the patches along the navigated path
+    # (P,) and (P, 3); times of the patches, and the gradient of time over the surface.
     times_s: np.ndarray
     slopes_s_mm: np.ndarray
+    # (P, 3); position and velocity of the platform at these times.
     platform_mm: np.ndarray
     velocity_mm_s: np.ndarray
-    held_out: np.ndarray
+    held_out: np.ndarray  # (P,) bool; patches that validate the estimate
 
     @property
     def middle_s(self) -> float:
@@ -140,18 +121,9 @@ class Piece:
 def fit_piece(
     survey: Survey, part: np.ndarray, corrections: np.ndarray, rates: np.ndarray, options: AlignmentOptions
 ) -> Piece | None:
-    """Fit patches to a part of the points, along the corrected path. Return None if the points form no surface.
+    """Fit patches to points of indices ``part`` along the corrected path; return None if they form no surface.
 
-    Parameters
-    ----------
-    survey
-        Cloud along the path.
-    part : (N,)
-        Indices of the points.
-    corrections, rates : (M, 6)
-        Corrections of the poses of all images, and their time derivatives.
-    options
-        Options of the alignment.
+    ``corrections`` and ``rates`` (M, 6) are corrections of the poses of all images, and their time derivatives.
     """
     known = None if survey.cloud.uncertainty is None else survey.cloud.uncertainty[part]
     # Errors common to all points do not affect differences between passes.

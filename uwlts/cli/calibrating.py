@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.command_options import STRIPE, CalibrationOut, Overwrite, a_file, a_page, app, wrote, wrote_page
+from uwlts.cli.command_options import STRIPE, CalibrationOut, Overwrite, a_file, app, wrote, wrote_page
 from uwlts.errors import DescriptionError, OutputError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.command_line import Call, command_from, say, show, warn
@@ -15,7 +15,7 @@ from uwlts.runtime.command_line import Call, command_from, say, show, warn
 _EVIDENCE = ("air", "water", "step", "scan")
 
 
-@command_from(app, uwlts, "calibrate", job="Calibrate", also=[(uwlts, "record_guided")], shortcuts=STRIPE)
+@command_from(app, uwlts, "calibrate", job="Calibrate", also=[(uwlts.desk, "record_guided")], shortcuts=STRIPE)
 def calibrate(
     call: Call,
     *,
@@ -51,7 +51,7 @@ def calibrate(
             require_index(index)
         wanted = call.given.get("distortion", "auto")
         require_coefficients(wanted)
-        recording = uwlts.record_guided(
+        recording = uwlts.desk.record_guided(
             live,
             out,
             camera=camera,
@@ -140,22 +140,16 @@ def polynomials(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False
     wrote(polynomial_lines(found.calibration), found.warnings, out)
 
 
-@command_from(app, uwlts, "compare_models", job="Calibrate", shortcuts=STRIPE)
-def models(
-    call: Call,
-    *,
-    out: Annotated[Path | None, a_page(), Parameter(help="Page to write, with the figures as JSON beside it.")] = None,
-    overwrite: Overwrite = False,
-) -> None:
+@command_from(app, uwlts.report, "write_models", job="Calibrate", shortcuts=STRIPE)
+def models(call: Call) -> None:
     """Example: uwlts models --air target-air.h5 --water target-water.h5 --out models.html"""
     from uwlts.report.model_comparison import format_lines, make_content
 
     comparison = call()
     show(format_lines(make_content(comparison)))
     warn(*comparison.warnings)
-    if out is not None:
-        uwlts.report.write_models(out, comparison, overwrite=overwrite)
-        wrote_page(out)
+    if out := call.given.get("out"):
+        wrote_page(Path(out))
 
 
 @command_from(app, uwlts.report, "write_certificate", job="Calibrate")

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import uwlts
+import uwlts.thesis
 from uwlts.cli.command_options import (
     STRIPE,
     ColouredOut,
@@ -152,7 +153,7 @@ def report(call: Call) -> None:
     say(f"wrote {written.page} and {written.summary}")
 
 
-@command_from(app, uwlts, "evaluate_thesis", job="Inspect")
+@command_from(app, uwlts.thesis, "evaluate_thesis", job="Inspect")
 def thesis(call: Call) -> None:
     """`twin reproduce` renders such a folder.
 

@@ -17,19 +17,19 @@ def scan(call: Call) -> None:
     say(f"wrote {call.given['out']}, {lines}; exposure {exposures or 'as before'}")
 
 
-@command_from(app, uwlts, "watch", job="Scan")
+@command_from(app, uwlts.desk, "watch", job="Scan")
 def watch(call: Call) -> None:
     """Example: uwlts watch scan.h5 --calibration calibration.json"""
     call()
 
 
-@command_from(app, uwlts, "serve_desk", job="Scan")
+@command_from(app, uwlts.desk, "serve_desk", job="Scan")
 def desk(call: Call) -> None:
     """Example: uwlts desk tank --plan plan.toml"""
     call()
 
 
-@command_from(app, uwlts, "serve_ros", job="Scan")
+@command_from(app, uwlts.desk, "serve_ros", job="Scan")
 def ros(call: Call) -> None:
     """Example: uwlts ros plan.toml --calibration calibration.json --home"""
     call()

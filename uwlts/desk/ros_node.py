@@ -80,9 +80,9 @@ def serve_ros(
     folder : str or Path
         Folder of the captures, which are numbered.
     camera : str, optional
-        As for `scan`.
+        As for `uwlts.scan`.
     stage : str, optional
-        As for `scan`.
+        As for `uwlts.scan`.
     home : bool
         Home the stage first, before each scan for which it is locked.
     unlock : bool

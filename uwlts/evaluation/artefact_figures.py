@@ -177,43 +177,28 @@ def measure_ovality(points: np.ndarray, fit: CylinderFit) -> float | None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepEvaluation(ArtefactEvaluation):
-    """Evaluation of a step, mm. Deviations refer to the reference face's plane, shifted by the calibrated height.
-
-    Attributes
-    ----------
-    height_mm, height_std_mm : float
-        Mean distance of the points of one face from the plane of the other, and its standard uncertainty by the scatter
-        of the points alone.
-    profile_height_mm, profile_height_std_mm : float or None
-        Mean and standard deviation of the heights of single profiles, projected onto the normal of the faces; None
-        without a profile of both faces.
-    profiles : int
-        Number of profiles that show both faces.
-    labels : (N,) int8
-        Face of each point (`StepFace`).
-    lower_std_mm, upper_std_mm : float
-        Standard deviation of each face about its own plane.
-    parallelism_deg : float
-        Angle between both planes.
-    normal, point_mm : (float, float, float)
-        Unit normal of the reference face towards the sensor, and the mean of the points of both faces.
-    """
+    """Evaluation of a step, mm. Deviations refer to the reference face's plane, shifted by the calibrated height."""
 
     kind: ClassVar[str] = "step"
 
+    # Mean distance of the points of one face from the plane of the other; standard uncertainty by their scatter alone.
     height_mm: float
     height_error_mm: float
     height_std_mm: float
+    # Mean and standard deviation of the heights of single profiles, projected onto the normal of the faces; None
+    # without a profile of both faces.
     profile_height_mm: float | None
     profile_height_error_mm: float | None
     profile_height_std_mm: float | None
-    profiles: int
+    profiles: int  # number of profiles that show both faces
+    # Standard deviation of each face about its own plane.
     lower_std_mm: float
     upper_std_mm: float
-    parallelism_deg: float
+    parallelism_deg: float  # angle between both planes
+    # Unit normal of the reference face towards the sensor, and the mean of the points of both faces.
     normal: tuple[float, float, float]
     point_mm: tuple[float, float, float]
-    labels: np.ndarray
+    labels: np.ndarray  # (N,) int8; face of each point (`StepFace`)
 
     def values_mm(self) -> dict[FigureId, float | None]:
         return {

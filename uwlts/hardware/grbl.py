@@ -489,11 +489,19 @@ class GrblStage:
                 self._line.begin(*self._lighting)
 
     def _see_spindle(self, power: float) -> None:
-        """Check that the pin gets into the expected state, which may take the controller a few ms."""
+        """Check that the pin gets into the expected state, which may take the controller a few ms.
+
+        An answer that comes after a timed light has ended does not show whether it shone.
+        """
         deadline = time.monotonic() + _LIGHTS_S
+        if power:
+            deadline = min(deadline, self.lit_until_s)
         while not self._follows(report := self._line.status(), power) and time.monotonic() < deadline:
             time.sleep(POLL_S / 20)
-        self._require_spindle(report, power)
+        if power and self._line.answered_s >= self.lit_until_s:
+            self._refuse_stop(report)
+        else:
+            self._require_spindle(report, power)
 
     def _follows(self, report: Status, power: float) -> bool:
         return report.spindle is None or abs(report.spindle - power * self.settings.spindle_max) <= 1

@@ -153,22 +153,9 @@ _RUN_UP_MM = 1.0
 def add_provenance(
     header: CaptureHeader, plan: RigPlan, camera: CameraDevice, *, source: str, stage: str, **more: JsonValue
 ) -> CaptureHeader:
-    """Return the header of a capture with the provenance of its images.
+    """Return the header of a capture with the provenance of its images, and ``more`` entries.
 
-    Parameters
-    ----------
-    header
-        Header without provenance.
-    plan
-        Plan of the recording.
-    camera
-        Camera that takes the images.
-    source
-        Kind of the recording, such as "scan".
-    stage
-        Name of the stage's controller.
-    **more
-        Further entries.
+    ``source`` is the kind of the recording, such as "scan", ``stage`` the name of the stage's controller.
     """
     provenance = {
         "source": source,

@@ -86,27 +86,11 @@ class LaserWatch:
     def check(
         self, image: Seen, stripe: Stripe, level: float, here: LitPlace, *, unlit: np.ndarray | None, last: bool
     ) -> None:
-        """Check that the laser emitted light in an image, before the image is stored. The stage may move.
+        """Check that the laser emitted light in an image or centre line, before it is stored. The stage may move.
 
-        Parameters
-        ----------
-        image : (H, W), or Stripe
-            Laser image, or centre line of a 3D camera.
-        stripe
-            Stripe found in it.
-        level
-            Brightness of the stripe; it is compared with that of the image before.
-        here
-            Position and exposure of the image.
-        unlit : (H, W), optional
-            Image without laser at the same position; if missing, it is taken when it is needed.
-        last
-            No further image follows.
-
-        Raises
-        ------
-        HardwareError
-            The laser emits no light.
+        ``level`` is the brightness of the stripe, which is compared with that of the image before. ``unlit`` (H, W) is
+        an image without laser at the same position; if missing, it is taken when it is needed. No further image follows
+        the ``last``. Raises HardwareError if the laser emits no light.
         """
         now = (int((stripe.status != StripeStatus.NO_STRIPE).sum()), level)
         if self._usual is None or any(a < _DROP * b for a, b in zip(now, self._usual, strict=True)):

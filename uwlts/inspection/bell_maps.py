@@ -119,40 +119,18 @@ def limit_deviations(surface: UnrolledSurface, tree: KDTree) -> tuple[UnrolledSu
 
 @dataclass(frozen=True, eq=False)
 class BellMap:
-    """Fitted bells of one radius on a grid of places.
+    """Fitted bells of one radius on a grid of places."""
 
-    Attributes
-    ----------
-    radius, cell : float
-        Radius of the bells and side of a cell, mm.
-    origin : (2,) float64
-        Corner of the grid.
-    height : (I, J) float64
-        Heights of the bells, mm.
-    information : (I, J) float64
-        Inverse variances of the heights for unit point noise.
-    spread : (I, J) float64
-        Local standard deviation of height times root information.
-    z : (I, J) float64
-        Significance, as a standard normal variable.
-    area_mm2 : float
-        Searched area.
-    moments : (2,) float64
-        Root spectral moments along both axes, 1/mm.
-    sides : (2,) float64
-        Sides of the searched area, mm.
-    """
-
-    radius: float
-    origin: np.ndarray
-    cell: float
-    height: np.ndarray
-    information: np.ndarray
-    spread: np.ndarray
-    z: np.ndarray
-    area_mm2: float
-    moments: np.ndarray
-    sides: np.ndarray
+    radius: float  # radius of the bells, mm
+    origin: np.ndarray  # (2,); corner of the grid
+    cell: float  # side of a cell, mm
+    height: np.ndarray  # (I, J); heights of the bells, mm
+    information: np.ndarray  # (I, J); inverse variances of the heights for unit point noise
+    spread: np.ndarray  # (I, J); local standard deviation of height times root information
+    z: np.ndarray  # (I, J); significance, as a standard normal variable
+    area_mm2: float  # searched area
+    moments: np.ndarray  # (2,); root spectral moments along both axes, 1/mm
+    sides: np.ndarray  # (2,); sides of the searched area, mm
 
     def false_alarms(self, level: float) -> float:
         """Return the expected Euler characteristic of the region where |z| exceeds a level."""

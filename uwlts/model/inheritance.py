@@ -12,7 +12,7 @@ import numpy as np
 
 from uwlts.errors import DesignError
 from uwlts.model.placement import apparent_depth_mm, camera_from_object, laser_pose
-from uwlts.model.sensor import Medium, Sensor, Table, Window
+from uwlts.model.sensor import Sensor, Table, Window
 
 _SAME_WAVELENGTH_NM = 5.0
 """Lasers of the same type differ by less."""
@@ -143,8 +143,8 @@ def find_misfits(levels: Sequence[Level], sensor: Sensor) -> list[str]:
     found += inherited.say("camera.principal_point_px", size, "", "set the principal point of these images")
     if any(sensor.camera.distortion.model_dump().values()):
         found += inherited.say("camera.distortion", _LENS, "", "set the coefficients of this lens")
-    for name, medium in sensor.media.items():
-        found += _check_medium(inherited, name, medium, nm)
+    for name in sensor.media:
+        found += _check_medium(inherited, name, nm)
     return found
 
 
@@ -199,7 +199,7 @@ def _apparent_mm(window: Window, distance_mm: float, *, index: float, wavelength
     return apparent_depth_mm(distance_mm, *behind, glass_index=window.index(wavelength_nm), medium_index=index)
 
 
-def _check_medium(inherited: _Inherited, name: str, medium: Medium, nm: str) -> Iterator[str]:
+def _check_medium(inherited: _Inherited, name: str, nm: str) -> Iterator[str]:
     """Yield warnings about inherited optical constants of a medium."""
     at = f"media.{name}"
     kind = f"{at}.kind"
@@ -216,10 +216,3 @@ def _check_medium(inherited: _Inherited, name: str, medium: Medium, nm: str) -> 
         if not of_medium and key != "phase":
             of_medium = inherited.say(f"{at}.{key}", [_WAVELENGTH], "", f"set the value at {nm}")
         yield from of_medium
-    if medium.kind == "sea" and medium.salinity_g_kg == 0:
-        origin = inherited.origin(f"{at}.temperature_c")
-        if origin is not None and inherited.changes(origin, [kind]):
-            yield (
-                f"{inherited.name}: {at}.salinity_g_kg is 0, as in the fresh water of '{origin.name}', but this "
-                f"description changes {kind} to 'sea': set the salinity, such as 35"
-            )

@@ -8,9 +8,9 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from uwlts.errors import DescriptionError, DescriptionWarning, Error, list_problems
@@ -113,7 +113,7 @@ def validate_description(model: type[AnyDescription], table: object, source: str
         return model.model_validate(table)
     except ValidationError as error:
         words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
-        known = [*map(_explain, list_problems(error, _MOST_PROBLEMS))]
+        known = [_explain(each, model) for each in list_problems(error, _MOST_PROBLEMS)]
         left = error.error_count() - len(known)
         more = [f"  {left:,} {'more ' if known else ''}values are wrong"] if left else []
         raise DescriptionError("\n".join([f"{source} is not a valid {words}:", *known, *more])) from error
@@ -123,15 +123,38 @@ def validate_description(model: type[AnyDescription], table: object, source: str
         raise DescriptionError(f"{source} contains numbers outside the range of calculations: {error}") from error
 
 
-def _explain(problem: ErrorDetails) -> str:
+def _explain(problem: ErrorDetails, model: type[Description]) -> str:
     # The default kind of a tagged union has an empty tag.
     key = ".".join(str(part) for part in problem["loc"] if part != "") or "(whole description)"
     if problem["type"] == "extra_forbidden":
-        return f"  {key}: unknown key (check its spelling and its unit suffix, such as _mm or _deg)"
+        keys = ", ".join(_list_keys(model, problem["loc"][:-1]))
+        return f"  {key}: unknown key (check its spelling and its unit suffix; the keys here are {keys})"
     if problem["type"] == "missing":
         return f"  {key}: missing"
     found = "" if isinstance(problem["input"], dict) else f" (found {shorten(repr(problem['input']))})"
     return f"  {key}: {problem['msg'].removeprefix('Value error, ')}{found}"
+
+
+def _list_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
+    """Return the keys that a description has at a location, which consists of keys, indices and kinds."""
+    models: list[type[BaseModel]] = [model]
+    for part in location:
+        fields = [each.model_fields[str(part)] for each in models if part in each.model_fields]
+        if fields:
+            models = [each for field in fields for each in _list_models(field.annotation)]
+        else:
+            models = [each for each in models if part in _list_kinds(each)] or models
+    return list(dict.fromkeys(key for each in models for key in each.model_fields))
+
+
+def _list_kinds(model: type[BaseModel]) -> tuple[object, ...]:
+    return get_args(model.model_fields["kind"].annotation) if "kind" in model.model_fields else ("",)
+
+
+def _list_models(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [each for part in get_args(annotation) for each in _list_models(part)]
 
 
 def load_sensor(name_or_path: str | Path) -> Sensor:

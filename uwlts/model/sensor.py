@@ -349,6 +349,8 @@ class Medium(Description):
             raise ValueError("a custom medium needs its index")
         if self.kind == "fresh" and self.salinity_g_kg > 0:
             raise ValueError(f"fresh water with salinity {self.salinity_g_kg:g} g/kg: use kind = 'sea'")
+        if self.kind == "sea" and self.salinity_g_kg == 0:
+            raise ValueError("sea water with salinity 0 g/kg: set salinity_g_kg, such as 35, or use kind = 'fresh'")
         if self.water is not None and self.turbidity is not None:
             raise ValueError(f"give water ('{self.water}') or turbidity ({self.turbidity:g}), not both")
         if self.kind == "air" and (self.water is not None or self.turbidity is not None):

@@ -196,18 +196,8 @@ def fit_brightness_slopes(
     """Return the slopes (N,) of the log stripe amplitude per mm of stage travel, 0 where they are unknown.
 
     Each slope belongs to a plane fitted to the log amplitudes of neighbouring lines and images. The fit averages noise
-    and speckle. All slopes are 0 if an amplitude is not finite, because the 3D camera does not supply it.
-
-    Parameters
-    ----------
-    frame, line : (N,) int
-        Image and profile line of each stripe centre.
-    amplitude : (N,)
-        Stripe amplitudes, positive.
-    stage_mm : (F,)
-        Stage position of each image, in any order.
-    exposure_ms : (F,)
-        Exposure time of each image. If one of them is unknown (0), all are assumed equal.
+    and speckle. All slopes are 0 if an amplitude is not finite, because the 3D camera does not supply it. Images are at
+    stage positions (F,) in any order. If one of their exposures (F,) is unknown (0), all are assumed equal.
     """
     if not np.isfinite(amplitude).all():
         return np.zeros(len(frame))

@@ -25,27 +25,13 @@ _GRAZING = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class FanDistances:
-    """Distances of points from the apparent origin of a fan in a medium.
+    """Distances of points from the apparent origin of a fan in a medium."""
 
-    Attributes
-    ----------
-    away : (3, N)
-        Vectors from the origin to the points.
-    all : (N,)
-        Their lengths r.
-    along : (N,)
-        Their components z along the fan's axis.
-    in_air : (N,)
-        The lengths q in air (see the module's description).
-    wet : (N,)
-        Fraction w of ``along`` that is in the medium.
-    """
-
-    away: np.ndarray
-    distance: np.ndarray
-    along: np.ndarray
-    in_air: np.ndarray
-    wet: np.ndarray
+    away: np.ndarray  # (3, N); vectors from the origin to the points
+    distance: np.ndarray  # (N,); their lengths r
+    along: np.ndarray  # (N,); their components z along the fan's axis
+    in_air: np.ndarray  # (N,); the lengths q in air (see the module's description)
+    wet: np.ndarray  # (N,); fraction w of ``along`` that is in the medium
 
     def bulges(self) -> tuple[np.ndarray, np.ndarray]:
         """Return n times the sheet's deviation (N,), (N,) per beam tilt b and per window angle t."""

@@ -29,24 +29,9 @@ def follow_sensor(
 ) -> Sensor:
     """Return the described sensor with calibrated lens, window and sheet, and fitted laser, water and detector.
 
-    Parameters
-    ----------
-    header
-        Description of the capture.
-    calibration
-        Calibration of the sensor.
-    found
-        Estimates by name.
-    reflectance
-        Reflectance of the surface, which divides the fitted product.
-    sheet_distance_mm
-        Distance from the laser of the fitted radius of the sheet.
-    attenuation_per_m
-        Attenuation to describe, for which the power was fitted.
-    dark_e
-        Dark current in electrons during the exposure.
-    exposure_ms
-        Exposure of the laser images.
+    ``reflectance`` of the surface divides the fitted product. ``sheet_distance_mm`` is the laser's distance from the
+    fitted radius of the sheet. ``attenuation_per_m`` is the attenuation for which the power was fitted. ``dark_e`` is
+    the dark current in electrons during the exposure of the laser images.
     """
     sensor, value = header.sensor, {name: each.value for name, each in found.items()}
     index = calibration.medium_index(header.medium)

@@ -28,31 +28,16 @@ _SMOOTH_PX = 2.0
 
 @dataclass(frozen=True, eq=False)
 class ImageSet:
-    """Laser images with one direction of the stripe.
+    """Laser images with one direction of the stripe."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the file or folder.
-    stripe_along : str
-        ``"height"`` or ``"width"``, as for `extract_stripe`.
-    full_dn : float
-        Grey value of clipped pixels.
-    options : StripeOptions
-        Options for finding the stripe.
-    count : int
-        Number of images.
-    read : callable
-        Yields images (H, W), uint8 or uint16, by their numbers, without marks of clipped pixels; None for an image
-        without the laser.
-    """
-
-    name: str
-    stripe_along: str
-    full_dn: float
-    options: StripeOptions
-    count: int
+    name: str  # name of the file or folder
+    stripe_along: str  # ``"height"`` or ``"width"``, as for `extract_stripe`
+    full_dn: float  # grey value of clipped pixels
+    options: StripeOptions  # options for finding the stripe
+    count: int  # number of images
     read: Callable[[Sequence[int]], Iterator[np.ndarray | None]]
+    """Yields images (H, W), uint8 or uint16, by their numbers, without marks of clipped pixels; None for an image
+    without the laser."""
 
     def images(self, most: int) -> Iterator[np.ndarray]:
         """Return up to a number of laser images (H, W), evenly chosen."""

@@ -29,14 +29,8 @@ _CELLS = 4096
 def line_spread(per_sr: Callable[[np.ndarray], np.ndarray], distance_mm: np.ndarray, path_mm: float) -> np.ndarray:
     """Return the line spread (N,) of single scattering, per mm and per scattering coefficient in 1/mm: no unit.
 
-    Parameters
-    ----------
-    per_sr
-        Phase function: 1/sr at angles in rad.
-    distance_mm : (N,)
-        Distances from the sheet, positive.
-    path_mm
-        Path in the water before the surface.
+    ``per_sr`` is the phase function, 1/sr at angles in rad. Distances (N,) from the sheet are positive; ``path_mm`` is
+    the path in the water before the surface.
     """
     # Logarithmic nodes: the integrand varies over the scale of the distance.
     x = distance_mm[:, None, None]

@@ -52,43 +52,24 @@ Chosen with the width of the bands on the drawn captures 100 to 111 of docs/stud
 
 @dataclass(frozen=True, eq=False)
 class StripeImages:
-    """Light of M groups of neighbouring stripe centres, in J blocks of consecutive groups.
-
-    Attributes
-    ----------
-    light : (M,)
-        Grey values across the stripe, added over ``width`` pixels, with the background; mean of the group.
-    of_group : (N,) int
-        Group of each stripe centre, -1 for unused ones.
-    block : (M,) int
-        Block of each group.
-    exposure_ms : (M,)
-        Exposure of each group.
-    width : int
-        Number of pixels across the stripe that are added.
-    fine_px, fine : (K,), (J, K)
-        Distances from the centre, and mean grey value there of each block.
-    tail : (J, TAIL_PX)
-        Mean grey value at 1, 2, ... pixels from the centre, on both sides.
-    tail_count : (J, TAIL_PX)
-        Number of pixels of ``tail``.
-    grain : (J, _LAGS + 1)
-        Mean product of the relative deviations of ``light`` from smooth at lags along the stripe, lines.
-    peak_dn : float
-        Grey value that one of two hundred stripe centres exceeds.
-    """
+    """Light of M groups of neighbouring stripe centres, in J blocks of consecutive groups."""
 
     light: np.ndarray
-    of_group: np.ndarray
-    block: np.ndarray
-    exposure_ms: np.ndarray
-    width: int
+    """(M,); grey values across the stripe, added over ``width`` pixels, with the background; mean of the group."""
+    of_group: np.ndarray  # (N,) int; group of each stripe centre, -1 for unused ones
+    block: np.ndarray  # (M,) int; block of each group
+    exposure_ms: np.ndarray  # (M,); exposure of each group
+    width: int  # number of pixels across the stripe that are added
+    # (K,) and (J, K); distances from the centre, and mean grey value there of each block.
     fine_px: np.ndarray
     fine: np.ndarray
     tail: np.ndarray
-    tail_count: np.ndarray
+    """(J, TAIL_PX); mean grey value at 1, 2, ... pixels from the centre, on both sides."""
+    tail_count: np.ndarray  # (J, TAIL_PX); number of pixels of ``tail``
     grain: np.ndarray
-    peak_dn: float
+    """(J, _LAGS + 1); mean product of the relative deviations of ``light`` from smooth at lags along the stripe,
+    lines."""
+    peak_dn: float  # grey value that one of two hundred stripe centres exceeds
 
 
 def fill_gaps(stripes: CaptureStripes) -> CaptureStripes:
@@ -181,27 +162,15 @@ def measure_stripes(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Pixels about N neighbouring centres.
+    """Pixels about N neighbouring centres."""
 
-    Attributes
-    ----------
-    values : (N, 2 TAIL_PX + 1)
-        Grey values, NaN outside the image.
-    offset : (N,)
-        Distance of the middle pixel from the centre.
-    light, deviation : (N,)
-        Light added across the stripe, and its relative deviation from smooth.
-    clipped : (N,) bool
-    middle : int
-        Number of the middle pixel.
-    """
-
-    values: np.ndarray
-    offset: np.ndarray
+    values: np.ndarray  # (N, 2 TAIL_PX + 1); grey values, NaN outside the image
+    offset: np.ndarray  # (N,); distance of the middle pixel from the centre
+    # (N,); light added across the stripe, and its relative deviation from smooth.
     light: np.ndarray
     deviation: np.ndarray
-    clipped: np.ndarray
-    middle: int = TAIL_PX
+    clipped: np.ndarray  # (N,) bool
+    middle: int = TAIL_PX  # number of the middle pixel
 
     def select(self, kept: np.ndarray) -> _Part:
         """Return the pixels of some centres."""

@@ -39,36 +39,23 @@ _JOULE_NM = 6.62607015e-34 * 299792458.0 * 1e9
 
 @dataclass(frozen=True, eq=False)
 class StripeLight:
-    """Light at N stripe centres.
-
-    Attributes
-    ----------
-    usable : (N,) bool
-        Centres with a point, a normal, and light and view at no grazing angle; all values are NaN elsewhere.
-    grey_per_mw : (N,)
-        Grey values times px across the stripe, per ms of exposure and mW of laser power times reflectance, without
-        attenuation by the water.
-    laser_path_mm, camera_path_mm : (N,)
-        Path in the medium from the laser's window and to the camera's window.
-    distance_mm : (N,)
-        Distance from the laser's origin.
-    depth_mm : (N,)
-        Depth along the camera's axis from the entrance pupil.
-    sheet_per_px, ray_per_px : (N,)
-        Distance of the surface point of the next pixel from the sheet, and from the camera ray, mm.
-    fan_angle : (N,)
-        Angle of the fan ray in air divided by half the fan angle.
-    """
+    """Light at N stripe centres."""
 
     usable: np.ndarray
+    """(N,) bool; centres with a point, a normal, and light and view at no grazing angle; all values are NaN
+    elsewhere."""
     grey_per_mw: np.ndarray
+    """(N,); grey values times px across the stripe, per ms of exposure and mW of laser power times reflectance, without
+    attenuation by the water."""
+    # (N,); path in the medium from the laser's window and to the camera's window.
     laser_path_mm: np.ndarray
     camera_path_mm: np.ndarray
-    distance_mm: np.ndarray
-    depth_mm: np.ndarray
+    distance_mm: np.ndarray  # (N,); distance from the laser's origin
+    depth_mm: np.ndarray  # (N,); depth along the camera's axis from the entrance pupil
+    # (N,); distance of the surface point of the next pixel from the sheet, and from the camera ray, mm.
     sheet_per_px: np.ndarray
     ray_per_px: np.ndarray
-    fan_angle: np.ndarray
+    fan_angle: np.ndarray  # (N,); angle of the fan ray in air divided by half the fan angle
 
     def path_mm(self) -> np.ndarray:
         """Return the path (N,) of the light in the medium."""
@@ -78,23 +65,10 @@ class StripeLight:
 def stripe_light(
     header: CaptureHeader, calibration: Calibration, stripes: CaptureStripes, stage_mm: np.ndarray
 ) -> StripeLight:
-    """Calculate the light at the stripe centres of a scan by a stage.
+    """Calculate the light at the stripe centres of a scan, from stage positions (F,) of its images.
 
-    Parameters
-    ----------
-    header
-        Description of the capture; its sensor gives laser, lens and detector.
-    calibration
-        Camera, window and sheet.
-    stripes
-        Stripe centres.
-    stage_mm : (F,)
-        Stage position of each image.
-
-    Raises
-    ------
-    CaptureError
-        All laser images are from one position of the stage, which does not show the surface's normals.
+    The sensor of ``header`` gives laser, lens and detector. Raises CaptureError if all laser images are from one
+    position of the stage, which does not show the surface's normals.
     """
     if len(np.unique(stage_mm[stripes.frame])) < _FEWEST_POSITIONS:
         raise CaptureError(

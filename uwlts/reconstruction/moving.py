@@ -40,27 +40,15 @@ _LEAST = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class PlatformPoses:
-    """Poses of a platform at the N images of a capture.
+    """Poses of a platform at the N images of a capture."""
 
-    Attributes
-    ----------
-    poses : (N, 4, 4) float64
-        ``T_base_platform``, mm; NaN for images without a pose.
-    covariance : (N, 6, 6) float64 or None
-        Covariance of each pose, as in `Trajectory`.
-    times_s : (N,) float64
-        Times of the images.
-    rates : (N, 6) float64 or None
-        Velocity (mm/s) and angular velocity (rad/s) in the base frame; None without a trajectory.
-    doubts : tuple of str
-        Warnings about the trajectory.
-    """
-
-    poses: np.ndarray
-    covariance: np.ndarray | None
-    times_s: np.ndarray
+    poses: np.ndarray  # (N, 4, 4); ``T_base_platform``, mm; NaN for images without a pose
+    covariance: np.ndarray | None  # (N, 6, 6); covariance of each pose, as in `Trajectory`
+    times_s: np.ndarray  # (N,); times of the images
     rates: np.ndarray | None = None
-    doubts: tuple[str, ...] = ()
+    """(N, 6); velocity (mm/s) and angular velocity (rad/s) in the base frame; None without a
+    trajectory."""
+    doubts: tuple[str, ...] = ()  # warnings about the trajectory
 
 
 def find_platform_poses(
@@ -71,25 +59,13 @@ def find_platform_poses(
     clock_offset_s: float | None,
     clock_drift_ppm: float = 0.0,
 ) -> PlatformPoses:
-    """Return the poses of the platform at all images.
+    """Return the poses of the platform at all images: of a trajectory, or those stored in the capture.
 
-    Parameters
-    ----------
-    capture
-        Capture of the moving sensor.
-    trajectory
-        Trajectory of the platform; None: the poses stored in the capture.
-    mount
-        Mount, which may state the scale of a robot's lengths.
-    clock_offset_s, clock_drift_ppm
-        Lead of the platform's clock at the first laser image, by default that of the mount, and its drift.
+    A ``mount`` may state the scale of a robot's lengths. ``clock_offset_s`` is the lead of the platform's clock at the
+    first laser image, by default that of the mount.
 
-    Raises
-    ------
-    CalibrationError
-        There is no trajectory, and a laser image has no pose.
-    DescriptionError
-        Images were taken before or after the trajectory.
+    Raises CalibrationError if there is no trajectory and a laser image has no pose; DescriptionError if images were
+    taken before or after the trajectory.
     """
     scale = 1.0 if mount is None or mount.robot_scale is None else mount.robot_scale
     if trajectory is None:
@@ -138,23 +114,12 @@ def add_platform_uncertainty(
     mount_covariance: np.ndarray | None = None,
     correlation_s: float | None = None,
 ) -> PointUncertainty:
-    """Add the uncertainty of mount, time offset and poses to that of points.
+    """Add the uncertainty of mount, time offset and poses to that of points (N, 3) in the base frame.
 
-    Parameters
-    ----------
-    uncertainty
-        Uncertainty of the points without that of the platform.
-    points_mm : (N, 3)
-        Points in the base frame.
-    frame : (N,)
-        Image of each point.
-    ride, mount
-        Poses of the platform and mount of the sensor.
-    mount_covariance : (6, 6), optional
-        Replaces the mount's own covariance if ``uncertainty`` already contains a part of it.
-    correlation_s
-        Correlation time of pose errors; 0 for independent errors. By default 0 without a trajectory; with a trajectory,
-        the correlation of a navigation filter. Images without a covariance have no pose uncertainty.
+    ``mount_covariance`` (6, 6) replaces the mount's own covariance if ``uncertainty`` already contains a part of it.
+    ``correlation_s`` is the correlation time of pose errors, 0 for independent errors. By default it is 0 without a
+    trajectory; with a trajectory, the correlation is that of a navigation filter. Images without a covariance have no
+    pose uncertainty.
     """
     levers, errors, poses_mm = points_mm - ride.poses[frame, :3, 3], [], uncertainty.poses_mm
     count, shared = len(uncertainty.patterns_mm), dict(uncertainty.shared)

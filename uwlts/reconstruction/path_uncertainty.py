@@ -20,18 +20,10 @@ _BLOCK = 50_000  # points, to limit memory
 def propagate_pose_errors(
     errors: np.ndarray, image: np.ndarray, levers_mm: np.ndarray, *, after: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the shifts (K, N, 3) float32 of points by K pose errors, preceded by given patterns.
+    """Return the shifts (K, N, 3) float32 of points by K pose errors, preceded by given patterns ``after`` (M, N, 3).
 
-    Parameters
-    ----------
-    errors : (F, 6, K)
-        Translation (mm) and rotation (rad) errors of the poses of F images.
-    image : (N,)
-        Image of each point.
-    levers_mm : (N, 3)
-        Positions of the points relative to the platform, along the axes of the base.
-    after : (M, N, 3), optional
-        Patterns at the beginning of the result (M + K, N, 3).
+    ``errors`` (F, 6, K) are translations (mm) and rotations (rad) of the poses of F images, ``image`` (N,) the image of
+    each point. ``levers_mm`` (N, 3) are positions relative to the platform, along the axes of the base.
     """
     first = 0 if after is None else len(after)
     moved = np.empty((first + errors.shape[2], len(image), 3), np.float32)
@@ -101,23 +93,12 @@ def correct_path_uncertainty(
 ) -> PointUncertainty:
     """Return the uncertainty of N points after a correction of the path, which replaces that of the navigation.
 
-    Noise and the patterns of sensor and mount calibration (``shared`` of ``known``) are kept and rotated. All other
-    patterns come from the navigation and are dropped.
-
-    Parameters
-    ----------
-    known
-        Uncertainty of the points along the original path.
-    turns, levers_mm : (N, 3)
-        Rotation vectors of the correction, rad, and positions relative to the platform afterwards.
-    image : (N,) int
-        Image of each point.
-    basis : (F, C)
-        Weights of the C nodes at the F images.
-    covariance : (6 C, 6 C)
-        Covariance of the correction at the nodes, translation (mm) and rotation (rad) about the platform.
-    poses : (F, 6, 6)
-        Covariance of the corrected poses. The part beyond that of the nodes is independent between images.
+    Noise and the patterns of sensor and mount calibration (``shared`` of ``known``) are kept and rotated by ``turns``
+    (N, 3) in rad. All other patterns come from the navigation and are dropped. ``levers_mm`` (N, 3) are positions
+    relative to the platform after the correction. ``basis`` (F, C) holds the weights of the C nodes at the F images.
+    ``covariance`` (6 C, 6 C) is that of the correction at the nodes, translation (mm) and rotation (rad) about the
+    platform. ``poses`` (F, 6, 6) are covariances of the corrected poses; the part beyond that of the nodes is
+    independent between images.
     """
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))).reshape(-1, 6, len(values))

@@ -110,10 +110,12 @@ class OpenMovement:
 
     def describe(self) -> str:
         """Describe the motion in the common frame as text."""
-        along = "({:.3f}, {:.3f}, {:.3f})".format(*(self.direction + 0.0))
+        # Adding zero removes the sign of a rounded -0.
+        along = "({:.3f}, {:.3f}, {:.3f})".format(*(np.round(self.direction, 3) + 0.0))
         if self.point_mm is None:
             return f"shift along {along}"
-        return "turn about the line through ({:.1f}, {:.1f}, {:.1f}) mm along ".format(*self.point_mm) + along
+        point = "({:.1f}, {:.1f}, {:.1f})".format(*(np.round(self.point_mm, 1) + 0.0))
+        return f"turn about the line through {point} mm along {along}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -1,6 +1,6 @@
 """Plots, tables and pages: reports of campaigns, certificates and model comparisons.
 
-The stub beside this file lists the pages that can be written. Each is imported when it is first used.
+The stub beside this file lists its functions. Each is imported when it is first used.
 """
 
 from uwlts.argument_types import attach_public

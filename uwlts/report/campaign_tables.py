@@ -16,8 +16,8 @@ from uwlts.model.calibration import Calibration
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.pages.numbers import entries_of, format_fixed, format_number, is_number, split_name, unit_of
 from uwlts.pages.toolkit import MISSING, ComparisonTable
-from uwlts.report.certificate import parameter_rows
 from uwlts.report.gather import CALIBRATION, GatheredCalibration, GatheredCampaign, GatheredMeasurement, Reference
+from uwlts.report.parameters import parameter_rows
 from uwlts.report.plot import SHORT_LIST
 
 _QUANTITIES = {"PE": "probing error PE", "RE": "range error RE", "STD": "deviations STD", "range": "deviations range"}

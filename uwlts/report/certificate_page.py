@@ -31,7 +31,7 @@ from uwlts.pages.toolkit import (
     render_page,
     write_page,
 )
-from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, make_certificate, parameter_rows
+from uwlts.report.certificate import AnyCertificate, JointCertificate, make_certificate
 from uwlts.report.certificate_volume import (
     LengthUncertainty,
     compare_calibrations,
@@ -40,6 +40,7 @@ from uwlts.report.certificate_volume import (
     uncertainty_maps,
 )
 from uwlts.report.digital_certificate import digital_certificate, load_administration
+from uwlts.report.parameters import ParameterRow, parameter_rows
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import read_calibration
 

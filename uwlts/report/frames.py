@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import TYPE_CHECKING, Any, get_type_hints
 
@@ -16,7 +16,7 @@ from uwlts.evaluation.evaluate import Evaluation
 from uwlts.inspection.features import Inspection
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import Calibration
-from uwlts.model.parameter_keys import LensParameter, WindowParameter
+from uwlts.report.parameters import parameter_rows
 from uwlts.runtime.optional_library import optional_library
 from uwlts.storage.cloud import NO_INDEX, PointCloud
 
@@ -27,28 +27,13 @@ _KEY = "key"
 """Field that identifies a record; its own fields are columns without prefix."""
 
 
-@dataclasses.dataclass(frozen=True)
-class CalibrationParameter:
-    """Parameter of a calibration, in ``unit``: its value, and standard uncertainties after and before; None if unknown.
-
-    The direction of the sheet's normal has no single value.
-    """
-
-    name: str
-    meaning: str
-    value: float | None
-    std: float | None
-    std_before: float | None
-    unit: str
-
-
 def to_frame(result: object) -> DataFrame:
     """Return a result as a table of pandas, an optional library.
 
     Rows are the figures of an `Evaluation`, the features' values of an `Inspection`, the parameters of a `Calibration`,
     the points of a `PointCloud`, and the designs of `twin.sweep`. A list of records has a row for each: a row of
     `design`, or an entry of ``Verification.verdicts`` or ``SurfaceChange.regions()``. Parameters have their standard
-    uncertainties, those of a joint estimate in the units of pages. Points have the standard uncertainty of each
+    uncertainties, in the units of pages. Points have the standard uncertainty of each
     coordinate, or that along the normal.
 
     Columns have the names of the attributes. A record within a record contributes its columns after its own name, and a
@@ -84,7 +69,10 @@ def to_frame(result: object) -> DataFrame:
                 for each in feature.values
             ]
         case Calibration():
-            table = [_row(each) for each in _parameters(result)]
+            table = [_row(each) for each in parameter_rows(result)]
+            if result.joint is None:
+                words, std = "direction of the sheet's normal", result.std().sheet_normal_deg
+                table.append({"name": "sheet_normal", "words": words, "unit": "°", "std": std})
         case Brief(columns=Mapping() as columns):
             table = columns
         case Mapping():
@@ -113,25 +101,6 @@ def _point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
     if cloud.uncertainty is not None:
         columns |= dict(zip(_axis_names("std_mm"), cloud.uncertainty.std_mm().T, strict=True))
     return {name: values for name, values in columns.items() if values is not None}
-
-
-def _parameters(calibration: Calibration) -> Iterator[CalibrationParameter]:
-    """Iterate over the parameters of a joint estimate, or else over those of camera and window."""
-    if (joint := calibration.joint) is not None:
-        for key, value, std, before in zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True):
-            shown, factor = key.quantity, key.quantity.factor
-            prior = None if before is None else factor * before
-            yield CalibrationParameter(key.text, shown.words, factor * value, factor * std, prior, shown.unit)
-        return
-    std, values = calibration.std(), calibration.camera.parameters()
-    stated = {name: getattr(std, f"{name}_px") for name in ("fx", "fy", "cx", "cy")} | std.distortion
-    window: list[tuple[WindowParameter, float, float | None]] = []
-    if calibration.window is not None:
-        window = [(WindowParameter.DISTANCE, calibration.window.distance_mm, std.window_distance_mm)]
-    lens = [(key, values[key.text], stated.get(key.text)) for key in LensParameter if key is not LensParameter.F]
-    for key, value, known in (*lens, *window):
-        yield CalibrationParameter(key.text, key.quantity.words, value, known, None, key.quantity.unit)
-    yield CalibrationParameter("sheet_normal", "direction of the sheet's normal", None, std.sheet_normal_deg, None, "°")
 
 
 def _is_record(value: object) -> bool:

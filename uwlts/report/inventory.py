@@ -20,6 +20,7 @@ from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.pages.numbers import numbers_in
 from uwlts.report.any_file import read
+from uwlts.report.parameters import parameter_rows
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_readable_cloud, read_cloud
@@ -145,7 +146,6 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         f"camera: f {camera.fx_px:.2f} x {camera.fy_px:.2f} px, centre {camera.cx_px:.2f}, {camera.cy_px:.2f} px, "
         + ", ".join(f"{name} {value:.5f}" for name, value in camera.distortion.used_coefficients().items()),
         f"sheet: normal {', '.join(f'{x:.6f}' for x in sheet.normal)}, offset {sheet.offset_mm:.4f} mm",
-        *_std_lines(calibration),
     ]
     if window is None:
         kind = _MEDIA[calibration.medium_kind]
@@ -159,17 +159,11 @@ def calibration_lines(calibration: Calibration) -> list[str]:
             f"window: {window.refractions} refraction(s), {window.distance_mm:.3f} mm from the entrance pupil{glass}"
         )
     lines += _figure_lines(
-        calibration,
-        camera=("rms_px", "camera residual: {:.4f} px"),
-        sheet=("rms_mm", "sheet residual: {:.4f} mm"),
-        window=("std_mm", "window: {:.3f} mm standard uncertainty of d"),
+        calibration, camera=("rms_px", "camera residual: {:.4f} px"), sheet=("rms_mm", "sheet residual: {:.4f} mm")
     )
     lines += _image_lines(calibration.figures("camera"), calibration.figures("sheet"))
+    lines += _parameter_lines(calibration)
     if (joint := calibration.joint) is not None:
-        lines.append("joint estimate, with standard uncertainties after and before:")
-        for key, value, std, before in zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True):
-            known = "" if before is None else f" ({before:.2g})"
-            lines.append(f"  {key.text.replace('_', ' ')}: {value:.6g} ± {std:.2g}{known}")
         scatter = ", ".join(f"{kind} {value:.3f} px" for kind, value in joint.scatter_px.items())
         lines.append(f"scatter: {scatter}; {joint.outlier_count} of {joint.residual_count} residuals left out")
     return lines
@@ -202,18 +196,17 @@ def _image_lines(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]
     return lines + ([f"by every second image and by the others: {', '.join(by_half)}"] if by_half else [])
 
 
-def _std_lines(calibration: Calibration) -> list[str]:
-    """Describe the standard uncertainties of camera and sheet of a sequential calibration."""
-    if calibration.joint is not None:
+def _parameter_lines(calibration: Calibration) -> list[str]:
+    """List the parameters if any uncertainty is known."""
+    rows, direction_deg = parameter_rows(calibration), calibration.std().sheet_normal_deg
+    if direction_deg is None and all(row.std is None for row in rows):
         return []
-    std, found = calibration.std(), []
-    centre = [each for each in (std.cx_px, std.cy_px) if each is not None]
-    found += [f"f {std.fx_px:.2f} px"] if std.fx_px is not None and std.fx_px == std.fy_px else []
-    found += [f"fx {std.fx_px:.2f}, fy {std.fy_px:.2f} px"] if None not in (std.fx_px, std.fy_px) and not found else []
-    found += [f"centre {' and '.join(f'{each:.2f}' for each in centre)} px"] if centre else []
-    found += [f"{name} {value:.2g}" for name, value in std.distortion.items()]
-    found += [] if std.sheet_normal_deg is None else [f"sheet's normal {std.sheet_normal_deg:.3g} deg"]
-    return [f"standard uncertainties: {', '.join(found)}"] if found else []
+    lines = ["standard uncertainties after calibration, and in brackets before:"]
+    for row in rows:
+        std = "" if row.std is None else f" ± {row.std:.2g}"
+        before = "" if row.std_before is None else f" ({row.std_before:.2g})"
+        lines.append(f"  {row.words}: {row.value:.6g}{std}{before} {row.unit}".rstrip())
+    return lines if direction_deg is None else [*lines, f"  direction of the sheet's normal: ± {direction_deg:.2g} °"]
 
 
 def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tuple[str, str]) -> list[str]:

@@ -12,11 +12,13 @@ from uwlts._version import __version__
 from uwlts.calibration.model_comparison.comparison import (
     POINTS,
     STRIPES,
+    Captures,
     Choice,
     Comparison,
     PolynomialScore,
     Score,
     ScoredModel,
+    compare_models,
 )
 from uwlts.calibration.model_comparison.held_out import (
     DIMENSIONS,
@@ -26,10 +28,21 @@ from uwlts.calibration.model_comparison.held_out import (
     Candidate,
     describe_distortion,
 )
+from uwlts.files.inputs import protect_inputs
 from uwlts.files.json_files import json_text
 from uwlts.model.sensor import Description
 from uwlts.pages.numbers import format_fixed, format_length
-from uwlts.pages.toolkit import MISSING, figure_svg, legend_below, new_figure, render_page, write_page
+from uwlts.pages.toolkit import (
+    MISSING,
+    figure_svg,
+    legend_below,
+    new_figure,
+    refuse_unsuitable_page,
+    render_page,
+    write_page,
+)
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.stripe import StripeSettings
 
 _WAYS = (INSIDE, OUTSIDE)
 
@@ -147,25 +160,86 @@ def _in_um(value_mm: float, std_mm: float) -> str:
     return f"{format_fixed(1e3 * value_mm, 1)} ± {format_fixed(1e3 * std_mm, 1)}"
 
 
-def write_models(path: str | Path, comparison: Comparison, *, overwrite: bool = False) -> None:
-    """Write a comparison as a page, with its figures as JSON beside it.
+@protect_inputs()
+def write_models(
+    *,
+    air: Captures = (),
+    water: Captures = (),
+    step: Captures = (),
+    target_poses: Literal["stage", "free"] = "stage",
+    index: float | None = None,
+    stripe: StripeSettings = None,
+    workers: int | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    progress: ProgressListener = ignore_progress,
+) -> Comparison:
+    """Compare sensor models by how well each predicts images that were not used for its calibration.
+
+    The models differ in one property: one or two refractions, window tilt, bow of the sheet, turn of the laser's
+    window, or lens distortion. Each model is calibrated without every fourth image, and without the nearest and
+    farthest images.
 
     Parameters
     ----------
-    path : str or Path
-        Page to write; the figures go into a JSON file of the same name.
-    comparison : Comparison
-        Result of `uwlts.compare_models`.
+    air : sequence of Capture or path
+        Captures of the target in air, as for uwlts calibrate.
+    water : sequence of Capture or path
+        Captures of the target in the medium of use.
+    step : sequence of Capture or path
+        Captures of the step standard in the medium of use.
+    target_poses : {"stage", "free"}
+        stage: one target pose per capture, moved by the stage. free: every image has its own pose.
+    index : float, optional
+        Refractive index of the medium relative to air. Default: the index that follows from the captures.
+    stripe : StripeOptions or dict, optional
+        Options for finding the stripe, all or some: see `uwlts.StripeOptions`.
+    workers : int, optional
+        Number of models calibrated in parallel. Default: number of processors.
+    out : str or Path, optional
+        Page to write, with the figures as JSON beside it. Default: none is written.
     overwrite : bool
         Replace existing files.
+    progress : callable, optional
+        Called with the number of images or models done, the total, and the name of the stage.
+
+    Returns
+    -------
+    Comparison
+        Models ranked by their errors in held-out images, the polynomials' errors, and warnings.
 
     Raises
     ------
+    CalibrationError
+        There are too few images, or they do not determine a calibration.
+    DescriptionError
+        There is no capture of a target, a capture does not describe its target or step standard, or ``workers`` is less
+        than 1.
+    CaptureError
+        A file is missing or damaged.
+    RangeError
+        The refractive index is out of range.
     OutputError
         A file exists and ``overwrite`` is not given, or cannot be written.
     """
-    content = make_content(comparison)
-    write_page(path, models_page(content), beside=json_text(content, indent=2, only_ascii=False), overwrite=overwrite)
+    if out is not None:
+        refuse_unsuitable_page(Path(out), overwrite=overwrite)
+    comparison = compare_models(
+        air=air,
+        water=water,
+        step=step,
+        target_poses=target_poses,
+        index=index,
+        stripe=stripe,
+        workers=workers,
+        progress=progress,
+    )
+    if out is not None:
+        content = make_content(comparison)
+        write_page(
+            out, models_page(content), beside=json_text(content, indent=2, only_ascii=False), overwrite=overwrite
+        )
+    return comparison
 
 
 def models_page(content: ModelComparisonContent) -> str:

@@ -313,13 +313,13 @@ def parse_settings(option: str, texts: Sequence[str]) -> dict[str, Any]:
 
 
 def descriptions(package: ModuleType, function: str) -> dict[str, str]:
-    """Return the descriptions of parameters in a docstring; "As for `other`" refers to that function's."""
+    """Return the descriptions of parameters in a docstring; "As for `package.other`" refers to that function's."""
     found = {}
     sections = _sections(docstring(package, function))
     parameters = dict(zip(sections[1::2], sections[2::2], strict=True)).get("Parameters", "")
     for listed, block in re.findall(r"^(\*?\w.*)\n((?:    .*\n?|\n(?=    ))+)", parameters, flags=re.MULTILINE):
-        other = re.match(r"\s*As for `(?:\w+\.)?(\w+)`", block)
-        elsewhere = descriptions(package, other[1]) if other else {}
+        other = re.match(r"\s*As for `(?:(\w+)\.)?(\w+)`", block)
+        elsewhere = descriptions(sys.modules.get(other[1], package), other[2]) if other else {}
         names = listed.split(" : ")[0].split(", ")
         found |= {name.lstrip("*"): elsewhere.get(name, " ".join(block.split())) for name in names}
     return found

@@ -92,33 +92,12 @@ def read_mount_evidence(
     profile_times_s: np.ndarray | None,
     pose_times_s: np.ndarray | None,
 ) -> MountEvidence:
-    """Read and check profiles and poses from arrays or files.
+    """Read and check profiles and poses from arrays or files; poses are None with a TOML description of the profiles.
 
-    Parameters
-    ----------
-    profiles
-        Folder, CSV file or TOML description of the profiles, or arrays.
-    poses
-        File or array of the platform's poses; None with a TOML description.
-    artefact
-        Kind of the artefact.
-    radius_mm, height_mm
-        Known size of the artefact.
-    pose_format
-        Format of the poses (`read_poses`).
-    profile_unit, pose_unit
-        Units of files without a unit in the names of their columns.
-    axis
-        Direction of the sensor's frame nearest to the axis of a rotary table.
-    scale, time
-        Estimate the scale of the robot's lengths, and the offset of its clock.
-    profile_times_s, pose_times_s : (N,), optional
-        Times of profiles and poses, if these are arrays.
-
-    Raises
-    ------
-    DescriptionError
-        Profiles and poses do not match, or one of them is not valid.
+    Units are for files without a unit in the names of their columns. ``axis`` is the direction of the sensor's frame
+    nearest to the axis of a rotary table. ``scale`` and ``time`` ask for the scale of the robot's lengths and the
+    offset of its clock. Times (N,) belong to arrays. Raises DescriptionError if profiles and poses do not match, or one
+    of them is not valid.
     """
     digests: dict[str, str] = {}
     names: list[str] | None = None

@@ -33,33 +33,24 @@ class DirectRule:
     All were chosen on the scenes `NAMED` of docs/studies/stripe_reflections.py, rendered for a small camera, with 0.40
     % wrong points. The effects of other values are stated below. They were determined at 0.02 for ``skipped``, with an
     earlier version of the rule that gave 0.45 % wrong points.
-
-    Attributes
-    ----------
-    gap_lines : int
-        Largest gap of a stripe, in lines: noise and speckle hide parts of a faint stripe. 20 gives 0.53 %; 28 and 48
-        give the same as 36.
-    fewest_lines : int
-        Fewest lines of a stripe next to others; shorter ones are grains of speckle. 4 to 10 give the same.
-    skipped : float
-        Cost of a line whose candidates a path omits: 80 lines cost as much as a jump. For a stripe with gaps the cost
-        is multiplied by its fraction of lines with a candidate. 0.02 and 0.03 give the same with fewer ambiguous lines,
-        but make a corner with a faint wall ambiguous (drawn in tests/uwlts/stripe/test_direct.py).
-    margin : float
-        Least difference of the costs of the best and the second-best path. 0.2 and 0.4 give the same; 0.4 leaves more
-        lines ambiguous.
-    meeting_jumps : float
-        Largest distance of merging stripes, in jump lengths: one window. 3 gives 0.48 %, 6 the same as 4.
-    meeting_lines : int
-        Most lines omitted where stripes merge. 12 gives 0.66 %; 36 gives 0.36 % with 1 % more lines lost.
     """
 
     gap_lines: int = 36
+    """Largest gap of a stripe, in lines: noise and speckle hide parts of a faint stripe. 20 gives 0.53 %; 28 and 48
+    give the same as 36."""
     fewest_lines: int = 6
+    """Fewest lines of a stripe next to others; shorter ones are grains of speckle. 4 to 10 give the same."""
     skipped: float = 0.0125
+    """Cost of a line whose candidates a path omits: 80 lines cost as much as a jump. For a stripe with gaps the cost is
+    multiplied by its fraction of lines with a candidate. 0.02 and 0.03 give the same with fewer ambiguous lines, but
+    make a corner with a faint wall ambiguous (drawn in tests/uwlts/stripe/test_direct.py)."""
     margin: float = 0.3
+    """Least difference of the costs of the best and the second-best path. 0.2 and 0.4 give the same; 0.4 leaves more
+    lines ambiguous."""
     meeting_jumps: float = 4.0
+    """Largest distance of merging stripes, in jump lengths: one window. 3 gives 0.48 %, 6 the same as 4."""
     meeting_lines: int = 20
+    """Most lines omitted where stripes merge. 12 gives 0.66 %; 36 gives 0.36 % with 1 % more lines lost."""
 
 
 def direct_stripe(
@@ -68,18 +59,8 @@ def direct_stripe(
     """Return the stripe of an image without reflections, including its ends.
 
     Lines without a unique choice become AMBIGUOUS. Candidates without a width cannot be measured: two merging stripes,
-    or a stripe too wide. The path may use them, but their lines get no point.
-
-    Parameters
-    ----------
-    stripe
-        Stripe found by the extraction.
-    rivals
-        All candidates on lines with more than one.
-    jump_px
-        Distance between centres on neighbouring lines, px, above which they belong to two stripes.
-    rule
-        Numbers of the rule.
+    or a stripe too wide. The path may use them, but their lines get no point. ``rivals`` are all candidates on lines
+    with more than one. Centres on neighbouring lines that are farther apart than ``jump_px`` belong to two stripes.
     """
     alone = np.setdiff1d(stripe.lines, rivals.line)
     line = np.concatenate([alone, rivals.line])

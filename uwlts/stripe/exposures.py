@@ -24,34 +24,21 @@ class FusionRule:
 
     Chosen by hand with the reasons below; docs/studies/stripe_brackets.py shows the resulting stripes in rendered
     images of black rubber beside steel. Grey values "of full scale" are divided by the grey value of saturation.
-
-    Attributes
-    ----------
-    exposure_slack : float
-        Ratio of a camera's exposure step to the planned step, at least: cameras round exposures.
-    same_place_mm : float
-        Largest difference of readings of a stage at rest, mm.
-    roll_off_from, roll_off_to : float
-        Range of grey values, of full scale, over which the weight of a pixel falls to zero. Full well and gain differ
-        between pixels, and a step of the weight at saturation would appear in the stripe's profile.
-    well_exposed : float
-        Least grey value, of full scale, of pixels that determine the ratio of two exposures.
-    fewest_pixels : int
-        Fewest such pixels; with fewer pixels the ratio of the stated exposures is used.
-    dark_dn : float
-        Distance of the background from the median, grey values, at least: covers rounding and offsets.
-    dark_sigmas : float
-        Distance of the background from the median, standard deviations: all but one in 16,000 background pixels.
     """
 
     exposure_slack: float = 0.98
-    same_place_mm: float = 1e-3
+    """Ratio of a camera's exposure step to the planned step, at least: cameras round exposures."""
+    same_place_mm: float = 1e-3  # largest difference of readings of a stage at rest, mm
+    # Range of grey values, of full scale, over which the weight of a pixel falls to zero. Full well and gain differ
+    # between pixels, and a step of the weight at saturation would appear in the stripe's profile.
     roll_off_from: float = 0.85
     roll_off_to: float = 0.95
-    well_exposed: float = 0.3
-    fewest_pixels: int = 200
+    well_exposed: float = 0.3  # least grey value, of full scale, of pixels that determine the ratio of two exposures
+    fewest_pixels: int = 200  # fewest such pixels; with fewer pixels the ratio of the stated exposures is used
     dark_dn: float = 3.0
+    """Distance of the background from the median, grey values, at least: covers rounding and offsets."""
     dark_sigmas: float = 4.0
+    """Distance of the background from the median, standard deviations: all but one in 16,000 background pixels."""
 
 
 _RULE = FusionRule()

@@ -28,28 +28,17 @@ class ExtractionRule:
     """Numbers of the extraction that are not options.
 
     Chosen by hand with the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes.
-
-    Attributes
-    ----------
-    too_wide : float
-        Ratio of lines with a stripe too wide to be measured to lines with a measured stripe, above which a wider window
-        is tried.
-    coarse_sigmas : float
-        Least contrast of closely examined blocks above the background's median, in standard deviations. A stripe of
-        six standard deviations is rarely missed.
-    least_noise : float
-        Least standard deviation of the noise, grey levels: that of rounding to integers.
-    short_gap : int
-        Most consecutive lines without a centre inside a stripe, as caused by noise.
-    warm_lines : int
-        Lines of the image for `warm_up`: enough for stripes that continue.
     """
 
     too_wide: float = 0.25
+    """Ratio of lines with a stripe too wide to be measured to lines with a measured stripe, above which a wider window
+    is tried."""
     coarse_sigmas: float = 4.0
-    least_noise: float = 0.3
-    short_gap: int = 2
-    warm_lines: int = 200
+    """Least contrast of closely examined blocks above the background's median, in standard deviations. A stripe of six
+    standard deviations is rarely missed."""
+    least_noise: float = 0.3  # least standard deviation of the noise, grey levels: that of rounding to integers
+    short_gap: int = 2  # most consecutive lines without a centre inside a stripe, as caused by noise
+    warm_lines: int = 200  # lines of the image for `warm_up`: enough for stripes that continue
 
 
 _RULE = ExtractionRule()

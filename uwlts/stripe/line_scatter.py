@@ -19,44 +19,33 @@ class ScatterRule:
 
     ``reach``, ``run`` and the use of squares were chosen on the real stripes of docs/results/stripe-methods.md, where
     the result is compared on drawn stripes that were not used.
-
-    Attributes
-    ----------
-    reach : int
-        Lines on either side of a line, through whose centres a parabola is fitted. Surfaces are smooth over them, and
-        errors by texture and flare are longer than a few lines.
-    run, runs : int
-        Consecutive lines of a run, and number of runs. Their 320 evaluated lines compare methods to some percent, and
-        the comparison costs little more than the fit of an image.
-    fewest : int
-        Fewest evaluated lines. With fewer lines the difference of two methods may be chance.
-    advantage : float
-        Ratio of the scatters of the zero crossing and the profile fit above which the noise model describes the stripe:
-        the ratio is 2 in speckle and 1 in white noise. Half of the runs are used, so that speckle costs little time.
-    gain, gain_px : float
-        Least gain by another method, relative and in px. Methods that differ less would be exchanged by chance from
-        image to image. Errors of 0.005 px with the pixel phase (`WindowRule.least_kernel`) are no scatter if the stripe
-        is inclined little: their root mean square is the least gain.
-    narrowest : float
-        Least median sigma of a stripe, px. The simple methods pull the centres of narrower stripes to the pixels'
-        middles, which lowers their scatter.
-    largest_px : float
-        Limit of the distances, px; larger ones are due to edges and would conceal the others. Squares, as in the fits
-        for which the centres are used.
-    jump : float
-        Largest distance of neighbouring centres, as a fraction of the window; other lines belong to two surfaces.
     """
 
     reach: int = 12
+    """Lines on either side of a line, through whose centres a parabola is fitted. Surfaces are smooth over them, and
+    errors by texture and flare are longer than a few lines."""
+    # Consecutive lines of a run, and number of runs. Their 320 evaluated lines compare methods to some percent, and the
+    # comparison costs little more than the fit of an image.
     run: int = 64
     runs: int = 8
     fewest: int = 64
+    """Fewest evaluated lines. With fewer lines the difference of two methods may be chance."""
     advantage: float = 1.3
+    """Ratio of the scatters of the zero crossing and the profile fit above which the noise model describes the stripe:
+    the ratio is 2 in speckle and 1 in white noise. Half of the runs are used, so that speckle costs little time."""
+    # Least gain by another method, relative and in px. Methods that differ less would be exchanged by chance from image
+    # to image. Errors of 0.005 px with the pixel phase (`WindowRule.least_kernel`) are no scatter if the stripe is
+    # inclined little: their root mean square is the least gain.
     gain: float = 0.02
     gain_px: float = 0.0035
     narrowest: float = WINDOW_RULE.least_kernel
+    """Least median sigma of a stripe, px. The simple methods pull the centres of narrower stripes to the pixels'
+    middles, which lowers their scatter."""
     largest_px: float = 3.0
+    """Limit of the distances, px; larger ones are due to edges and would conceal the others. Squares, as in the fits
+    for which the centres are used."""
     jump: float = 0.2
+    """Largest distance of neighbouring centres, as a fraction of the window; other lines belong to two surfaces."""
 
 
 _RULE = ScatterRule()
@@ -65,18 +54,11 @@ _RULE = ScatterRule()
 def least_scattered(
     peak: PeakWindow, centre: np.ndarray, first: ModuleType, others: tuple[ModuleType, ...]
 ) -> np.ndarray:
-    """Return the centres (M,) of the method that scatters least along the stripe.
+    """Return the centres (M,), px from each window's first pixel, of the method that scatters least along the stripe.
 
-    Parameters
-    ----------
-    peak
-        Windows of M lines in their order.
-    centre
-        Centres (M,) of the preferred method, px from the first pixel of each window.
-    first
-        Module of another method. Only if the preferred method lacks its advantage over this one, all are compared.
-    others
-        Modules of further methods. One of all is used if it scatters less by `ScatterRule.gain` and ``gain_px``.
+    ``peak`` are windows of M lines in their order, with centres (M,) of the preferred method. All methods are compared
+    only if that method lacks its advantage over ``first``. Another one is used if it scatters less by
+    `ScatterRule.gain` and ``gain_px``.
     """
     rows = _select_runs(peak.start.size)
     # The median of the lines that are compared, because only their scatter decides; counting is faster than sorting.

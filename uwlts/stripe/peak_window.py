@@ -18,27 +18,17 @@ class WindowRule(NamedTuple):
     """Numbers of the measurement of a peak; a named tuple, which compiled code reads as constants.
 
     They follow from the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes.
-
-    Attributes
-    ----------
-    least_kernel : float
-        Sigma of the narrowest weight, px. A narrower weight covers too few pixels: for a stripe of sigma 0.7 px the
-        error of the centre with the pixel phase would be 0.015 px instead of 0.005 px.
-    flank : int
-        Pixels of background on either side of a peak, for two low-passed values at a distance of three pixels.
-    tail : float
-        Range of sums with Gaussian weights, in sigmas: further weights are below 0.0004 of the largest.
-    background : float
-        Distance of the background from a peak's middle, in sigmas: a Gaussian has fallen to 0.011 of its height.
-    low_pass : float
-        Range of the low-pass, in sigmas: its last weight is below 0.0022 of the largest.
     """
 
     least_kernel: float = 1.0
+    """Sigma of the narrowest weight, px. A narrower weight covers too few pixels: for a stripe of sigma 0.7 px the
+    error of the centre with the pixel phase would be 0.015 px instead of 0.005 px."""
     flank: int = 5
-    tail: float = 4.0
+    """Pixels of background on either side of a peak, for two low-passed values at a distance of three pixels."""
+    tail: float = 4.0  # range of sums with Gaussian weights, in sigmas: further weights are below 0.0004 of the largest
     background: float = 3.0
-    low_pass: float = 3.5
+    """Distance of the background from a peak's middle, in sigmas: a Gaussian has fallen to 0.011 of its height."""
+    low_pass: float = 3.5  # range of the low-pass, in sigmas: its last weight is below 0.0022 of the largest
 
 
 WINDOW_RULE = WindowRule()
@@ -52,37 +42,23 @@ LAST = 1
 
 
 class SearchRules(NamedTuple):
-    """Options of the search; lengths in px, heights in grey levels.
+    """Options of the search; lengths in px, heights in grey levels."""
 
-    Attributes
-    ----------
-    half, block : int
-        A window consists of a block and ``half`` pixels on either side.
-    smoothing : float
-        Sigma of the low-pass.
-    share : float
-        Height of a second peak, as a fraction of the first one's, that makes a window crowded. For the strongest stripe
-        the whole window is searched, otherwise the pixels used.
-    order : int
-        Rule for several stripes: `FIRST`, `STRONGEST` or `LAST`.
-    narrowest, widest : float
-        Range of a stripe's sigma.
-    coarse, fine : float
-        Least height of a block, and of a peak after the low-pass; lower ones are noise.
-    bright : float
-        Least height of a peak that is too wide to be measured and not haze.
-    """
-
+    # A window consists of a block and ``half`` pixels on either side.
     half: int
     block: int
-    smoothing: float
+    smoothing: float  # sigma of the low-pass
     share: float
-    order: int
+    """Height of a second peak, as a fraction of the first one's, that makes a window crowded. For the strongest stripe
+    the whole window is searched, otherwise the pixels used."""
+    order: int  # rule for several stripes: `FIRST`, `STRONGEST` or `LAST`
+    # Range of a stripe's sigma.
     narrowest: float
     widest: float
+    # Least height of a block, and of a peak after the low-pass; lower ones are noise.
     coarse: float
     fine: float
-    bright: float
+    bright: float  # least height of a peak that is too wide to be measured and not haze
 
 
 LANES = 64
@@ -166,7 +142,7 @@ class PeakWindow(NamedTuple):
 
 
 class PeakShape(NamedTuple):
-    """Further results for M peaks, which only the search uses, as arrays (M,).
+    """Further properties of M peaks for the search, as arrays (M,).
 
     Attributes
     ----------

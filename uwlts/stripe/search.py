@@ -30,36 +30,22 @@ class _SearchRule(NamedTuple):
 
     Chosen by hand with the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes. The
     least height is that of `SearchRules`.
-
-    Attributes
-    ----------
-    looks : int
-        Places examined per line: hot pixels before the stripe, and a second stripe after it.
-    most_stripes : int
-        Most stripes on one line: two sheets, each with two reflections.
-    coarse_slack : float
-        Ratio of the block contrasts of equal stripes that have different pixel phases (sigma 0.7 px).
-    clear : float
-        Contrast of a block, in least heights, that cannot be noise in single pixels.
-    rival : float
-        Contrast of a block, in least heights, that may be a second stripe. Noise reaches it on one line in a hundred,
-        and the least height on every second line.
-    spike : float
-        Least ratio of a stripe's three-pixel mean to the least height; noise may lower the mean a little.
-    bright : float
-        Least height of a bright peak, as a fraction of the saturation. A wide peak that is lower is haze.
-    minor : float
-        Largest height of an ignored stripe, as a fraction of another stripe's; it cannot be measured itself.
     """
 
-    looks: int = 4
-    most_stripes: int = 6
+    looks: int = 4  # places examined per line: hot pixels before the stripe, and a second stripe after it
+    most_stripes: int = 6  # most stripes on one line: two sheets, each with two reflections
     coarse_slack: float = 0.75
-    clear: float = 3.0
+    """Ratio of the block contrasts of equal stripes that have different pixel phases (sigma 0.7 px)."""
+    clear: float = 3.0  # contrast of a block, in least heights, that cannot be noise in single pixels
     rival: float = 1.3
+    """Contrast of a block, in least heights, that may be a second stripe. Noise reaches it on one line in a hundred,
+    and the least height on every second line."""
     spike: float = 0.85
+    """Least ratio of a stripe's three-pixel mean to the least height; noise may lower the mean a little."""
     bright: float = 0.25
+    """Least height of a bright peak, as a fraction of the saturation. A wide peak that is lower is haze."""
     minor: float = 0.5
+    """Largest height of an ignored stripe, as a fraction of another stripe's; it cannot be measured itself."""
 
 
 _RULE = _SearchRule()

@@ -152,21 +152,7 @@ class _Tables:
         return _sizes(measured.figures_mm.get(name) for measured in found)
 
     def objects(self, table: str, thing: str, names: Sequence[str], method: str, processing: str) -> Iterator[TableRow]:
-        """Yield rows of a thing's positions in both media and their means, with published values.
-
-        Parameters
-        ----------
-        table
-            Title of the table.
-        thing
-            Kind of the object, such as "spheres".
-        names
-            Names of the figures.
-        method
-            Calibration method, whose published values are shown.
-        processing
-            Image processing.
-        """
+        """Yield rows of a thing's positions in both media and their means, with the values published for the method."""
         source = method if method in (PROPOSED, POLYNOMIALS) else PROPOSED
         for medium, name in product(MEDIA, names):
             rows = []

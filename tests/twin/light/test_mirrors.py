@@ -3,11 +3,13 @@
 import math
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from tests.virtual_sensors import block, clear, image_of, plate, scene_of, sensor_at
-from twin.light.pose import Travel
+from twin.backend.arrays import to_numpy
+from twin.light.pose import SensorPose, Travel
 from twin.light.renderer import Renderer
 from twin.recording.frame_truth import find_true_stripe
 from twin.rendering_options import NONE
@@ -57,6 +59,21 @@ def test_a_stripe_lit_and_seen_by_way_of_a_mirror_shows_at_its_mirrored_points(t
     strip = np.stack([image[row + k, column] for k in range(-30, 31)])
     assert (strip.max(axis=0) > 0).all()
     assert (np.abs(strip.argmax(axis=0) - 30) <= 1).all()
+
+
+def test_lengths_with_a_mirror_lead_to_the_mirrored_points(thesis):
+    renderer = Renderer(thesis, clear(), hidden(SHARE), effects=EFFECTS)
+    bundle, _ = renderer.view.trace_grid(8)
+    _, segment, *_ = renderer._segments(SensorPose(sensor_at()), bundle, None)
+    straight = to_numpy(mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t)))
+    end, seen = to_numpy(segment.end()), segment.valid.numpy() & (bundle.weight.numpy() > 0)
+    # Of all that is seen in the mirror only the small plate's hidden face is lower.
+    seen &= np.abs(end[:, 2] - PLATE_Z) < 1e-3
+    assert seen.sum() > 50
+    normal = np.array([-math.sin(TILT), 0.0, -math.cos(TILT)])
+    expected = end - 2 * ((end - (0.0, 0.0, MIRROR_Z)) @ normal)[:, None] * normal
+    # Reflected rays start 0.01 mm before the mirror; single precision adds some tenths of that at 0.5 m.
+    np.testing.assert_allclose(straight[seen], expected[seen], atol=0.015)
 
 
 def test_light_by_way_of_a_mirror_twice_goes_with_its_share_squared(thesis):

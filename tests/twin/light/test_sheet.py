@@ -370,9 +370,9 @@ def test_a_table_is_drawn_from_by_the_inverse_of_its_integral():
 def drawn(sheet: Sheet, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions (N, 3) of rays drawn from the sheet."""
     u = np.random.default_rng(seed).random((3, count), dtype=np.float32)
-    rays = sheet.sample(mi.Point3f(*[to_jit(mi.Float, column) for column in u]))
-    dr.eval(rays.origin, rays.direction)
-    return to_numpy(rays.origin).astype(float), to_numpy(rays.direction).astype(float)
+    origin, direction = sheet.sample(mi.Point3f(*[to_jit(mi.Float, column) for column in u]))
+    dr.eval(origin, direction)
+    return to_numpy(origin).astype(float), to_numpy(direction).astype(float)
 
 
 FOCUSED = {"waist_radius_mm": 0.06, "waist_distance_mm": 430.0}
@@ -430,8 +430,7 @@ def test_the_numbers_0_and_almost_1_give_rays(thesis):
         sheet = Sheet(altered(thesis, {"laser": LASERS[name]}), WATER)
         ends = np.array([0.0, 0.5, 1 - 2**-24])
         u = np.stack(np.meshgrid(ends, ends, ends), axis=-1).reshape(-1, 3)
-        rays = sheet.sample(mi.Point3f(*[to_jit(mi.Float, column) for column in u.T]))
-        origin, direction = to_numpy(rays.origin), to_numpy(rays.direction)
+        origin, direction = map(to_numpy, sheet.sample(mi.Point3f(*[to_jit(mi.Float, column) for column in u.T])))
         assert np.isfinite(origin).all()
         assert np.isfinite(direction).all()
         assert np.ptp(direction[:, 1]) > 0.4, "the fan's two edges"
@@ -441,9 +440,9 @@ def test_a_waist_at_the_origin_of_a_bare_fan_gives_rays(thesis):
     # All rays of the fan meet there, and the normal of the surface is undefined.
     sensor = altered(thesis, {"laser": {"waist_distance_mm": 1e-6, "window": {"mounted": False}}})
     u = mi.Point3f(*(to_jit(mi.Float, np.linspace(0.01, 0.99, 50)) for _ in range(3)))
-    rays = Sheet(sensor, Medium(kind="air")).sample(u)
-    assert np.isfinite(to_numpy(rays.origin)).all()
-    np.testing.assert_allclose(np.linalg.norm(to_numpy(rays.direction), axis=1), 1.0, atol=1e-6)
+    origin, direction = map(to_numpy, Sheet(sensor, Medium(kind="air")).sample(u))
+    assert np.isfinite(origin).all()
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0, atol=1e-6)
 
 
 def test_what_is_not_a_point_gets_no_light(thesis):

@@ -431,6 +431,25 @@ def test_paths_start_at_the_campaigns_folder(tmp_path: Path, monkeypatch):
     assert take.name == "board-standoff-water"
 
 
+def test_the_sensor_as_built_is_that_of_the_last_sensor_named(tmp_path: Path):
+    written(tmp_path / "mine.toml", 'base = "thesis-small"\nname = "mine"\n')
+    built = {}
+    for name, text in {
+        "base": 'base = "thesis"\n',
+        "other": 'base = "thesis"\nsensor = "mine.toml"\n',
+        "both": 'base = "other"\nas_built = "thesis-small-as-built"\n',
+        "again": 'base = "both"\ntitle = "again"\n',
+    }.items():
+        described = load_campaign(written(tmp_path / f"{name}.toml", text))
+        built[name] = Path(described.sensor).stem, Path(described.as_built).stem
+    assert built == {
+        "base": ("thesis", "thesis-as-built"),
+        "other": ("mine", "mine"),
+        "both": ("mine", "thesis-small-as-built"),
+        "again": ("mine", "thesis-small-as-built"),
+    }
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -464,6 +483,7 @@ def test_campaigns_that_are_wrong(tmp_path: Path, text: str, says: str):
         (HEAD + f"{PLANE}motion = {{ steps = 3 }}\n", "motion.steps: unknown key"),
         (HEAD.replace('sensor = "thesis"', 'sensor = "eye"') + PLANE, "nothing is called 'eye'"),
         (HEAD.replace('as_built = "thesis"', 'as_built = "eye"') + PLANE, "nothing is called 'eye'"),
+        (HEAD.replace('as_built = "thesis"', 'as_built = "thesis-small"') + PLANE, "'thesis' differ in image size"),
     ],
 )
 def test_campaigns_that_cannot_be_taken(tmp_path: Path, text: str, says: str):

@@ -167,7 +167,7 @@ BAD_SCENES = {
     "unknown object": ("title = 't'\n[[objects]]\nkind = 'cube'", r"objects\.0: .*'cube'"),
     "wrong unit": (
         "title = 't'\n[[objects]]\nkind = 'sphere'\ndiameter_m = 0.05",
-        r"objects\.0\.sphere\.diameter_m: unknown key",
+        r"objects\.0\.sphere\.diameter_m: unknown key.* diameter_mm\)",
     ),
     "reflectance": (
         "base = 'plane'\n[[objects]]\nkind = 'sphere'\ndiameter_mm = 5.0\nreflectance = 1.2",

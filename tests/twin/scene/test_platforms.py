@@ -42,6 +42,23 @@ def test_a_path_is_travelled_at_its_speed_with_the_sensor_where_the_waypoints_sa
     np.testing.assert_allclose([shot.travelled_mm for shot in course.shots], 100 * times, atol=1e-9)
 
 
+def test_a_path_passes_its_waypoints_and_goes_on_straight():
+    path = IdealPath(kind="path", waypoints=views(5), speed_mm_per_s=20.0, turn_deg_per_s=10.0, frame_rate_hz=20.0)
+    expected = np.array([waypoint.matrix() for waypoint in path.waypoints])
+    ways = np.linalg.norm(np.diff(expected[:, :3, 3], axis=0), axis=1) / 20.0
+    times = np.append(0.0, np.cumsum(np.maximum(ways, angle_of(expected[1:], expected[:-1]) / np.radians(10.0))))
+    poses = path.command_poses()
+    np.testing.assert_allclose(poses(times), expected, atol=1e-9)
+    # Before and after it, each step is that of the path's ends, to second order within it.
+    for end, away in ((times[0], -1.0), (times[-1], 1.0)):
+        inner, last, outer, far = poses(end + away * np.array([-1e-4, 0.0, 1e-4, 1.0]))
+        velocity, shift = last[:3, 3] - inner[:3, 3], far[:3, 3] - last[:3, 3]
+        np.testing.assert_allclose(shift, 1e4 * velocity, atol=0.02)
+        np.testing.assert_allclose(outer - last, last - inner, atol=1e-6)
+        turns = [Rotation.from_matrix(last[:3, :3].T @ other[:3, :3]).as_rotvec() for other in (inner, far)]
+        np.testing.assert_allclose(turns[1], -1e4 * turns[0], atol=1e-3)
+
+
 def test_the_same_path_is_described_again():
     described = {"kind": "path", "frame_rate_hz": 10.0, "speed_mm_per_s": 100.0}
     described["waypoints"] = [{"position_mm": (0.0, 0.0, 0.0)}, {"position_mm": (30.0, 0.0, 0.0)}]

@@ -173,6 +173,13 @@ def test_the_corrected_cloud_is_that_of_the_corrected_trajectory(loop, closed):
     np.testing.assert_allclose(found.cloud.points_mm, again, atol=1e-3)
 
 
+def test_a_stored_trajectory_is_not_overwritten(closed, tmp_path):
+    closed.save(tmp_path / "corrected.csv")
+    with pytest.raises(uwlts.Error, match="exists"):
+        closed.save(tmp_path / "corrected.csv")
+    closed.save(tmp_path / "corrected.csv", overwrite=True)
+
+
 def test_wrong_input_is_refused(loop):
     cloud, reported, _ = loop
     with pytest.raises(uwlts.Error, match="states no covariance: give drift_mm"):

@@ -67,6 +67,7 @@ def test_the_drift_has_the_covariance_of_drifts_drawn_step_by_step(correlation: 
 def test_closer_nodes_keep_the_correction_and_are_no_more_than_wanted():
     even, times = prior_of(), np.linspace(0, SECONDS, 801)
     closer = even.with_nodes(np.linspace(9, 11, 200), 0.02, most=400)
+    np.testing.assert_allclose(even.nodes_s, np.linspace(0, SECONDS, 81), atol=1e-9)
     inside = (closer.nodes_s > 9) & (closer.nodes_s < 11)
     np.testing.assert_allclose(np.diff(closer.nodes_s[inside]), 0.02, atol=1e-9)
     assert closer.count < even.count + 2 / 0.02 + 5

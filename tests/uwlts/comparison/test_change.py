@@ -11,12 +11,14 @@ from scipy.spatial.transform import Rotation
 
 import uwlts
 from uwlts.cli import app
-from uwlts.comparison.change import _thin_points
+from uwlts.comparison.change import SurfaceChange, _estimate_areas, _thin_points
+from uwlts.comparison.change_reference import read_reference, sample_mesh
 from uwlts.comparison.comparison_options import ComparisonOptions
+from uwlts.comparison.ideal_shapes import IdealCylinder, IdealPlane, IdealSphere, place_shape
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
 from uwlts.fitting.point_groups import number_cubes
 from uwlts.registration.surface_registration import SampledSurface, register_to_surface
-from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty
+from uwlts.storage.cloud import STEP, WATER, PointCloud, PointUncertainty
 from uwlts.storage.ply import read_ply
 
 NOISE_MM, SHIFT_MM, TILT, STAGE_MM = 0.03, 0.04, 1e-3, 0.02
@@ -380,3 +382,110 @@ def test_thinning_needs_few_rounds(monkeypatch):
     chosen, apart = _thin_points(points, 0.5)
     assert len(chosen) <= 1000 and 1.0 < apart < 1.03
     assert 10 < len(rounds) < 50
+
+
+def stored(depth, step):
+    """Return a plane at a depth in points every 1 mm, without noise, in coordinates rounded to a step."""
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(30.0), np.arange(30.0)))
+    points = np.column_stack([x, y, np.full(x.size, depth)])
+    return PointCloud(points, np.ones(x.size), x.astype(int), y.astype(int), metadata={STEP: step})
+
+
+def test_rounded_coordinates_limit_the_level():
+    """Uniform errors of 0.3 and 0.4 mm width: variances of a twelfth of the squares, which no mean reduces."""
+    change = uwlts.compare_clouds(stored(99.0, 0.3), stored(100.0, 0.4), disc_mm=4.0)
+    np.testing.assert_allclose(change.level_mm, 1.96 * 0.5 / np.sqrt(12), rtol=1e-9)
+    np.testing.assert_allclose(change.distance_mm, 1.0, atol=1e-9)
+    assert change.significant.all()
+
+
+def test_a_cloud_in_metres_is_scaled_and_one_with_uncertainty_refused():
+    cloud = stored(100.0, 0.4)
+    read = read_reference(cloud, unit="m", disc_mm=4.0)
+    np.testing.assert_allclose(read.points_mm, 1000 * cloud.points_mm)
+    assert read.rounding_std_mm == pytest.approx(400 / np.sqrt(12))
+    known = scanned(np.random.default_rng(1))
+    assert read_reference(known, unit="mm", disc_mm=4.0).uncertainty is known.uncertainty
+    with pytest.raises(EvaluationError, match="the unit is m, but clouds with uncertainty are always in mm"):
+        read_reference(known, unit="m", disc_mm=4.0)
+
+
+def test_samples_of_a_mesh_are_even():
+    """Covariance of a uniform triangle: a twelfth of the sum of the corners' squares about the centroid."""
+    corners = np.array([[0.0, 0, 0], [8, 0, 0], [2, 6, 3], [8, 6, 40]])
+    faces = np.array([[0, 1, 2], [1, 3, 2]])
+    area = np.array([np.linalg.norm(np.cross(b - a, c - a)) / 2 for a, b, c in corners[faces]])
+    disc = 0.25
+    samples = sample_mesh(corners, faces, disc_mm=disc)
+    # 60 in a disc; strata of equal areas leave at most one sample of each triangle to chance.
+    assert len(samples.points_mm) == int(area.sum() / (np.pi / 4 * disc**2) * 60)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0]) / (2 * area[0])
+    first = samples.normals @ normal > 1 - 1e-9
+    assert abs(first.sum() - len(first) * area[0] / area.sum()) <= 1
+    inside = samples.points_mm[first]
+    weights = np.linalg.lstsq(np.vstack([corners[:3].T, np.ones(3)]), np.vstack([inside.T, np.ones(len(inside))]))[0]
+    assert weights.min() > -1e-12 and np.abs((inside - corners[0]) @ normal).max() < 1e-12
+    off = corners[:3] - corners[:3].mean(axis=0)
+    expected = off.T @ off / 12
+    # Relative standard deviations of means and variances of 2,000 and more points: 2.5 % at most, four times that.
+    std = np.sqrt(np.diag(expected))
+    assert len(inside) > 2000
+    np.testing.assert_allclose(inside.mean(axis=0), corners[:3].mean(axis=0), atol=0.1 * std.min())
+    np.testing.assert_allclose(np.cov(inside.T), expected, atol=0.1 * np.outer(std, std).max())
+
+
+def test_regions_and_figures_are_those_of_the_places():
+    """Places every 2 mm of 4 mm2 each: a loss of 3 x 8 places, a rise of 5, and two places that are no region."""
+    x, y = np.meshgrid(2.0 * np.arange(20), 2.0 * np.arange(12), indexing="ij")
+    distance, level = np.zeros(x.shape), np.full(x.shape, 0.1)
+    distance[2:5, 1:9], distance[3, 4] = -0.5, -0.9
+    distance[12, 2:7] = 0.3
+    distance[17, 9:11] = 0.7
+    distance[10, 10] = np.nan
+    level[2:5, 1:9] = 0.2
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    area = np.full(x.size, 4.0)
+    change = SurfaceChange(points, points, distance.ravel(), level.ravel(), area, 2.0, 4.0, 12.0, None, "cloud")
+    loss, rise = change.regions()
+    assert (loss.places, loss.area_mm2, loss.level_mm) == (24, 96.0, 0.2)
+    assert loss.centre_mm == pytest.approx((6.0, 9.0, 0.0)) and loss.extent_mm == pytest.approx(14.0)
+    assert loss.volume_mm3 == pytest.approx(-4 * (23 * 0.5 + 0.9)) and loss.largest_mm == -0.9
+    assert loss.mean_mm == pytest.approx(loss.volume_mm3 / 96)
+    assert (rise.places, rise.largest_mm) == (5, 0.3) and rise.extent_mm == pytest.approx(8.0)
+    record = change.record()
+    assert (record["places"], record["compared"], record["compared_area_mm2"]) == (240, 239, 239 * 4.0)
+    assert record["significant_share"] == pytest.approx(31 / 239)
+    assert record["mean_mm"] == pytest.approx((-12.4 + 1.5 + 1.4) / 239)
+    assert record["rms_mm"] == pytest.approx(np.sqrt((23 * 0.25 + 0.81 + 5 * 0.09 + 2 * 0.49) / 239))
+    assert (record["largest_loss_mm"], record["largest_rise_mm"], record["level_median_mm"]) == (-0.9, 0.7, 0.1)
+    assert change.lines() == [
+        "reference                 cloud",
+        "places compared           239 of 240, means over 4 mm",
+        f"distance, mm              mean {-9.5 / 239:+.4f}, rms {record['rms_mm']:.4f}",
+        "level of detection, mm    0.1000 (median; 95 %)",
+        "significant change        13.0 % of the area, -0.900 to +0.700 mm",
+        "regions of change         2 with at least 4 places, spacing 2 mm; 2 places are in no region",
+    ]
+
+
+def test_ideal_shapes_have_their_distances_and_normals():
+    """Signed distances along unit normals; also in the centre of a sphere, where no normal is defined."""
+    places = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]])
+    sphere = place_shape(IdealSphere(diameter_mm=6.0, point_mm=(0, 0, 0)), places).nearest(places)
+    np.testing.assert_allclose(sphere.distance_mm, [2.0, -1.0, -3.0])
+    np.testing.assert_allclose(sphere.normals, [[0.6, 0.8, 0], [0, 0, 1], [0, 0, 0]])
+    pipe = IdealCylinder(diameter_mm=6.0, point_mm=(0, 0, 7), axis=(0, 0, -3))
+    found = place_shape(pipe, places).nearest(places, reach_mm=2.5)
+    np.testing.assert_allclose(found.distance_mm, [2.0, np.nan, np.nan])
+    np.testing.assert_allclose(found.normals[0], [0.6, 0.8, 0])
+    plane = place_shape(IdealPlane(point_mm=(0, 0, 1), normal=(0, 3, 4)), places).nearest(places)
+    np.testing.assert_allclose(plane.distance_mm, [2.4 - 0.8, 0.8, -0.8])
+    np.testing.assert_allclose(plane.normals, [[0, 0.6, 0.8]] * 3)
+
+
+def test_areas_of_places_add_up_to_the_surface():
+    """Inner places of a square lattice of 2 mm: 12 neighbours lie within 4 mm, so that the area is pi 16 / 12.5."""
+    x, y = np.meshgrid(2.0 * np.arange(9), 2.0 * np.arange(9), indexing="ij")
+    area = _estimate_areas(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])).reshape(x.shape)
+    np.testing.assert_allclose(area[2:-2, 2:-2], np.pi * 16 / 12.5)
+    np.testing.assert_array_equal(_estimate_areas(np.zeros((1, 3))), [0.0])

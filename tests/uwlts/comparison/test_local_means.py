@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from uwlts.comparison.local_means import TWO_SIDED, _student_ratio, average_locally
 from uwlts.storage.cloud import PointUncertainty
@@ -43,3 +44,46 @@ def test_the_factor_of_few_points_is_students() -> None:
     """Quantiles of 97.5 % for 1, 4, 10 and 30 degrees of freedom, from tables."""
     tabulated = np.array([12.706, 2.776, 2.228, 2.042])
     np.testing.assert_allclose(_student_ratio(np.array([2, 5, 11, 31])), tabulated / TWO_SIDED, rtol=2e-4)
+
+
+def images(values: np.ndarray, each: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points in a tilted disc of 1 mm radius, ``each`` of every image at its height, in mixed order."""
+    image = np.random.default_rng(6).permutation(np.repeat(np.arange(len(values)), each))
+    angle = np.arange(len(image))
+    flat = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(image))])
+    return (flat + np.outer(values[image], [0, 0, 1])) @ TURN.T, image
+
+
+TURN = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix()
+
+
+def test_points_of_an_image_that_err_together_count_once() -> None:
+    """The variance is that of a mean of five images, times Student's factor of the 40 points."""
+    heights = np.array([0.3, -0.2, 0.05, 0.4, -0.1])
+    points, image = images(heights, 8)
+    found = average_locally(
+        np.zeros((1, 3)), TURN[:, 2][None], points, uncertainty=None, frame=image, disc_mm=2.1, deep_mm=1.0
+    )
+    assert found.mean_mm[0] == pytest.approx(heights.mean())
+    student = 2.0227 / TWO_SIDED
+    assert found.variance_mm2[0] == pytest.approx(student**2 * heights.var(ddof=1) / 5, rel=1e-4)
+
+
+def test_variance_of_a_mean_without_scatter_is_that_stated() -> None:
+    """Noise is divided by the number of points; errors of images by that of images; patterns are averaged."""
+    points, image = images(np.zeros(4), 6)
+    count, normal = len(points), TURN[:, 2]
+    random = np.array([1.0, 0.2, -0.3, 2.0, 0.4, 3.0])
+    full = np.array([[1.0, 0.2, -0.3], [0.2, 2.0, 0.4], [-0.3, 0.4, 3.0]])
+    position, pose = np.array([0.1, -0.2, 0.3]), np.array([0.0, 0.5, 0.1])
+    number = np.arange(count)[:, None]
+    patterns = np.stack([np.outer(np.ones(count), [0.0, 0.0, 2.0]), number * np.array([[1.0, 0.0, 0.0]])])
+    known = PointUncertainty(
+        np.tile(random, (count, 1)), np.tile(position, (count, 1)), patterns, np.tile(pose, (1, count, 1))
+    )
+    found = average_locally(
+        np.zeros((1, 3)), normal[None], points, uncertainty=known, frame=image, disc_mm=2.1, deep_mm=1.0
+    )
+    expected = normal @ full @ normal / 24 + ((position @ normal) ** 2 + (pose @ normal) ** 2) / 4
+    assert found.variance_mm2[0] == pytest.approx(expected)
+    np.testing.assert_allclose(found.patterns_mm[0], [2 * normal[2], 11.5 * normal[0]])

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
+from uwlts.evaluation.spheres import _propose_centres
 from uwlts.evaluation.step_faces import StepFace, label_step_faces, step_height
 from uwlts.evaluation.truth_comparison import compare_with_truth
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
@@ -95,6 +96,18 @@ def test_the_spacing_error_scatters_as_stated_and_has_no_bias():
     # 24 values of unit variance: mean 0 +- 0.20, standard deviation 1 +- 0.145; four of these.
     assert abs(np.mean(scaled)) < 0.8
     assert np.std(scaled) == pytest.approx(1, abs=0.58)
+
+
+def test_spheres_through_three_points_have_the_true_centre():
+    """Of exact points of a sphere, one of the two spheres through each triple is the true one."""
+    rng, centre, radius = np.random.default_rng(9), np.array([5.0, -3.0, 310.0]), 20.0
+    way = rng.normal(size=(3000, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    centres = _propose_centres(centre + radius * way, radius, rng)
+    first, second = np.linalg.norm(centres.reshape(2, -1, 3) - centre, axis=2)
+    assert len(first) > 1500
+    # Rounding is larger for narrow triangles.
+    assert np.minimum(first, second).max() < 1e-3 and np.median(np.minimum(first, second)) < 1e-9
 
 
 def test_form_errors_count_all_points():
@@ -324,6 +337,15 @@ def test_labels_serve_slightly_changed_points():
         stretched = step_height(points * [1, scale], labels).height_mm
         # Stretching Z stretches the height, but for the tilt of the fitted line: 1e-4 rad squared.
         assert stretched == pytest.approx(scale * first, rel=1e-6)
+
+
+@pytest.mark.parametrize("share", [0.82, 1.2])
+def test_the_described_height_may_be_wrong_by_a_fifth(share):
+    points, _ = step_profile(np.random.default_rng(1), "base, block, base")
+    right, wrong = (label_step_faces(points, height_mm=height) for height in (HEIGHT, share * HEIGHT))
+    # Limits of a face follow from its scatter: some points of the riser may differ.
+    assert np.mean(right == wrong) > 0.98
+    assert step_height(points, wrong).height_mm == pytest.approx(step_height(points, right).height_mm, abs=0.005)
 
 
 def test_a_step_as_low_as_ten_times_the_noise_is_found():

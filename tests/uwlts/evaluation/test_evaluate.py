@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.evaluate import EvaluationRecord, evaluate
+from uwlts.evaluation.evaluate import EvaluationRecord, TruthFigures, evaluate
 from uwlts.model.library import load_sensor
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.truth import Truth, TruthHeader, scene_digest, write_truth
@@ -94,3 +94,14 @@ def test_a_stored_evaluation_has_finite_values(index: float) -> None:
     EvaluationRecord(cloud="a.ply", medium_index=1.33)
     with pytest.raises(ValidationError, match="finite number"):
         EvaluationRecord(cloud="a.ply", medium_index=index)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("share_within_tolerance", -0.01), ("share_within_tolerance", 1.01), ("missed", -1)]
+)
+def test_stored_fractions_and_counts_are_possible(tmp_path: Path, name: str, value: float) -> None:
+    found = evaluate(a_cloud(METADATA), truth=truth_file(tmp_path / "a.truth.h5", scene=SCENE)).truth
+    assert found is not None
+    TruthFigures.model_validate(found.as_dict())
+    with pytest.raises(ValidationError, match=name):
+        TruthFigures.model_validate(found.as_dict() | {name: value})

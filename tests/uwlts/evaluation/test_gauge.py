@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import uwlts
 from uwlts.cli import app
@@ -49,6 +50,53 @@ def test_aiags_example():
     assert any("pooled with the repeatability" in line for line in study.lines())
 
 
+def test_intervals_of_single_mean_squares_are_those_of_chi_square():
+    """78 degrees of freedom with the pooled interaction; a quantile of 20,000 draws is known to 0.5 %.
+
+    The other mean squares are forty and two hundred times as large, so that nearly they alone count. Upper ends with 2
+    and 9 degrees of freedom are known to 2.3 and 0.7 %.
+    """
+    components = uwlts.gauge_study(ROWS).components
+    found = components["repeatability (EV)"]
+    assert found.low == pytest.approx(found.std * np.sqrt(78 / chi2.ppf(0.975, 78)), rel=0.01)
+    assert found.high == pytest.approx(found.std * np.sqrt(78 / chi2.ppf(0.025, 78)), rel=0.01)
+    assert found.tolerance_percent is None
+    parts, operators = components["parts (PV)"], components["reproducibility (AV)"]
+    assert parts.low == pytest.approx(np.sqrt(9.8180 / chi2.ppf(0.975, 9)), rel=0.01)
+    assert parts.high == pytest.approx(np.sqrt(9.8180 / chi2.ppf(0.025, 9)), rel=0.03)
+    assert operators.high == pytest.approx(np.sqrt(1.5836 / 30 * 2 / chi2.ppf(0.025, 2)), rel=0.1)
+
+
+def test_components_of_chosen_mean_squares():
+    """Orthogonal effects of three parts, two operators, their interaction, and two repeats; by hand."""
+    part, operator, both, repeat = 5.0, 1.5, 0.5, 0.1
+    rows = [
+        (f"p{p}", f"o{o}", 7 + part * (p - 1) + operator * s + both * s * (1, -2, 1)[p] + repeat * r)
+        for p in range(3)
+        for o, s in enumerate((-1, 1))
+        for r in (-1, 1)
+    ]
+    study = uwlts.gauge_study(rows)
+    squares = {"parts": 4 * part**2, "operators": 12 * operator**2, "parts x operators": 12 * both**2}
+    squares["repeats"] = 2 * repeat**2
+    assert {row.source: row.mean_square for row in study.variances} == pytest.approx(squares)
+    assert [row.degrees for row in study.variances] == [2, 1, 2, 6] and not study.interaction_pooled
+    assert [row.f for row in study.variances[:3]] == pytest.approx(
+        [squares["parts"] / 3, squares["operators"] / 3, 3 / squares["repeats"]]
+    )
+    assert study.variances[3].f is None
+    # F of 2 and 2 degrees of freedom exceeds x with the probability 1 / (1 + x).
+    assert study.variances[0].probability == pytest.approx(1 / (1 + 100 / 3))
+    of_both, of_operators, of_parts = (3 - 0.02) / 2, (27 - 3) / 6, (100 - 3) / 4
+    variances = [0.02, of_operators + of_both, 0.02 + of_operators + of_both, of_parts]
+    variances.append(variances[2] + of_parts)
+    assert [each.std**2 for each in study.components.values()] == pytest.approx(variances)
+    shares = [each.share_percent for each in study.components.values()]
+    assert shares == pytest.approx(100 * np.sqrt(np.array(variances) / variances[-1]))
+    assert study.distinct == int(1.41 * np.sqrt(of_parts / variances[2])) == 2
+    assert "parts x operators             2            3  150.000       0.0000" in "\n".join(study.lines())
+
+
 @pytest.mark.parametrize("interaction", [0.0, 0.5])
 def test_intervals_hold_the_truth(interaction):
     rng, held, count = np.random.default_rng(3), [], 120
@@ -68,6 +116,7 @@ def test_a_reference_measured_again_and_again():
     values = 50.0 + 0.004 + 0.002 * np.sin(np.arange(50.0))
     study = uwlts.gauge_study([("ball", "me", value) for value in values], tolerance=0.1, true_value=50.0)
     assert study.bias == pytest.approx(values.mean() - 50.0) and abs(study.bias) > study.bias_half_interval
+    assert study.bias_half_interval == pytest.approx(2.0096 * values.std(ddof=1) / np.sqrt(50), rel=1e-4)
     assert study.cg == pytest.approx(0.02 / (6 * values.std(ddof=1)))
     assert study.cgk == pytest.approx((0.01 - study.bias) / (3 * values.std(ddof=1)))
     text = "\n".join(study.lines())

@@ -1,8 +1,16 @@
-"""Tukey's biweight: outliers do not count, normal noise costs five percent, and the solution is a sum of the values."""
+"""Tukey's biweight, rigid transforms, and covariances: known solutions and efficiencies."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from uwlts.fitting.least_squares import biweight, fit_biweight, noise_factor, robust_std
+from uwlts.fitting.least_squares import (
+    biweight,
+    fit_biweight,
+    fit_rigid_transform,
+    noise_factor,
+    parameter_covariance,
+    robust_std,
+)
 
 SEED = 4
 
@@ -46,3 +54,25 @@ def test_scatter_is_that_of_normal_noise_and_never_less_than_stated():
     assert abs(robust_std(noise) - 1) < limit and abs(noise_factor(3 * noise) / 3 - 1) < limit
     assert noise_factor(0.1 * noise) == 1.0 and noise_factor(np.empty(0)) == 1.0
     np.testing.assert_allclose(biweight(np.array([0.0, 4.685 / 2, 4.685, 9.0])), [1.0, 0.75**2, 0.0, 0.0], atol=1e-12)
+
+
+def test_points_moved_rigidly_are_moved_back_without_a_reflection():
+    rng = np.random.default_rng(SEED)
+    source, turn = rng.normal(size=(6, 3)), Rotation.from_rotvec([1.0, -2.0, 0.3]).as_matrix()
+    found = fit_rigid_transform(source, source @ turn.T + [5.0, -3.0, 100.0])
+    np.testing.assert_allclose(
+        found, np.block([[turn, np.array([[5.0], [-3.0], [100.0]])], [np.eye(4)[3:]]]), atol=1e-9
+    )
+    # A mirror image is approached by a rotation.
+    assert np.linalg.det(fit_rigid_transform(source, source * [1, 1, -1])[:3, :3]) > 0
+
+
+def test_a_straight_line_has_the_covariance_of_the_text_books():
+    """Slope and mean of values at -2 to 2, with residuals of one size: s2 = 4 h2 / 3."""
+    x = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    residuals = 0.1 * np.array([1.0, -1.0, 0.0, -1.0, 1.0])
+    covariance, std = parameter_covariance(
+        np.column_stack([np.ones(5), x]), float(residuals @ residuals), what="a line"
+    )
+    assert std == np.sqrt(0.04 / 3)
+    np.testing.assert_allclose(covariance, 0.04 / 3 * np.diag([1 / 5, 1 / 10]), atol=1e-15)

@@ -1,11 +1,14 @@
 """Propagation of the errors of points to patches, against patches of surfaces whose errors are drawn again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from tests.oracles.views import draw_views
-from uwlts.fitting.patches import Patches, distances_between, refit_distances, surface_patches
+from uwlts.fitting.patches import Patches, distances_between, refit_distances, rigid_derivatives, surface_patches
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 
 DRAWS = 30
@@ -86,3 +89,50 @@ def test_errors_of_the_second_order_cancel_at_the_foot() -> None:
     assert len(again.source) > 50
     before, after = (np.median(np.abs(each.distance_mm)) for each in (found, again))
     assert after < 0.6 * before
+
+
+def plane_patches(turn: np.ndarray, shift_mm: np.ndarray) -> tuple[Patches, np.ndarray]:
+    """Return patches of a plane of 30 mm and their pose; the plane faces the sensor in its own frame."""
+    flat = np.random.default_rng(6).uniform(-15, 15, (3000, 2))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, shift_mm
+    return surface_patches(np.column_stack([flat, np.zeros(3000)]), radius_mm=3.0), pose
+
+
+@pytest.mark.parametrize(("angle_deg", "overlap"), [(0, True), (30, True), (45, False), (180, False)])
+def test_planes_overlap_up_to_an_angle_between_their_normals(angle_deg: float, overlap: bool) -> None:
+    """Distances are those from the plane, 0.2 mm away along its own normal; normals differ by up to 37 deg."""
+    rotate = Rotation.from_euler("x", angle_deg, degrees=True).as_matrix()
+    whole = Rotation.from_rotvec([0.2, -0.4, 1.0]).as_matrix()
+    target, at = plane_patches(whole, np.array([1.0, 2.0, 300.0]))
+    source, moved = plane_patches(whole @ rotate, at[:3, 3] + 0.2 * whole[:, 2])
+    assert source.one_sided and target.one_sided
+    found = distances_between(source, moved, target, at, reach_mm=1.0)
+    assert (len(found.source) > 5) == overlap
+    places = source.places_mm[found.source] @ moved[:3, :3].T + moved[:3, 3]
+    np.testing.assert_allclose(found.places_mm, places)
+    # Normals point to the sensor, -Z of the frame.
+    normals = np.broadcast_to(-whole[:, 2], found.normals.shape)
+    np.testing.assert_allclose(found.normals, normals, atol=1e-6)
+    np.testing.assert_allclose(found.distance_mm, (places - at[:3, 3]) @ -whole[:, 2], atol=1e-6)
+
+
+def test_motions_move_points_as_their_derivatives() -> None:
+    """Against differences by small motions about a middle."""
+    rng = np.random.default_rng(7)
+    places, directions, middle = rng.normal(size=(3, 5, 3))
+    by = rigid_derivatives(places, directions, middle[0])
+    step = 1e-6 * rng.normal(size=6)
+    turned = Rotation.from_rotvec(step[3:]).apply(places - middle[0]) + middle[0] + step[:3]
+    np.testing.assert_allclose(by @ step, np.einsum("qi,qi->q", turned - places, directions), atol=1e-11)
+
+
+def test_patterns_move_patches_as_a_whole() -> None:
+    """A common pattern, in two amounts."""
+    cloud = exact_cloud()
+    patterns = np.tile([[0.3, 0.0, 0.1]], (2, len(cloud), 1)) * np.array([1.0, -2.0])[:, None, None]
+    patches = surface_patches(cloud.points_mm, replace(cloud.uncertainty, patterns_mm=patterns), radius_mm=3.0)
+    moved = patches.corrected(np.array([1.0, 0.25]))
+    shift = 0.5 * np.array([0.3, 0.0, 0.1])
+    np.testing.assert_allclose(moved.places_mm, patches.places_mm + shift, atol=1e-6)
+    np.testing.assert_allclose(moved.averages.places_mm, patches.averages.places_mm + shift, atol=1e-6)

@@ -84,3 +84,31 @@ def test_a_linear_problem_has_the_solution_and_covariance_of_the_normal_equation
     np.testing.assert_allclose(np.r_[found.global_values, *found.local], solution, rtol=1e-6)
     inverse = np.linalg.inv(whole.T @ whole)
     np.testing.assert_allclose(found.covariance / found.sigma**2, inverse[:3, :3], rtol=1e-6)
+
+
+def curve(residual, derivative, *, feasible=lambda x: True):
+    """Return the model of one residual of one global parameter, and of another that is zero, without local ones."""
+
+    def model(_, values, local):
+        x = values[0]
+        if not feasible(x):
+            return None
+        return Observation(np.array([[residual(x)], [0.0]]), np.array([[derivative(x)], [0.0]]), np.zeros((2, 0)))
+
+    return model
+
+
+def test_steps_that_raise_the_cost_or_are_infeasible_are_damped():
+    """From 2, Gauss-Newton's step of atan(x) leads to -3.5 and on to infinity; that of log(x) from 5 to -3.05."""
+    overshooting = curve(np.arctan, lambda x: 1 / (1 + x * x))
+    bounded = curve(np.log, lambda x: 1 / x, feasible=lambda x: x > 0)
+    for model, start, end in ((overshooting, 2.0, 0.0), (bounded, 5.0, 1.0)):
+        found = schur_least_squares(model, np.array([start]), [np.zeros(0)])
+        assert found.global_values[0] == pytest.approx(end, abs=1e-6)
+
+
+def test_a_border_of_what_is_feasible_ends_the_iteration():
+    """No step towards the minimum at 0 is feasible: damping grows from 1e-4 to beyond 1e8 in 13 rounds."""
+    found = schur_least_squares(curve(lambda x: x, lambda x: 1.0, feasible=lambda x: x >= 1), np.ones(1), [np.zeros(0)])
+    assert found.global_values[0] == 1.0 and found.stopped == "no step lowers the cost further"
+    assert found.rounds == 14

@@ -862,6 +862,20 @@ def test_the_controller_ends_a_laser_with_a_time_by_itself(controller, stage):
         stage.laser(False)
 
 
+def test_a_computer_that_asks_after_a_timed_light_takes_the_darkness_for_no_fault(controller, stage, monkeypatch):
+    begin = stage._line.begin
+
+    def begin_and_be_late(*lines):
+        begin(*lines)
+        time.sleep(0.3)
+
+    monkeypatch.setattr(stage._line, "begin", begin_and_be_late)
+    stage.laser(True, at_most_s=0.05)
+    assert not controller.state().laser_on
+    stage.laser(False)
+    assert not stage.faulty and stage.position_known
+
+
 def test_a_hold_while_the_laser_is_on_is_not_hidden_by_switching_it_off(controller, stage):
     stage.laser(True, at_most_s=5.0)
     controller.inject("hold")

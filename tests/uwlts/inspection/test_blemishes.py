@@ -1,11 +1,14 @@
-"""Depths of shallow pits are free of the bias of a maximum in noise."""
+"""Depths of shallow pits without the bias of a maximum in noise; sizes of known shapes, and exact quadratics."""
 
 import numpy as np
+import pytest
+from scipy.spatial import KDTree
 
 from uwlts.fitting.propagation import PointErrors
+from uwlts.inspection.bead_profiles import interpolation_rows, profile_rows
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
-from uwlts.inspection.blemishes import measure_blemish
+from uwlts.inspection.blemishes import _Bell, _interpolation_rows, _measure_section, _quadratic_rows, measure_blemish
 
 
 def test_shallow_pits_are_as_deep_as_they_are_on_average() -> None:
@@ -25,3 +28,67 @@ def test_shallow_pits_are_as_deep_as_they_are_on_average() -> None:
     wrong = [each.values[0].value - depth for each in measured]
     assert len(wrong) >= 12
     assert abs(np.mean(wrong)) < 0.015
+
+
+def quadratic(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return 1.0 + 0.2 * u - 0.3 * v + 0.04 * u * u - 0.05 * u * v + 0.06 * v * v
+
+
+def test_a_paraboloid_has_its_sizes_at_an_edge() -> None:
+    """Depth 2 (1 - t^2) with half axes of 3 and 5 mm, at an edge of 0.5: three quarters of the squared axes."""
+    bell = _Bell(np.array([1.0, -2.0]), np.array([3.0, 5.0]), 2.0, 1)
+    rim = np.sqrt(0.75)
+    lost = 2 * 3 * 2 * (rim - rim**3 / 3)
+    expected = [2.0, 6 * rim, 10 * rim, np.pi * 15 * 0.75, lost]
+    # The trapezoidal rule of 100 steps.
+    np.testing.assert_allclose(bell.figures(0.5), expected, rtol=1e-4)
+    np.testing.assert_allclose(bell.depths_at(np.array([[1.0, -2], [2.5, -2], [1, 3], [9, 9]])), [2, 1.5, 0, 0])
+    for p in (1, 2, 3):
+        sharp = _Bell(np.zeros(2), np.array([3.0, 5.0]), 2.0, p)
+        at = np.column_stack([0.5 * sharp.figures(0.5)[1:2], [0.0]])
+        np.testing.assert_allclose(sharp.depths_at(at), 0.5)
+    again = _Bell.resembling(bell.figures(0.5), 0.5, bell.middle, 1.0, np.random.default_rng(1))
+    np.testing.assert_allclose(again.figures(0.5)[:4], expected[:4], rtol=1e-4)
+
+
+def test_a_section_ends_where_it_crosses_the_edge() -> None:
+    """A triangle with slopes of 1 and 1/2: cut at 0.5 it is 4.5 long, with an area of 6 - 1/8 - 1/4 beneath."""
+    profile = np.array([0.0, 1.0, 2.0, 1.5, 1.0, 0.5 - 1e-12, 0.0])
+    length, area = _measure_section(profile, 0.5, 1.0)
+    assert length == pytest.approx(4.5)
+    assert area == pytest.approx(6 - 1 / 8 - 1 / 4, abs=1e-9)
+    assert _measure_section(profile, 0.5, 0.1) == pytest.approx((0.45, 0.5625), abs=1e-9)
+    assert _measure_section(profile, 3.0, 1.0) == (0.0, 0.0)
+    # Half a cell beyond the border of a grid.
+    assert _measure_section(np.ones(4), 0.5, 1.0)[0] == pytest.approx(4.0)
+
+
+def test_interpolation_and_smoothing_are_exact_for_quadratics() -> None:
+    rng = np.random.default_rng(2)
+    shape, inner = (9, 12), rng.uniform([1.5, 1.5], [6.5, 9.5], (40, 2))
+    u, v = (each.ravel() for each in np.indices(shape).astype(float))
+    rows = _interpolation_rows(inner, shape)
+    np.testing.assert_allclose(rows @ quadratic(u, v), quadratic(*inner.T))
+    assert not (_interpolation_rows(np.array([[-5.0, 3.0], [4.0, 40.0]]), shape) @ quadratic(u, v)).any()
+    places = rng.uniform(-1, 10, (1500, 2))
+    smooth = _quadratic_rows(inner, places, KDTree(places), 1.2)
+    np.testing.assert_allclose(smooth @ quadratic(*places.T), quadratic(*inner.T))
+    # Fewer than nine points in the window: the mean of the three nearest.
+    few = _quadratic_rows(np.zeros((1, 2)), places[:40] + 50.0, KDTree(places[:40] + 50.0), 1.2)
+    nearest = np.argsort(np.hypot(*(places[:40] + 50.0).T))[:3]
+    assert (few @ np.arange(40.0))[0] == pytest.approx(nearest.mean())
+
+
+def test_profiles_of_beads_are_exact_for_quadratics() -> None:
+    """Two sections of other quadratics; beside a section's points the profile is unknown."""
+    rng = np.random.default_rng(3)
+    section, across = np.repeat([0, 1], 200), rng.uniform(-5, 5, 400)
+    heights = np.where(section == 0, quadratic(across, 0 * across), 2 - quadratic(0 * across, across))
+    grid = np.linspace(-6, 6, 25)
+    found = (profile_rows(across, section, 2, grid, 1.0) @ heights).reshape(2, 25)
+    inner = np.abs(grid) < 4.6
+    np.testing.assert_allclose(found[0, inner], quadratic(grid, 0 * grid)[inner])
+    np.testing.assert_allclose(found[1, inner], 2 - quadratic(0 * grid, grid)[inner])
+    assert np.isnan(found[:, np.abs(grid) > 5.5]).all()
+    true = np.concatenate([quadratic(grid, 0 * grid), 2 - quadratic(0 * grid, grid)])
+    np.testing.assert_allclose(interpolation_rows(across, section, 2, grid) @ true, heights)

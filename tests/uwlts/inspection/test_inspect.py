@@ -21,7 +21,7 @@ from uwlts.errors import EvaluationError
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
-from uwlts.inspection.flat import _fit_circle
+from uwlts.inspection.flat import _fit_circle, _Hole, _measure_bolt_circle
 from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
@@ -101,6 +101,12 @@ def test_the_form_of_a_pipe_is_within_its_intervals():
         assert pipe["ovality"].uncertainty < 0.03
     assert min(inside.values()) >= 14, inside
     assert len(sections) == 12
+    # The length from -20 to 20 mm in twelve parts, about the axis in the origin; the bow has its means here.
+    middles = (np.arange(12) + 0.5) * 40 / 12 - 20
+    places = np.array([section.place_mm for section in sections])
+    order = np.argsort(places[:, 0])
+    bow = 0.001 * (middles**2 + (40 / 12) ** 2 / 12)
+    np.testing.assert_allclose(places[order], np.column_stack([middles, 0 * middles, bow]), atol=0.05)
     for section in sections:
         assert section["ovality"].value == pytest.approx(1.5, abs=GATE * section["ovality"].uncertainty + 0.05)
 
@@ -215,10 +221,15 @@ def test_pits_are_found_and_measured():
     rng = np.random.default_rng(5)
     cloud = pipe_scan(rng, half_arc=0.5, along=(-24, 24, 0.5), around_mm=0.3, radius=radius, correlated=True)
     found = uwlts.inspect_pipe(cloud, wall_mm=9.0)
-    assert any("deg of the circumference" in note for note in found.notes)
+    assert any("deg of the circumference" in note and "ovality of up to 2 %" in note for note in found.notes)
     assert not any("no uncertainty" in note for note in found.notes)
     blemishes = found.select(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
     assert len(blemishes) == len(places)
+    # Numbers descend with depth, by kind.
+    pits = [feature.values[0].value for feature in found.select(FeatureKind.PIT)]
+    assert pits == sorted(pits, reverse=True) and [feature.name for feature in found.select(FeatureKind.PIT)] == [
+        f"pit {number}" for number in range(1, 5)
+    ]
     for feature in blemishes:
         x, y, z = feature.place_mm
         at = min(places, key=lambda place: np.hypot(place[0] - x, place[1] - RADIUS_MM * np.arctan2(y, -z)))
@@ -350,12 +361,41 @@ def test_a_flange_is_measured():
     assert len(holes) == 6
     for hole in holes:
         within(hole, {"diameter": 12.0})
+        np.testing.assert_allclose(hole.extent_mm, [hole["diameter"].value] * 2 + [0.0])
         assert hole["position"].low < 0.01
     # A parabola from the bore to the rim; the outermost cells average over a twenty-fourth of the face.
     assert flange["flatness"].value == pytest.approx(0.1 * (1 - np.square(18 / 55)), abs=0.01)
     # The noise of a perfect face is subtracted: what is left is within twice the stated uncertainty.
     plain = uwlts.inspect_flange(flat_scan(rng, lambda x, y: 0 * x, face, along=(-60, 60, 0.5))).features[0]["flatness"]
     assert plain.value < 2 * plain.uncertainty and plain.value < 0.01
+
+
+def test_a_bolt_circle_is_that_of_its_holes():
+    """Five of six even holes, with 0.05 mm each: the radius has a variance by least squares, offsets of zero."""
+    angles = 0.4 + 2 * np.pi * np.array([0, 1, 2, 3, 5]) / 6
+    units = np.column_stack([np.cos(angles), np.sin(angles)])
+    random, growth = np.diag([0.05**2, 0.05**2, 0.1**2]), 1e-3
+    bolts = [
+        _Hole(
+            np.array([3.0, -7.0]) + 40 * unit, 6.0, random, np.array([[*(growth * 40 * unit), 0.0]]), np.arange(9), 0.01
+        )
+        for unit in units
+    ]
+    circle, offsets = _measure_bolt_circle(bolts)
+    design = np.column_stack([units, np.ones(5)])
+    assert circle.value == pytest.approx(80.0)
+    assert circle.random == pytest.approx(2 * 0.05 * np.sqrt(np.linalg.inv(design.T @ design)[2, 2]))
+    assert circle.systematic == pytest.approx(80 * growth)
+    np.testing.assert_allclose(offsets, 0.0, atol=1e-9)
+    # All six, one of them 0.3 mm outside: the circle follows by a sixth in radius and a third in position.
+    whole = [
+        _Hole(40 * np.array([np.cos(a), np.sin(a)]), 6.0, random, None, np.arange(9), 0.0)
+        for a in 2 * np.pi / 6 * np.arange(6)
+    ]
+    whole[0] = replace(whole[0], middle=whole[0].middle + [0.3, 0.0])
+    circle, offsets = _measure_bolt_circle(whole)
+    assert circle.value == pytest.approx(80.1, abs=1e-3) and circle.systematic is None
+    assert offsets[0] == pytest.approx(0.3 - 0.1 - 0.05, abs=1e-3)
 
 
 def test_a_gap_is_measured():

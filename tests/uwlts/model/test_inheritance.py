@@ -103,7 +103,6 @@ def test_another_medium_is_said_for_its_optical_constants(tmp_path):
     found = warned(tmp_path, '[media.lake]\nkind = "fresh"\nwater = "harbour"\n', base="middle")
     assert keys(found) == ["media.lake.index", "media.lake.absorption_per_m", "media.lake.scattering_per_m"]
     assert "media.lake.water (now 'harbour')" in found[2]
-    assert keys(warned(tmp_path, OWN + '[media.water]\nkind = "sea"\n')) == ["media.water.salinity_g_kg"]
     assert warned(tmp_path, OWN + '[media.water]\nkind = "sea"\nsalinity_g_kg = 35.0\n') == []
 
 

@@ -134,7 +134,7 @@ def test_unknown_base(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[camera]\nwidth = 64\n", ("camera.width: unknown key", "unit suffix")),
+        ("[camera]\nwidth = 64\n", ("camera.width: unknown key", "unit suffix", "width_px, height_px")),
         ("colour = 'red'\n", ("colour: unknown key",)),
         ("[camera]\nwidth_px = 64.5\n", ("camera.width_px", "64.5")),
         ("[camera]\nwidth_px = 4\n", ("camera.width_px", "16", "found 4")),
@@ -147,6 +147,7 @@ def test_unknown_base(tmp_path: Path):
         ("[laser]\naxis = [0, 0, 1]\n", ("laser: place the laser by",)),
         ("[volume]\nnear_mm = 500\n", ("volume: near_mm 500 must be smaller than far_mm 420",)),
         ("[media.brine]\nkind = 'custom'\n", ("media.brine: a custom medium needs its index",)),
+        ("[media.brine]\nkind = 'sea'\n", ("media.brine: sea water with salinity 0 g/kg: set salinity_g_kg",)),
         ("[media.sea]\nkind = 'see'\n", ("media.sea.kind", "'sea'", "see")),
     ],
 )

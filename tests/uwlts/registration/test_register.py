@@ -17,7 +17,8 @@ from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_pipe
 from uwlts.fitting.patches import distances_between, surface_patches
 from uwlts.model.artefacts import PipeStandard
-from uwlts.registration.joint_registration import FEWEST_OF_PAIR, JointRegistration
+from uwlts.registration.joint_registration import FEWEST_OF_PAIR, JointRegistration, PairEvidence
+from uwlts.registration.register import _open_movements, _overlap, _pair_fit
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 from uwlts.storage.pose_files import read_poses, write_poses
 
@@ -80,6 +81,41 @@ def test_overlaps_of_few_patches_are_named_and_do_not_count():
     ((first, third, count),) = joint.find_narrow_overlaps(joint.measure_distances(1.0))
     assert (first, third) == (0, 2) and 0 < count < FEWEST_OF_PAIR
     assert set(joint.collect_evidence(joint.measure_distances(1.0))) == {(0, 1), (1, 2)}
+
+
+def test_the_agreement_of_a_pair_is_that_of_its_residuals():
+    """Four distances, one of zero weight, and two spheres, whose differences are relative to their uncertainty."""
+    distances, centres = np.array([0.1, -0.2, 5.0, 0.4]), np.array([0.5, -1.0, 2.0, 0.0, 1.0, -0.5])
+    weights = np.array([1.0, 2.0, 0.0, 1.0, *np.ones(6)])
+    residuals, places = np.append(distances, centres), np.arange(12.0).reshape(4, 3)
+    pair = PairEvidence(np.ones((10, 1)), residuals, weights, np.ones(10), 1.5, np.zeros((1, 1)), (), places, 4, 2)
+    assert pair.normal() == [[10.0]] and pair.gradient() == pytest.approx([0.1 - 0.4 + 0.4 + 2.0])
+    fit = _pair_fit(None, (0, 1), {(0, 1): pair}, None)
+    assert (fit.patches, fit.spheres, fit.scatter, fit.closure_mm) == (3, 2, 1.5, None)
+    assert fit.mean_mm == pytest.approx(0.1) and fit.rms_mm == pytest.approx(np.sqrt(0.21 / 3))
+    assert fit.sphere_rms == pytest.approx(np.sqrt(6.5 / 6))
+    np.testing.assert_array_equal(_overlap(pair).places_mm, places[[0, 1, 3]])
+    np.testing.assert_array_equal(_overlap(pair).distance_mm, [0.1, -0.2, 0.4])
+
+
+def test_undetermined_motions_are_translations_and_rotations_about_axes():
+    """The second of three scans may slide along an axis and turn about it; rotations are scaled by the scan's size."""
+    axis, point, size = np.array([0.0, 0.6, -0.8]), np.array([5.0, 3.0, -4.0]), 40.0
+    middle = point + 7.0 * axis + [2.0, 0.0, 0.0]
+    # A turn about a line through the point moves the scan's centroid across.
+    turn = np.concatenate([np.cross(axis, middle - point), size * axis])
+    slide = np.append(axis, np.zeros(3))
+    directions = np.zeros((2, 12))
+    directions[:, :6] = np.linalg.qr(np.array([slide, turn]).T)[0].T
+    directions[:, 3:6] /= size
+    shift, rotation = _open_movements(directions, np.array([np.zeros(3), middle, point]), np.array([1.0, size, 9.0]))
+    assert shift.scan == rotation.scan == 1 and shift.point_mm is None
+    np.testing.assert_allclose(shift.direction, -axis, atol=1e-9)
+    np.testing.assert_allclose(rotation.direction, -axis, atol=1e-9)
+    # The point of the axis nearest to the centroid.
+    np.testing.assert_allclose(rotation.point_mm, point + 7.0 * axis, atol=1e-9)
+    assert shift.describe() == "shift along (0.000, -0.600, 0.800)"
+    assert rotation.describe() == "turn about the line through (5.0, 7.2, -9.6) mm along (0.000, -0.600, 0.800)"
 
 
 def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from uwlts.registration.surface_registration import SampledSurface, register_to_surface
+from uwlts.registration.surface_registration import Nearest, SampledSurface, register_to_surface, shape_registration
 from uwlts.storage.cloud import PointUncertainty
 
 
@@ -51,3 +51,60 @@ def test_the_covariance_is_that_of_the_errors(points_each: int) -> None:
         squares += float(error @ np.linalg.solve(found.covariance, error))
     low, high = chi2.ppf([5e-5, 1 - 5e-5], 6 * draws)
     assert low < squares < high
+
+
+def test_what_a_plane_does_not_determine_is_left() -> None:
+    """Normals that are tilted by 1e-3 alone give less than a thousandth of the information on a shift across."""
+    rng, std = np.random.default_rng(5), 0.01
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(-20.0, 21.0), np.arange(-20.0, 21.0)))
+    points = np.column_stack([x, y, np.zeros(len(x))])
+    normals = np.column_stack([*1e-3 * rng.standard_normal((2, len(x))), np.ones(len(x))])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    cloud = points + [0.3, -0.2, 0.1] + np.outer(std * rng.standard_normal(len(x)), [0, 0, 1])
+    cloud[0, 2] += 0.5
+    found = register_to_surface(cloud, SampledSurface(points, normals), reach_mm=1.0)
+    # The three motions are equally undetermined, so that any combinations of them may be named.
+    names = {name for words in found.open_directions for name in words.split(" with ")}
+    assert names == {"shift along x", "shift along y", "turn about z"} and len(found.open_directions) == 3
+    # The mean of 1,681 points; five standard deviations.
+    np.testing.assert_allclose(found.transform[:3, 3], [0, 0, -0.1], atol=5 * std / 41 + 1e-3 * std)
+    # The biweight of normal noise is 95 % efficient.
+    assert found.covariance[2, 2] == pytest.approx(std**2 / len(x) / 0.95, rel=0.15)
+    assert found.covariance[3, 3] == pytest.approx(std**2 / (y @ y) / 0.95, rel=0.15)
+    assert np.abs(found.covariance[[0, 1, 5]]).max() < 1e-3 * found.covariance[2, 2]
+    assert found.rms_mm == pytest.approx(std, rel=0.1) and len(x) - 20 < found.points < len(x)
+
+
+def test_the_uncertainty_of_a_fitted_plane_is_that_of_its_residuals() -> None:
+    """Residuals of one size and alternating signs, which no motion reduces; five images, and two patterns."""
+    side = np.arange(-4.5, 5.0)
+    x, y = (each.ravel() for each in np.meshgrid(side, side, indexing="ij"))
+    points, up = np.column_stack([x, y, np.zeros(100)]), np.tile([0.0, 0.0, 1.0], (100, 1))
+    size, image = 0.03, np.repeat(np.arange(5), 20)
+    near = Nearest(size * np.where((x + y) % 2 == 0, 1.0, -1.0), up, np.arange(100))
+    known = PointUncertainty(np.zeros((100, 6)), 0.2 * up, np.stack([0.5 * up, 0.01 * y[:, None] * up]))
+    plain = shape_registration(points, near, sized=False, uncertainty=None, frame=None)
+    assert plain.rms_mm == pytest.approx(size) and plain.points == 100
+    expected = size**2 * np.array([0, 0, 1 / 100, 1 / (y @ y), 1 / (x @ x), 0])
+    np.testing.assert_allclose(plain.covariance, np.diag(expected), atol=1e-12)
+    # Halfway to the border: the offset and one tilt.
+    std = plain.std_along(np.array([[0.0, 3.0, 0.0]]), up[:1])
+    np.testing.assert_allclose(std, size * np.sqrt(1 / 100 + 9 / (y @ y)))
+    found = shape_registration(points, near, sized=False, uncertainty=known, frame=image)
+    assert found.covariance[2, 2] == pytest.approx(expected[2] + 0.2**2 / 5)
+    # The motion undoes the errors: a shift, and a turn by the slope.
+    np.testing.assert_allclose(found.by_cloud, [[0, 0, -0.5, 0, 0, 0], [0, 0, 0, -0.01, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(found.moves_mm(found.by_cloud[1], points), -0.01 * y[:, None] * up, atol=1e-12)
+
+
+def test_the_uncertainty_of_a_fitted_sphere_includes_its_radius() -> None:
+    """Points on all axes: their normals have a third of the sum of squares each, and turns are undetermined."""
+    normals = np.tile(np.vstack([np.eye(3), -np.eye(3)]), (4, 1))
+    size, radius = 0.02, 10.0
+    near = Nearest(size * np.repeat([1.0, -1.0, 1.0, -1.0], 6), normals, np.arange(24))
+    found = shape_registration(radius * normals, near, sized=True, uncertainty=None, frame=None)
+    expected = size**2 * np.array([1 / 8, 1 / 8, 1 / 8, 0, 0, 0, 1 / 24])
+    np.testing.assert_allclose(found.covariance, np.diag(expected), atol=1e-12)
+    assert found.std_along(radius * normals[:1], normals[:1])[0] == pytest.approx(size * np.sqrt(1 / 8 + 1 / 24))
+    grown = found.moves_mm(np.array([0, 0, 0, 0, 0, 0, 0.1]), radius * normals, normals)
+    np.testing.assert_allclose(grown, 0.1 * normals)

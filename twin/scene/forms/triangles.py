@@ -74,20 +74,10 @@ def wave(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def waves(
     places: np.ndarray, rng: np.random.Generator, *, shortest: float, longest: float, count: int = 24
 ) -> np.ndarray:
-    """Return a smooth irregular function between -1 and 1 at ``places``, a sum of plane waves.
+    """Return a smooth irregular function between -1 and 1 at ``places`` (D, ...), a sum of plane waves.
 
-    Amplitudes are proportional to the wavelengths, as on self-similar natural surfaces.
-
-    Parameters
-    ----------
-    places : (D, ...)
-        Positions, in the unit of the wavelengths.
-    rng
-        Source of directions and phases.
-    shortest, longest
-        Range of the wavelengths, which are spaced logarithmically.
-    count
-        Number of plane waves.
+    Amplitudes are proportional to the wavelengths, as on self-similar natural surfaces. Wavelengths are spaced
+    logarithmically, in the unit of the places.
     """
     direction = rng.normal(size=(count, len(places)))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)

@@ -58,7 +58,7 @@ def nominal_camera(setting: Setting) -> CameraModel:
     return CameraModel.from_description(camera, magnified=index)
 
 
-def estimate_pose(view: TargetView, camera: CameraModel) -> np.ndarray:
+def estimate_pose(view: TargetView | TargetImage, camera: CameraModel) -> np.ndarray:
     """Estimate ``T_camera_target`` (4, 4) of a view with a known camera.
 
     Raises CalibrationError if no pose fits the points.

@@ -202,22 +202,14 @@ class TargetEvidence(StripeEvidence):
     The local parameters are the rotation vector and shift ``T_camera_target`` at the first image. If the stage moved,
     the tilt of its direction against the target's normal (2,) and a position error in mm of all images except the first
     follow.
-
-    Attributes
-    ----------
-    placement, predicted_points : detected target points; predicted pixels (M, 2), like ``predicted`` for the stripe
-    image : (N,); image number of each stripe pixel
-    shifts_mm : (N,); stage position of each stripe pixel, relative to the first image
-    staged : whether the stage's motion connects the images
-    extent_mm : (K, 2); corners of the target; its bow is given at the corner farthest from the middle
     """
 
-    placement: Placement
-    image: np.ndarray
-    shifts_mm: np.ndarray
-    staged: bool
-    extent_mm: np.ndarray
-    predicted_points: np.ndarray | None = None
+    placement: Placement  # detected target points
+    image: np.ndarray  # (N,); image number of each stripe pixel
+    shifts_mm: np.ndarray  # (N,); stage position of each stripe pixel, relative to the first image
+    staged: bool  # whether the stage's motion connects the images
+    extent_mm: np.ndarray  # (K, 2); corners of the target; its bow is given at the corner farthest from the middle
+    predicted_points: np.ndarray | None = None  # (M, 2); predicted pixels, like ``predicted`` for the stripe
     middle_mm: np.ndarray = field(init=False)
     radius_mm: float = field(init=False)
 

@@ -37,7 +37,7 @@ from uwlts.stripe import StripeSettings
 
 Level = TypeVar("Level")
 
-_Captures = Sequence[Capture | str | Path]
+Captures = Sequence[Capture | str | Path]
 
 
 POINTS, STRIPES = "points", "stripes"
@@ -353,57 +353,16 @@ class Comparison(Brief):
 
 def compare_models(
     *,
-    air: _Captures = (),
-    water: _Captures = (),
-    step: _Captures = (),
+    air: Captures = (),
+    water: Captures = (),
+    step: Captures = (),
     target_poses: Literal["stage", "free"] = "stage",
     index: float | None = None,
     stripe: StripeSettings = None,
     workers: int | None = None,
     progress: ProgressListener = ignore_progress,
 ) -> Comparison:
-    """Compare sensor models by how well each predicts images that were not used for its calibration.
-
-    The models differ in one property: one or two refractions, window tilt, bow of the sheet, turn of the laser's
-    window, or lens distortion. Each model is calibrated without every fourth image, and without the nearest and
-    farthest images.
-
-    Parameters
-    ----------
-    air : sequence of Capture or path
-        Captures of the target in air, as for uwlts calibrate.
-    water : sequence of Capture or path
-        Captures of the target in the medium of use.
-    step : sequence of Capture or path
-        Captures of the step standard in the medium of use.
-    target_poses : {"stage", "free"}
-        stage: one target pose per capture, moved by the stage. free: every image has its own pose.
-    index : float, optional
-        Refractive index of the medium relative to air. Default: the index that follows from the captures.
-    stripe : StripeOptions or dict, optional
-        As for `reconstruct`.
-    workers : int, optional
-        Number of models calibrated in parallel. Default: number of processors.
-    progress : callable, optional
-        Called with the number of images or models done, the total, and the name of the stage.
-
-    Returns
-    -------
-    Comparison
-        Models ranked by their errors in held-out images, the polynomials' errors, and warnings.
-
-    Raises
-    ------
-    CalibrationError
-        There are too few images, or they do not determine a calibration.
-    DescriptionError
-        There is no capture of a target, a capture does not describe its target or step standard, or ``workers`` is less
-        than 1.
-    CaptureError
-        A file is missing or damaged.
-    RangeError
-        The refractive index is out of range.
-    """
+    """Compare sensor models; arguments and errors as for `uwlts.report.write_models`."""
     if index is not None:
         require_index(index)
     if workers is not None and workers < 1:

@@ -29,20 +29,9 @@ class Screen(Protocol):
     def live(
         self, image: np.ndarray, *, full_dn: int, points: np.ndarray | None, stripe: np.ndarray | None, remark: str
     ) -> None:
-        """Show an image with the target and the stripe found in it.
+        """Show an image (H, W) with the points of the target and the pixels of the stripe found in it, (N, 2) in px.
 
-        Parameters
-        ----------
-        image : (H, W)
-            Latest image.
-        full_dn
-            Grey value of a saturated pixel.
-        points : (N, 2) or None
-            Points of the target in the image, px.
-        stripe : (N, 2) or None
-            Pixels of the stripe in the image.
-        remark
-            Text below the image.
+        ``full_dn`` is the grey value of a saturated pixel; ``remark`` stands below the image.
         """
 
     def show_coverage(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:

@@ -53,7 +53,7 @@ def guide(
     report: Callable[[str], None] = print,
     answers: int | None = None,
 ) -> GuidedRecording:
-    """Lead through the images of a calibration on a screen. The errors are those of `uwlts.record_guided`.
+    """Lead through the images of a calibration on a screen. The errors are those of `uwlts.desk.record_guided`.
 
     The captures are written beside ``out``, the calibration; ``resume`` continues interrupted ones. ``refractions`` and
     ``distortion`` are those of the calibration that judges the images. ``answers`` is the file descriptor of the

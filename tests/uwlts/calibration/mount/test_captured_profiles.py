@@ -10,17 +10,23 @@ from scipy.stats import chi2
 
 import uwlts
 from tests.uwlts.calibration.mount.test_hand_eye import CAMERA, MIDDLE, simulated
+from tests.uwlts.calibration_views import WATER
+from tests.uwlts.drawn_stripes import SENSOR, step_image, write
 from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.mount_views import errors_of
 from tests.uwlts.sensor_profiles import RADIUS_MM, captured_by, half_way, joint_estimate, largest_parts
 from uwlts.calibration.joint.stored_estimate import covariance_root
+from uwlts.calibration.mount.captured_profiles import reconstruct_profiles
 from uwlts.calibration.mount.hand_eye import BoardEvidence
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate, solve_step
 from uwlts.calibration.sequential.sheet_fit import object_frame
+from uwlts.errors import DescriptionError
 from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.sensor import Medium
+from uwlts.optics.nominal import nominal_calibration
 from uwlts.reconstruction.moving import PlatformPoses, add_platform_uncertainty
 from uwlts.reconstruction.point_uncertainty import point_uncertainty
-from uwlts.storage.capture import CaptureHeader, FrameTable
+from uwlts.storage.capture import Capture, CaptureHeader, FrameTable
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +56,21 @@ def test_a_mount_follows_the_sensor_as_its_derivatives_say(known, captured, moun
         moved, std = half_way(*found), mount.std()
         assert np.linalg.norm(moved / std) > 0.3, "a part that matters"
         np.testing.assert_allclose(by @ part[: by.shape[1]] / std, moved / std, atol=0.02 * np.linalg.norm(moved / std))
+
+
+def test_poses_of_a_table_replace_those_of_the_capture(tmp_path):
+    medium, image = Medium(kind="custom", index=WATER), step_image(20.0, height_mm=12.0, count=60)
+    path = write(tmp_path / "step.h5", [image] * 2)
+    given = np.tile(np.eye(4), (3, 1, 1))
+    with Capture(path) as capture:
+        with pytest.raises(DescriptionError, match="2 of 2 laser images of step.h5 have no platform pose"):
+            reconstruct_profiles(capture, nominal_calibration(SENSOR, medium), None, None)
+        found = reconstruct_profiles(capture, nominal_calibration(SENSOR, medium), given, np.arange(3.0))
+    assert found.poses is given and found.pose_times_s == pytest.approx([0, 1, 2])
+    for profile in found.profiles:
+        # The mean of half a hundred points with noise of some 0.1 mm each; the block is nearer.
+        on_block, on_base = np.abs(profile[:, 1]) < 25, np.abs(profile[:, 1]) > 35
+        assert np.median(profile[on_base, 2]) - np.median(profile[on_block, 2]) == pytest.approx(12.0, abs=0.1)
 
 
 @pytest.mark.slow

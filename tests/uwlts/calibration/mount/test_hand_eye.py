@@ -10,6 +10,7 @@ from tests.uwlts.sensor_profiles import half_way, joint_estimate, largest_parts
 from tests.virtual_sensors import scene_of
 from twin import render
 from uwlts.calibration.mount.hand_eye import BoardEvidence, BoardImage, estimate_board_pose, select_agreeing_images
+from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import KnownMedium
 from uwlts.model.mount import BoardFound
@@ -167,6 +168,22 @@ def test_a_target_in_water_gives_the_mount(thesis, capture_path, tmp_path):
     assert (np.abs(error) < 4 * mount.std()).all()
     mount.save(tmp_path / "mount.json")
     assert uwlts.read(tmp_path / "mount.json") == mount
+
+
+def test_a_mount_by_a_target_is_that_of_the_true_sheet(thesis, capture_path):
+    """The sensor's frame moves with its sheet: the covariance contains its shifts and rotations, by differences."""
+    known = joint_estimate(thesis)
+    mount = uwlts.calibrate_mount(capture_path, calibration=known.calibration)
+    from_camera, moved = mount.transform() @ np.linalg.inv(known.calibration.object_transform()), []
+    std = np.sqrt(np.diag(known.covariance))
+    for part in 0.1 * np.diag(std):
+        sheets = (known.parameters.sheet_model(known.values + sign * part) for sign in (1, -1))
+        frames = (from_camera @ object_frame(each, laser_axis=known.parameters.sheet.axis) for each in sheets)
+        moved.append(half_way(*frames) / 0.1)
+    by = np.array(mount.sensor.by_parameters) + np.array(moved).T / std
+    expected = np.array(mount.sensor.covariance_apart) + by @ known.covariance @ by.T
+    scale = np.outer(mount.std(), mount.std())
+    np.testing.assert_allclose(np.array(mount.covariance) / scale, expected / scale, atol=0.02)
 
 
 def test_wrong_evidence_is_refused(thesis, capture_path):

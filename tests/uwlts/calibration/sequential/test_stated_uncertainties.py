@@ -38,6 +38,7 @@ def test_the_command_prints_them(thesis):
     figures = {"camera": {"std": {"f": 1.25, "cx": 2.0, "cy": 3.5, "k1": 0.004}}, "sheet": {"normal_std_deg": 0.031}}
     nominal = nominal_calibration(thesis)
     lines = calibration_lines(nominal.model_copy(update={"residuals": figures}))
-    expected = "standard uncertainties: f 1.25 px, centre 2.00 and 3.50 px, k1 0.004, sheet's normal 0.031 deg"
-    assert expected in lines
+    assert f"  focal length: {nominal.camera.fx_px:.6g} ± 1.2 px" in lines
+    assert f"  row of the principal point: {nominal.camera.cy_px:.6g} ± 3.5 px" in lines
+    assert "  direction of the sheet's normal: ± 0.031 °" in lines
     assert not any("standard uncertainties" in line for line in calibration_lines(nominal))

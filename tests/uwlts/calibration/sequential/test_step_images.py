@@ -131,3 +131,12 @@ def test_a_turn_is_worth_a_warning_where_it_exceeds_the_heights_uncertainty():
     turn = StandardTurn(np.radians(1.0), None, np.radians(1.0))
     assert turn.doubt(height_mm=23.0, std_mm=0.0036) == ""
     assert "higher by 0.02 % or 0.004 mm" in turn.doubt(height_mm=23.0, std_mm=0.0034)
+
+
+@pytest.mark.parametrize(("expanded_mm", "count"), [(0.0115, 0), (0.007, 1), (None, 0)])
+def test_half_of_the_certificates_expanded_uncertainty_decides(expanded_mm, count):
+    """0.02 rad make 23 mm higher by 4.6 um; without a statement, the usual uncertainty is 10 um."""
+    standard = STANDARD.model_copy(update={"height_uncertainty_mm": expanded_mm})
+    steps = [replace(step, standard=standard) for step in turned_step("step.h5", aside=0.02, travel_mm=(0.0,))]
+    _, warnings = label_steps(AIR, DESCRIBED, steps, uncertainty=Uncertainty(step_height_mm=0.01))
+    assert len(warnings) == count

@@ -1,0 +1,1 @@
+from .report import evaluate_thesis as evaluate_thesis
