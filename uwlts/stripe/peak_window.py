@@ -121,7 +121,7 @@ class PeakWindow(NamedTuple):
         """Return the windows selected by a boolean mask or by indices."""
         which = np.flatnonzero(which) if which.dtype == np.bool_ else which
         chosen = PeakWindow.empty(len(which), self.window.shape[1], self.smoothing)
-        _copy_windows(self, which, chosen)
+        _copy_windows(self, which, np.empty(LANES, np.uintp), chosen)
         return chosen
 
     def first(self, count: int) -> PeakWindow:
@@ -344,16 +344,24 @@ def _smooth_windows(window: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> 
 
 
 @compiled
-def _copy_windows(peaks: PeakWindow, which: np.ndarray, out: PeakWindow) -> None:
-    """Copy chosen windows."""
+def _copy_windows(peaks: PeakWindow, which: np.ndarray, place: np.ndarray, out: PeakWindow) -> None:
+    """Copy chosen windows; ``place`` (LANES,) is a buffer."""
+    size, pixels = out.window.shape[1], peaks.window.reshape(peaks.window.size)
     for m in range(which.size):
         chosen = which[m]
-        group, k, to_group, to_k = chosen // LANES, chosen % LANES, m // LANES, m % LANES
-        for x in range(out.window.shape[1]):
-            out.window[to_group, x, to_k] = peaks.window[group, x, k]
         out.start[m], out.middle[m], out.sigma[m] = peaks.start[chosen], peaks.middle[chosen], peaks.sigma[chosen]
         out.reach[m], out.base[m] = peaks.reach[chosen], peaks.base[chosen]
         out.slope[m], out.height[m] = peaks.slope[chosen], peaks.height[chosen]
+    for group in range(out.window.shape[0]):
+        window = out.window[group]
+        for k in range(LANES):
+            chosen = which[min(group * LANES + k, which.size - 1)]
+            # Unsigned: compiled code does not examine whether these indices are negative.
+            place[k] = chosen // LANES * size * LANES + chosen % LANES
+        for x in range(size):
+            row = pixels[x * LANES :]
+            for k in range(LANES):
+                window[x, k] = row[place[k]]
 
 
 @compiled_part
