@@ -199,41 +199,42 @@ def measure_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, opti
 @compiled
 def _measure_lines(profiles: np.ndarray, jobs: _Jobs, count: int, rules: SearchRules) -> None:
     """Measure the first windows without moving them."""
-    _measure_jobs(profiles, jobs, 0, count, rules)
+    _measure_jobs(profiles, jobs, 0, count, 0, rules)
 
 
 @compiled_part
-def _measure_jobs(profiles: np.ndarray, jobs: _Jobs, first: int, end: int, rules: SearchRules) -> None:
-    """Cut and measure the windows from `first`, the beginning of a group, to `end`."""
+def _measure_jobs(profiles: np.ndarray, jobs: _Jobs, first: int, end: int, moves: int, rules: SearchRules) -> None:
+    """Cut and measure the windows from `first`, the beginning of a group, to `end`.
+
+    If ``moves`` is 1, windows that do not contain a half-height crossing or a flank of their peak are moved to it, and
+    measured again.
+    """
+    peaks, size = jobs.peaks, jobs.peaks.window.shape[1]
     for m in range(end, -(-end // LANES) * LANES):
-        jobs.peaks.start[m], jobs.line[m] = jobs.peaks.start[end - 1], jobs.line[end - 1]
+        peaks.start[m], jobs.line[m] = peaks.start[end - 1], jobs.line[end - 1]
     for group in range(first // LANES, -(-end // LANES)):
-        _measure_group(profiles, jobs, group, rules)
+        for attempt in range(1 + moves):
+            _cut_group(profiles, peaks.start, jobs.line, group, jobs.buffers.place, peaks.window[group])
+            measure_group(group, profiles.shape[0], rules, jobs.buffers, peaks, jobs.shape)
+            moved = False
+            for m in range(group * LANES, (group + 1) * LANES if attempt < moves else 0):
+                offset = _window_offset(jobs, m, size, rules)
+                peaks.start[m] += offset
+                moved |= offset != 0
+            if not moved:
+                break
 
 
-@compiled_part
-def _follow_peaks(profiles: np.ndarray, jobs: _Jobs, first: int, end: int, rules: SearchRules) -> None:
-    """Measure windows again that do not contain a half-height crossing or a flank of their peak, moved to it."""
-    size = jobs.peaks.window.shape[1]
-    for group in range(first // LANES, -(-end // LANES)):
-        moved = False
-        for m in range(group * LANES, (group + 1) * LANES):
-            offset = _window_offset(jobs, m, size, rules)
-            jobs.peaks.start[m] += offset
-            moved |= offset != 0
-        if moved:
-            _measure_group(profiles, jobs, group, rules)
-
-
-@compiled_part
-def _measure_group(profiles: np.ndarray, jobs: _Jobs, group: int, rules: SearchRules) -> None:
-    """Cut a group of windows and measure them; beyond the image the border pixel is repeated."""
-    m0, place, out = group * LANES, jobs.buffers.place, jobs.peaks.window[group]
-    last, size, lines = profiles.shape[0] - 1, out.shape[0], profiles.shape[1]
+@compiled_inline
+def _cut_group(
+    profiles: np.ndarray, start: np.ndarray, line: np.ndarray, group: int, place: np.ndarray, out: np.ndarray
+) -> None:
+    """Copy the pixels of a group of windows; beyond the image the border pixel is repeated."""
+    m0, last, size, lines = group * LANES, profiles.shape[0] - 1, out.shape[0], profiles.shape[1]
     pixels, lowest, highest = profiles.reshape(profiles.size), np.intp(0), np.intp(0)
     for k in range(LANES):
-        lowest, highest = min(lowest, jobs.peaks.start[m0 + k]), max(highest, jobs.peaks.start[m0 + k])
-        place[k] = jobs.peaks.start[m0 + k] * lines + jobs.line[m0 + k]
+        lowest, highest = min(lowest, start[m0 + k]), max(highest, start[m0 + k])
+        place[k] = start[m0 + k] * lines + line[m0 + k]
     if lowest >= 0 and highest + size - 1 <= last:
         for x in range(size):
             row = pixels[x * lines :]
@@ -242,8 +243,7 @@ def _measure_group(profiles: np.ndarray, jobs: _Jobs, group: int, rules: SearchR
     else:
         for k in range(LANES):
             for x in range(size):
-                out[x, k] = profiles[min(max(jobs.peaks.start[m0 + k] + x, 0), last), jobs.line[m0 + k]]
-    measure_group(group, profiles.shape[0], rules, jobs.buffers, jobs.peaks, jobs.shape)
+                out[x, k] = profiles[min(max(start[m0 + k] + x, 0), last), line[m0 + k]]
 
 
 @compiled
@@ -282,8 +282,7 @@ def _search_lines(
                 looked = True
         if not looked:
             break
-        _measure_jobs(profiles, jobs, first, end, rules)
-        _follow_peaks(profiles, jobs, first, end, rules)
+        _measure_jobs(profiles, jobs, first, end, 1, rules)
         for m in range(first, end):
             line = jobs.line[m]
             verdict = _classify_peak(jobs, m, profiles.shape[0], rules)
@@ -391,8 +390,7 @@ def _search_all(
                 end, looked = end + added, True
         if not looked:
             break
-        _measure_jobs(profiles, jobs, first, end, rules)
-        _follow_peaks(profiles, jobs, first, end, rules)
+        _measure_jobs(profiles, jobs, first, end, 1, rules)
         for m in range(first, end):
             row, count, known = jobs.block[m], 0, False
             verdict = _classify_peak(jobs, m, profiles.shape[0], rules)
