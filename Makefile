@@ -103,6 +103,8 @@ $(INSTALLED) $(FOR_TESTS): pyproject.toml
 		rm -rf $(VENV) && $(call create_venv,$(VENV),python3.13 python3.12 python3.11 python3); }
 	@echo "setup: installing the project and its libraries into $(VENV) (about a minute)"
 	@$(PYTHON) -m pip install --quiet --editable '.$(if $(filter $@,$(FOR_TESTS)),[test])'
+	@echo "setup: compiling the loops for stripes (some seconds)"
+	@$(PYTHON) -c "from uwlts.stripe import warm_up; warm_up()"
 	@touch $(INSTALLED) $@
 
 # Their wheels are for Python 3.11 and 3.12.
