@@ -104,6 +104,8 @@ $(INSTALLED) $(FOR_TESTS): pyproject.toml
 	@echo "setup: installing the project and its libraries into $(VENV) (about a minute)"
 	@$(PYTHON) -m pip install --quiet --no-compile --editable '.$(if $(filter $@,$(FOR_TESTS)),[test])'
 	@$(call write_bytecode,$(VENV))
+	@echo "setup: compiling the loops for stripes (some seconds)"
+	@$(PYTHON) -c "from uwlts.stripe import warm_up; warm_up()"
 	@touch $(INSTALLED) $@
 
 # Their wheels are for Python 3.11 and 3.12.

@@ -105,10 +105,9 @@ def search_profiles(
     status = np.full(lines, _NO_STRIPE, np.uint8)
     wide, several = np.zeros((2, lines), np.bool_)
     own, rival = np.full((2, lines), -1, np.intp)
-    _search_lines(profiles, board, jobs, rules, status, wide, several, own, rival)
-    chosen = own[status == _OK]
-    in_order = not chosen.size or chosen[-1] == chosen.size - 1
-    return status, wide, several, jobs.peaks.first(chosen.size) if in_order else jobs.peaks.select(chosen)
+    count = _search_lines(profiles, board, jobs, rules, status, wide, several, own, rival)
+    peaks = jobs.peaks.first(count) if count >= 0 else jobs.peaks.select(own[status == _OK])
+    return status, wide, several, peaks
 
 
 class _Jobs(NamedTuple):
@@ -200,51 +199,51 @@ def measure_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, opti
 @compiled
 def _measure_lines(profiles: np.ndarray, jobs: _Jobs, count: int, rules: SearchRules) -> None:
     """Measure the first windows without moving them."""
-    _measure_jobs(profiles, jobs, 0, count, rules)
+    _measure_jobs(profiles, jobs, 0, count, 0, rules)
 
 
 @compiled_part
-def _measure_jobs(profiles: np.ndarray, jobs: _Jobs, first: int, end: int, rules: SearchRules) -> None:
-    """Cut and measure the windows from `first`, the beginning of a group, to `end`."""
-    for group in range(first // LANES, -(-end // LANES)):
-        lanes = min(end - group * LANES, LANES)
-        _cut_group(profiles, jobs.peaks.start, jobs.line, group, lanes, jobs.peaks.window[group])
-        measure_group(group, lanes, profiles.shape[0], rules, jobs.buffers, jobs.peaks, jobs.shape)
+def _measure_jobs(profiles: np.ndarray, jobs: _Jobs, first: int, end: int, moves: int, rules: SearchRules) -> None:
+    """Cut and measure the windows from `first`, the beginning of a group, to `end`.
 
-
-@compiled_part
-def _follow_peaks(profiles: np.ndarray, jobs: _Jobs, first: int, end: int, rules: SearchRules) -> None:
-    """Measure windows again that do not contain a half-height crossing or a flank of their peak, moved to it."""
-    size = jobs.peaks.window.shape[1]
-    for group in range(first // LANES, -(-end // LANES)):
-        lanes, moved = min(end - group * LANES, LANES), False
-        for m in range(group * LANES, group * LANES + lanes):
-            offset = _window_offset(jobs, m, size, rules)
-            jobs.peaks.start[m] += offset
-            moved |= offset != 0
-        if moved:
-            _cut_group(profiles, jobs.peaks.start, jobs.line, group, lanes, jobs.peaks.window[group])
-            measure_group(group, lanes, profiles.shape[0], rules, jobs.buffers, jobs.peaks, jobs.shape)
-
-
-@compiled_part
-def _cut_group(
-    profiles: np.ndarray, start: np.ndarray, line: np.ndarray, group: int, lanes: int, out: np.ndarray
-) -> None:
-    """Copy the pixels of a group of windows; beyond the image the border pixel is repeated.
-
-    Windows of neighbouring lines that start at the same pixel are copied together, in the order of memory.
+    If ``moves`` is 1, windows that do not contain a half-height crossing or a flank of their peak are moved to it, and
+    measured again.
     """
-    last, m0, k = profiles.shape[0] - 1, group * LANES, 0
-    while k < lanes:
-        begin, at, end = start[m0 + k], line[m0 + k], k + 1
-        while end < lanes and start[m0 + end] == begin and line[m0 + end] == at + end - k:
-            end += 1
-        for x in range(out.shape[0]):
-            pixels = profiles[min(max(begin + x, 0), last)]
-            for n in range(end - k):
-                out[x, k + n] = pixels[at + n]
-        k = end
+    peaks, size = jobs.peaks, jobs.peaks.window.shape[1]
+    for m in range(end, -(-end // LANES) * LANES):
+        peaks.start[m], jobs.line[m] = peaks.start[end - 1], jobs.line[end - 1]
+    for group in range(first // LANES, -(-end // LANES)):
+        for attempt in range(1 + moves):
+            _cut_group(profiles, peaks.start, jobs.line, group, jobs.buffers.place, peaks.window[group])
+            measure_group(group, profiles.shape[0], rules, jobs.buffers, peaks, jobs.shape)
+            moved = False
+            for m in range(group * LANES, (group + 1) * LANES if attempt < moves else 0):
+                offset = _window_offset(jobs, m, size, rules)
+                peaks.start[m] += offset
+                moved |= offset != 0
+            if not moved:
+                break
+
+
+@compiled_inline
+def _cut_group(
+    profiles: np.ndarray, start: np.ndarray, line: np.ndarray, group: int, place: np.ndarray, out: np.ndarray
+) -> None:
+    """Copy the pixels of a group of windows; beyond the image the border pixel is repeated."""
+    m0, last, size, lines = group * LANES, profiles.shape[0] - 1, out.shape[0], profiles.shape[1]
+    pixels, lowest, highest = profiles.reshape(profiles.size), np.intp(0), np.intp(0)
+    for k in range(LANES):
+        lowest, highest = min(lowest, start[m0 + k]), max(highest, start[m0 + k])
+        place[k] = start[m0 + k] * lines + line[m0 + k]
+    if lowest >= 0 and highest + size - 1 <= last:
+        for x in range(size):
+            row = pixels[x * lines :]
+            for k in range(LANES):
+                out[x, k] = row[place[k]]
+    else:
+        for k in range(LANES):
+            for x in range(size):
+                out[x, k] = profiles[min(max(start[m0 + k] + x, 0), last), line[m0 + k]]
 
 
 @compiled
@@ -258,8 +257,11 @@ def _search_lines(
     several: np.ndarray,
     own: np.ndarray,
     rival: np.ndarray,
-) -> None:
-    """Fill `status`, `wide`, `several`, and the numbers of the windows of each line's stripe and a dimmer one."""
+) -> int:
+    """Fill `status`, `wide`, `several`, and the numbers of the windows of each line's stripe and a dimmer one.
+
+    Return the number of lines with a stripe, or -1 if their windows are not the first ones in the lines' order.
+    """
     near, peaks, end = jobs.buffers.values[: rules.block + 2], jobs.peaks, int(np.intp(0))
     for _ in range(_RULE.looks):
         _find_highest_blocks(board, jobs.highest, jobs.chosen)
@@ -271,7 +273,7 @@ def _search_lines(
             highest, least = jobs.highest[line], np.float32(rules.coarse)
             if status[line] == _OK:
                 several[line] |= highest >= _RULE.rival * rules.coarse
-                least = max(least, jobs.contrast[own[line]] * np.float32(rules.share * _RULE.coarse_slack))
+                least = max(least, np.float32(jobs.contrast[own[line]]) * np.float32(rules.share * _RULE.coarse_slack))
             if highest < least or highest <= 0:
                 jobs.active[line] = False
             else:
@@ -280,8 +282,7 @@ def _search_lines(
                 looked = True
         if not looked:
             break
-        _measure_jobs(profiles, jobs, first, end, rules)
-        _follow_peaks(profiles, jobs, first, end, rules)
+        _measure_jobs(profiles, jobs, first, end, 1, rules)
         for m in range(first, end):
             line = jobs.line[m]
             verdict = _classify_peak(jobs, m, profiles.shape[0], rules)
@@ -297,17 +298,22 @@ def _search_lines(
                 jobs.active[line] = verdict == _OK and rules.order == STRONGEST
                 continue
             # The flank of a wide stripe may have contrast in another block, which leads to the same stripe.
-            stripe = own[line]
+            stripe = int(own[line])
             if _distance(peaks, m, stripe) <= peaks.sigma[stripe] * np.float32(FWHM_PER_SIGMA):
                 continue
             if peaks.height[m] >= rules.share * peaks.height[stripe]:
                 status[line], several[line], jobs.active[line] = _AMBIGUOUS, True, False
             else:
                 rival[line] = m
+    count, in_order = int(np.intp(0)), True
     for line in range(status.size):
+        if status[line] == _OK:
+            in_order &= own[line] == count
+            count += 1
         if rival[line] >= 0:
             # Too dim to make the line ambiguous, but left in the board for a search of all stripes.
             board[jobs.block[rival[line]], line] = jobs.contrast[rival[line]]
+    return count if in_order else -1
 
 
 @compiled_part
@@ -384,8 +390,7 @@ def _search_all(
                 end, looked = end + added, True
         if not looked:
             break
-        _measure_jobs(profiles, jobs, first, end, rules)
-        _follow_peaks(profiles, jobs, first, end, rules)
+        _measure_jobs(profiles, jobs, first, end, 1, rules)
         for m in range(first, end):
             row, count, known = jobs.block[m], 0, False
             verdict = _classify_peak(jobs, m, profiles.shape[0], rules)
@@ -451,7 +456,7 @@ def _is_inside(highest: int, count: int) -> bool:
 
 @compiled_part
 def _choose_block(
-    board: np.ndarray, line: int, highest: np.number, chosen: int, least: np.float32, rules: SearchRules
+    board: np.ndarray, line: int, highest: np.number, chosen: int, least: float | np.floating, rules: SearchRules
 ) -> int:
     """Return a line's block by the rule, among those of at least `least` contrast; `chosen` is the highest one.
 
