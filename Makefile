@@ -102,7 +102,8 @@ $(INSTALLED) $(FOR_TESTS): pyproject.toml
 	@$(PYTHON) -m pip --version >/dev/null 2>&1 || { \
 		rm -rf $(VENV) && $(call create_venv,$(VENV),python3.13 python3.12 python3.11 python3); }
 	@echo "setup: installing the project and its libraries into $(VENV) (about a minute)"
-	@$(PYTHON) -m pip install --quiet --editable '.$(if $(filter $@,$(FOR_TESTS)),[test])'
+	@$(PYTHON) -m pip install --quiet --no-compile --editable '.$(if $(filter $@,$(FOR_TESTS)),[test])'
+	@$(call write_bytecode,$(VENV))
 	@echo "setup: compiling the loops for stripes (some seconds)"
 	@$(PYTHON) -c "from uwlts.stripe import warm_up; warm_up()"
 	@touch $(INSTALLED) $@
@@ -113,7 +114,9 @@ $(OLDEST)/.installed: pyproject.toml tests/oldest.py | $(INSTALLED)
 	@$(call create_venv,$(OLDEST),python3.11 python3.12)
 	@echo "setup: installing the oldest allowed libraries into $(OLDEST) (about a minute)"
 	@$(PYTHON) -m tests.oldest test >$(OLDEST)/oldest.txt
-	@$(OLDEST)/bin/python -m pip install --quiet --only-binary :all: --editable . --requirement $(OLDEST)/oldest.txt
+	@$(OLDEST)/bin/python -m pip install --quiet --no-compile --only-binary :all: --editable . \
+		--requirement $(OLDEST)/oldest.txt
+	@$(call write_bytecode,$(OLDEST))
 	@touch $@
 
 clean:
@@ -135,6 +138,10 @@ $(1) 2>/dev/null || { \
 	$(1); \
 }
 endef
+
+# Writes the bytecode of the libraries of the environment $(1) on all processors; pip would do it on one, in twice the
+# time. Some libraries contain files for other Pythons, which do not compile.
+write_bytecode = $(1)/bin/python -m compileall -q -j 0 $(1)/lib >/dev/null 2>&1 || true
 
 # Makes the environment $(1) with the first of the Pythons $(2) that is new enough and brings pip along; on Debian pip
 # comes with an extra package.

@@ -18,14 +18,21 @@ CORPUS = Path(__file__).with_name("corpus")
 CASES = 500
 
 
-def test_past_failures_are_refused(tmp_path: Path):
-    files = {}
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
+    """Return the outcomes of the corpus, by path, and of past failures, by their words. One process reads them all."""
+    folder = tmp_path_factory.mktemp("stored")
+    files = {str(path): (path.name.split("--")[0], str(path)) for path in sorted(CORPUS.glob("*--*"))}
     for number, (words, (reader, build)) in enumerate(PAST.items()):
-        (tmp_path / reader).mkdir(exist_ok=True)
-        path = tmp_path / reader / f"past-{number}{READERS[reader].suffix}"
+        (folder / reader).mkdir(exist_ok=True)
+        path = folder / reader / f"past-{number}{READERS[reader].suffix}"
         build(path)
         files[words] = reader, str(path)
-    outcomes = dict(zip(files, watched(tmp_path, files.values()), strict=True))
+    return dict(zip(files, watched(folder, files.values()), strict=True))
+
+
+def test_past_failures_are_refused(stored: dict[str, Outcome]):
+    outcomes = {words: stored[words] for words in PAST}
     assert {words: each.fault for words, each in outcomes.items() if each.fault} == {}
     # An altered certificate is reported, not rejected.
     assert [words for words, each in outcomes.items() if not each.refusal] == []
@@ -34,10 +41,9 @@ def test_past_failures_are_refused(tmp_path: Path):
     assert "is an HDF5 file, such as a capture" in outcomes["capture as a calibration"].refusal
 
 
-def test_corpus(tmp_path: Path):
-    files = sorted(path for path in CORPUS.iterdir() if "--" in path.name)
-    outcomes = watched(tmp_path, [(path.name.split("--")[0], str(path)) for path in files])
-    assert [each for each in outcomes if each.fault] == []
+def test_corpus(stored: dict[str, Outcome]):
+    outcomes = [outcome for name, outcome in stored.items() if name not in PAST]
+    assert outcomes and [each for each in outcomes if each.fault] == []
 
 
 @pytest.fixture(scope="module")

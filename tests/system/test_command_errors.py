@@ -262,7 +262,13 @@ def test_wrong_command_line(fails, folder: Path, monkeypatch, line: str, says: s
 
 
 @pytest.mark.parametrize(
-    "line", ["uwlts bogus", "uwlts info missing.h5", "twin simulate --out x.h5", "twin simulate no-scene --out x.h5"]
+    "line",
+    [
+        "uwlts info missing.h5",
+        "twin simulate --out x.h5",
+        pytest.param("uwlts bogus", marks=pytest.mark.slow),
+        pytest.param("twin simulate no-scene --out x.h5", marks=pytest.mark.slow),
+    ],
 )
 def test_as_a_process_of_its_own(tmp_path: Path, line: str):
     program, *arguments = line.split()

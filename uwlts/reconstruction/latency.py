@@ -153,8 +153,11 @@ class _Surface:
         t = ((places - self.position[left]) / gap)[:, None]
         h = gap[:, None]
         a, b, da, db = self.centre[left], self.centre[left + 1], self.slope[left] * h, self.slope[left + 1] * h
-        value = a + t * da + t**2 * (3 * (b - a) - 2 * da - db) + t**3 * (2 * (a - b) + da + db)
-        slope = (da + 2 * t * (3 * (b - a) - 2 * da - db) + 3 * t**2 * (2 * (a - b) + da + db)) / h
+        rise = b - a
+        cubic = da + db - 2 * rise
+        square = rise - da - cubic
+        value = a + t * (da + t * (square + t * cubic))
+        slope = (da + t * (2 * square + 3 * t * cubic)) / h
         away = other.centre - value
         good = np.isfinite(away) & ((t >= 0) & (t <= 1))
         return away[good], slope[good], other.slope[good]

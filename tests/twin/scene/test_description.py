@@ -40,11 +40,12 @@ def test_every_shipped_sensor_loads(name):
 @pytest.mark.parametrize(("name", "place"), PLACES)
 def test_every_shipped_scene_stands_before_the_thesis_sensor(thesis, name, place):
     scene = load_scene(name, placement=place)
-    assert built(scene).scene.bbox().valid()
     assert len(scene.object_poses()) == len(scene.objects)
     window = {"mounted": scene.window_mounted}
     sensor = altered(thesis, {"camera": {"window": window}})
-    check_scene(Renderer(sensor, medium_of(sensor, scene), scene), scene)
+    renderer = Renderer(sensor, medium_of(sensor, scene), scene)
+    assert renderer.objects.scene.bbox().valid()
+    check_scene(renderer, scene)
 
 
 def written(folder, text: str, *, name: str = "sensor.toml"):
@@ -249,6 +250,18 @@ def test_a_placement_may_be_chosen_and_must_be_known():
 def test_a_medium_that_the_sensor_does_not_know_is_refused(thesis):
     with pytest.raises(DescriptionError, match="'thesis' knows the media air, water, not 'oil'"):
         medium_of(thesis, scene_of(plate(), medium="oil"))
+
+
+def test_the_water_of_a_scene_replaces_that_of_the_sensor(thesis):
+    own = thesis.medium("water")
+    clear, turbid, named = (medium_of(thesis, scene_of(plate(), water=water)) for water in (None, 1.5, "jerlov-III"))
+    assert clear == own and turbid.turbidity == 1.5 and named.water == "jerlov-III"
+    for medium in (turbid, named):
+        assert (medium.kind, medium.temperature_c, medium.salinity_g_kg) == (
+            own.kind,
+            own.temperature_c,
+            own.salinity_g_kg,
+        )
 
 
 MESH = "title = 't'\n[[objects]]\nkind = 'mesh'\npath = 'part.stl'\n"

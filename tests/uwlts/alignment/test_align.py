@@ -1,12 +1,14 @@
 """Alignment of a trajectory by its crossings: against the true path of a simulated vehicle over a sea bed."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import uwlts
 from tests.uwlts.path_views import ride
+from uwlts.alignment.align import Crossing
 from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.crossing_search import correlate_heights
 from uwlts.cli import app
@@ -52,10 +54,25 @@ def loop():
     return ride(np.random.default_rng(SEED), LOOP_MM, drift_mm=60.0, drift_deg=0.3)
 
 
+class Written:
+    """What the command writes for a cloud and its reported path: the trajectory, the cloud and the crossings."""
+
+    def __init__(self, folder: Path, cloud: PointCloud, reported: Trajectory):
+        cloud.save(folder / "pass.h5")
+        reported.save(folder / "pass.csv")
+        words = ["align", folder / "pass.h5", "--trajectory", folder / "pass.csv", "--drift-mm", 60, "--drift-deg", 0.3]
+        words += ["--out", folder / "corrected.csv", "--aligned", folder / "aligned.h5"]
+        app([str(word) for word in words], result_action="return_value")
+        self.trajectory: Trajectory = uwlts.read(folder / "corrected.csv", pose_format="quaternion-xyzw")
+        self.cloud: PointCloud = uwlts.read(folder / "aligned.h5")
+        self.record = json.loads((folder / "corrected.json").read_text())
+        self.crossings = [Crossing(**each) for each in self.record["crossings"]]
+
+
 @pytest.fixture(scope="module")
-def closed(loop):
+def closed(loop, tmp_path_factory):
     cloud, reported, _ = loop
-    return uwlts.align_trajectory(cloud, reported, drift_mm=60.0, drift_deg=0.3)
+    return Written(tmp_path_factory.mktemp("closed"), cloud, reported)
 
 
 def test_shifts_are_found_in_heights_with_gaps():
@@ -200,15 +217,8 @@ def test_wrong_input_is_refused(loop):
         uwlts.align_trajectory(straight, reported, drift_mm=60.0, drift_deg=0.3)
 
 
-def test_the_command_writes_a_trajectory_with_covariance(loop, tmp_path, monkeypatch):
+def test_the_command_writes_a_trajectory_with_covariance(loop, closed):
     cloud, reported, _ = loop
-    monkeypatch.chdir(tmp_path)
-    cloud.save("pass.h5")
-    reported.save("pass.csv")
-    words = ["align", "pass.h5", "--trajectory", "pass.csv", "--drift-mm", "60", "--drift-deg", "0.3"]
-    app([*words, "--out", "corrected.csv", "--aligned", "aligned.h5"], result_action="return_value")
-    corrected = uwlts.read("corrected.csv", pose_format="quaternion-xyzw")
-    assert corrected.covariance is not None and len(corrected.times_s) == len(reported.times_s)
-    record = json.loads((tmp_path / "corrected.json").read_text())
-    assert record["crossings"] and record["largest_shift_mm"] > 10
-    assert len(uwlts.read("aligned.h5")) == len(cloud)
+    assert closed.trajectory.covariance is not None and len(closed.trajectory.times_s) == len(reported.times_s)
+    assert closed.record["crossings"] and closed.record["largest_shift_mm"] > 10
+    assert len(closed.cloud) == len(cloud)

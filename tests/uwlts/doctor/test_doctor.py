@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
+from tests.system.in_process import uwlts
 from twin.devices.grbl_controller import BENCH_SETTINGS, GrblController
 from uwlts.doctor import devices, libraries, machine
 from uwlts.doctor.machine import Finding, examine_renderer
@@ -60,15 +61,7 @@ def as_nobody(program: str) -> str:
 # The command
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess:
-    return doctor(folder=tmp_path_factory.mktemp("empty"))
-
-
-def test_a_machine_on_which_the_tests_run_lacks_nothing_required(whole):
-    assert whole.returncode == 0, whole.stdout + whole.stderr
-    assert not other_than_progress(whole.stderr)
-    assert "nothing that is required is missing" in whole.stdout
+def assert_all_is_examined(said: str) -> None:
     devices_of_all = ("Aravis", "camera", "GenTL producer", "serial port")
     for subject in (
         "Python",
@@ -80,7 +73,16 @@ def test_a_machine_on_which_the_tests_run_lacks_nothing_required(whole):
         "clock",
         *devices_of_all,
     ):
-        assert re.search(rf"^ ?(ok|optional|warning) +{subject}", whole.stdout, re.MULTILINE), subject
+        assert re.search(rf"^ ?(ok|optional|warning) +{subject}", said, re.MULTILINE), subject
+
+
+@pytest.mark.slow
+def test_a_machine_on_which_the_tests_run_lacks_nothing_required(tmp_path):
+    ended = doctor(folder=tmp_path)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert not other_than_progress(ended.stderr)
+    assert "nothing that is required is missing" in ended.stdout
+    assert_all_is_examined(ended.stdout)
 
 
 def test_a_broken_library_ends_in_exit_code_1_without_a_traceback(tmp_path):
@@ -96,10 +98,13 @@ def test_a_broken_library_ends_in_exit_code_1_without_a_traceback(tmp_path):
     assert re.search(r"--force-reinstall --no-deps 'numpy>=.*'$", ended.stdout, re.M)
 
 
-def test_devices_that_are_named_and_missing_end_in_exit_code_1(tmp_path):
-    ended = doctor("--camera", "replay:nothing", "--stage", str(tmp_path / "tty"), folder=tmp_path)
+def test_devices_that_are_named_and_missing_end_in_exit_code_1(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ended = uwlts("doctor", "--camera", "replay:nothing", "--stage", tmp_path / "tty")
     assert ended.returncode == 1 and not other_than_progress(ended.stderr)
+    # Nothing else is missing.
     assert "missing: camera, stage; " in ended.stdout
+    assert_all_is_examined(ended.stdout)
     assert "there is no such port" in re.sub(r"\s+", " ", ended.stdout)
 
 

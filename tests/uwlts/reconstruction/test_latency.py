@@ -8,7 +8,7 @@ from uwlts.reconstruction.latency import measure_latency
 
 SPEED = 20.0  # mm/s
 POSITIONS = np.arange(-30.0, 30.0, 0.5)
-LINES = np.arange(240)
+LINES = np.arange(120)
 GRAIN = 4
 """Neighbouring lines with the same error, as in speckle."""
 
