@@ -26,10 +26,6 @@ from docs.studies.result_tables import ROOT, publish, table
 from uwlts.calibration.camera.lens import LensChoice, calibrate_lens
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.guidance.pose_advice import estimate_pose
-from uwlts.calibration.joint.gathering import gather_jointly
-from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.joint.residuals import STRIPE
-from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, CalibrationResult, gather, solve
 from uwlts.calibration.sequential.sheet_fit import points_on_target
 from uwlts.fitting.least_squares import MAD_TO_STD
@@ -146,28 +142,24 @@ def windows(centre_px: np.ndarray) -> list[np.ndarray]:
     return [run[at : at + LINES] for run in runs for at in range(0, len(run) - LINES + 1, LINES)]
 
 
-def stripe_residuals(groups: Sequence[np.ndarray], shared: float) -> np.ndarray:
-    """Return noise, scatter about parabolas, that of means, and stated noise (4, G) of groups of windows (W, `LINES`).
-
-    ``shared`` is the stated variance of means relative to independent centres.
-    """
+def stripe_residuals(groups: Sequence[np.ndarray]) -> np.ndarray:
+    """Return stated noise, scatter about parabolas, and that of means (3, G) of groups of windows (W, `LINES`)."""
     result = []
     for group in groups:
         frame, line = np.indices(group.shape)
         noise = float(estimate_stripe_noise_px(frame.ravel(), line.ravel(), group.ravel()).mean())
         smooth = np.exp(np.log([smooth_residuals(each) for each in group]).mean(axis=0))
-        result.append([noise, *smooth, noise * math.sqrt(shared)])
+        result.append([noise, *smooth])
     return np.array(result).T
 
 
-def stripe_rows(name: str, halves: Sequence[list[np.ndarray]], *, shared: float = 1.0) -> Iterator[Row]:
+def stripe_rows(name: str, halves: Sequence[list[np.ndarray]]) -> Iterator[Row]:
     """Yield the rows of a stripe from the groups of both halves; the second is empty if it is not known yet."""
-    first, *second = (stripe_residuals(half, shared) for half in halves if half)
+    first, *second = (stripe_residuals(half) for half in halves if half)
     others = len(halves[0])
     for k, residual in enumerate(("centre noise", "centres about parabolas", "means of 8 centres, times root 8")):
         found = second[0][k] if second else ()
-        stated = first[0] if k == 0 else first[3]
-        yield Row.of(name, residual, "px", first[k], found, others=others, stated=stated)
+        yield Row.of(name, residual, "px", first[k], found, others=others, stated=first[0])
 
 
 def single_images(measured: bool) -> Iterator[Row]:
@@ -269,7 +261,7 @@ def etna(measured: bool, folder: Path) -> Iterator[Row]:
     (folder / "import.toml").write_text(ETNA)
     import_images(DATA / "etna", folder / "etna.h5", description=folder / "import.toml")
     with Capture(folder / "etna.h5") as capture:
-        evidence, jointly = gather([capture], [], options=OPTIONS), gather_jointly([capture], [], options=OPTIONS)
+        evidence = gather([capture], [], options=OPTIONS)
         stripes = find_stripes(capture)
         numbers = np.unique(stripes.frame)
         first, second = numbers[::2], numbers[1::2]
@@ -281,17 +273,13 @@ def etna(measured: bool, folder: Path) -> Iterator[Row]:
         def only(some: np.ndarray) -> CalibrationResult:
             return solve(replace(evidence, air=air.only(some, [air.images[n] for n in some])), options=OPTIONS)
 
-        (series,) = jointly.series
-        half = series.found.only(chosen, [series.found.images[n] for n in chosen])
-        joint = solve_jointly(replace(jointly, series=[replace(series, found=half)]), options=OPTIONS).calibration
         groups = []
         for number in numbers:
             centre = np.full(capture.header.sensor.camera.height_px, np.nan)
             own = stripes[stripes.frame == number]
             centre[own.line] = own.centre_px
             groups.append(np.array(windows(centre)))
-        shared = require_joint(joint).shared_variance[STRIPE]
-        yield from stripe_rows(name, (groups[::2], groups[1::2] if measured else []), shared=shared)
+        yield from stripe_rows(name, (groups[::2], groups[1::2] if measured else []))
         yield from camera_rows(name, air.images, (1280, 1024), measured)
 
         sensor = only(chosen)

@@ -1,7 +1,8 @@
 """Mutation testing, the fraction of small faults that tests detect: ``python -m tests.bench.mutants [package ...]``.
 
 Mutants of each package are drawn at random with Cosmic Ray's operators: another arithmetic operator, comparison, sign,
-number or truth value, or a loop left out. Annotations are not changed. Each mutant is tested in a copy of the checkout:
+number or truth value, or a loop left out. Not changed is what has no effect on results: annotations, options of
+dataclasses, and ``strict`` of ``zip``. Each mutant is tested in a copy of the checkout:
 first with the tests that run the changed line, shortest first, then with the other tests of their files. Slow tests
 are left out. ``--whole`` runs all fast tests of the package instead, which takes less time for few mutants.
 ``--again FILE`` runs all tests on the survivors of earlier results. A mutant survives if no test fails;
@@ -90,6 +91,16 @@ class Result:
     after: str
 
 
+def places_without_effect(source: str) -> set[tuple[int, int]]:
+    """Line and column of the options of dataclasses and of ``strict``."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            names = {"eq", "frozen", "repr", "kw_only"} if ast.unparse(node.func) == "dataclass" else {"strict"}
+            found |= {(each.value.lineno, each.value.col_offset) for each in node.keywords if each.arg in names}
+    return found
+
+
 def annotated_lines(source: str) -> set[tuple[int, int]]:
     """Line and column of everything within annotations of types."""
     found = set()
@@ -111,7 +122,7 @@ def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
         if any(path.is_relative_to(other) for other in within):
             continue
         source, file = path.read_text(), str(path.relative_to(ROOT))
-        annotated, tree = annotated_lines(source), get_ast(source)
+        annotated, unchanged, tree = annotated_lines(source), places_without_effect(source), get_ast(source)
         for name in operator_names():
             short = name.removeprefix("core/")
             kind, *between = short.split("_")
@@ -122,7 +133,7 @@ def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
             positions = [at for node in ast_nodes(tree) for at in operator.mutation_positions(node)]
             for occurrence, ((line, column), _) in enumerate(positions):
                 in_annotation = any(at[0] == line and abs(at[1] - column) <= 40 for at in annotated)
-                if not (in_annotation and "BitOr" in short):
+                if not (in_annotation and "BitOr" in short) and (line, column) not in unchanged:
                     places.setdefault((file, line, column), []).append(Mutant(package, file, line, short, occurrence))
     chosen = rng.sample(sorted(places), min(number, len(places)))
     return [rng.choice(places[place]) for place in chosen]

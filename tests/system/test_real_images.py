@@ -24,6 +24,7 @@ from uwlts.errors import CaptureError
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import PlaneFound
 from uwlts.model.parameter_keys import LensParameter
+from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px, measure_correlation
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_ import import_images
@@ -108,6 +109,31 @@ def test_the_stripe_runs_over_the_bust(tmp_path: Path):
     brightest = cv2.GaussianBlur(lit.astype(np.float32) - dark, (0, 0), 3).argmax(axis=1)
     away = np.abs(stripe.centre_px[good] - brightest[good])
     assert np.mean(away < 5) > 0.98
+
+
+def test_a_cloud_warns_of_a_camera_that_smooths_its_images(tmp_path: Path, etna: Capture):
+    """Its noise, the difference of two images beside the stripe, is correlated by 0.84 from line to line."""
+    with imported(tmp_path, "bust", LASER_AND_BACKGROUND) as capture:
+        cloud = uwlts.reconstruct(capture, uwlts.nominal(capture.header.sensor, medium="air"))
+    lit, dark = (
+        cv2.imread(str(DATA / "ciclop" / "bust" / f"{name}_x400_y0.png"))[:, :60, 2].astype(float)
+        for name in ("laser", "laser-background")
+    )
+    noise = (lit - dark) - np.mean(lit - dark)
+    assert np.mean(noise[1:] * noise[:-1]) > 0.7 * np.mean(noise**2)
+    assert any("smooths or compresses" in said for said in cloud.warnings)
+    stripes = find_stripes(etna)
+    noise = estimate_stripe_noise_px(stripes.frame, stripes.line, stripes.centre_px)
+    assert measure_correlation(stripes.frame, stripes.line, stripes.centre_px) < 2
+    # The scatter about parabolas, without its largest tenth at the board's edges.
+    scatter = []
+    for frame in np.unique(stripes.frame):
+        own = np.flatnonzero(stripes.frame == frame)
+        for run in np.split(own, np.arange(64, len(own), 64))[:-1]:
+            line, centre = stripes.line[run], stripes.centre_px[run]
+            away = centre - np.polynomial.Polynomial.fit(line, centre, 2)(line)
+            scatter.append(np.std(away) / noise[run[0]])
+    assert len(scatter) > 150 and 0.5 < np.median(scatter) < 1.5
 
 
 @pytest.mark.parametrize(("peak", "column"), [(PeakRule.FIRST, 275), (PeakRule.LAST, 590)])

@@ -197,12 +197,10 @@ def predict(
         Number of campaigns.
     first
         Seed of the first campaign; the others follow.
-    every
-        Take only every n-th profile of the scans; calibrations keep all images.
-    workers
-        Number of parallel recordings (default: number of processors).
     overwrite
         Render everything again.
+    every, workers
+        As for `record`.
     spp, variant
         As for `simulate`.
     progress

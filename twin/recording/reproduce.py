@@ -43,18 +43,12 @@ def reproduce(
         summary.json.
     out
         Folder for campaigns and report (default: runs/CAMPAIGN). Complete recordings in it are kept.
-    campaigns
-        Number of campaigns.
-    first
-        Seed of the first campaign; the others follow.
-    every
-        Take only every n-th profile of the scans; calibrations keep all images.
     trials
         Trials of the Monte Carlo propagation of every campaign: at least 20, or 0 to skip it.
-    workers
-        Number of parallel recordings (default: number of processors).
     overwrite
         Render and evaluate everything again.
+    campaigns, first, every, workers
+        As for `predict`.
     spp, variant
         As for `simulate`.
     progress

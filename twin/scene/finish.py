@@ -161,13 +161,14 @@ def read_grey(path: str | Path) -> np.ndarray:
     return grey if grey.ndim == 2 else grey @ _LUMINANCE
 
 
-def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray, *, samples: int = 4096) -> np.ndarray:
+def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray) -> np.ndarray:
     """Return the directional-hemispherical reflectance (N,) of a surface for cosines (N,) of the incidence angle.
 
     As BSDFs are reciprocal, it is also the radiance towards that direction under a uniform sky of radiance 1. The
     integral is the mean of Mitsuba's sample weights over a rank-1 lattice with the generalised golden ratio (Roberts
     2018), accurate to 1e-3.
     """
+    samples = 4096
     index = dr.arange(mi.UInt32, len(cosines) * samples)
     sample = cast(Float, mi.Float(index % samples))
     si = dr.zeros(mi.SurfaceInteraction3f, len(cosines) * samples)

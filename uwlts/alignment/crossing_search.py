@@ -21,6 +21,7 @@ from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nodes, refit, solve
 from uwlts.fitting.least_squares import rms_distance
+from uwlts.fitting.shapes import perpendicular_to
 from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -42,26 +43,24 @@ def accept_crossings(estimate: PathEstimate, progress: ProgressListener = ignore
     doubtful: list[Pair] = []
     count, ahead = len(estimate.pieces), estimate.options.decided_after
     within_reach = hypotheses = 0
-
-    def beside(pair: Pair, others: list[Pair]) -> bool:
-        return any(max(abs(pair[0] - first), abs(pair[1] - second)) <= ahead for first, second in others)
-
     for number in range(count):
         for pair in ((earlier, number) for earlier in range(number - 2)):
             if pair in estimate.pairs or (reach := _search_range(estimate, pair)) is None:
                 continue
             found = _find_hypotheses(estimate, pair, reach)
             within_reach, hypotheses = within_reach + 1, hypotheses + len(found)
-            waiting += [] if beside(pair, doubtful) else found
+            waiting += [] if _is_beside(pair, doubtful, ahead) else found
         while waiting and (number - min(each.pair[1] for each in waiting) >= ahead or number == count - 1):
             best = max(waiting, key=lambda each: each.patches)
             waiting.remove(best)
             closed = accept_hypothesis(estimate, best)
             if closed is None:
                 continue
-            if _has_rival(estimate, closed, best, [each for each in waiting if beside(each.pair, [best.pair])]):
+            if _has_rival(
+                estimate, closed, best, [each for each in waiting if _is_beside(each.pair, [best.pair], ahead)]
+            ):
                 doubtful.append(best.pair)
-                waiting = [each for each in waiting if not beside(each.pair, doubtful)]
+                waiting = [each for each in waiting if not _is_beside(each.pair, doubtful, ahead)]
                 continue
             estimate = add_overlaps(closed, number + 1)
             waiting = [each for each in waiting if each.pair not in estimate.pairs and _is_likely(estimate, each)]
@@ -69,6 +68,11 @@ def accept_crossings(estimate: PathEstimate, progress: ProgressListener = ignore
     estimate = add_overlaps(estimate, count)
     left_out = tuple(pair for pair in doubtful if pair not in estimate.pairs)
     return Search(estimate, left_out, within_reach, hypotheses)
+
+
+def _is_beside(pair: Pair, others: list[Pair], within: int) -> bool:
+    """Check whether both pieces of a pair are within a number of pieces of those of another."""
+    return any(max(abs(pair[0] - first), abs(pair[1] - second)) <= within for first, second in others)
 
 
 def accept_hypothesis(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstimate | None:
@@ -118,9 +122,7 @@ def _find_hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> l
     """
     other, own = (estimate.surface(number) for number in pair)
     normal = np.linalg.eigh(other.normals.T @ other.normals)[1][:, 2]
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    frame = np.stack([first, np.cross(normal, first), normal])
+    frame = np.stack([*perpendicular_to(normal), normal])
     near = [range(max(0, k - 1), min(len(estimate.pieces), k + 2)) for k in pair[::-1]]
     clouds = [np.vstack([estimate.points(k) for k in numbers]) @ frame.T for numbers in near]
     options, drift, part = estimate.options, estimate.prior.drift, 1 / len(estimate.pieces)
@@ -200,7 +202,11 @@ def correlate_heights(
     with np.errstate(invalid="ignore", divide="ignore"):
         similarity = np.where(enough & (spread > options.least_spread * usual), both / np.sqrt(spread), 0.0)
     score = np.where(similarity > options.least_correlation, similarity * np.sqrt(count), -np.inf)
-    steps = [np.where(np.arange(n) > n // 2, np.arange(n) - n, np.arange(n)) for n in sizes]
+    # The largest shift is that of the target's last row onto the source's first one; later rows are negative shifts.
+    steps = [
+        np.where(np.arange(n) < rows, np.arange(n), np.arange(n) - n)
+        for n, rows in zip(sizes, maps[1][0].shape, strict=True)
+    ]
     outside = [np.abs(each * pixel_mm) > reach + pixel_mm for each, reach in zip(steps, reach_mm[:2], strict=True)]
     score[outside[0][:, None] | outside[1]] = -np.inf
     # The width of a peak is that of the compared structures.

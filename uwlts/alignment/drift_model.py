@@ -91,10 +91,7 @@ class DriftModel:
 def choose_drift_model(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> DriftModel:
     """Return the drift model from the covariance of a trajectory, or from given standard deviations.
 
-    Raises
-    ------
-    EvaluationError
-        The given values are not valid, or no covariance is stated.
+    Raises EvaluationError if the given values are not valid, or no covariance is stated.
     """
     if drift_mm is not None and drift_deg is not None:
         return DriftModel.of_size(drift_mm, drift_deg)

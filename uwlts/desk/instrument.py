@@ -174,18 +174,7 @@ class Instrument:
     def scan(self, plan: ScanPlan, out: Path, *, calibration: Path | None, resume: bool, overwrite: bool) -> None:
         """Record a scan by a plan, in the worker thread.
 
-        Parameters
-        ----------
-        plan
-            Plan of the scan.
-        out
-            Capture to write.
-        calibration
-            File of a calibration for a cloud that grows during the scan; None: no cloud.
-        resume
-            Continue an interrupted capture.
-        overwrite
-            Replace an existing capture.
+        A ``calibration`` gives a cloud that grows during the scan. ``resume`` continues an interrupted capture.
         """
         self._ask(lambda: self._scan(plan, out, calibration, resume, overwrite))
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from uwlts.desk.scan_service import ScanService
-from uwlts.errors import DescriptionError, Error, SetupError
+from uwlts.errors import Error, SetupError
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
@@ -104,10 +104,7 @@ def serve_ros(
     with ExitStack() as stack:
         opened, moved = None, None
         if isinstance(source, ScanPlan):
-            address, port = camera or source.camera, stage or source.stage.port
-            if address is None or port is None:
-                what = "camera" if address is None else "stage"
-                raise DescriptionError(f"the plan names no {what}: give `{what}`")
+            address, port = source.devices(camera=camera, stage=stage)
             moved, opened = stack.enter_context(GrblStage(port)), stack.enter_context(open_camera(address))
         rclpy.init()
         stack.callback(rclpy.try_shutdown)

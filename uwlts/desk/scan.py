@@ -102,10 +102,7 @@ def scan(
     """
     refuse_unsuitable(Path(out), overwrite=overwrite, endings=CAPTURES)
     plan, out = plan if isinstance(plan, ScanPlan) else load_plan(Path(plan)), Path(out)
-    address, serial_port = camera or plan.camera, stage or plan.stage.port
-    if address is None or serial_port is None:
-        what = "camera" if address is None else "stage"
-        raise DescriptionError(f"the plan names no {what}: give `{what}`")
+    address, serial_port = plan.devices(camera=camera, stage=stage)
     if calibration:
         if not watch:
             raise DescriptionError("`calibration` is for the cloud on the page: give `watch` too")

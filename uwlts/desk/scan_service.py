@@ -29,29 +29,9 @@ class ScanService:
     """Scans on request, one at a time, each in a thread of its own: recorded by a plan, or played from a capture.
 
     `start`, `stop` and `laser_off` return at once, with a text for the caller; they raise Error if refused. ``publish``
-    is called with the points of each laser image, and the time of the image in s since the start of the scan.
-
-    Parameters
-    ----------
-    source
-        Plan of scans, or capture to play; it may still be recorded by another program.
-    calibration
-        Calibration of the sensor.
-    publish
-        Receives clouds and times.
-    folder
-        Folder of the captures.
-    camera, stage
-        Open camera and stage; None to play a capture.
-    home, unlock
-        Home the stage, or accept its position, before a scan for which it is locked.
-    report
-        Receives lines of text.
-
-    Attributes
-    ----------
-    scans : int
-        Number of scans begun.
+    is called with the points of each laser image, and the time of the image in s since the start of the scan. A played
+    capture may still be recorded by another program; it needs neither camera nor stage. ``home`` homes the stage before
+    a scan for which it is locked, ``unlock`` accepts its position. ``scans`` is the number of scans begun.
     """
 
     def __init__(

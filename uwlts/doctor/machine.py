@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Literal
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 Status = Literal["ok", "optional", "warning", "missing"]
 
 _STYLES = {"ok": "green", "optional": "dim", "warning": "yellow", "missing": "bold red"}
-_WIDTH = 110  # of a table that is not shown in a terminal, characters
 
 
 @dataclass(frozen=True)
@@ -172,11 +170,11 @@ def examine_renderer() -> list[Finding]:
     return [Finding("libLLVM", "warning", f"the twin cannot render: {reason}", advice)]
 
 
-def print_findings(findings: Sequence[Finding], *, console: Console | None = None) -> None:
+def print_findings(findings: Sequence[Finding]) -> None:
     """Print a table of the findings, followed by the advice in lines that can be copied."""
-    if console is None:
-        usual = Console()
-        console = usual if usual.is_terminal and not usual.is_dumb_terminal else Console(width=_WIDTH)
+    from uwlts.runtime.console import table_console
+
+    console = table_console()
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in ("", "examined", "found"):
         table.add_column(heading, no_wrap=heading == "", overflow="fold")

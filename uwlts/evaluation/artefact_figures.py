@@ -208,12 +208,12 @@ class StepEvaluation(ArtefactEvaluation):
         }
 
 
-def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard, *, seed: int = 0) -> StepEvaluation:
+def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard) -> StepEvaluation:
     """Evaluate points (N, 3), mm, in the OCS with images ``frame`` (N,) as a step.
 
     EvaluationError if the points show no two faces of this height.
     """
-    labels = label_step_faces(points, height_mm=artefact.height_mm, edge_mm=artefact.edge_mm, seed=seed)
+    labels = label_step_faces(points, height_mm=artefact.height_mm, edge_mm=artefact.edge_mm)
     rejected = 0
     for face in (StepFace.LOWER, StepFace.UPPER):
         members = np.flatnonzero(labels == face)

@@ -266,12 +266,12 @@ class SphereEvaluation(ArtefactEvaluation):
         return values
 
 
-def evaluate_spheres(points: np.ndarray, artefact: SphereStandard, *, seed: int = 0) -> SphereEvaluation:
+def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEvaluation:
     """Find the spheres in points (N, 3), mm, in the OCS, and evaluate them.
 
     EvaluationError for missing spheres, or for hollow spheres, which indicate rotated images.
     """
-    found = _sort_spheres(_find_spheres(points, artefact, np.random.default_rng(seed)), artefact)
+    found = _sort_spheres(_find_spheres(points, artefact, np.random.default_rng(0)), artefact)
     deviation = np.full(len(points), np.nan)
     spheres, fits = [], []
     for sphere, diameter in zip(found, artefact.diameters_mm, strict=True):

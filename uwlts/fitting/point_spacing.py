@@ -69,6 +69,7 @@ def project_footprint(cloud: PointCloud, chosen: np.ndarray, tangents: np.ndarra
     # The laser is parallel to Z. Its footprint in X and Y is longer on an inclined surface.
     flat = tangents[:, :, :2]
     leaning = np.abs(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0])
-    inverse = np.stack([flat[:, 1, ::-1] * [1, -1], flat[:, 0, ::-1] * [-1, 1]], axis=1)
+    # Inverse times its determinant, without the signs of its elements.
+    inverse = flat[:, ::-1, ::-1]
     spread = np.linalg.norm(inverse * size, axis=2) / np.maximum(leaning, _STEEPEST)[:, None]
     return spread, float(std) if isinstance(std, float) else 0.0

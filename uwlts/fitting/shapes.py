@@ -247,6 +247,13 @@ def _refined_cylinder(
     return turned, np.array([*foot, 0.0, 0.0, *parameters[4:]]), cost
 
 
+def perpendicular_to(direction: np.ndarray) -> np.ndarray:
+    """Return two unit directions (2, 3) perpendicular to a unit direction and to each other."""
+    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(direction, first)])
+
+
 def _axis_frame(axis: np.ndarray) -> np.ndarray:
     """Return right-handed unit directions (u, v, axis) in rows; the largest component of the axis becomes positive.
 

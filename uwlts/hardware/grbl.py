@@ -72,30 +72,12 @@ class StageReport:
 class GrblStage:
     """A stage that is open after construction; a context manager that leaves the laser off. Not thread-safe.
 
-    Only `darken` may be called from other threads.
+    Only `darken` may be called from other threads. ``boot_s`` is the longest start-up time of a controller that
+    restarts when the port, such as /dev/ttyACM0, is opened. ``settings`` are those reported by ``$$``, ``version`` is
+    that of Grbl, and ``limits_mm`` are the lowest and highest position.
 
-    Parameters
-    ----------
-    port : str
-        Serial port, such as /dev/ttyACM0.
-    baud : int
-        Baud rate.
-    boot_s : float
-        Longest start-up time of a controller that restarts when the port is opened.
-
-    Attributes
-    ----------
-    settings : GrblSettings
-        Settings reported by ``$$``.
-    version : str
-        Version of Grbl.
-    limits_mm : tuple of float
-        Lowest and highest position.
-
-    Raises
-    ------
-    HardwareError
-        The port cannot be opened, nothing answers, or the controller is not a Grbl 1.1 with variable spindle.
+    Raises HardwareError if the port cannot be opened, nothing answers, or the controller is not a Grbl 1.1 with
+    variable spindle.
     """
 
     def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
@@ -188,22 +170,12 @@ class GrblStage:
     ) -> float:
         """Move, wait until the stage is at rest, and return the position read back in mm.
 
-        Parameters
-        ----------
-        position_mm : float
-            Target within ``limits_mm``.
-        feed_mm_per_min : float
-            Speed, at most that of the stage ($110).
-        reported : callable
-            Called with every `StageReport` during the movement, about ten times a second.
+        The target is within ``limits_mm``, and the speed at most that of the stage ($110). ``reported`` is called with
+        every `StageReport` during the movement, about ten times a second.
 
-        Raises
-        ------
-        RangeError
-            The target is outside the travel, or the feed outside the stage's range; nothing has moved.
-        HardwareError
-            The position is unknown, or a fault occurred: alarm, stall, hold, lost steps, restart, silence, noise, lost
-            connection.
+        Raises RangeError if the target is outside the travel, or the feed outside the stage's range; nothing has moved.
+        Raises HardwareError if the position is unknown, or a fault occurred: alarm, stall, hold, lost steps, restart,
+        silence, noise, lost connection.
         """
         start_mm = self._start_of(position_mm, feed_mm_per_min)
         self._go(position_mm, feed_mm_per_min)
@@ -406,26 +378,15 @@ class GrblStage:
         """Switch the laser at rest and check the reported state; only the camera can show whether it emits light.
 
         Until the laser is switched off the stage cannot move. The guard also switches it off if no method of the stage
-        is called for more than half a second, unless `keep_lit` has announced it.
+        is called for more than half a second, unless `keep_lit` has announced it. ``power`` is the duty cycle of the
+        pin, 0 < power <= 1; below 1 it is pulsed at some kHz.
 
-        Parameters
-        ----------
-        on : bool
-            Whether the laser shall be on.
-        power : float
-            Duty cycle of the pin, 0 < power <= 1; below 1 it is pulsed at some kHz.
-        at_most_s : float, optional
-            Time after which the controller itself switches the laser off, rounded to 0.05 s. The controller holds the
-            commands for that before the laser is on, so it does not depend on the computer. By default that time is 0.9
-            s after the last call of `keep_lit`, which is needed every half second.
+        After ``at_most_s``, rounded to 0.05 s, the controller itself switches the laser off. The controller holds the
+        commands for that before the laser is on, so it does not depend on the computer. By default that time is 0.9 s
+        after the last call of `keep_lit`, which is needed every half second.
 
-        Raises
-        ------
-        RangeError
-            The power is out of range.
-        HardwareError
-            The controller is locked or does not follow, the guard process is gone or has switched the laser off, or
-            another fault occurred.
+        Raises RangeError if the power is out of range. Raises HardwareError if the controller is locked or does not
+        follow, the guard process is gone or has switched the laser off, or another fault occurred.
         """
         speed = self._speed_of(power)
         # A fault has already switched it off.

@@ -161,6 +161,14 @@ class ScanPlan(RigPlan):
             )
         return self
 
+    def devices(self, *, camera: str | None, stage: str | None) -> tuple[str, str]:
+        """Return the addresses of camera and stage, given or planned; raises DescriptionError if one is missing."""
+        address, port = camera or self.camera, stage or self.stage.port
+        if address is None or port is None:
+            what = "camera" if address is None else "stage"
+            raise DescriptionError(f"the plan names no {what}: give `{what}`")
+        return address, port
+
     def images(self) -> list[tuple[Light, float]]:
         """Return the light, and the multiple of its exposure, of each image at a position."""
         return [(light, each) for light in self.lights for each in (self.bracket if light == "laser" else (1.0,))]

@@ -245,17 +245,10 @@ def estimate_blur_shift_px(
 ) -> np.ndarray:
     """Estimate the largest shifts (N,) in px that blur can cause, from neighbouring centres in the same image.
 
-    Let a stripe y(x) have the amplitude A(x). Isotropic blur of standard deviation b moves its centre to
-    E[y(x - e) A(x - e)] / E[A(x - e)], where e has the standard deviation b. To second order, the shift is
-    b^2 (y' (ln A)' + y'' / 2). The squared stripe width, corrected for the stripe's tilt in the image, is an upper
-    limit of b^2.
-
-    Parameters
-    ----------
-    frame, line : (N,) int
-        Image and profile line of each stripe centre, in any order.
-    centre_px, amplitude, width_px : (N,)
-        Centre, positive amplitude, and full width at half maximum of each stripe.
+    Let a stripe y(x) have the amplitude A(x). Isotropic blur of standard deviation b moves its centre to E[y(x - e) A(x
+    - e)] / E[A(x - e)], where e has the standard deviation b. To second order, the shift is b^2 (y' (ln A)' + y'' / 2).
+    The squared stripe width, corrected for the stripe's tilt in the image, is an upper limit of b^2. Centres may be in
+    any order; amplitudes are positive, and widths full widths at half maximum.
     """
     if np.any((frame[1:] < frame[:-1]) | ((frame[1:] == frame[:-1]) & (line[1:] < line[:-1]))):
         order, moved = np.lexsort((line, frame)), np.empty(len(line))

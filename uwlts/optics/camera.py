@@ -54,10 +54,7 @@ def project(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     A row is NaN if the camera cannot see the point: at or behind the plane z = 0, or outside the domain of
     `directions`, where the polynomial would fold the point back into the image.
 
-    Raises
-    ------
-    RangeError
-        A coordinate is not finite.
+    Raises RangeError if a coordinate is not finite.
     """
     return _project(camera, _require_finite("points", points))
 

@@ -108,10 +108,7 @@ def depth_mm(setup: Triangulation, u_px: ArrayLike, v_px: ArrayLike = 0.0) -> np
     In air, Z = B f / (f tan theta_t - s u) (thesis Eq. 2.8). Behind a window, Z tan theta_t - B = p M(Z), where M is
     `FlatWindow.reach_mm`, linear in Z.
 
-    Raises
-    ------
-    RangeError
-        A pixel is not finite, or its ray does not meet the sheet beyond the window.
+    Raises RangeError if a pixel is not finite, or its ray does not meet the sheet beyond the window.
     """
     depth = _depth_or_inf(setup, *setup.slopes(u_px, v_px))
     if not ((depth >= setup.window.outer_mm) & (depth < math.inf)).all():

@@ -18,12 +18,10 @@ _OTHER_LENS = 1.1
 def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: str) -> list[str]:
     """Compare the header of a recording, named ``source``, with a calibration, and return warnings about differences.
 
-    Raises
-    ------
-    CalibrationError
-        Image size, a stated offset of the images on the image sensor, stripe orientation, wavelength or focal length
-        differ; the recording was made in water and the calibration has no window; or a polynomial calibration was made
-        in another medium, or with the window mounted and the recording without, or the reverse.
+    Raises CalibrationError if image size, a stated offset of the images on the image sensor, stripe orientation,
+    wavelength or focal length differ; the recording was made in water and the calibration has no window; or a
+    polynomial calibration was made in another medium, or with the window mounted and the recording without, or the
+    reverse.
     """
     camera = header.sensor.camera
     model = calibration if isinstance(calibration, PolynomialCalibration) else calibration.camera

@@ -54,12 +54,8 @@ def open_image_set(source: str | Path, *, stripe: StripeSettings = None) -> Imag
     image. The first of several stripes is measured if it is longer than the unambiguous one.
     Full scale of 16-bit image files is 2^n - 1 for the smallest n of 10, 12, 14, 16 that the first image allows.
 
-    Raises
-    ------
-    CaptureError, ImageError
-        A file cannot be read, there are no images, or the first image file shows no stripe.
-    DescriptionError
-        A setting of the stripe is unknown or out of range.
+    Raises CaptureError or ImageError if a file cannot be read, there are no images, or the first image file shows no
+    stripe; DescriptionError if a setting of the stripe is unknown or out of range.
     """
     path = Path(source)
     if (path / CARD).is_file():

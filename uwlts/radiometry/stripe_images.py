@@ -99,10 +99,8 @@ def measure_stripes(
     Runs of lines with more than a few clipped pixels are left out as a whole: to leave out single bright lines would
     make the stripe seem darker.
 
-    Raises
-    ------
-    CaptureError
-        Fewer than `BLOCKS` groups of centres can be used, or the capture has centre lines instead of images.
+    Raises CaptureError if fewer than `BLOCKS` groups of centres can be used, or the capture has centre lines instead of
+    images.
     """
     along, full_dn = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
     core = math.ceil(3 * float(np.nanmedian(stripes.width_px)) / FWHM_PER_SIGMA) + 3

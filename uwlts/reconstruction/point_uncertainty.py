@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from uwlts.calibration.joint.residuals import STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, perpendicular_directions
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, read_stored_estimate, require_joint
 from uwlts.errors import CalibrationError
@@ -32,6 +31,15 @@ _NEGLIGIBLE_MM = 5e-5
 """Largest rms shift of the points by all omitted patterns together."""
 _FEWEST_NEIGHBOURS = 10
 """Least number of centres with two neighbours for the noise, whose relative standard error is then one third."""
+_MEAN_LINES = 4
+"""Lines of means: as many as speckle and filters correlate. The form of a sphere or pit is seen in longer means."""
+_FEWEST_MEANS = 40
+"""Least number of differences of means; one in four is independent."""
+_NEIGHBOUR_SCALE = float(MAD_TO_STD / np.sqrt(1.5))
+"""Standard deviation of a centre, divided by the median distance from the mean of its neighbours."""
+MOST_CORRELATED = 4.0
+"""Largest factor for correlated noise: 1.0 to 1.3 on rendered stripes, 1.3 to 1.7 on real ones of an industrial camera,
+3.4 after averaging over five lines. Larger ratios are of a wavy surface or of a camera that smooths its images."""
 _SAMPLED = 500
 """Number of points used to choose patterns: their rms agrees with that of all within some percent."""
 _TABLE_TOLERANCE_MM = 1e-6
@@ -41,22 +49,17 @@ _LEFT_OUT_MM = 1e-9
 
 
 def estimate_stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
-    """Estimate the standard deviation (N,) of stripe centres from their second differences in each image.
+    """Estimate the noise (N,) of stripe centres: the standard deviation of independent centres with equal means.
 
     On a smooth surface, the centre minus the mean of its two neighbours has 3/2 of the variance of one centre. The
     median makes the estimate robust against edges and outliers. Images with few lines receive the value of all images.
+
+    Speckle, texture and the camera's processing give neighbours similar errors: these differences are small, and means
+    scatter more than those of independent centres. Therefore the estimate is multiplied by `measure_correlation` of all
+    images, up to `MOST_CORRELATED`.
     """
-    f, at, c = frame, line, centre_px.astype(np.float64)
-    if np.any((f[1:] < f[:-1]) | ((f[1:] == f[:-1]) & (at[1:] < at[:-1]))):
-        order = np.lexsort((line, frame))
-        f, at, c = frame[order], line[order], c[order]
-    beside = (f[2:] == f[:-2]) & (at[2:] - at[:-2] == 2)
-    off, image = np.abs(c[1:-1] - 0.5 * (c[2:] + c[:-2]))[beside], f[1:-1][beside]
-    if len(off) < _FEWEST_NEIGHBOURS:
-        raise CalibrationError(
-            f"only {len(off)} stripe centres have two neighbours; {_FEWEST_NEIGHBOURS} are needed to measure noise"
-        )
-    scale = MAD_TO_STD / np.sqrt(1.5)
+    f, at, c, off, image = _compare_neighbours(frame, line, centre_px)
+    scale = _NEIGHBOUR_SCALE * min(_correlation(f, at, c, off), MOST_CORRELATED)
     noise = np.full(int(frame.max()) + 1, np.nan)
     starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1], True])
     for start, end in pairwise(starts.tolist()):
@@ -65,6 +68,45 @@ def estimate_stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.
     if (few := np.isnan(noise)).any():
         noise[few] = scale * _median(off)
     return noise[frame]
+
+
+def measure_correlation(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> float:
+    """Return the noise of means of `_MEAN_LINES` neighbouring centres relative to that of independent ones, at least 1.
+
+    It is 1 for too few centres. The third difference of means of neighbouring lines has 20 times the variance of one
+    mean. Parabolas have none.
+    """
+    return _correlation(*_compare_neighbours(frame, line, centre_px)[:4])
+
+
+def _compare_neighbours(
+    frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Sort centres (N,) by image and line; return them, distances (M,) from the mean of two neighbours, and images."""
+    f, at, c = frame, line, centre_px.astype(np.float64)
+    if np.any((f[1:] < f[:-1]) | ((f[1:] == f[:-1]) & (at[1:] < at[:-1]))):
+        order = np.lexsort((line, frame))
+        f, at, c = frame[order], line[order], c[order]
+    beside = (f[2:] == f[:-2]) & (at[2:] - at[:-2] == 2)
+    off = np.abs(c[1:-1] - 0.5 * (c[2:] + c[:-2]))[beside]
+    if len(off) < _FEWEST_NEIGHBOURS:
+        raise CalibrationError(
+            f"only {len(off)} stripe centres have two neighbours; {_FEWEST_NEIGHBOURS} are needed to measure noise"
+        )
+    return f, at, c, off, f[1:-1][beside]
+
+
+def _correlation(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, off: np.ndarray) -> float:
+    """Return `measure_correlation` of sorted centres (N,) with distances (M,) from the means of two neighbours."""
+    count, usual = 4 * _MEAN_LINES, _median(off)
+    if len(line) < count or usual <= 0:
+        return 1.0
+    whole = (frame[count - 1 :] == frame[: 1 - count]) & (line[count - 1 :] - line[: 1 - count] == count - 1)
+    if np.count_nonzero(whole) < _FEWEST_MEANS:
+        return 1.0
+    weights = np.repeat([1.0, -3.0, 3.0, -1.0], _MEAN_LINES) / _MEAN_LINES
+    third = np.abs(np.convolve(centre_px, weights, mode="valid")[whole])
+    return max(1.0, float(np.sqrt(_MEAN_LINES / 20)) * MAD_TO_STD * _median(third) / (_NEIGHBOUR_SCALE * usual))
 
 
 def _median(values: np.ndarray) -> float:
@@ -121,9 +163,7 @@ def point_uncertainty(
     if scans and hash_file(capture.path) in scans:
         sensor = sensor.model_copy(update={"uncertainty": sensor.uncertainty.model_copy(update={"drift_k": 0.0})})
     known = read_stored_estimate(calibration, sensor, header.medium)
-    # Noise is correlated between neighbours, so that second differences show only a part of it.
-    shared = require_joint(calibration).shared_variance.get(STRIPE, 1.0)
-    noise = estimate_stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
+    noise = estimate_stripe_noise_px(frame, line, centre_px)
     of_sensor = sensor_poses(capture)
     pose = of_sensor[:, :3, :3]
     posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)

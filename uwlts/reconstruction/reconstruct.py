@@ -20,7 +20,7 @@ from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile, stage_travel
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.reconstruction.moving import add_platform_poses, add_platform_uncertainty, find_platform_poses
-from uwlts.reconstruction.point_uncertainty import point_uncertainty
+from uwlts.reconstruction.point_uncertainty import MOST_CORRELATED, measure_correlation, point_uncertainty
 from uwlts.runtime.compiled import compiled
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import resolve_calibration
@@ -32,6 +32,9 @@ from uwlts.storage.pose_files import PoseFormat, read_trajectory
 from uwlts.storage.verification_file import describe_verification
 from uwlts.stripe import StripeSettings, find_stripes
 from uwlts.stripe.capture_stripes import FEWEST_LINES
+
+_NOISE_SAMPLED = 100_000
+"""Number of stripe centres that show whether their noise is correlated."""
 
 
 @trusting
@@ -204,6 +207,7 @@ def reconstruct_stripes(
         The refractive index is outside the range of media.
     """
     doubts = check_fits(capture.header, calibration, source=capture.path.name) + _warn_of_repeats(stripes)
+    doubts += _warn_of_smoothing(stripes)
     if index is not None and isinstance(calibration, PolynomialCalibration):
         raise CalibrationError(
             "a polynomial calibration is valid only for its own medium, so a refractive index cannot be given; omit it"
@@ -276,6 +280,22 @@ def _warn_of_repeats(stripes: CaptureStripes) -> list[str]:
     return [
         f"the stripe in {len(repeated)} of {len(frames)} images is exactly that in the image before, such as in image "
         f"{repeated[0]}: the camera or a copy repeated an image, or the images have no noise; check their positions"
+    ]
+
+
+def _warn_of_smoothing(stripes: CaptureStripes) -> list[str]:
+    """Return a warning if centres scatter over several lines by far more than from line to line."""
+    some = stripes[:_NOISE_SAMPLED]
+    try:
+        ratio = measure_correlation(some.frame, some.line, some.centre_px)
+    except CalibrationError:  # too few centres
+        return []
+    if ratio <= MOST_CORRELATED:
+        return []
+    return [
+        f"means of four neighbouring stripe centres scatter {ratio:.1f} times as much as their noise from line to line "
+        "allows: the surface is wavy over a few lines, or the camera smooths or compresses its images, and the "
+        "uncertainty of points is stated too small; record raw images without noise reduction"
     ]
 
 

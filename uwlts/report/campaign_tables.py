@@ -19,10 +19,10 @@ from uwlts.pages.toolkit import MISSING, ComparisonTable
 from uwlts.report.gather import CALIBRATION, GatheredCalibration, GatheredCampaign, GatheredMeasurement, Reference
 from uwlts.report.parameters import parameter_rows
 from uwlts.report.plot import SHORT_LIST
+from uwlts.runtime.console import table_console
 
 _QUANTITIES = {"PE": "probing error PE", "RE": "range error RE", "STD": "deviations STD", "range": "deviations range"}
 _ORDER = ("sphere spacing", "step height", "pipe diameter", "diameter", "probing", "range", "deviations", "ovality")
-_WIDTH = 110  # of a table that is not shown in a terminal, characters
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,11 @@ def summary_table(campaign: GatheredCampaign, reference: Reference | None = None
     return rows + _window_rows(campaign, reference)
 
 
-def print_table(rows: list[Row], *, published: str = "thesis", console: Console | None = None) -> None:
-    """Print rows on a terminal of any kind or to a file; ``published`` is the heading of the last column."""
-    if console is None:
-        usual = Console()
-        console = usual if usual.is_terminal and not usual.is_dumb_terminal else Console(width=_WIDTH)
+def print_table(rows: list[Row], *, console: Console | None = None) -> None:
+    """Print rows on a terminal of any kind or to a file."""
+    console = console or table_console()
     table = Table(box=box.SIMPLE_HEAD, title="lengths in mm", title_justify="left", pad_edge=False)
-    for number, heading in enumerate(("measurement", "quantity", "true", "measured", "error", "U (k = 2)", published)):
+    for number, heading in enumerate(("measurement", "quantity", "true", "measured", "error", "U (k = 2)", "thesis")):
         table.add_column(heading, justify="left" if number < 2 else "right", no_wrap=number >= 2)
     last = None
     for row in rows:

@@ -26,10 +26,17 @@ SWITCHES = {
     "quiet": (("--quiet", "-q"), "With any command: print only warnings and errors, without results and progress."),
 }
 """Options of all commands, with their words and their help."""
+_TABLE_WIDTH = 110  # characters, without a terminal
 _LINE_EVERY_S = 10.0
 """Interval between lines of progress without a terminal: a log of an hour stays readable."""
 _quiet = False
 _python_show_warning = warnings.showwarning
+
+
+def table_console() -> Console:
+    """Return the terminal, or a console of fixed width for tables that are not shown in one."""
+    usual = Console()
+    return usual if usual.is_terminal and not usual.is_dumb_terminal else Console(width=_TABLE_WIDTH)
 
 
 @contextmanager

@@ -158,18 +158,19 @@ def leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
     return stripe.remove_lines(found[beside[lines : lines + len(found)]], StripeStatus.END)
 
 
-def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOptions()) -> None:
-    """Load or compile all functions that find stripes in images of a given type.
+def warm_up() -> None:
+    """Load or compile all functions that find stripes in images of 8 bits.
 
     Without it, the first images of a stream are delayed by some tenths of a second; by some seconds if the functions
     have to be compiled. It covers the rule of direct light, `extract_candidates` and saturated stripes.
     """
+    options = StripeOptions()
     half = options.half_window_px
     place, lines = np.arange(8 * half), np.arange(_RULE.warm_lines)[:, None]
     # A stripe, and a dimmer one with gaps beside it.
     beside = 0.3 * (lines % 20 < 10)
     seen = [share * np.exp(-0.5 * np.square((place - at * half) / 2.0)) for share, at in ((1.0, 2), (beside, 5))]
-    image = np.broadcast_to(100.0 * sum(seen), (_RULE.warm_lines, 8 * half)).astype(dtype)
+    image = np.broadcast_to(100.0 * sum(seen), (_RULE.warm_lines, 8 * half)).astype(np.uint8)
     # The default method uses all others for some images.
     for method in dict.fromkeys((options.method, *method_names())):
         extract_stripe(image, stripe_along="height", options=replace(options, method=method))
@@ -251,40 +252,18 @@ def _level_clipped(image: np.ndarray, clipped: np.ndarray, along: str) -> np.nda
 
 @dataclass(frozen=True, eq=False)
 class _SearchedImage:
-    """Result of the search with one window size, including the ends of the stripe.
-
-    Attributes
-    ----------
-    stripe : Stripe
-    profiles : (N, L) array
-        Pixels along the L lines.
-    options : StripeOptions
-    several : (L,) bool
-        Lines that may contain more than one stripe.
-    wide : (L,) bool
-        Lines with a bright peak too wide to be measured.
-    white : (L,) bool
-        Lines with a completely saturated block.
-    board : (B + 2 `MARGIN`, L) array
-        Contrasts of the blocks.
-    left : (B + 2 `MARGIN`, L) array
-        Contrasts of the blocks not examined by the search.
-    noise : float
-        Standard deviation of a pixel's noise, grey levels.
-    rules : SearchRules or None
-        None for a network, which finds one stripe only.
-    """
+    """Result of the search with one window size, including the ends of the stripe."""
 
     stripe: Stripe
-    profiles: np.ndarray
+    profiles: np.ndarray  # (N, L); pixels along the L lines
     options: StripeOptions
-    several: np.ndarray
-    wide: np.ndarray
-    white: np.ndarray
-    board: np.ndarray
-    left: np.ndarray
-    noise: float
-    rules: SearchRules | None
+    several: np.ndarray  # (L,) bool; lines that may contain more than one stripe
+    wide: np.ndarray  # (L,) bool; lines with a bright peak too wide to be measured
+    white: np.ndarray  # (L,) bool; lines with a completely saturated block
+    board: np.ndarray  # (B + 2 `MARGIN`, L); contrasts of the blocks
+    left: np.ndarray  # (B + 2 `MARGIN`, L); contrasts of the blocks not examined by the search
+    noise: float  # standard deviation of a pixel's noise, grey levels
+    rules: SearchRules | None  # None for a network, which finds one stripe only
 
     def is_too_wide(self) -> bool:
         """Return True if many lines show a stripe too wide to be measured."""

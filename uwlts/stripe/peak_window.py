@@ -69,36 +69,21 @@ class PeakWindow(NamedTuple):
     """Peaks in M windows of W pixels, in groups of `LANES`, in the form for compiled code.
 
     Positions are in px from the window's first pixel, heights in grey levels.
-
-    Attributes
-    ----------
-    start : (M,) int
-        First pixel of each window on its line.
-    window : (ceil(M / LANES), W, LANES) float32
-        Pixels of groups of windows; beyond the image the border pixel is repeated.
-    middle : (M,) float32
-        Midpoint of the half-height crossings.
-    sigma : (M,) float32
-        Half-height width divided by 2.355, without the low-pass (variances add).
-    reach : (M,) float32
-        Number of pixels from ``middle`` to the first background pixel.
-    base, slope : (M,) float32
-        Background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
-    height : (M,) float32
-        Height of the top above ``base``; above the lowest surroundings unless the peak is closed.
-    smoothing : float
-        Sigma of the low-pass, px.
     """
 
-    start: np.ndarray
+    start: np.ndarray  # (M,) int; first pixel of each window on its line
     window: np.ndarray
-    middle: np.ndarray
-    sigma: np.ndarray
-    reach: np.ndarray
+    """(ceil(M / LANES), W, LANES) float32; pixels of groups of windows; beyond the image the border pixel is
+    repeated."""
+    middle: np.ndarray  # (M,) float32; midpoint of the half-height crossings
+    sigma: np.ndarray  # (M,) float32; half-height width divided by 2.355, without the low-pass (variances add)
+    reach: np.ndarray  # (M,) float32; number of pixels from ``middle`` to the first background pixel
+    # (M,) float32; background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
     base: np.ndarray
     slope: np.ndarray
     height: np.ndarray
-    smoothing: float
+    """(M,) float32; height of the top above ``base``; above the lowest surroundings unless the peak is closed."""
+    smoothing: float  # sigma of the low-pass, px
 
     @classmethod
     def empty(cls, count: int, size: int, smoothing: float) -> PeakWindow:
@@ -132,22 +117,13 @@ class PeakWindow(NamedTuple):
 
 
 class PeakShape(NamedTuple):
-    """Further properties of M peaks for the search, as arrays (M,).
+    """Further properties of M peaks for the search, as arrays (M,)."""
 
-    Attributes
-    ----------
-    top : int32
-        Highest pixel after the low-pass.
-    closed : bool
-        Both half-height crossings are in the window.
-    crowded : bool
-        The profile rises again outside the crossings: above half height, or to the required fraction of the height
-        after a valley of half its own height.
-    """
-
-    top: np.ndarray
-    closed: np.ndarray
+    top: np.ndarray  # int32; highest pixel after the low-pass
+    closed: np.ndarray  # bool; both half-height crossings are in the window
     crowded: np.ndarray
+    """bool; the profile rises again outside the crossings: above half height, or to the required fraction of the height
+    after a valley of half its own height."""
 
 
 _FLOATS = 6

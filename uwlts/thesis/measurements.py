@@ -45,12 +45,8 @@ def calibrations(
 ) -> dict[tuple[str, str], AnyCalibration]:
     """Return calibrations by method and medium; up-to-date ones are read from the folder ``calibrations``.
 
-    Raises
-    ------
-    CaptureError
-        A recording is missing or damaged.
-    CalibrationError
-        The recordings do not determine a calibration.
+    Raises CaptureError if a recording is missing or damaged; CalibrationError if the recordings do not determine a
+    calibration.
     """
     made = {
         (PROPOSED, "water"): lambda: _calibrate_rays(folder.target("air"), folder.steps(), refractions=1),

@@ -16,6 +16,7 @@ import numpy as np
 from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, CalibrationResult, Evidence, solve
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
+from uwlts.fitting.shapes import perpendicular_to
 from uwlts.model.sensor import Medium
 from uwlts.optics.camera import project
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -214,7 +215,6 @@ def _stripe_noise_px(start: CalibrationResult, across: int) -> float:
 
 def _rotate_direction(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Rotate a unit direction (3,) by two small angles about axes perpendicular to it."""
-    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
-    first /= np.linalg.norm(first)
-    turned = direction + angles[0] * first + angles[1] * np.cross(direction, first)
+    first, second = perpendicular_to(direction)
+    turned = direction + angles[0] * first + angles[1] * second
     return turned / np.linalg.norm(turned)

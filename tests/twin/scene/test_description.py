@@ -252,6 +252,18 @@ def test_a_medium_that_the_sensor_does_not_know_is_refused(thesis):
         medium_of(thesis, scene_of(plate(), medium="oil"))
 
 
+def test_the_water_of_a_scene_replaces_that_of_the_sensor(thesis):
+    own = thesis.medium("water")
+    clear, turbid, named = (medium_of(thesis, scene_of(plate(), water=water)) for water in (None, 1.5, "jerlov-III"))
+    assert clear == own and turbid.turbidity == 1.5 and named.water == "jerlov-III"
+    for medium in (turbid, named):
+        assert (medium.kind, medium.temperature_c, medium.salinity_g_kg) == (
+            own.kind,
+            own.temperature_c,
+            own.salinity_g_kg,
+        )
+
+
 MESH = "title = 't'\n[[objects]]\nkind = 'mesh'\npath = 'part.stl'\n"
 
 

@@ -11,6 +11,7 @@ from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.crossing_search import (
     _find_hypotheses,
     _has_rival,
+    _is_beside,
     _is_likely,
     _search_range,
     accept_crossings,
@@ -151,6 +152,11 @@ def test_equal_stones_at_equal_distances_are_ambiguous():
     assert not _has_rival(before, closed, found[0], [replace(each, patches=found[0].patches // 3) for each in rivals])
 
 
+@pytest.mark.parametrize(("pair", "beside"), [((10, 30), True), ((14, 26), True), ((15, 30), False), ((10, 25), False)])
+def test_neighbours_of_a_crossing_are_within_some_pieces_in_both_passes(pair, beside):
+    assert _is_beside(pair, [(50, 70), (10, 30)], 4) == beside and not _is_beside(pair, [], 4)
+
+
 def test_a_surface_that_has_changed_in_part_does_not_agree():
     def with_box(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return stones(x, y) + 5.0 * (x > 20)
@@ -186,8 +192,8 @@ def test_distances_change_by_their_derivatives(turned_deg: float):
     estimate = two_passes(turned_deg=turned_deg)
     rng = np.random.default_rng(2)
     size = np.repeat([0.02, 0.02, 0.02, 5e-5, 5e-5, 5e-5], estimate.prior.count)
-    steady = rng.standard_normal(6)[:, None] + rng.standard_normal(6)[:, None] * estimate.prior.nodes_s / SECONDS
-    values = size * steady.ravel()
+    nodes = np.arange(estimate.prior.count)
+    values = size * (rng.standard_normal(6)[:, None] + (-1.0) ** nodes * rng.standard_normal(6)[:, None]).ravel()
     for (source, target), (by, weight, before) in zip(
         (CROSSING[::-1], CROSSING), _linearise_pair(estimate, CROSSING), strict=True
     ):
@@ -265,6 +271,16 @@ def test_shifts_of_whole_pixels_are_exact():
     best, *others = correlate_heights(first - shift, second, options, pixel_mm=1.0, reach_mm=np.array([8, 5, 3.0]))
     np.testing.assert_allclose(best, shift, atol=1e-9)
     assert all(not np.allclose(each, shift) for each in others) and len(others) < options.proposals
+    # So are shifts by more than the size of the maps, either way.
+    for far in (np.array([300.0, 40.0, 2.5]), np.array([-40.0, -300.0, 2.5])):
+        best, *_ = correlate_heights(first - far, second, options, pixel_mm=1.0, reach_mm=np.abs(far) + 1)
+        np.testing.assert_allclose(best, far, atol=1e-9)
+    # Shifts with few common pixels are not proposed, though these may agree by chance.
+    many = replace(options, proposals=100)
+    found = correlate_heights(first - shift, second, many, pixel_mm=1.0, reach_mm=np.array([200.0, 200, 10]))
+    low, high = (np.array([each - shift[:2] for each in ends]) for ends in ([[0, 0]], [[80, 90]]))
+    common = np.minimum(high + np.array(found)[:, :2], [120, 90]) - np.maximum(low + np.array(found)[:, :2], [30, 0])
+    assert len(found) > 4 and common.prod(axis=1).min() > many.fewest_patches / many.pixel**2
     for reach in ([5.9, 5, 3], [8, 2.9, 3], [8, 5, 1.4]):
         found = correlate_heights(first - shift, second, options, pixel_mm=1.0, reach_mm=np.array(reach, float))
         assert all(np.linalg.norm(each - shift) > 1 for each in found)

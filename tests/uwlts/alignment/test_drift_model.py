@@ -55,6 +55,24 @@ def test_rates_walks_and_dead_reckoning_are_found_from_the_covariance(by_heading
     np.testing.assert_allclose(walk[5], HEADING_NOISE**2 * SECONDS, rtol=0.1)
 
 
+def test_a_navigation_a_hundred_times_as_accurate_has_a_hundredth_of_the_drift():
+    usual = navigated(by_heading=True)
+    better = Trajectory(usual.times_s, usual.poses, 1e-4 * usual.covariance)
+    one, other = (choose_drift_model(each, None, None) for each in (usual, better))
+    np.testing.assert_allclose(other.std, one.std / 100, rtol=1e-3)
+    np.testing.assert_allclose(other.walk, one.walk, atol=1e-3)
+
+
+@pytest.mark.parametrize(("share", "dead_reckoned"), [(0.6, True), (0.4, False), (-1.0, False)])
+def test_positions_count_as_dead_reckoned_by_half_of_the_covariance_with_the_heading(share, dead_reckoned):
+    path = navigated(by_heading=True)
+    covariance = path.covariance.copy()
+    covariance[:, :2, 5] *= share
+    covariance[:, 5, :2] *= share
+    found = choose_drift_model(Trajectory(path.times_s, path.poses, covariance), None, None)
+    assert found.dead_reckoned == dead_reckoned
+
+
 @pytest.mark.parametrize("rate", [0.0, 0.3])
 def test_a_random_walk_is_distinguished_from_an_earlier_rate(rate: float):
     times = np.linspace(0, SECONDS, 200)

@@ -57,9 +57,10 @@ def images(values: np.ndarray, each: int) -> tuple[np.ndarray, np.ndarray]:
 TURN = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix()
 
 
-def test_points_of_an_image_that_err_together_count_once() -> None:
-    """The variance is that of a mean of five images, times Student's factor of the 40 points."""
-    heights = np.array([0.3, -0.2, 0.05, 0.4, -0.1])
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_points_of_an_image_that_err_together_count_once(unit: float) -> None:
+    """The variance is that of a mean of five images, times Student's factor of the 40 points, in mm or um."""
+    heights = unit * np.array([0.3, -0.2, 0.05, 0.4, -0.1])
     points, image = images(heights, 8)
     found = average_locally(
         np.zeros((1, 3)), TURN[:, 2][None], points, uncertainty=None, frame=image, disc_mm=2.1, deep_mm=1.0
@@ -67,6 +68,21 @@ def test_points_of_an_image_that_err_together_count_once() -> None:
     assert found.mean_mm[0] == pytest.approx(heights.mean())
     student = 2.0227 / TWO_SIDED
     assert found.variance_mm2[0] == pytest.approx(student**2 * heights.var(ddof=1) / 5, rel=1e-4)
+
+
+def test_a_disc_holds_the_points_within_its_radius_and_depth() -> None:
+    """Of two rings of six points beside the radius of 3 mm, and two beside the depth of 5 mm, the inner ones count."""
+    angle = np.arange(6) * np.pi / 3
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(6)])
+    up = np.array([0.0, 0.0, 1.0])
+    rings = [2.99 * ring + 1.0 * up, 3.01 * ring + 2.0 * up, ring + 4.99 * up, ring - 5.01 * up]
+    place = np.array([7.0, -3.0, 20.0])
+    points = (place + np.vstack(rings)) @ TURN.T
+    options = {"uncertainty": None, "frame": None, "disc_mm": 6.0, "deep_mm": 5.0}
+    found = average_locally((TURN @ place)[None], TURN[:, 2][None], points, **options)
+    assert found.mean_mm[0] == pytest.approx((1.0 + 4.99) / 2)
+    # Four points are too few.
+    assert np.isnan(average_locally((TURN @ place)[None], TURN[:, 2][None], points[:4], **options).mean_mm[0])
 
 
 def test_variance_of_a_mean_without_scatter_is_that_stated() -> None:

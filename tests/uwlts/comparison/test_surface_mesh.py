@@ -1,5 +1,6 @@
 """Meshes of exactly simulated scans: error against the true surface, stated uncertainty, holes and thin walls."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,9 @@ import trimesh
 import uwlts
 from uwlts.cli import app
 from uwlts.comparison.change_reference import read_reference
+from uwlts.comparison.surface_mesh import _orient_faces, _remove_small_pieces, _split_scans, _thinnest_wall
 from uwlts.errors import CaptureError, EvaluationError, OutputError
+from uwlts.fitting.local_surface import SurfacePoints
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 from uwlts.storage.mesh_file import read_mesh
 from uwlts.storage.ply import read_ply
@@ -208,3 +211,46 @@ def test_damaged_headers_and_absurd_vertices_are_refused(tmp_path):
     for name in ("a.ply", "b.obj"):
         with pytest.raises(CaptureError, match="not a complete PLY file|beyond 1e\\+10"):
             read_mesh(tmp_path / name)
+
+
+def test_the_thinnest_wall_is_that_of_opposite_normals():
+    """Plates 1.5 mm apart with outward normals, also turned; facing each other across a gap, they form no wall."""
+    flat = np.random.default_rng(8).uniform(-10, 10, (3000, 2))
+    upper = np.arange(3000) % 2 == 0
+    turn = about_y(70.0)
+    points = np.column_stack([flat, np.where(upper, 0.0, -1.5)]) @ turn.T
+    up = np.where(upper, 1.0, -1.0)[:, None] * turn[:, 2]
+    rest = np.ones(3000), np.zeros(3000), np.zeros(3000), np.zeros(3000, int), np.zeros((0, 3000)), np.zeros(3000, int)
+    assert _thinnest_wall(SurfacePoints(points, up, *rest), 2.0) == pytest.approx(1.5)
+    assert _thinnest_wall(SurfacePoints(points, -up, *rest), 2.0) == np.inf
+    assert _thinnest_wall(SurfacePoints(points, up, *rest), 1.4) == np.inf
+
+
+def test_triangles_face_outwards_and_small_pieces_go():
+    sheet = trimesh.creation.icosphere(subdivisions=2)
+    faces = np.where((np.arange(len(sheet.faces)) % 3 == 0)[:, None], sheet.faces[:, [0, 2, 1]], sheet.faces)
+    flat = [[0, 0, 1]]
+    oriented = _orient_faces(sheet.vertices, np.vstack([faces, flat]), sheet.vertices)
+    assert len(oriented) == len(faces)
+    assert (trimesh.Trimesh(sheet.vertices, oriented, process=False).volume) == pytest.approx(sheet.volume)
+    # A triangle beside the sphere, and vertices without a triangle.
+    first = len(sheet.vertices) + 4
+    used, kept = _remove_small_pieces(np.vstack([[[first, first + 1, first + 2]], oriented + 2]), first + 3)
+    np.testing.assert_array_equal(used, 2 + np.arange(len(sheet.vertices)))
+    np.testing.assert_array_equal(kept, oriented)
+
+
+def test_a_merged_cloud_is_split_by_its_images():
+    """Each scan has the direction to its sensor, -Z of its pose; a given direction counts for the whole cloud."""
+    frame, poses = np.array([0, 1, 2, 5, 6, 6]), [np.eye(4), np.eye(4)]
+    poses[1][:3, :3] = about_y(90.0)
+    listed = [{"first_frame": first, "pose": pose.tolist()} for first, pose in zip((0, 5), poses, strict=True)]
+    cloud = PointCloud(np.arange(18.0).reshape(6, 3), np.ones(6), frame, np.arange(6), metadata={"scans": listed})
+    (one, front), (other, side) = _split_scans(cloud, None)
+    np.testing.assert_array_equal(one.frame, [0, 1, 2])
+    np.testing.assert_array_equal(other.points_mm, cloud.points_mm[3:])
+    np.testing.assert_allclose([front, side], [[0, 0, -1], [-1, 0, 0]], atol=1e-12)
+    ((whole, way),) = _split_scans(cloud, np.array([0.0, 3.0, 4.0]))
+    assert len(whole) == 6 and way == pytest.approx([0, 0.6, 0.8])
+    with pytest.raises(EvaluationError, match="list of scans is not valid"):
+        _split_scans(replace(cloud, metadata={"scans": [{"first_frame": 0}]}), None)

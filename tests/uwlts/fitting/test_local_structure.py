@@ -60,5 +60,7 @@ def test_a_footprint_is_longer_on_an_inclined_surface():
     assert found[2, 1] == pytest.approx(0.1 / 0.3) and std == 0.2
     turned, _ = project_footprint(cloud, np.arange(1), np.stack([down[:1], -across[:1]], axis=1))
     np.testing.assert_allclose(turned, [[0.1, 0.3]])
+    diagonal = np.array([[[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]]) / np.sqrt(2)
+    np.testing.assert_allclose(project_footprint(cloud, np.arange(1), diagonal)[0], [[np.sqrt(0.05)] * 2])
     plain, std = project_footprint(replace(cloud, metadata={}), np.arange(2), np.zeros((2, 2, 3)))
     assert std == 0 and not plain.any()

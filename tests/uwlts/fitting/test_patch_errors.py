@@ -136,3 +136,18 @@ def test_patterns_move_patches_as_a_whole() -> None:
     shift = 0.5 * np.array([0.3, 0.0, 0.1])
     np.testing.assert_allclose(moved.places_mm, patches.places_mm + shift, atol=1e-6)
     np.testing.assert_allclose(moved.averages.places_mm, patches.averages.places_mm + shift, atol=1e-6)
+
+
+def test_errors_of_unknown_images_count_as_noise() -> None:
+    """Noise of 0.02 mm and positions of 0.03 mm along a level plane; with known images, positions are common."""
+    flat = np.random.default_rng(8).uniform(-15, 15, (3000, 2))
+    along = np.tile([0.0, 0.0, 0.03], (3000, 1))
+    known = PointUncertainty(np.tile([0, 0, 0, 0, 0, 0.02**2], (3000, 1)), along, np.zeros((0, 3000, 3)))
+    points = np.column_stack([flat, np.full(3000, 300.0)])
+    alone = surface_patches(points, known, radius_mm=3.0)
+    np.testing.assert_allclose(alone.errors.noise_mm, np.hypot(0.02, 0.03), rtol=1e-6)
+    assert not alone.image_variance_mm2.any()
+    by_images = surface_patches(points, known, radius_mm=3.0, frame=np.zeros(3000, int))
+    np.testing.assert_allclose(by_images.errors.noise_mm, 0.02, rtol=1e-6)
+    # A single image moves all heights by its whole error.
+    np.testing.assert_allclose(by_images.image_variance_mm2, 0.03**2, rtol=1e-4)

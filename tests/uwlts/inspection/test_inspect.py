@@ -21,7 +21,7 @@ from uwlts.errors import EvaluationError
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
-from uwlts.inspection.flat import _fit_circle, _Hole, _measure_bolt_circle
+from uwlts.inspection.flat import _estimate_step_height, _fit_circle, _Hole, _mask_inner_points, _measure_bolt_circle
 from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
@@ -87,10 +87,11 @@ def test_the_form_of_a_pipe_is_within_its_intervals():
     """20 pipes; fewer than 14 of 20 intervals of 95 % contain the truth 3 times in 100,000."""
 
     def oval(x, angle):
-        return RADIUS_MM * (1 + 0.0025 * np.cos(2 * (angle - 0.3))) + 0.05 * np.cos(3 * angle)
+        bow = 3e-4 * np.square(x) * np.sin(angle)
+        return RADIUS_MM * (1 + 0.0025 * np.cos(2 * (angle - 0.3))) + 0.05 * np.cos(3 * angle) + bow
 
     rng = np.random.default_rng(1)
-    truth = {"diameter": 300.0, "ovality": 1.5, "ovality share": 0.5, "straightness": 0.002 * 0.5 * 20.0**2}
+    truth = {"diameter": 300.0, "ovality": 1.5, "ovality share": 0.5, "straightness": np.hypot(1e-3, 3e-4) * 20.0**2}
     truth |= {"axis slope 1": 0.0, "axis slope 2": 0.0}
     inside = dict.fromkeys(truth, 0)
     for _ in range(20):
@@ -101,12 +102,11 @@ def test_the_form_of_a_pipe_is_within_its_intervals():
         assert pipe["ovality"].uncertainty < 0.03
     assert min(inside.values()) >= 14, inside
     assert len(sections) == 12
-    # The length from -20 to 20 mm in twelve parts, about the axis in the origin; the bow has its means here.
+    # The length from -20 to 20 mm in twelve parts, about an axis through the origin, which is bowed along y and z.
     middles = (np.arange(12) + 0.5) * 40 / 12 - 20
-    places = np.array([section.place_mm for section in sections])
-    order = np.argsort(places[:, 0])
-    bow = 0.001 * (middles**2 + (40 / 12) ** 2 / 12)
-    np.testing.assert_allclose(places[order], np.column_stack([middles, 0 * middles, bow]), atol=0.05)
+    squares = np.square(middles) + (40 / 12) ** 2 / 12
+    places = np.array(sorted((section.place_mm for section in sections), key=lambda place: place[0]))
+    np.testing.assert_allclose(places, np.column_stack([middles, 3e-4 * squares, 1e-3 * squares]), atol=0.03)
     for section in sections:
         assert section["ovality"].value == pytest.approx(1.5, abs=GATE * section["ovality"].uncertainty + 0.05)
 
@@ -368,6 +368,33 @@ def test_a_flange_is_measured():
     # The noise of a perfect face is subtracted: what is left is within twice the stated uncertainty.
     plain = uwlts.inspect_flange(flat_scan(rng, lambda x, y: 0 * x, face, along=(-60, 60, 0.5))).features[0]["flatness"]
     assert plain.value < 2 * plain.uncertainty and plain.value < 0.01
+
+
+def test_points_near_edges_of_profiles_are_no_inner_points():
+    """Two profiles of 30 lines, one with a gap of ten lines: four lines beside each edge; single lines may lack."""
+    line = np.concatenate([np.delete(np.arange(30), 15), np.arange(10), np.arange(20, 30)])
+    frame = np.repeat([4, 7], [29, 20])
+    order = np.random.default_rng(1).permutation(49)
+    cloud = PointCloud(np.zeros((49, 3)), np.ones(49), frame[order], line[order])
+    inner = _mask_inner_points(cloud, np.arange(49))
+    expected = np.concatenate(
+        [
+            np.delete((np.arange(30) >= 4) & (np.arange(30) < 26), 15),
+            2 * [False, False, False, False, True, True, False, False, False, False],
+        ]
+    )
+    np.testing.assert_array_equal(inner, expected[order])
+    unknown = PointCloud(np.zeros((49, 3)), np.ones(49), np.full(49, -1), line)
+    assert _mask_inner_points(unknown, np.arange(49)).all()
+
+
+def test_the_height_of_a_step_is_that_between_its_two_most_frequent_levels():
+    rng = np.random.default_rng(2)
+    levels = np.concatenate([rng.normal(3.0, 0.02, 6000), rng.normal(-9.0, 0.02, 3000), rng.uniform(-9, 3, 500)])
+    # Bins of the histogram are wider than the noise.
+    assert _estimate_step_height(levels) == pytest.approx(12.0, rel=0.02)
+    with pytest.raises(EvaluationError, match="only one face found"):
+        _estimate_step_height(np.full(100, 2.0))
 
 
 def test_a_bolt_circle_is_that_of_its_holes():

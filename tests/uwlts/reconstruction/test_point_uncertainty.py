@@ -22,7 +22,13 @@ from uwlts.model.calibration import KnownMedium, KnownStage
 from uwlts.model.parameter_keys import MediumIndex, StageParameter
 from uwlts.model.sensor import Medium
 from uwlts.optics.triangulation import reconstruct_pixels
-from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px, point_uncertainty, stage_components
+from uwlts.reconstruction.point_uncertainty import (
+    MOST_CORRELATED,
+    estimate_stripe_noise_px,
+    measure_correlation,
+    point_uncertainty,
+    stage_components,
+)
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, describe_source
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
@@ -87,6 +93,28 @@ def test_the_stripes_noise_is_that_of_its_image(stripes):
     noise = estimate_stripe_noise_px(frame, line, centre)
     assert noise[frame == 0] == pytest.approx(0.1, rel=0.08)
     assert noise[frame == 1] == pytest.approx(0.3, rel=0.08)
+
+
+@pytest.mark.parametrize(("lines", "expected"), [(1, 1.0), (2, 0.884), (3, 0.782)])
+def test_noise_that_neighbours_share_counts_as_in_means(lines, expected):
+    """A moving mean leaves the variance of long means; of differences of means of four, it leaves ``expected`` squared.
+
+    Second differences alone would give 1, 0.41 and 0.27. One of sixteen differences is independent: 4 % is more than
+    five standard deviations of their median.
+    """
+    noise = np.random.default_rng(11).normal(0, 0.1, 400_000 + lines - 1)
+    line = np.arange(400_000)
+    centre = 300 + 1e-10 * (line - 2e5) ** 2 + np.convolve(noise, np.full(lines, 1 / lines), mode="valid")
+    found = estimate_stripe_noise_px(np.zeros_like(line), line, centre)
+    assert found == pytest.approx(0.1 * expected, rel=0.04)
+
+
+def test_a_wavy_surface_adds_at_most_as_much_as_correlated_noise_does():
+    line = np.arange(100_000)
+    centre = 300 + np.sin(2 * np.pi * line / 20) + np.random.default_rng(12).normal(0, 0.1, len(line))
+    assert measure_correlation(np.zeros_like(line), line, centre) > MOST_CORRELATED
+    # Second differences of this wave have 0.1 px, as the noise has.
+    assert np.all(estimate_stripe_noise_px(np.zeros_like(line), line, centre) < MOST_CORRELATED * 0.15)
 
 
 def test_covariances_are_those_of_monte_carlo(calibration, stripes, thesis, tmp_path):
@@ -168,8 +196,7 @@ def test_random_covariance_is_the_stripes_noise_on_the_object(calibration, strip
             stage_direction=np.array([1.0, 0, 0]),
         ).points_mm
 
-    shared = np.sqrt(calibration.joint.shared_variance["stripe on the target"])
-    expected = (points(0.5) - points(-0.5)) * (estimate_stripe_noise_px(frame, line, centre) * shared)[:, None]
+    expected = (points(0.5) - points(-0.5)) * estimate_stripe_noise_px(frame, line, centre)[:, None]
     np.testing.assert_allclose(
         full(known.random_mm2), np.einsum("ni,nj->nij", expected, expected), rtol=1e-3, atol=1e-3 * np.max(expected**2)
     )
@@ -424,13 +451,7 @@ def test_residual_shifts_by_blur_and_stray_light_are_common_to_all_points(calibr
     with capture_of(tmp_path, thesis, MEDIUM) as capture:
         plain = point_uncertainty(capture, calibration, frame, line, centre)
         known = point_uncertainty(capture, calibration, frame, line, centre, blur_px=blur, beside_mm=beside)
-    per_px = (
-        noise_shifts(plain)
-        / (
-            estimate_stripe_noise_px(frame, line, centre)
-            * np.sqrt(calibration.joint.shared_variance["stripe on the target"])
-        )[:, None]
-    )
+    per_px = noise_shifts(plain) / estimate_stripe_noise_px(frame, line, centre)[:, None]
     # Any part of what blur may do is as likely; the sheet's thickness, known to 10 %, counts by its square.
     added = [per_px * blur[:, None] / np.sqrt(3), 0.2 * beside]
     expected = sum(np.stack([each[:, i] * each[:, j] for i, j in PAIRS], axis=1) for each in added)

@@ -40,7 +40,8 @@ def test_a_merged_cloud_has_the_errors_of_points_poses_and_patterns() -> None:
     joint = JointRegistration(patches, [[], []], np.array([np.eye(4), pose]), start_std=None, sphere_mm=None)
     joint.patterns = [np.array([0.5, -1.0]), np.array([2.0])]
     # Six parameters of the second pose, two amplitudes of the first scan and one of the second.
-    root = np.random.default_rng(3).normal(size=(9, 9)) * np.array([0.1] * 3 + [0.005] * 3 + [1.0] * 3)[:, None]
+    # Their errors have four independent causes.
+    root = np.random.default_rng(3).normal(size=(9, 4)) * np.array([0.1] * 3 + [0.005] * 3 + [1.0] * 3)[:, None]
     merged = merge_clouds(scans, ("a", "b"), joint, root @ root.T)
     first, second = (each.uncertainty for each in scans)
     corrected = [
@@ -60,9 +61,9 @@ def test_a_merged_cloud_has_the_errors_of_points_poses_and_patterns() -> None:
     total = np.einsum("nii->", expected)
     assert abs(np.einsum("nii->", found) - total) < 1e-4 * total
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
-    # Patterns are orthogonal over all points, and no more than the unknowns.
+    # Patterns are orthogonal over all points, and no more than the causes.
     gram = np.einsum("mni,kni->mk", patterns, patterns)
-    assert len(gram) <= 9 and np.abs(gram - np.diag(np.diag(gram))).max() < 1e-5 * gram[0, 0]
+    assert len(gram) == 4 and np.abs(gram - np.diag(np.diag(gram))).max() < 1e-5 * gram[0, 0]
     own = merged.uncertainty.random_mm2[800:]
     full = np.zeros((800, 3, 3))
     for k, (i, j) in enumerate(PAIRS):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from uwlts.registration.surface_registration import Nearest, SampledSurface, register_to_surface, shape_registration
@@ -53,6 +54,29 @@ def test_the_covariance_is_that_of_the_errors(points_each: int) -> None:
     assert low < squares < high
 
 
+def test_the_result_does_not_depend_on_the_start() -> None:
+    """A cloud in place, and the same moved by 2.7 mm and 1 deg: one motion more, equal covariances and middles."""
+    rng, side = np.random.default_rng(9), np.arange(-30, 30, 1.0)
+    x, y = (each.ravel() for each in np.meshgrid(side, side))
+    slopes = [2 / 9 * np.cos(x / 9) + 0.002 * y, -1.5 / 7 * np.sin(y / 7) + 0.002 * x]
+    normals = np.column_stack([-slopes[0], -slopes[1], np.ones(len(x))])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    surface = SampledSurface(np.column_stack([x, y, height(x, y)]), normals)
+    inner = np.flatnonzero(np.hypot(x - 5, y + 3) < 20)
+    cloud = surface.points_mm[inner] + 0.01 * rng.standard_normal(len(inner))[:, None] * normals[inner]
+    turn, shift = Rotation.from_rotvec([0.01, -0.01, 0.01]).as_matrix(), np.array([1.5, -1.0, 2.0])
+    still = register_to_surface(cloud, surface, reach_mm=6.0)
+    moved = register_to_surface(cloud @ turn.T + shift, surface, reach_mm=6.0)
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = turn, shift
+    np.testing.assert_allclose(moved.transform @ motion, still.transform, atol=2e-4)
+    placed = cloud @ still.transform[:3, :3].T + still.transform[:3, 3]
+    np.testing.assert_allclose(still.middle_mm, placed.mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(moved.middle_mm, still.middle_mm, atol=2e-4)
+    std = np.sqrt(np.diag(still.covariance))
+    np.testing.assert_allclose(moved.covariance / np.outer(std, std), still.covariance / np.outer(std, std), atol=0.02)
+
+
 def test_what_a_plane_does_not_determine_is_left() -> None:
     """Normals that are tilted by 1e-3 alone give less than a thousandth of the information on a shift across."""
     rng, std = np.random.default_rng(5), 0.01
@@ -85,6 +109,7 @@ def test_the_uncertainty_of_a_fitted_plane_is_that_of_its_residuals() -> None:
     known = PointUncertainty(np.zeros((100, 6)), 0.2 * up, np.stack([0.5 * up, 0.01 * y[:, None] * up]))
     plain = shape_registration(points, near, sized=False, uncertainty=None, frame=None)
     assert plain.rms_mm == pytest.approx(size) and plain.points == 100
+    assert plain.by_cloud.shape == plain.by_reference.shape == (0, 6)
     expected = size**2 * np.array([0, 0, 1 / 100, 1 / (y @ y), 1 / (x @ x), 0])
     np.testing.assert_allclose(plain.covariance, np.diag(expected), atol=1e-12)
     # Halfway to the border: the offset and one tilt.

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from uwlts.errors import ImageError
-from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
+from uwlts.stripe import StripeStatus, extract_stripe
 from uwlts.targets import Target, TargetView
 
 # The edge of a Gaussian blur s has the slope 0.4 / s times its contrast.
@@ -170,7 +170,6 @@ def judge_stripe(
     *,
     stripe_along: str,
     full_dn: int,
-    options: StripeOptions = StripeOptions(),
     limits: QualityLimits = QualityLimits(),
 ) -> StripeQuality:
     """Assess a laser image (H, W) of the target.
@@ -180,7 +179,7 @@ def judge_stripe(
     ``view`` holds the points in the lamp image of the same pose, ``full_dn`` is the grey value of saturation.
     """
     try:
-        stripe = extract_stripe(image, stripe_along=stripe_along, options=options, saturation=full_dn)
+        stripe = extract_stripe(image, stripe_along=stripe_along, saturation=full_dn)
     except ImageError as error:
         return StripeQuality(np.empty((0, 2)), 0.0, (str(error),))
     found, pixels = stripe.status == StripeStatus.OK, stripe.pixels()

@@ -13,7 +13,7 @@ from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Sensor
 from uwlts.optics.triangulation import points_on_sheet
-from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
+from uwlts.stripe import StripeStatus, extract_stripe
 
 PLACES = 3
 """Number of depths of the standard that are needed: near, middle and far."""
@@ -71,7 +71,6 @@ def judge_step(
     *,
     medium_index: float,
     full_dn: int,
-    options: StripeOptions = StripeOptions(),
 ) -> StepQuality:
     """Assess a laser image (H, W) of the step standard.
 
@@ -80,7 +79,7 @@ def judge_step(
     """
     along = calibration.stripe_along
     try:
-        stripe = extract_stripe(image, stripe_along=along, options=options, saturation=full_dn)
+        stripe = extract_stripe(image, stripe_along=along, saturation=full_dn)
     except ImageError as error:
         return StepQuality(np.empty((0, 2)), None, (str(error),))
     pixels, reasons = stripe.pixels(), []

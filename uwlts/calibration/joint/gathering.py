@@ -149,15 +149,10 @@ def gather_jointly(
 ) -> Gathered:
     """Find the target, the stripes on it, and the stripes on steps and scanned surfaces in all images.
 
-    Raises
-    ------
-    CalibrationError
-        The captures are from different sensors, show no target or several targets, or use one name for different media;
-        a capture is given twice (its noise would count twice); no step image shows a stripe; a scan contains poses.
-    DescriptionError
-        A capture does not describe its target, step standard or scanned object correctly.
-    CaptureError
-        A scan shows no stripe, or an image is damaged.
+    Raises CalibrationError if the captures are from different sensors, show no target or several targets, or use one
+    name for different media. It is also raised if a capture is given twice (its noise would count twice), no step image
+    shows a stripe, or a scan contains poses. Raises DescriptionError if a capture does not describe its target, step
+    standard or scanned object correctly; CaptureError if a scan shows no stripe, or an image is damaged.
     """
     sensor, provenance = common_sensor([*targets, *steps, *scans]), sources_of(targets, steps, scans)
     media: dict[str, Medium] = {}

@@ -84,10 +84,7 @@ class SeriesStart:
 
         Only stripes with the least influence of the window are used; None if no stripe is on the target.
 
-        Raises
-        ------
-        CalibrationError
-            The stripes are not on a plane, or do not determine one.
+        Raises CalibrationError if the stripes are not on a plane, or do not determine one.
         """
         views = {e.view for e in self.evidence if len(e.pixels)}
         if not views:

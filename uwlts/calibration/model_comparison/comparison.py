@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.polynomial import legendre
 
 from uwlts.calibration.joint.estimate import outlier_limit
 from uwlts.calibration.joint.gathering import Gathered, Series, gather_jointly
@@ -177,12 +176,8 @@ def score_polynomials(
     depth_mm, _ = object_coordinates(stripes, header)
     held = np.isin(stripes.pose, [image for _, image in images])
     fit = fit_line_polynomials(stripes.lines[~held], stripes.centres_px[~held], depth_mm[~held], degree=DEGREE)
-    low, high = fit.range
-    rows, x = stripes.lines[held] - fit.first_line, stripes.centres_px[held]
-    known = (rows >= 0) & (rows < len(fit.coefficients)) & (x >= low) & (x <= high)
-    argument = (2 * x[known] - low - high) / (high - low)
-    found = legendre.legval(argument, fit.coefficients[rows[known]].T, tensor=False)
-    off, pose = found - depth_mm[held][known], stripes.pose[held][known]
+    off, pose = fit.evaluate(stripes.lines[held], stripes.centres_px[held]) - depth_mm[held], stripes.pose[held]
+    off, pose = off[np.isfinite(off)], pose[np.isfinite(off)]
     by_model = [m.mm for m in model.misses if m.image in images and m.kind == STRIPE]
     own = _robust_rms([off[pose == image] for image in np.unique(pose)])
     return PolynomialScore(header.medium_name, len(images), *own, *_robust_rms(by_model))
@@ -272,10 +267,8 @@ def choose(
 ) -> Choice:
     """Compare the usual model, models that differ from it by one property, and the simplest sufficient one.
 
-    Raises
-    ------
-    CalibrationError
-        There are too few images, or the usual model cannot be calibrated without the held-out images.
+    Raises CalibrationError if there are too few images, or the usual model cannot be calibrated without the held-out
+    images.
     """
     ways, usual, done = split_images(problem), Candidate(), count(1)
     dimensions = select_dimensions(problem.parameters)

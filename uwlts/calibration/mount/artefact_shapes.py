@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from uwlts.calibration.mount.profiles import Detection, find_arc, find_face, find_line, find_step, find_walls
+from uwlts.fitting.shapes import perpendicular_to
 from uwlts.model.mount import PlaneFound, RingFound, SphereFound, StepFound
 from uwlts.storage.mount_files import Artefact
 
@@ -253,13 +254,6 @@ class RingShape(Shape):
 
 
 SHAPES: dict[Artefact, type[Shape]] = {each.kind: each for each in (SphereShape, PlaneShape, StepShape, RingShape)}
-
-
-def perpendicular_to(normal: np.ndarray) -> np.ndarray:
-    """Return two unit directions (2, 3) perpendicular to a normal and to each other."""
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    return np.array([first, np.cross(normal, first)])
 
 
 def _rotate_normal(normal: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -43,8 +43,8 @@ class MountState:
 class Scatter(NamedTuple):
     """Standard deviations of a point, the smooth error along a profile, a pose's coordinates, and its rotation.
 
-    The covariance of the smooth error decreases to 1/e over ``length_mm``. ``turn_rad`` is used for flat artefacts
-    only.
+    The correlation of the smooth error is (1 + d) exp(-d) for a distance of d times ``length_mm``. ``turn_rad`` is
+    used for flat artefacts only.
     """
 
     point_mm: float

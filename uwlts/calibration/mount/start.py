@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefact_shapes import PlaneShape, RingShape, SphereShape, StepShape, perpendicular_to
+from uwlts.calibration.mount.artefact_shapes import PlaneShape, RingShape, SphereShape, StepShape
 from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet, point_by_mount, to_sheet
 from uwlts.calibration.mount.profiles import Detection, ProfileArc, ProfileLine, circles_through
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError
+from uwlts.fitting.shapes import perpendicular_to
 
 _SUBSET = 8  # poses of a random subset: 24 linear equations for 12 unknowns
 _SUBSETS = 40  # random subsets: with a fifth of the poses wrong, one of six subsets contains no wrong pose

@@ -148,12 +148,8 @@ def image_files(folder: Path, *, more: tuple[str, ...] = ()) -> list[str]:
 def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -> Matched:
     """Assign roles to a folder's images, by patterns or by the ``rows`` of a table.
 
-    Raises
-    ------
-    ImageError
-        The folder contains no image.
-    DescriptionError
-        No image has a role, an image has two, a named file is missing, or the background of an image is ambiguous.
+    Raises ImageError if the folder contains no image; DescriptionError if no image has a role, an image has two, a
+    named file is missing, or the background of an image is ambiguous.
     """
     files = image_files(folder, more=(".csv", ".npy") if given.centre_lines else ())
     known = [ImageRow(name) for name in files] if rows is None else rows

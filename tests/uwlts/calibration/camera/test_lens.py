@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.calibration.camera.lens import LensChoice, calibrate_lens
+from uwlts.calibration.camera.lens import LensChoice, calibrate_lens, half_doubt
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.errors import CalibrationError
 from uwlts.model.sensor import Distortion
@@ -122,6 +122,15 @@ def test_an_image_that_alone_decides_is_left_out_and_named():
         assert set(found.left_out) <= {19}
         reasons += [reason for reason in found.left_out.values() if "standard uncertainties" in reason]
     assert len(reasons) >= 4
+
+
+def test_halves_are_doubted_beyond_four_standard_deviations_of_their_difference():
+    # Halves of N independent measurements, with deviations s sqrt(2 / N) each, differ by s 2 / sqrt(N).
+    values = np.random.default_rng(0).standard_normal((20_000, 16)) * 3.0
+    deviation = np.std(values[:, ::2].mean(axis=1) - values[:, 1::2].mean(axis=1))
+    assert half_doubt("f", apart=3.9 * deviation, std=3.0 / 4) == []
+    (doubt,) = half_doubt("f", apart=4.1 * deviation, std=3.0 / 4)
+    assert "by 4.1 standard uncertainties" in doubt
 
 
 @pytest.mark.slow

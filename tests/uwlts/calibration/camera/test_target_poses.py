@@ -56,6 +56,27 @@ def test_exact_pixels_give_the_exact_camera(poses):
     assert [len(r) for r in solution.residuals_px] == [len(i.points_mm) for i in images]
 
 
+def test_prior_knowledge_of_the_tangential_terms_is_weighed_by_its_covariance():
+    """The posterior of two normal distributions; that of the images is normal to a fraction of its deviation."""
+    noise_px, std = 0.1, 7e-5
+    images, _ = free_images(noise_px=noise_px, rng=np.random.default_rng(6))
+    distortion = ("k1", "k2", "p1", "p2")
+    alone, known = (
+        solve_camera(images, **SIZE, poses="free", options=CameraOptions(distortion, tangential=tangential))
+        for tangential in (None, (std, noise_px))
+    )
+    # Weights are relative to the stated noise of the points, which the images' own scatter confirms.
+    information = np.linalg.inv(alone.covariance) * (alone.sigma_px / noise_px) ** 2
+    prior = np.diag([name in ("p1", "p2") for name in alone.parameters]) / std**2
+    covariance = np.linalg.inv(information + prior)
+    values, found = (np.array(list(each.values().values())) for each in (alone, known))
+    deviation = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found / deviation, covariance @ information @ values / deviation, atol=0.05)
+    np.testing.assert_allclose(list(known.std().values()), deviation * known.sigma_px / noise_px, rtol=0.02)
+    # The prior is about as certain as the images, so that both count.
+    assert 0.5 < std / alone.std()["p1"] < 2
+
+
 def test_the_stage_is_found_tilted_against_the_target():
     images, _, direction = stage_images(SENSOR, positions=FEW, stage_tilt=(0.02, -0.01))
     free = solve_camera(images, **SIZE, poses="stage")

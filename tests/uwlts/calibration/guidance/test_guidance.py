@@ -26,6 +26,7 @@ from uwlts.calibration.guidance.pose_advice import (
     best_pose,
     candidates,
     compute_gain,
+    compute_shortfall,
     coverage_of,
     describe_missing,
     describe_missing_sheet,
@@ -241,6 +242,22 @@ def test_following_the_advice_leads_to_a_good_camera_soon(setting, thesis_as_bui
     assert (tilts.max(axis=0) > 12).all() and (tilts.min(axis=0) < -12).all()
 
 
+def test_more_coverage_than_wanted_does_not_replace_other_evidence(setting):
+    """The part of the wanted coverage that is missing counts four, what is beyond it a twentieth of that."""
+    state = solve_state([], setting, CompletionLimits(coverage=0.5))
+    shape = state.coverage.counts.shape
+
+    def shortfall(share: float) -> float:
+        counts = np.zeros(shape, dtype=int)
+        counts.flat[: round(share * counts.size)] = 9
+        return compute_shortfall(replace(state, coverage=replace(state.coverage, counts=counts)))
+
+    size = np.prod(shape)
+    few, half, most = (round(share * size) / size for share in (0.2, 0.5, 0.9))
+    assert shortfall(few) - shortfall(half) == pytest.approx(4 * (1 + 0.05) * (half - few), abs=4 / size)
+    assert shortfall(half) - shortfall(most) == pytest.approx(4 * 0.05 * (most - half), abs=1e-9)
+
+
 def test_advised_poses_beat_as_many_random_ones(setting):
     wanted = CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6)
     count = 6
@@ -378,6 +395,8 @@ def test_the_step_standard_is_judged(thesis):
     assert any("saturated" in reason for reason in judge(step_image(thesis, step_profile(0.0), gain=5.0)).reasons)
     dark = judge(step_image(thesis, step_profile(0.0), gain=0.0))
     assert dark.depth_mm is None and "0 lines only" in dark.reasons[0]
+    other = judge(np.zeros((64, 64)))
+    assert other.pixels.shape == (0, 2) and other.depth_mm is None and "float64" in other.reasons[0]
 
 
 def test_the_step_standard_is_wanted_at_three_depths(thesis):

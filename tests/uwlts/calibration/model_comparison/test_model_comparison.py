@@ -11,7 +11,7 @@ from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.procedure import joint_problem, solve_jointly
 from uwlts.calibration.joint.residuals import STRIPE, TARGET
 from uwlts.calibration.joint.stored_estimate import read_original_estimate
-from uwlts.calibration.model_comparison.comparison import Comparison, build_choice, choose, sum_errors
+from uwlts.calibration.model_comparison.comparison import Comparison, build_choice, choose, compare_models, sum_errors
 from uwlts.calibration.model_comparison.held_out import (
     INSIDE,
     OUTSIDE,
@@ -23,7 +23,7 @@ from uwlts.calibration.model_comparison.held_out import (
     split_images,
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
-from uwlts.errors import CalibrationError
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.files.json_files import SEAL, compute_seal, json_text
 from uwlts.report.model_comparison import (
     ModelComparisonContent,
@@ -33,8 +33,6 @@ from uwlts.report.model_comparison import (
     models_page,
     verdicts,
 )
-
-pytestmark = pytest.mark.slow
 
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
 AIR, IN_WATER = np.arange(8) * 35.0 - 200.0, np.arange(11) * 18.0 - 120.0
@@ -81,6 +79,7 @@ def tilted_choice(thesis):
     )
 
 
+@pytest.mark.slow
 def test_where_nothing_is_tilted_or_bowed_the_simplest_model_is_chosen(plain_choice):
     simplest = plain_choice.simplest()
     assert not (simplest.window_tilt or simplest.bow or simplest.window_turn)
@@ -93,6 +92,7 @@ def test_where_nothing_is_tilted_or_bowed_the_simplest_model_is_chosen(plain_cho
     assert "distortion k1 k2 is enough: with distortion k1" in said
 
 
+@pytest.mark.slow
 def test_a_tilted_window_is_found_to_be_needed(tilted_choice):
     """A tilt t shifts rays by t (n - 1) times the distance to the object: 0.2 deg and 400 mm give 0.46 mm.
 
@@ -107,6 +107,7 @@ def test_a_tilted_window_is_found_to_be_needed(tilted_choice):
     assert any(line.startswith("the tilt of the window is needed: without it") for line in verdicts(tilted_choice))
 
 
+@pytest.mark.slow
 def test_images_held_out_are_predicted_to_their_noise(plain_choice):
     """Distance of points with 0.03 px in both directions, stripes with 0.1 px; 3 µm of the stage add a hundredth.
 
@@ -145,6 +146,7 @@ def test_the_outermost_images_are_held_out_outside_and_never_inside(plain):
     assert len(inside) >= 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [12, 14])
 def test_fourteen_images_at_even_depths_are_enough(thesis, count):
     series = target_series(built_sensor(), medium=0, positions=np.linspace(-80.0, 40.0, count), columns=5)
@@ -157,11 +159,16 @@ def test_fourteen_images_at_even_depths_are_enough(thesis, count):
 
 
 def test_too_few_images_are_refused(thesis):
+    with pytest.raises(DescriptionError, match="workers is 0"):
+        compare_models(air=["none.h5"], workers=0)
+    with pytest.raises(DescriptionError, match="no captures of a target"):
+        compare_models(workers=1)
     series = target_series(built_sensor(), medium=0, positions=IN_WATER[::3], columns=15)
     with pytest.raises(CalibrationError, match="too few images with a stripe"):
         split_images(joint_problem(gathered(thesis, [series]), options=OPTIONS))
 
 
+@pytest.mark.slow
 def test_a_target_held_by_hand_is_predicted_from_its_own_points(thesis):
     """Nothing ties its poses, so each is fitted to the target's points; the stripe then shows the sheet's error."""
     tilts = np.array([(0, 0), (0.35, 0), (-0.35, 0), (0, 0.35), (0, -0.35), (0.25, 0.25), (-0.25, 0.25), (0.3, -0.2)])
@@ -203,6 +210,7 @@ def test_what_a_model_adds_is_distinguished_from_noise_and_outliers_do_not_count
     assert found.as_good(2, 0) and found.as_good(0, 1)
 
 
+@pytest.mark.slow
 def test_a_parameter_without_uncertainty_is_held_and_read_back(thesis):
     """If tilts and bow are known exactly, they are not estimated, but the file contains them."""
     known = thesis.uncertainty.model_copy(update={"window_tilt_deg": 0.0, "bow_deg": 0.0})
@@ -238,6 +246,7 @@ def test_every_candidate_has_the_parameters_its_name_says(plain):
     assert lacking(distortion=("k1", "k2", "p1", "p2")) == (set(), {"p1", "p2"})
 
 
+@pytest.mark.slow
 def test_the_page_and_the_lines_tell_every_model(plain_choice):
     comparison = Comparison(
         "thesis <as built>", ["target.h5"], plain_choice, None, "no polynomials here", ["a warning"]

@@ -25,7 +25,7 @@ from tests.uwlts.mount_views import (
 )
 from uwlts.calibration.mount import restricted_likelihood
 from uwlts.calibration.mount.artefact_shapes import RingShape
-from uwlts.calibration.mount.profiles import _fit_circle
+from uwlts.calibration.mount.profiles import ProfileLine, _fit_circle, _line_distance
 from uwlts.cli import main
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, PlaneFound, RingFound, SphereFound, StepFound
@@ -94,6 +94,24 @@ def test_a_short_arc_is_fitted_by_its_distances(rng):
     )
     centre, found = _fit_circle(points)
     np.testing.assert_allclose(np.append(centre, found), fit.x, atol=1e-4)
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 30.0, 170.0])
+@pytest.mark.parametrize(("apart_mm", "found"), [(0.12, True), (-0.12, True), (0.04, False)])
+def test_faces_of_a_step_are_apart_by_more_than_their_noise(turned_deg, apart_mm, found):
+    """Eight standard deviations of 0.01 mm; the distance is along the normal that points to larger z."""
+    direction = np.array([np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))])
+    normal = np.array([-direction[1], direction[0]]) * np.sign(direction[0])
+
+    def face(at: np.ndarray, along: np.ndarray) -> ProfileLine:
+        members = np.ones(50, dtype=bool)
+        return ProfileLine(
+            members=members, part=0 * members, std_mm=0.01, middle_mm=at, direction=along, length_mm=20.0
+        )
+
+    first, second = face(30 * direction, direction), face(-12 * direction + apart_mm * normal, -direction)
+    distance = _line_distance(first, second)
+    assert distance == (pytest.approx(apart_mm, abs=1e-9) if found else None)
 
 
 def test_points_near_the_edge_of_a_ring_are_on_neither_surface(rng):

@@ -1,12 +1,69 @@
 """Least squares with variance components: steps that oscillate, and estimates that cannot settle."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy.stats import t
+from scipy.optimize import brentq
+from scipy.stats import f, norm, t
 
-from uwlts.calibration.mount.restricted_likelihood import NotSettled, settle
+from tests.uwlts.mount_views import MOUNT, RADIUS_MM, SPHERE_MM, sphere_campaign
+from uwlts.calibration.mount.artefact_shapes import SHAPES
+from uwlts.calibration.mount.profile_evidence import MountState, Problem
+from uwlts.calibration.mount.restricted_likelihood import NotSettled, settle, settle_agreeing
+
+
+def profiles_of(kind: str) -> tuple[Problem, MountState]:
+    """Return points near a sphere of unknown radius or a plane, with the true state, and a robot of unknown scale."""
+    rng = np.random.default_rng(3)
+    campaign = sphere_campaign(rng, poses=4, plane_only=kind == "plane")
+    campaign.poses[:, :3, 3] += rng.normal(0, 0.05, (4, 3))
+    points, height = [], SPHERE_MM[2] - 1.1 * RADIUS_MM
+    for profile, pose in zip(campaign.profiles, campaign.poses, strict=True):
+        seen = np.column_stack([profile[:, 0], np.zeros(len(profile)), profile[:, 1]])
+        base = (seen @ MOUNT[:3, :3].T + MOUNT[:3, 3]) @ pose[:3, :3].T + pose[:3, 3]
+        off = base[:, 2] - height if kind == "plane" else np.linalg.norm(base - SPHERE_MM, axis=1) - RADIUS_MM
+        points.append(seen[np.abs(off) < 1])
+    artefact = np.array([0.0, 0.0, 1.0, height]) if kind == "plane" else np.append(SPHERE_MM, RADIUS_MM)
+    part = [np.zeros(len(each), dtype=int) for each in points]
+
+    def motion(offset_s: float) -> tuple[np.ndarray, np.ndarray]:
+        return campaign.poses[:, :3, :3], campaign.poses[:, :3, 3] + offset_s * np.array([3.0, 5.0, -2.0])
+
+    problem = Problem(points, motion, np.array([0.0, 1.0, 0.0]), SHAPES[kind](), part, scale=True, time=True)
+    return problem, MountState(MOUNT[:3, :3], MOUNT[:3, 3], artefact)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "plane"])
+def test_variances_of_profiles_change_by_their_derivatives(kind: str):
+    problem, state = profiles_of(kind)
+    covariances = problem.covariance(state)
+    logs = np.log([0.03, 0.07, 6.0, 0.05, 3e-4])
+    total, changes = covariances(logs)
+    for number, change in enumerate(changes):
+        step = 1e-4 * np.eye(5)[number]
+        expected = (covariances(logs + step)[0] - covariances(logs - step)[0]) / 2e-4
+        np.testing.assert_allclose(change, expected, atol=1e-6 * total.max())
+    # Each component doubles its standard deviation's square four times.
+    for number in (0, 1, 3, 4):
+        more = covariances(logs + np.log(2) * np.eye(5)[number])[0]
+        np.testing.assert_allclose(more - total, 1.5 * changes[number], atol=1e-6 * total.max())
+
+
+@pytest.mark.parametrize("turned_rad", [0.0, 0.3])
+@pytest.mark.parametrize("kind", ["sphere", "plane"])
+def test_distances_of_profiles_change_by_their_derivatives(kind: str, turned_rad: float):
+    """At the state, and after a step that turns the mount."""
+    problem, state = profiles_of(kind)
+    here = np.zeros(problem.size)
+    here[3:6] = turned_rad * np.array([0.6, -0.48, 0.64])
+    by = problem.jacobian(state, here if turned_rad else None)
+    assert by.shape[2] == problem.size == 6 + (4 if kind == "sphere" else 3) + 2
+    sizes = np.array([*[0.01] * 3, *[1e-4] * 3, *[0.01 if kind == "sphere" else 1e-4] * 2, 0.01, 0.01, 1e-5, 1e-3])
+    for number, size in enumerate(sizes[: problem.size]):
+        step = size * np.eye(problem.size)[number]
+        expected = (problem.residuals(state, here + step) - problem.residuals(state, here - step)) / (2 * size)
+        np.testing.assert_allclose(by[:, :, number], expected, atol=1e-4 * np.abs(expected).max())
 
 
 @dataclass(frozen=True)
@@ -68,6 +125,16 @@ class Readings:
 
     size = 1
 
+    @property
+    def groups(self):
+        return len(self.read)
+
+    def select(self, kept):
+        return replace(self, read=self.read[kept])
+
+    def pose_directions(self, state):
+        return [np.eye(1)] * len(self.read)
+
     def bounds(self):
         return np.array([(1e-3, 1e3)])
 
@@ -86,6 +153,23 @@ class Readings:
 
     def pool_repeats(self, state):
         return self.repeats, self.squares
+
+
+@pytest.mark.parametrize(("beyond", "rejected"), [(0.98, []), (1.02, [7])])
+def test_one_of_a_thousand_sets_of_equal_readings_loses_one(beyond, rejected):
+    """A reading's distance from the mean of n - 1 others has the variance s^2 n / (n - 1), and n may be rejected."""
+    count = 40
+    read = norm.ppf((np.arange(count) + 0.5) / count)
+    read = np.random.default_rng(2).permutation(read)
+
+    def squared_distance(value: float) -> float:
+        every = np.append(np.delete(read, 7), value)
+        return (value - every[:-1].mean()) ** 2 / (every.var(ddof=1) * count / (count - 1))
+
+    limit = f.isf(1e-3 / count, 1, count - 1)
+    read[7] = brentq(lambda value: squared_distance(value) - beyond * limit, 2.0, 1e3)
+    _, kept = settle_agreeing(Readings(read, 0, 0.0), [(0.0, np.ones(1))], require=lambda kept: None)
+    assert np.flatnonzero(~kept).tolist() == rejected
 
 
 @pytest.mark.parametrize("repeats", [0, 4])

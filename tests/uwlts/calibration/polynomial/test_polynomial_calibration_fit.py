@@ -11,6 +11,11 @@ from tests.oracles.fermat import directions_seen, plate
 from tests.uwlts.calibration_views import WATER, built_sensor, inside, lattice, lens_of, turn
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
+from uwlts.calibration.joint.gathering import Series
+from uwlts.calibration.joint.parameters import ViewMedium
+from uwlts.calibration.joint.residuals import STRIPE
+from uwlts.calibration.model_comparison.comparison import score_polynomials
+from uwlts.calibration.model_comparison.held_out import Misses, Prediction
 from uwlts.calibration.polynomial.polynomial_calibration_fit import (
     MOST_SMOOTH,
     calibrate_polynomials,
@@ -281,6 +286,36 @@ def test_offset_of_the_position_changes_nothing(evidence):
     there = fit_line_polynomials(lines + 1000, centres + 1e3, depths, degree=6)
     assert there.first_line == here.first_line + 1000
     assert np.abs(there.coefficients - here.coefficients).max() < 1e-9
+
+
+def test_held_out_images_are_predicted_within_the_others_only(sensor, evidence):
+    """Inside, errors are those at unseen depths; the outermost images are beyond the polynomials of the others."""
+    series = Series(ViewMedium(True, 0), evidence, True, ["target"])
+    misses = [Misses((0, 5), STRIPE, np.ones(200), np.tile([0.03, 0.05], 100))]
+    model, inside_, ends = Prediction(misses, None, None, None), [(0, 5), (0, 9)], [(0, 0), (0, len(DEPTHS) - 1)]
+    score = score_polynomials(series, header_of(sensor), inside_, model)
+    assert score.all_mm < CLOSE_MM and score.images == 2
+    assert score.model_mm == pytest.approx(np.sqrt((0.03**2 + 0.05**2) / 2))
+    rows = np.concatenate([evidence.stripes[k] for _, k in ends])
+    others = [stripe for k, stripe in enumerate(evidence.stripes) if (0, k) not in ends]
+    flat, depths = np.concatenate(others), np.repeat(DEPTHS[1:-1], [len(each) for each in others])
+    fit = fit_line_polynomials(flat[:, 0].astype(int), flat[:, 1], depths, degree=6)
+    np.testing.assert_allclose(
+        fit.evaluate(flat[:, 0].astype(int), flat[:, 1])[fit.used], (depths - fit.residuals)[fit.used], atol=1e-9
+    )
+    beyond = fit.evaluate(rows[:, 0].astype(int), rows[:, 1])
+    assert np.isnan(beyond[(rows[:, 1] < fit.range[0]) | (rows[:, 1] > fit.range[1])]).all()
+    assert np.isnan(fit.evaluate(fit.first_line - np.array([1, 2]), np.full(2, np.mean(fit.range)))).all()
+
+
+@pytest.mark.parametrize(("lines", "degree"), [(10, 0), (21, 2), (200, 8)])
+def test_as_many_points_as_coefficients_are_too_few(lines, degree):
+    """One more is fitted: a degree for each 10 lines, up to the eighth, times three coefficients of a parabola."""
+    terms = 3 * (degree + 1)
+    at, x = (each.ravel() for each in np.meshgrid(np.linspace(0, lines - 1, degree + 2).round(), [-1.0, 0.2, 1.0]))
+    with pytest.raises(CalibrationError, match=f"{terms} stripe points .* {terms} coefficients"):
+        fit_line_polynomials(at[-terms:], x[-terms:], x[-terms:] ** 2, degree=2)
+    np.testing.assert_allclose(fit_line_polynomials(at, x, x**2, degree=2).residuals, 0, atol=1e-9)
 
 
 def test_outliers_are_left_out(sensor, evidence, result):

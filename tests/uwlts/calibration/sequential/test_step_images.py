@@ -84,6 +84,15 @@ def test_a_standard_that_faces_the_laser_is_not_doubted():
     assert 5e-5 < images[0].lengthened_std < 1e-4
 
 
+@pytest.mark.parametrize(("stated_mm", "doubted"), [(0.3, False), (0.2, True)])
+def test_a_turn_that_matters_less_than_the_certificate_is_not_doubted(stated_mm, doubted):
+    """At 6°, a step of 23 mm is 0.13 mm too high; a certificate states twice the standard uncertainty."""
+    standard = StepStandard(height_mm=STEP_MM, height_uncertainty_mm=stated_mm)
+    steps = [replace(step, standard=standard) for step in turned_step("step.h5", about_stripe=TURN)]
+    _, warnings = labelled(steps)
+    assert bool(warnings) == doubted
+
+
 @pytest.mark.parametrize(
     "steps",
     [
