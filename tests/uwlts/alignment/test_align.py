@@ -8,7 +8,7 @@ import pytest
 
 import uwlts
 from tests.uwlts.path_views import ride
-from uwlts.alignment.align import Crossing
+from uwlts.alignment.align import AlignedTrajectory, Crossing
 from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.crossing_search import correlate_heights
 from uwlts.cli import app
@@ -55,7 +55,7 @@ def loop():
 
 
 class Written:
-    """What the command writes for a cloud and its reported path: the trajectory, the cloud and the crossings."""
+    """Trajectory, cloud and crossings that the command writes for a cloud and its reported path."""
 
     def __init__(self, folder: Path, cloud: PointCloud, reported: Trajectory):
         cloud.save(folder / "pass.h5")
@@ -191,10 +191,12 @@ def test_the_corrected_cloud_is_that_of_the_corrected_trajectory(loop, closed):
 
 
 def test_a_stored_trajectory_is_not_overwritten(closed, tmp_path):
-    closed.save(tmp_path / "corrected.csv")
+    correction = np.zeros((len(closed.trajectory.times_s), 6))
+    aligned = AlignedTrajectory(closed.trajectory, correction, tuple(closed.crossings), (), closed.cloud)
+    aligned.save(tmp_path / "corrected.csv")
     with pytest.raises(uwlts.Error, match="exists"):
-        closed.save(tmp_path / "corrected.csv")
-    closed.save(tmp_path / "corrected.csv", overwrite=True)
+        aligned.save(tmp_path / "corrected.csv")
+    aligned.save(tmp_path / "corrected.csv", overwrite=True)
 
 
 def test_wrong_input_is_refused(loop):
