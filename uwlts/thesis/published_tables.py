@@ -127,16 +127,20 @@ def _sizes(values: Iterable[float | None]) -> tuple[float, ...]:
     return tuple(abs(value) for value in values if value is not None)
 
 
-def _with_mean(rows: list[TableRow], name: str) -> Iterator[TableRow]:
-    """Yield rows of one quantity, and their mean over the measured positions, for each campaign."""
+def _with_mean(rows: list[TableRow], name: str, sizes: list[list[float | None]]) -> Iterator[TableRow]:
+    """Yield rows of one quantity, and its mean over the measured positions, for each campaign that has all of them.
+
+    ``sizes`` are those of each row by campaign.
+    """
     yield from rows
-    measured = [row for row in rows if row.ours]
-    if len({len(row.ours) for row in measured}) != 1:
-        return
-    published = [row.published for row in measured if row.published is not None]
-    mean = float(np.mean(published)) if len(published) == len(measured) else None
-    ours = np.mean([row.ours for row in measured], axis=0)
-    yield TableRow(rows[0].table, name, rows[0].quantity, mean, tuple(ours.tolist()))
+    measured = [number for number, row in enumerate(rows) if row.ours]
+    published = [each for number in measured if (each := rows[number].published) is not None]
+    mean = float(np.mean(published)) if measured and len(published) == len(measured) else None
+    campaigns = zip(*(sizes[number] for number in measured), strict=True)
+    ours = [[each for each in campaign if each is not None] for campaign in campaigns]
+    complete = _sizes(float(np.mean(each)) for each in ours if len(each) == len(measured))
+    if complete:
+        yield TableRow(rows[0].table, name, rows[0].quantity, mean, complete)
 
 
 @dataclass(frozen=True)
@@ -146,22 +150,23 @@ class _Tables:
     results: Sequence[CampaignResults]
     published: Published
 
-    def figures(self, *key: str, name: str) -> tuple[float, ...]:
-        """Return a figure of every campaign that has it, for thing, place, medium, method and image processing."""
-        found = (measured for result in self.results for measured in result.measurements if _KEY(measured) == key)
-        return _sizes(measured.figures_mm.get(name) for measured in found)
+    def figures(self, *key: str, name: str) -> list[float | None]:
+        """Return the size of a figure by campaign, for thing, place, medium, method and image processing."""
+        found = [{_KEY(measured): measured.figures_mm for measured in result.measurements} for result in self.results]
+        values = [figures[key].get(name) if key in figures else None for figures in found]
+        return [None if value is None else abs(value) for value in values]
 
     def objects(self, table: str, thing: str, names: Sequence[str], method: str, processing: str) -> Iterator[TableRow]:
         """Yield rows of a thing's positions in both media and their means, with the values published for the method."""
         source = method if method in (PROPOSED, POLYNOMIALS) else PROPOSED
         for medium, name in product(MEDIA, names):
-            rows = []
+            rows, sizes = [], []
             for number, place in enumerate(self.published.positions(thing)):
                 theirs = self.published.value(thing, source, medium, name.removesuffix(" of all points"), number)
-                ours = self.figures(thing, place, medium, method, processing, name=name)
-                rows.append(TableRow(table, f"{thing}, {place}, {medium}", name, theirs, ours))
+                sizes.append(self.figures(thing, place, medium, method, processing, name=name))
+                rows.append(TableRow(table, f"{thing}, {place}, {medium}", name, theirs, _sizes(sizes[-1])))
             if any(row.ours for row in rows):
-                yield from _with_mean(rows, f"{thing}, {MEAN}, {medium}")
+                yield from _with_mean(rows, f"{thing}, {MEAN}, {medium}", sizes)
 
     def window(self) -> Iterator[TableRow]:
         sets = {f"{place} {n}": (place, n - 1) for place in STEP_PLACES for n in (1, 2, 3)}
@@ -177,12 +182,12 @@ class _Tables:
     def refractions(self) -> Iterator[TableRow]:
         cases = ("one", "one refraction", PROPOSED), ("two", "two refractions", TWO)
         for (key, title, method), name in product(cases, ("STD", "SSE")):
-            rows = []
+            rows, sizes = [], []
             for number, place in enumerate(self.published.positions("spheres")):
                 theirs = self.published.value("refractions", key, name, number)
-                ours = self.figures("spheres", place, "water", method, THESIS, name=name)
-                rows.append(TableRow("Table 5", f"{title}, {place}", name, theirs, ours))
-            yield from _with_mean(rows, f"{title}, {MEAN}")
+                sizes.append(self.figures("spheres", place, "water", method, THESIS, name=name))
+                rows.append(TableRow("Table 5", f"{title}, {place}", name, theirs, _sizes(sizes[-1])))
+            yield from _with_mean(rows, f"{title}, {MEAN}", sizes)
 
     def shares(self) -> Iterator[TableRow]:
         """Yield the largest errors relative to the depth; the thesis's text describes them as mean errors."""
@@ -190,7 +195,7 @@ class _Tables:
         for medium, method in product(MEDIA, (POLYNOMIALS, PROPOSED)):
             found = [self.figures("spheres", place, medium, method, THESIS, name="SSE") for place in places]
             depth = self.published.value("depth_mm", medium)
-            complete = [errors for errors in found if len(errors) == len(self.results)]
+            complete = [_sizes(errors) for errors in found if None not in errors]
             shares = tuple((100 / depth * np.max(complete, axis=0)).tolist()) if depth and complete else ()
             theirs = self.published.value("share_percent", medium, method)
             yield TableRow("Table 8", f"{method}, {medium}", "largest SSE over depth, %", theirs, shares)
@@ -220,4 +225,4 @@ class _Tables:
             names = {"pipe": ("STD", "diameter error"), "head": ("STD",), "weld": ("STD",)}.get(thing, ())
             for name in names:
                 row = f"{thing}, {medium}, {method}, {processing} image processing"
-                yield TableRow("Figure 66", row, name, None, self.figures(*key, name=name))
+                yield TableRow("Figure 66", row, name, None, _sizes(self.figures(*key, name=name)))
