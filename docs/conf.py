@@ -10,13 +10,16 @@ from sphinx.errors import ExtensionError
 
 import twin
 import uwlts
+import uwlts.desk
+import uwlts.report
+import uwlts.thesis
 from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
 
 ROOT = Path(__file__).resolve().parents[1]
 
 # autodoc changes the annotations of pydantic's classes; models that are imported afterwards cannot be built.
-for package in (uwlts, twin):
+for package in (uwlts, twin, uwlts.desk, uwlts.report, uwlts.thesis):
     for name in package.__all__:
         getattr(package, name)
 
