@@ -261,7 +261,7 @@ class _SearchedImage:
     wide: np.ndarray  # (L,) bool; lines with a bright peak too wide to be measured
     white: np.ndarray  # (L,) bool; lines with a completely saturated block
     board: np.ndarray  # (B + 2 `MARGIN`, L); contrasts of the blocks
-    left: np.ndarray  # (B + 2 `MARGIN`, L); contrasts of the blocks not examined by the search
+    left: np.ndarray  # (L, B + 2 `MARGIN`); contrasts of the blocks not examined by the search
     noise: float  # standard deviation of a pixel's noise, grey levels
     rules: SearchRules | None  # None for a network, which finds one stripe only
 
@@ -290,7 +290,7 @@ class _SearchedImage:
             own = np.intersect1d(lines, stripe.lines)
             columns = (each[own] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
             return StripeCandidates(own, *columns, log_likelihood=np.zeros(len(own)), count=count, stripe_along=along)
-        board = np.ascontiguousarray(self.board[:, lines])
+        board = np.ascontiguousarray(self.board[:, lines].T)
         line, clear, peak = search_all(self.profiles, board, lines, self.rules, fewest=2 if rivals else 1)
         if not rivals:
             line, clear, peak = line[clear], clear[clear], peak.select(clear)
@@ -320,7 +320,7 @@ def _search_profiles(
     noise = noise_from_contrast(block_contrast(high, low, out=board[MARGIN:-MARGIN]), block)
     coarse = max(options.threshold_floor, noise * (_RULE.coarse_sigmas - MEDIAN_SURROUNDINGS))
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
-    left, rules = board.copy(), search_rules(options, coarse=coarse, fine=fine, clip=clip)
+    left, rules = cv2.transpose(board), search_rules(options, coarse=coarse, fine=fine, clip=clip)
     status, wide, several, peak = search_profiles(profiles, left, rules)
     # The contrast of a plateau wider than the window is zero.
     if clipped is not None:

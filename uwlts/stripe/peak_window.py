@@ -6,6 +6,7 @@ import math
 from functools import lru_cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
@@ -18,17 +19,27 @@ class WindowRule(NamedTuple):
     """Numbers of the measurement of a peak; a named tuple, which compiled code reads as constants.
 
     They follow from the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes.
+
+    Attributes
+    ----------
+    least_kernel : float
+        Sigma of the narrowest weight, px. A narrower weight covers too few pixels: for a stripe of sigma 0.7 px the
+        error of the centre with the pixel phase would be 0.015 px instead of 0.005 px.
+    flank : int
+        Pixels of background on either side of a peak, for two low-passed values at a distance of three pixels.
+    tail : float
+        Range of sums with Gaussian weights, in sigmas: further weights are below 0.0004 of the largest.
+    background : float
+        Distance of the background from a peak's middle, in sigmas: a Gaussian has fallen to 0.011 of its height.
+    low_pass : float
+        Range of the low-pass, in sigmas: its last weight is below 0.0022 of the largest.
     """
 
     least_kernel: float = 1.0
-    """Sigma of the narrowest weight, px. A narrower weight covers too few pixels: for a stripe of sigma 0.7 px the
-    error of the centre with the pixel phase would be 0.015 px instead of 0.005 px."""
     flank: int = 5
-    """Pixels of background on either side of a peak, for two low-passed values at a distance of three pixels."""
-    tail: float = 4.0  # range of sums with Gaussian weights, in sigmas: further weights are below 0.0004 of the largest
+    tail: float = 4.0
     background: float = 3.0
-    """Distance of the background from a peak's middle, in sigmas: a Gaussian has fallen to 0.011 of its height."""
-    low_pass: float = 3.5  # range of the low-pass, in sigmas: its last weight is below 0.0022 of the largest
+    low_pass: float = 3.5
 
 
 WINDOW_RULE = WindowRule()
@@ -42,133 +53,124 @@ LAST = 1
 
 
 class SearchRules(NamedTuple):
-    """Options of the search; lengths in px, heights in grey levels."""
+    """Options of the search; lengths in px, heights in grey levels.
 
-    # A window consists of a block and ``half`` pixels on either side.
+    Attributes
+    ----------
+    half, block : int
+        A window consists of a block and ``half`` pixels on either side.
+    smoothing : float
+        Sigma of the low-pass.
+    share : float
+        Height of a second peak, as a fraction of the first one's, that makes a window crowded. For the strongest stripe
+        the whole window is searched, otherwise the pixels used.
+    order : int
+        Rule for several stripes: `FIRST`, `STRONGEST` or `LAST`.
+    narrowest, widest : float
+        Range of a stripe's sigma.
+    coarse, fine : float
+        Least height of a block, and of a peak after the low-pass; lower ones are noise.
+    bright : float
+        Least height of a peak that is too wide to be measured and not haze.
+    """
+
     half: int
     block: int
-    smoothing: float  # sigma of the low-pass
+    smoothing: float
     share: float
-    """Height of a second peak, as a fraction of the first one's, that makes a window crowded. For the strongest stripe
-    the whole window is searched, otherwise the pixels used."""
-    order: int  # rule for several stripes: `FIRST`, `STRONGEST` or `LAST`
-    # Range of a stripe's sigma.
+    order: int
     narrowest: float
     widest: float
-    # Least height of a block, and of a peak after the low-pass; lower ones are noise.
     coarse: float
     fine: float
-    bright: float  # least height of a peak that is too wide to be measured and not haze
+    bright: float
 
 
-LANES = 64
-"""Number of windows that are measured together: a multiple of the width of vector units."""
+class Peak(NamedTuple):
+    """Peak in a window; positions in px from the window's first pixel, heights in grey levels.
 
-_ALIGNED = 16
-"""Alignment of arrays in float32 numbers: the width of the widest vector units."""
+    Attributes
+    ----------
+    top : int
+        Highest pixel after the low-pass.
+    middle : float
+        Midpoint of the half-height crossings.
+    sigma : float
+        Half-height width divided by 2.355, without the low-pass (variances add).
+    reach : int
+        Number of pixels from ``middle`` to the first background pixel.
+    base, slope : float
+        Background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
+    height : float
+        Height of the top above ``base``; above the lowest surroundings unless ``closed``.
+    closed : bool
+        Both half-height crossings are in the window.
+    crowded : bool
+        The profile rises again outside the crossings: above half height, or to the required fraction of the height
+        after a valley of half its own height.
+    """
 
-
-def aligned(shape: tuple[int, ...]) -> np.ndarray:
-    """Return memory for a float32 array at an address aligned for vector units, which is a third faster."""
-    room = np.empty(math.prod(shape) + _ALIGNED, np.float32)
-    first = -(room.__array_interface__["data"][0] // room.itemsize) % _ALIGNED
-    return room[first : first + math.prod(shape)].reshape(shape)
+    top: int
+    middle: np.floating
+    sigma: float | np.floating
+    reach: int
+    base: np.floating
+    slope: np.floating
+    height: np.floating
+    closed: bool
+    crowded: np.bool_
 
 
 class PeakWindow(NamedTuple):
-    """Peaks in M windows of W pixels, in groups of `LANES`, in the form for compiled code.
+    """Peaks in M windows of W pixels, in the form for compiled code.
 
-    Positions are in px from the window's first pixel, heights in grey levels.
+    Attributes
+    ----------
+    start : (M,) int
+        First pixel of each window on its line.
+    window : (M, W) float32
+        Pixels; beyond the image the border pixel is repeated.
+    middle, sigma, reach, base, slope, height : (M,) float32
+        See `Peak`.
+    smoothing : float
+        Sigma of the low-pass, px.
     """
 
-    start: np.ndarray  # (M,) int; first pixel of each window on its line
+    start: np.ndarray
     window: np.ndarray
-    """(ceil(M / LANES), W, LANES) float32; pixels of groups of windows; beyond the image the border pixel is
-    repeated."""
-    middle: np.ndarray  # (M,) float32; midpoint of the half-height crossings
-    sigma: np.ndarray  # (M,) float32; half-height width divided by 2.355, without the low-pass (variances add)
-    reach: np.ndarray  # (M,) float32; number of pixels from ``middle`` to the first background pixel
-    # (M,) float32; background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
+    middle: np.ndarray
+    sigma: np.ndarray
+    reach: np.ndarray
     base: np.ndarray
     slope: np.ndarray
     height: np.ndarray
-    """(M,) float32; height of the top above ``base``; above the lowest surroundings unless the peak is closed."""
-    smoothing: float  # sigma of the low-pass, px
+    smoothing: float
 
     @classmethod
     def empty(cls, count: int, size: int, smoothing: float) -> PeakWindow:
         """Allocate ``count`` windows of ``size`` pixels."""
         numbers = np.empty((6, count), np.float32)
-        window = aligned((-(-count // LANES), size, LANES))
+        window = np.empty((count, size), np.float32)
         return cls(np.empty(count, np.intp), window, *numbers, smoothing=smoothing)
 
     def select(self, which: np.ndarray) -> PeakWindow:
         """Return the windows selected by a boolean mask or by indices."""
-        which = np.flatnonzero(which) if which.dtype == np.bool_ else which
-        chosen = PeakWindow.empty(len(which), self.window.shape[1], self.smoothing)
-        _copy_windows(self, which, np.empty(LANES, np.uintp), chosen)
-        return chosen
+        *values, smoothing = self
+        return PeakWindow(*(value[which] for value in values), smoothing=smoothing)
 
     def first(self, count: int) -> PeakWindow:
         """Return the first ``count`` windows."""
-        start, window, *numbers, smoothing = self
-        groups = -(-count // LANES)
-        return PeakWindow(start[:count], window[:groups], *(each[:count] for each in numbers), smoothing=smoothing)
+        *values, smoothing = self
+        return PeakWindow(*(value[:count] for value in values), smoothing=smoothing)
 
     def smooth(self) -> np.ndarray:
-        """Return the windows (groups, W, LANES) float32 after the low-pass."""
-        smooth = aligned(self.window.shape)
-        _smooth_windows(self.window, low_pass(self.smoothing), smooth)
-        return smooth
+        """Return the windows (M, W) float32 after the low-pass."""
+        kernel = low_pass(self.smoothing)
+        return cv2.sepFilter2D(self.window, cv2.CV_32F, kernel, np.ones(1, np.float32), borderType=cv2.BORDER_REPLICATE)
 
     def kernel_sigma(self) -> np.ndarray:
         """Return the sigma (M,) float32 of the Gaussian weight for each peak."""
         return np.maximum(self.sigma, np.float32(WINDOW_RULE.least_kernel))
-
-
-class PeakShape(NamedTuple):
-    """Further properties of M peaks for the search, as arrays (M,)."""
-
-    top: np.ndarray  # int32; highest pixel after the low-pass
-    closed: np.ndarray  # bool; both half-height crossings are in the window
-    crowded: np.ndarray
-    """bool; the profile rises again outside the crossings: above half height, or to the required fraction of the height
-    after a valley of half its own height."""
-
-
-_VALUES = 13
-"""Number of rows of lanes with values of the peaks."""
-_HIGHEST, _GROUND, _LEAST, _LEVEL, _BESIDE, _BEFORE, _AFTER, _FURTHER = (row * LANES for row in range(8))
-"""Rows: highest pixel; lowest surroundings; least value of one side; half height; highest value outside the crossings;
-pixels on either side of the crossing after the peak; the one after the crossing before it."""
-_MIDDLE, _SIGMA, _BASE, _SLOPE, _HEIGHT = (row * LANES for row in range(8, 13))
-"""Rows with results; see `PeakWindow`."""
-
-_PIXELS = 7
-"""Number of rows of lanes with pixels of the peaks."""
-_TOP, _LEFT, _RIGHT, _BEGIN, _END, _NEAR, _REACH = (row * LANES for row in range(7))
-"""Rows: highest pixel; last pixel before, and first after the peak below half height; range in which a second peak
-makes the window crowded; pixel nearest to the middle; see `PeakWindow`."""
-
-
-class Buffers(NamedTuple):
-    """Memory for the measurement of a group of peaks.
-
-    Compiled code takes its arrays as arguments, because Numba compiles longest for arrays made in compiled code.
-    """
-
-    kernel: np.ndarray
-    smooth: np.ndarray  # (W, LANES) float32
-    values: np.ndarray  # float32, rows of lanes; flat, so that the compiler knows that they do not overlap
-    pixels: np.ndarray  # int32, rows of lanes
-    place: np.ndarray  # (LANES,), of the first pixels in memory
-
-    @classmethod
-    def for_windows(cls, peaks: PeakWindow) -> Buffers:
-        """Allocate memory for windows."""
-        smooth, values = aligned(peaks.window.shape[1:]), aligned((_VALUES * LANES,))
-        pixels = aligned((_PIXELS * LANES,)).view(np.int32)
-        return cls(low_pass(peaks.smoothing), smooth, values, pixels, np.empty(LANES, np.intp))
 
 
 @compiled_part
@@ -184,177 +186,114 @@ def cut_window(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> 
 
 
 @compiled_part
-def filter_windows(window: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
-    """Filter windows (W, LANES) with a symmetric low-pass of 2 R + 1 weights; their border pixels are repeated."""
-    last, reach = window.shape[0] - 1, kernel.size // 2
-    for x in range(last + 1):
-        weight = kernel[reach]
-        for k in range(LANES):
-            out[x, k] = weight * window[x, k]
-        for j in range(reach):
-            weight, before, after = kernel[j], max(x - reach + j, 0), min(x + reach - j, last)
-            for k in range(LANES):
-                out[x, k] += weight * (window[before, k] + window[after, k])
+def filter_window(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
+    """Filter a window with a symmetric low-pass of 2 R + 1 weights.
+
+    ``pixels`` has R further elements on either side, which are overwritten with the window's border pixels.
+    """
+    size, reach = out.size, kernel.size // 2
+    middle = pixels[reach : reach + size]
+    for k in range(reach):
+        pixels[k], pixels[reach + size + k] = middle[0], middle[size - 1]
+    for k in range(size):
+        out[k] = kernel[reach] * middle[k]
+    for j in range(reach):
+        before, after = pixels[j : j + size], pixels[2 * reach - j : 2 * reach - j + size]
+        for k in range(size):
+            out[k] += kernel[j] * (before[k] + after[k])
 
 
 @compiled_part
-def measure_group(
-    group: int, count: int, rules: SearchRules, buffers: Buffers, peaks: PeakWindow, shape: PeakShape
-) -> None:
-    """Measure the peaks of a group of windows on lines of ``count`` pixels.
+def measure_peak(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> Peak:
+    """Measure the peak in the filtered window `smooth`, which starts at pixel `start` of `count`.
 
-    The windows may extend beyond the image. The peak is the highest pixel of the central block and half a block on
+    The window may extend beyond the image. The peak is the highest pixel of the central block and half a block on
     either side.
     """
-    smooth, values, pixels, m0 = buffers.smooth, buffers.values, buffers.pixels, group * LANES
-    size = smooth.shape[0]
-    filter_windows(peaks.window[group], buffers.kernel, smooth)
-    _find_crossings(smooth, peaks.start[m0:], count, rules, values, pixels)
-    for k in range(LANES):
-        left, right = pixels[_LEFT + k], pixels[_RIGHT + k]
-        values[_BEFORE + k], values[_MIDDLE + k] = smooth[max(left, 0), k], smooth[left + 1, k]
-        values[_AFTER + k], values[_FURTHER + k] = smooth[right - 1, k], smooth[min(right, size - 1), k]
-    _measure_widths(size, rules, values, pixels)
-    for k in range(LANES):
-        near, reach = pixels[_NEAR + k], pixels[_REACH + k]
-        values[_BEFORE + k] = _flank(smooth, k, near - reach - WINDOW_RULE.flank + 1)
-        values[_AFTER + k] = _flank(smooth, k, near + reach - 1)
-    _measure_heights(size, values, pixels)
-    for x in range(np.int32(size)):
-        for k in range(LANES):
-            before = (x <= pixels[_LEFT + k]) & (x >= pixels[_BEGIN + k])
-            beside = before | ((x >= pixels[_RIGHT + k]) & (x < pixels[_END + k]))
-            values[_BESIDE + k] = max(values[_BESIDE + k], smooth[x, k] if beside else np.float32(-np.inf))
-    for k in range(LANES):
-        peaks.middle[m0 + k], peaks.sigma[m0 + k] = values[_MIDDLE + k], values[_SIGMA + k]
-        peaks.base[m0 + k], peaks.slope[m0 + k] = values[_BASE + k], values[_SLOPE + k]
-        peaks.height[m0 + k], peaks.reach[m0 + k] = values[_HEIGHT + k], np.float32(pixels[_REACH + k])
-        ground, rise = values[_GROUND + k], values[_HIGHEST + k] - values[_GROUND + k]
-        left, right = pixels[_LEFT + k], pixels[_RIGHT + k]
-        shape.top[m0 + k], shape.closed[m0 + k] = pixels[_TOP + k], left >= 0 and right < size and rise > 0
-        crowded = rise > 0 and values[_BESIDE + k] >= ground + np.float32(rules.share) * rise
-        if crowded:
-            # A monotonic tail is no second stripe.
-            crowded = _rises_again(smooth, k, left, pixels[_BEGIN + k] - 1, -1, ground, rise, rules)
-            crowded |= _rises_again(smooth, k, right, pixels[_END + k], 1, ground, rise, rules)
-        shape.crowded[m0 + k] = crowded
-
-
-@compiled_part
-def _find_crossings(
-    smooth: np.ndarray, start: np.ndarray, count: int, rules: SearchRules, values: np.ndarray, pixels: np.ndarray
-) -> None:
-    """Fill the rows of lanes from `_HIGHEST` to `_LEVEL`, and from `_TOP` to `_RIGHT`."""
-    block, size, first = rules.block, smooth.shape[0], rules.half - rules.block // 2
-    for k in range(LANES):
-        values[_HIGHEST + k], pixels[_TOP + k] = smooth[first, k], np.int32(first)
-        values[_GROUND + k] = np.float32(-np.inf)
-        pixels[_LEFT + k], pixels[_RIGHT + k] = np.int32(-1), np.int32(size)
-    for x in range(first + 1, first + 2 * block):
-        for k in range(LANES):
-            pixels[_TOP + k] = np.int32(x) if smooth[x, k] > values[_HIGHEST + k] else pixels[_TOP + k]
-            values[_HIGHEST + k] = max(values[_HIGHEST + k], smooth[x, k])
+    half, block = rules.half, rules.block
+    size, first = smooth.size, half - block // 2
+    highest = find_greatest(smooth, first, first + 2 * block)
+    top = first
+    while smooth[top] != highest:
+        top += 1
     # Repeated border pixels may belong to the stripe: use only sides inside the image.
+    ground = np.float32(-np.inf)
     for side in range(2):
         begin = side * (size - block)
-        for k in range(LANES):
-            values[_LEAST + k] = smooth[begin, k]
-        for x in range(begin + 1, begin + block):
-            for k in range(LANES):
-                values[_LEAST + k] = min(values[_LEAST + k], smooth[x, k])
-        for k in range(LANES):
-            inside = start[k] + begin >= 0 and start[k] + begin + block <= count
-            values[_GROUND + k] = max(values[_GROUND + k], values[_LEAST + k] if inside else np.float32(-np.inf))
-    for k in range(LANES):
-        values[_LEVEL + k] = values[_GROUND + k] + np.float32(0.5) * (values[_HIGHEST + k] - values[_GROUND + k])
-    for x in range(np.int32(size)):
-        for k in range(LANES):
-            below, top = smooth[x, k] < values[_LEVEL + k], pixels[_TOP + k]
-            pixels[_LEFT + k] = x if below & (x < top) else pixels[_LEFT + k]
-            pixels[_RIGHT + k] = min(pixels[_RIGHT + k], x if below & (x > top) else np.int32(size))
+        if start + begin >= 0 and start + begin + block <= count:
+            ground = max(ground, _find_least(smooth, begin, begin + block))
+    rise = highest - ground
+    level = ground + np.float32(0.5) * rise
 
+    if rise <= 0:
+        # The surroundings are as high: there is no peak.
+        zero = np.float32(0.0)
+        return Peak(top, np.float32(top), zero, 0, ground, zero, zero, False, rise > 0)
 
-@compiled_inline
-def _measure_widths(size: int, rules: SearchRules, values: np.ndarray, pixels: np.ndarray) -> None:
-    """Fill the rows `_MIDDLE`, `_SIGMA` and `_BEGIN` to `_REACH` from the pixels at the crossings."""
-    zero, smoothing = np.float32(0.0), np.float32(rules.smoothing * rules.smoothing)
-    furthest, whole = np.int32(rules.half - WINDOW_RULE.flank), rules.order == STRONGEST
-    for k in range(LANES):
-        # Otherwise the surroundings are as high: there is no peak.
-        rises, level = values[_HIGHEST + k] > values[_GROUND + k], values[_LEVEL + k]
-        x_left = np.float32(pixels[_LEFT + k]) + _interpolate_level(values[_BEFORE + k], values[_MIDDLE + k], level)
-        x_right = np.float32(pixels[_RIGHT + k]) - _interpolate_level(values[_FURTHER + k], values[_AFTER + k], level)
-        middle = np.float32(0.5) * (x_left + x_right)
-        smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
-        squared = max(smooth_sigma * smooth_sigma - smoothing, zero)
-        reach = min(np.int32(np.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma)), furthest)
-        near = np.int32(np.floor(middle + np.float32(0.5)))
-        extent = np.int32(size) if whole else reach + np.int32(WINDOW_RULE.flank - 1)
-        pixels[_BEGIN + k] = max(near - extent, np.int32(0))
-        pixels[_END + k] = min(near + extent + np.int32(1), np.int32(size))
-        pixels[_NEAR + k], pixels[_REACH + k] = near, reach if rises else np.int32(0)
-        values[_MIDDLE + k] = middle if rises else np.float32(pixels[_TOP + k])
-        values[_SIGMA + k] = np.sqrt(squared) if rises else zero
+    left, right = top, top
+    while left >= 0 and smooth[left] >= level:
+        left -= 1
+    while right < size and smooth[right] >= level:
+        right += 1
+    closed = left >= 0 and right < size
+    x_left = np.float32(left) + _interpolate_level(smooth[max(left, 0)], smooth[left + 1], level)
+    x_right = np.float32(right) - _interpolate_level(smooth[min(right, size - 1)], smooth[right - 1], level)
+    middle = np.float32(0.5) * (x_left + x_right)
+    smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
+    sigma = math.sqrt(max(smooth_sigma * smooth_sigma - np.float32(rules.smoothing * rules.smoothing), np.float32(0.0)))
 
-
-@compiled_inline
-def _measure_heights(size: int, values: np.ndarray, pixels: np.ndarray) -> None:
-    """Fill the rows `_BASE`, `_SLOPE` and `_HEIGHT` from the flanks, and begin the row `_BESIDE`."""
-    zero = np.float32(0.0)
-    for k in range(LANES):
-        before, after, ground = values[_BEFORE + k], values[_AFTER + k], values[_GROUND + k]
-        rises, reach = values[_HIGHEST + k] > ground, pixels[_REACH + k]
-        slope = (after - before) / np.float32(np.int32(2) * reach + np.int32(WINDOW_RULE.flank - 2))
-        base = np.float32(0.5) * (before + after) + slope * (values[_MIDDLE + k] - np.float32(pixels[_NEAR + k]))
-        closed = pixels[_LEFT + k] >= 0 and pixels[_RIGHT + k] < size
-        values[_BASE + k], values[_SLOPE + k] = base if rises else ground, slope if rises else zero
-        values[_HEIGHT + k] = values[_HIGHEST + k] - (base if closed and rises else ground)
-        values[_BESIDE + k] = np.float32(-np.inf)
-
-
-@compiled
-def _smooth_windows(window: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
-    """Filter all groups of windows."""
-    for group in range(window.shape[0]):
-        filter_windows(window[group], kernel, out[group])
-
-
-@compiled
-def _copy_windows(peaks: PeakWindow, which: np.ndarray, place: np.ndarray, out: PeakWindow) -> None:
-    """Copy chosen windows; ``place`` (LANES,) is a buffer."""
-    size, pixels = out.window.shape[1], peaks.window.reshape(peaks.window.size)
-    for m in range(which.size):
-        chosen = which[m]
-        out.start[m], out.middle[m], out.sigma[m] = peaks.start[chosen], peaks.middle[chosen], peaks.sigma[chosen]
-        out.reach[m], out.base[m] = peaks.reach[chosen], peaks.base[chosen]
-        out.slope[m], out.height[m] = peaks.slope[chosen], peaks.height[chosen]
-    for group in range(out.window.shape[0]):
-        window = out.window[group]
-        for k in range(LANES):
-            chosen = which[min(group * LANES + k, which.size - 1)]
-            # Unsigned: compiled code does not examine whether these indices are negative.
-            place[k] = chosen // LANES * size * LANES + chosen % LANES
-        for x in range(size):
-            row = pixels[x * LANES :]
-            for k in range(LANES):
-                window[x, k] = row[place[k]]
+    reach = min(math.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma), half - WINDOW_RULE.flank)
+    near = math.floor(middle + np.float32(0.5))
+    before = _flank(smooth, near - reach - WINDOW_RULE.flank + 1)
+    after = _flank(smooth, near + reach - 1)
+    slope = (after - before) / np.float32(2 * reach + WINDOW_RULE.flank - 2)
+    base = np.float32(0.5) * (before + after) + slope * (middle - np.float32(near))
+    extent = size if rules.order == STRONGEST else reach + WINDOW_RULE.flank - 1
+    begin, end = max(near - extent, 0), min(near + extent + 1, size)
+    beside = max(find_greatest(smooth, begin, left + 1), find_greatest(smooth, right, end))
+    crowded = beside >= ground + np.float32(rules.share) * rise
+    if crowded:
+        # A monotonic tail is no second stripe.
+        crowded = beside < ground
+        for side in (-1, 1):
+            first, last = (left, begin - 1) if side < 0 else (right, end)
+            crowded |= _rises_again(smooth, first, last, side, ground, rise, rules)
+    return Peak(top, middle, sigma, reach, base, slope, highest - (base if closed else ground), closed, crowded)
 
 
 @compiled_part
+def find_greatest(values: np.ndarray, first: int, end: int) -> np.float32:
+    """Return the maximum of ``values[first:end]``; -inf if empty."""
+    result, part = np.float32(-np.inf), values[first:end]
+    for k in range(part.size):
+        result = max(result, part[k])
+    return result
+
+
+@compiled_inline
+def _find_least(values: np.ndarray, first: int, end: int) -> np.float32:
+    """Return the minimum of ``values[first:end]``; inf if empty."""
+    result, part = np.float32(np.inf), values[first:end]
+    for k in range(part.size):
+        result = min(result, part[k])
+    return result
+
+
+@compiled_inline
 def _rises_again(
-    values: np.ndarray, k: int, first: int, end: int, step: int, ground: float, rise: float, rules: SearchRules
-) -> bool:
-    """Return True if the profile of a lane outside a peak reaches half height, or the required fraction after a valley.
+    values: np.ndarray, first: int, end: int, step: int, ground: np.floating, rise: np.floating, rules: SearchRules
+) -> np.bool_:
+    """Return True if the profile outside a peak reaches half height, or the required fraction after a valley.
 
     The valley is at most half as high as the values after it. They must exceed it by at least ``fine``, the noise
     limit.
     """
     level, share, fine = np.float32(0.5) * rise, np.float32(rules.share) * rise, np.float32(rules.fine)
     lowest, found = np.float32(np.inf), rise < 0
-    for x in range(first, end, step):
-        lowest, above = min(lowest, values[x, k]), values[x, k] - ground
-        found |= above >= level or (above >= share and values[x, k] - lowest >= max(np.float32(0.5) * above, fine))
-    return bool(found)
+    for k in range(first, end, step):
+        lowest, above = min(lowest, values[k]), values[k] - ground
+        found |= above >= level or (above >= share and values[k] - lowest >= max(np.float32(0.5) * above, fine))
+    return found
 
 
 @compiled_part
@@ -364,10 +303,10 @@ def _interpolate_level(low: np.floating, high: np.floating, level: np.floating) 
 
 
 @compiled_part
-def _flank(smooth: np.ndarray, k: int, first: int) -> np.float32:
-    """Return the background in a lane's flank: the lower of two low-passed values, to ignore hot pixels."""
-    first = min(max(first, 0), smooth.shape[0] - WINDOW_RULE.flank)
-    return min(smooth[first + 1, k], smooth[first + WINDOW_RULE.flank - 1, k])
+def _flank(smooth: np.ndarray, first: int) -> np.float32:
+    """Return the background in a flank: the lower of two low-passed values, to ignore hot pixels."""
+    first = min(max(first, 0), smooth.size - WINDOW_RULE.flank)
+    return min(smooth[first + 1], smooth[first + WINDOW_RULE.flank - 1])
 
 
 @lru_cache(maxsize=16)
@@ -384,46 +323,22 @@ def noise_gain(sigma: float) -> float:
     return float(np.sqrt(np.sum(low_pass(sigma) ** 2)))
 
 
-def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Return moments M0, M1, M2 (3, M) of the windows above `base`, weighted at `centre`; see `zero_crossing`."""
-    moments = np.empty((3, centre.size), np.float32)
-    _sum_moments(peak, centre, sigma, aligned((7 * LANES,)), moments)
-    return moments
-
-
 @compiled
-def _sum_moments(
-    peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, sums: np.ndarray, moments: np.ndarray
-) -> None:
-    """Fill the moments (3, M); `sums` has rows of lanes for them, and for centre, 1 / sigma, background and reach."""
-    half, last = np.float32(0.5), np.int32(peak.window.shape[1] - 1)
-    for group in range(peak.window.shape[0]):
-        m0, window, first, end = group * LANES, peak.window[group], last, np.int32(0)
-        lanes = min(LANES, centre.size - m0)
-        for k in range(LANES):
-            m = m0 + min(k, lanes - 1)
-            sums[k] = sums[LANES + k] = sums[2 * LANES + k] = np.float32(0.0)
-            sums[3 * LANES + k], sums[4 * LANES + k] = centre[m], np.float32(1.0) / sigma[m]
-            # The centre may be outside its window.
-            near = min(max(np.int32(math.floor(centre[m] + half)), np.int32(0)), last)
-            reach = np.int32(math.ceil(np.float32(WINDOW_RULE.tail) * sigma[m]))
-            sums[5 * LANES + k], sums[6 * LANES + k] = (
-                peak.base[m],
-                np.float32(reach) + abs(centre[m] - np.float32(near)),
-            )
-            first, end = min(first, near - reach), max(end, near + reach + np.int32(1))
-        for x in range(max(first, np.int32(0)), min(end, last + np.int32(1))):
-            for k in range(LANES):
-                away = np.float32(x) - sums[3 * LANES + k]
-                t = away * sums[4 * LANES + k]
-                weight = exponential(-half * t * t) if abs(away) <= sums[6 * LANES + k] else np.float32(0.0)
-                value = weight * (window[x, k] - sums[5 * LANES + k])
-                sums[k] += value
-                sums[LANES + k] += value * t
-                sums[2 * LANES + k] += value * t * t
-        for k in range(lanes):
-            moments[0, m0 + k], moments[1, m0 + k] = sums[k], sums[LANES + k]
-            moments[2, m0 + k] = sums[2 * LANES + k]
+def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, moments: np.ndarray) -> None:
+    """Compute moments M0, M1, M2 (M, 3) of the windows above `base`, weighted at `centre`; see `zero_crossing`."""
+    half, last = np.float32(0.5), peak.window.shape[1] - 1
+    for m in range(centre.size):
+        ground, middle, inverse = peak.base[m], centre[m], np.float32(1.0) / sigma[m]
+        # The centre may be outside its window.
+        reach, near = math.ceil(np.float32(WINDOW_RULE.tail) * sigma[m]), min(max(math.floor(middle + half), 0), last)
+        first, end = max(near - reach, 0), min(near + reach, last) + 1
+        pixels, start = peak.window[m, first:end], np.float32(first) - middle
+        m0, m1, m2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for k in range(pixels.size):
+            t = (start + np.float32(k)) * inverse
+            value = exponential(-half * t * t) * (pixels[k] - ground)
+            m0, m1, m2 = m0 + value, m1 + value * t, m2 + value * t * t
+        moments[m, 0], moments[m, 1], moments[m, 2] = m0, m1, m2
 
 
 @compiled_part

@@ -12,16 +12,16 @@ from uwlts.stripe.options import PeakRule, StripeOptions
 from uwlts.stripe.peak_window import (
     FIRST,
     FWHM_PER_SIGMA,
-    LANES,
     LAST,
     STRONGEST,
     WINDOW_RULE,
-    Buffers,
-    PeakShape,
+    Peak,
     PeakWindow,
     SearchRules,
     cut_window,
-    measure_group,
+    filter_window,
+    low_pass,
+    measure_peak,
 )
 
 
@@ -30,22 +30,36 @@ class _SearchRule(NamedTuple):
 
     Chosen by hand with the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes. The
     least height is that of `SearchRules`.
+
+    Attributes
+    ----------
+    looks : int
+        Places examined per line: hot pixels before the stripe, and a second stripe after it.
+    most_stripes : int
+        Most stripes on one line: two sheets, each with two reflections.
+    coarse_slack : float
+        Ratio of the block contrasts of equal stripes that have different pixel phases (sigma 0.7 px).
+    clear : float
+        Contrast of a block, in least heights, that cannot be noise in single pixels.
+    rival : float
+        Contrast of a block, in least heights, that may be a second stripe. Noise reaches it on one line in a hundred,
+        and the least height on every second line.
+    spike : float
+        Least ratio of a stripe's three-pixel mean to the least height; noise may lower the mean a little.
+    bright : float
+        Least height of a bright peak, as a fraction of the saturation. A wide peak that is lower is haze.
+    minor : float
+        Largest height of an ignored stripe, as a fraction of another stripe's; it cannot be measured itself.
     """
 
-    looks: int = 4  # places examined per line: hot pixels before the stripe, and a second stripe after it
-    most_stripes: int = 6  # most stripes on one line: two sheets, each with two reflections
+    looks: int = 4
+    most_stripes: int = 6
     coarse_slack: float = 0.75
-    """Ratio of the block contrasts of equal stripes that have different pixel phases (sigma 0.7 px)."""
-    clear: float = 3.0  # contrast of a block, in least heights, that cannot be noise in single pixels
+    clear: float = 3.0
     rival: float = 1.3
-    """Contrast of a block, in least heights, that may be a second stripe. Noise reaches it on one line in a hundred,
-    and the least height on every second line."""
     spike: float = 0.85
-    """Least ratio of a stripe's three-pixel mean to the least height; noise may lower the mean a little."""
     bright: float = 0.25
-    """Least height of a bright peak, as a fraction of the saturation. A wide peak that is lower is haze."""
     minor: float = 0.5
-    """Largest height of an ignored stripe, as a fraction of another stripe's; it cannot be measured itself."""
 
 
 _RULE = _SearchRule()
@@ -101,40 +115,25 @@ def search_profiles(
         stripe (L,); and the windows of the lines with a stripe, in their order.
     """
     lines = profiles.shape[1]
-    jobs = _Jobs.allocate(_RULE.looks * lines, lines, board.dtype, rules)
+    peaks = _allocate_windows(lines, rules)
     status = np.full(lines, _NO_STRIPE, np.uint8)
     wide, several = np.zeros((2, lines), np.bool_)
-    own, rival = np.full((2, lines), -1, np.intp)
-    count = _search_lines(profiles, board, jobs, rules, status, wide, several, own, rival)
-    peaks = jobs.peaks.first(count) if count >= 0 else jobs.peaks.select(own[status == _OK])
-    return status, wide, several, peaks
+    count = _search_lines(profiles, board, *_make_buffers(peaks), rules, status, wide, several, peaks)
+    return status, wide, several, peaks.first(count)
 
 
-class _Jobs(NamedTuple):
-    """Peaks to be measured, in groups of `LANES`: places of up to M windows on L lines, and memory for the search.
+def _allocate_windows(count: int, rules: SearchRules) -> PeakWindow:
+    """Allocate windows for ``count`` peaks."""
+    return PeakWindow.empty(count, 2 * rules.half + rules.block, rules.smoothing)
+
+
+def _make_buffers(peaks: PeakWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the low-pass, and buffers for a window with borders and for the filtered window.
 
     Compiled code takes its arrays as arguments, because Numba compiles longest for arrays made in compiled code.
     """
-
-    peaks: PeakWindow
-    shape: PeakShape
-    buffers: Buffers
-    line: np.ndarray  # (M,), -1 without a window
-    block: np.ndarray  # (M,)
-    contrast: np.ndarray  # (M,), of the block
-    highest: np.ndarray  # (L,), contrast of the blocks to be examined
-    chosen: np.ndarray  # (L,), the block of this contrast
-    active: np.ndarray  # (L,) bool, lines to be examined further
-
-    @classmethod
-    def allocate(cls, most: int, lines: int, dtype: np.dtype, rules: SearchRules) -> _Jobs:
-        """Allocate memory for ``most`` windows, and groups that are not full."""
-        most += LANES * 2 * _RULE.most_stripes
-        peaks = PeakWindow.empty(most, 2 * rules.half + rules.block, rules.smoothing)
-        shape = PeakShape(np.empty(most, np.int32), *np.empty((2, most), np.bool_))
-        line, block = np.empty((2, most), np.intp)
-        of_lines = np.empty(lines, dtype), np.empty(lines, np.uint16), np.ones(lines, np.bool_)
-        return cls(peaks, shape, Buffers.for_windows(peaks), line, block, np.empty(most, np.float32), *of_lines)
+    kernel, size = low_pass(peaks.smoothing), peaks.window.shape[1]
+    return kernel, np.empty(size + kernel.size - 1, np.float32), np.empty(size, np.float32)
 
 
 def search_all(
@@ -143,19 +142,20 @@ def search_all(
     """Find all stripes on lines (M,) that contain at least ``fewest`` stripes.
 
     Returns the line of each stripe, whether it can be measured, and its window, in the order of the lines. ``board``
-    (B + 2 `MARGIN`, M) contains the contrasts on these lines; for other parameters see `search_profiles`.
+    (M, B + 2 `MARGIN`) contains the contrasts on these lines; for other parameters see `search_profiles`.
 
     A stripe cannot be measured if another one overlaps its pixels, if it is bright and too wide, or if it is cut off by
     the border.
     """
-    rules = rules._replace(order=FIRST)
-    jobs = _Jobs.allocate(2 * _RULE.most_stripes * len(lines), len(lines), board.dtype, rules)
-    own = np.full((len(lines), _RULE.most_stripes), -1, np.intp)
-    clear = np.zeros(own.shape, np.bool_)
-    _search_all(profiles, board, lines, jobs, rules, own, clear)
-    found = own >= 0
-    found[found.sum(axis=1) < fewest] = False
-    return np.repeat(lines, found.sum(axis=1)), clear[found], jobs.peaks.select(own[found])
+    rules, most = rules._replace(order=FIRST), _RULE.most_stripes * len(lines)
+    peaks, found, clear = _allocate_windows(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
+    count = _search_all(profiles, board, lines, *_make_buffers(peaks), rules, found, clear, peaks)
+    kept = np.flatnonzero(found[:count] >= 0)
+    if fewest > 1:
+        kept = kept[np.bincount(found[kept])[found[kept]] >= fewest]
+    if not kept.size:
+        return found[:0], clear[:0], peaks.first(0)
+    return found[kept], clear[kept], peaks.select(kept)
 
 
 def mark_rivals(
@@ -167,7 +167,7 @@ def mark_rivals(
     ----------
     profiles : (N, L)
         Grey values of all lines.
-    left : (B + 2 MARGIN, L)
+    left : (N, B + 2 MARGIN)
         Contrasts of the remaining blocks of all lines; spikes are ignored.
     lines : (M,)
         Profile lines to examine.
@@ -187,169 +187,103 @@ def measure_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, opti
     Their height is 0 if there is no peak.
     """
     rules = search_rules(options, coarse=0.0, fine=0.0, clip=np.inf)
-    jobs = _Jobs.allocate(len(lines), 0, np.dtype(np.uint8), rules)
-    jobs.line[: len(lines)] = lines
-    jobs.peaks.start[: len(lines)] = np.rint(centre).astype(np.intp) - rules.half - rules.block // 2
-    _measure_lines(profiles, jobs, len(lines), rules)
-    peaks = jobs.peaks.first(len(lines))
-    peaks.height[~jobs.shape.closed[: len(lines)]] = 0.0
+    peaks = _allocate_windows(len(lines), rules)
+    peaks.start[:] = np.rint(centre).astype(np.intp) - rules.half - rules.block // 2
+    _measure_lines(profiles, lines, *_make_buffers(peaks), rules, peaks)
     return peaks
 
 
 @compiled
-def _measure_lines(profiles: np.ndarray, jobs: _Jobs, count: int, rules: SearchRules) -> None:
-    """Measure the first windows without moving them."""
-    _measure_jobs(profiles, jobs, 0, count, 0, rules)
-
-
-@compiled_part
-def _measure_jobs(profiles: np.ndarray, jobs: _Jobs, first: int, end: int, moves: int, rules: SearchRules) -> None:
-    """Cut and measure the windows from `first`, the beginning of a group, to `end`.
-
-    If ``moves`` is 1, windows that do not contain a half-height crossing or a flank of their peak are moved to it, and
-    measured again.
-    """
-    peaks, size = jobs.peaks, jobs.peaks.window.shape[1]
-    for m in range(end, -(-end // LANES) * LANES):
-        peaks.start[m], jobs.line[m] = peaks.start[end - 1], jobs.line[end - 1]
-    for group in range(first // LANES, -(-end // LANES)):
-        for attempt in range(1 + moves):
-            _cut_group(profiles, peaks.start, jobs.line, group, jobs.buffers.place, peaks.window[group])
-            measure_group(group, profiles.shape[0], rules, jobs.buffers, peaks, jobs.shape)
-            moved = False
-            for m in range(group * LANES, (group + 1) * LANES if attempt < moves else 0):
-                offset = _window_offset(jobs, m, size, rules)
-                peaks.start[m] += offset
-                moved |= offset != 0
-            if not moved:
-                break
-
-
-@compiled_inline
-def _cut_group(
-    profiles: np.ndarray, start: np.ndarray, line: np.ndarray, group: int, place: np.ndarray, out: np.ndarray
+def _measure_lines(
+    profiles: np.ndarray,
+    lines: np.ndarray,
+    kernel: np.ndarray,
+    pixels: np.ndarray,
+    smooth: np.ndarray,
+    rules: SearchRules,
+    peaks: PeakWindow,
 ) -> None:
-    """Copy the pixels of a group of windows; beyond the image the border pixel is repeated."""
-    m0, last, size, lines = group * LANES, profiles.shape[0] - 1, out.shape[0], profiles.shape[1]
-    pixels, lowest, highest = profiles.reshape(profiles.size), np.intp(0), np.intp(0)
-    for k in range(LANES):
-        lowest, highest = min(lowest, start[m0 + k]), max(highest, start[m0 + k])
-        place[k] = start[m0 + k] * lines + line[m0 + k]
-    if lowest >= 0 and highest + size - 1 <= last:
-        for x in range(size):
-            row = pixels[x * lines :]
-            for k in range(LANES):
-                out[x, k] = row[place[k]]
-    else:
-        for k in range(LANES):
-            for x in range(size):
-                out[x, k] = profiles[min(max(start[m0 + k] + x, 0), last), line[m0 + k]]
+    """Fill the windows that start at ``peaks.start``."""
+    size, border = smooth.size, kernel.size // 2
+    for m in range(lines.size):
+        window = pixels[border : border + size]
+        cut_window(profiles, lines[m], peaks.start[m], window)
+        filter_window(pixels, kernel, smooth)
+        peak = measure_peak(smooth, peaks.start[m], profiles.shape[0], rules)
+        peaks.middle[m], peaks.sigma[m], peaks.reach[m] = peak.middle, peak.sigma, peak.reach
+        peaks.base[m], peaks.slope[m] = peak.base, peak.slope
+        peaks.height[m] = peak.height if peak.closed else np.float32(0.0)
+        for k in range(size):
+            peaks.window[m, k] = window[k]
 
 
 @compiled
 def _search_lines(
     profiles: np.ndarray,
     board: np.ndarray,
-    jobs: _Jobs,
+    kernel: np.ndarray,
+    pixels: np.ndarray,
+    smooth: np.ndarray,
     rules: SearchRules,
     status: np.ndarray,
     wide: np.ndarray,
     several: np.ndarray,
-    own: np.ndarray,
-    rival: np.ndarray,
+    peaks: PeakWindow,
 ) -> int:
-    """Fill `status`, `wide`, `several`, and the numbers of the windows of each line's stripe and a dimmer one.
-
-    Return the number of lines with a stripe, or -1 if their windows are not the first ones in the lines' order.
-    """
-    near, peaks, end = jobs.buffers.values[: rules.block + 2], jobs.peaks, int(np.intp(0))
-    for _ in range(_RULE.looks):
-        _find_highest_blocks(board, jobs.highest, jobs.chosen)
-        first = -(-end // LANES) * LANES
-        end, looked = first, False
-        for line in range(status.size):
-            if not jobs.active[line]:
-                continue
-            highest, least = jobs.highest[line], np.float32(rules.coarse)
-            if status[line] == _OK:
-                several[line] |= highest >= _RULE.rival * rules.coarse
-                least = max(least, np.float32(jobs.contrast[own[line]]) * np.float32(rules.share * _RULE.coarse_slack))
-            if highest < least or highest <= 0:
-                jobs.active[line] = False
-            else:
-                chosen = _choose_block(board, line, highest, int(jobs.chosen[line]), least, rules)
-                end += _add_job(profiles, board, chosen, line, line, jobs, end, near, rules)
-                looked = True
-        if not looked:
-            break
-        _measure_jobs(profiles, jobs, first, end, 1, rules)
-        for m in range(first, end):
-            line = jobs.line[m]
-            verdict = _classify_peak(jobs, m, profiles.shape[0], rules)
+    """Fill `status`, `wide`, `several` and the windows; return the number of lines with a stripe."""
+    # Not a literal, which Numba would compile further specialisations for.
+    size, border, count = smooth.size, kernel.size // 2, int(np.intp(0))
+    window = pixels[border : border + size]
+    near = window[rules.half - 1 : rules.half + rules.block + 1]
+    for line in range(profiles.shape[1]):
+        blocks, least, rival, of_rival = board[line], np.float32(rules.coarse), np.intp(-1), np.float32(0.0)
+        for _ in range(_RULE.looks):
+            highest = _find_highest_block(blocks)
+            if status[line] == _OK and highest >= _RULE.rival * rules.coarse:
+                several[line] = True
+            chosen = _choose_block(blocks, highest, least, rules)
+            if chosen < 0:
+                break
+            there = np.float32(blocks[chosen])
+            blocks[chosen] = 0
+            start = (chosen - MARGIN) * rules.block - rules.half
+            if there < _RULE.clear * rules.fine:
+                cut_window(profiles, line, start + rules.half - 1, near)
+                if _is_spike(near, there, rules.fine):
+                    continue
+            start, peak = _follow_peak(profiles, line, start, kernel, pixels, window, smooth, rules)
+            verdict = _classify_peak(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
-                wide[line] |= _is_too_wide(jobs, m, profiles.shape[0], rules)
+                wide[line] |= _is_too_wide(peak, start, profiles.shape[0], rules)
                 continue
-            # `measure_group` has searched this window for rivals.
-            for k in range(jobs.block[m] - MARGIN, jobs.block[m] + MARGIN + 1):
-                board[k, line] = 0
-            if status[line] != _OK:
-                status[line], own[line] = verdict, m
-                several[line] |= verdict != _OK
-                jobs.active[line] = verdict == _OK and rules.order == STRONGEST
+            # `measure_peak` has searched this window for rivals.
+            for k in range(chosen - MARGIN, chosen + MARGIN + 1):
+                blocks[k] = 0
+            if status[line] == _OK:
+                # The flank of a wide stripe may have contrast in another block, which leads to the same stripe.
+                away = abs(start + peak.middle - (peaks.start[count] + peaks.middle[count]))
+                if away <= peaks.sigma[count] * np.float32(FWHM_PER_SIGMA):
+                    continue
+                if peak.height >= rules.share * peaks.height[count]:
+                    status[line] = _AMBIGUOUS
+                    several[line] = True
+                    break
+                rival, of_rival = chosen, there
                 continue
-            # The flank of a wide stripe may have contrast in another block, which leads to the same stripe.
-            stripe = int(own[line])
-            if _distance(peaks, m, stripe) <= peaks.sigma[stripe] * np.float32(FWHM_PER_SIGMA):
-                continue
-            if peaks.height[m] >= rules.share * peaks.height[stripe]:
-                status[line], several[line], jobs.active[line] = _AMBIGUOUS, True, False
-            else:
-                rival[line] = m
-    count, in_order = int(np.intp(0)), True
-    for line in range(status.size):
+            status[line] = verdict
+            if verdict != _OK:
+                several[line] = True
+                break
+            _store_window(peaks, count, start, peak, window)
+            if rules.order != STRONGEST:
+                break
+            least = max(least, there * np.float32(rules.share * _RULE.coarse_slack))
         if status[line] == _OK:
-            in_order &= own[line] == count
             count += 1
-        if rival[line] >= 0:
+        if rival >= 0:
             # Too dim to make the line ambiguous, but left in the board for a search of all stripes.
-            board[jobs.block[rival[line]], line] = jobs.contrast[rival[line]]
-    return count if in_order else -1
-
-
-@compiled_part
-def _add_job(
-    profiles: np.ndarray,
-    board: np.ndarray,
-    chosen: int,
-    row: int,
-    line: int,
-    jobs: _Jobs,
-    m: int,
-    near: np.ndarray,
-    rules: SearchRules,
-) -> int:
-    """Clear a block in a row of the board and add it as window m, unless it is a spike; return the number added."""
-    there = np.float32(board[chosen, row])
-    board[chosen, row] = 0
-    start = (chosen - MARGIN) * rules.block - rules.half
-    if there < _RULE.clear * rules.fine:
-        cut_window(profiles, line, start + rules.half - 1, near)
-        if _is_spike(near, there, rules.fine):
-            return 0
-    jobs.peaks.start[m], jobs.line[m], jobs.block[m], jobs.contrast[m] = start, line, chosen, there
-    return 1
-
-
-@compiled_part
-def _find_highest_blocks(board: np.ndarray, highest: np.ndarray, chosen: np.ndarray) -> None:
-    """Find the highest contrast of each line's blocks, and the first block with it."""
-    for k in range(highest.size):
-        highest[k], chosen[k] = board[0, k], np.uint16(0)
-    for number in range(1, board.shape[0]):
-        blocks = board[number]
-        for k in range(highest.size):
-            chosen[k] = np.uint16(number) if blocks[k] > highest[k] else chosen[k]
-            highest[k] = max(highest[k], blocks[k])
+            blocks[rival] = of_rival
+    return count
 
 
 @compiled
@@ -358,10 +292,11 @@ def _mark_rivals(
 ) -> None:
     """Mark the lines with a block of high contrast that is not a spike."""
     for m in range(lines.size):
-        for k in range(MARGIN, left.shape[0] - MARGIN):
-            there = np.float32(left[k, lines[m]])
-            if there >= rules.coarse and not found[m]:
+        blocks = left[lines[m]]
+        for k in range(MARGIN, blocks.size - MARGIN):
+            if blocks[k] >= rules.coarse and not found[m]:
                 cut_window(profiles, lines[m], (k - MARGIN) * rules.block - 1, near)
+                there = np.float32(blocks[k])
                 found[m] = there >= _RULE.clear * rules.fine or not _is_spike(near, there, rules.fine)
 
 
@@ -370,82 +305,110 @@ def _search_all(
     profiles: np.ndarray,
     board: np.ndarray,
     lines: np.ndarray,
-    jobs: _Jobs,
+    kernel: np.ndarray,
+    pixels: np.ndarray,
+    smooth: np.ndarray,
     rules: SearchRules,
-    own: np.ndarray,
+    found: np.ndarray,
     clear: np.ndarray,
-) -> None:
-    """Fill the numbers of the windows of all stripes (M, `most_stripes`) on given lines, and whether they are clear."""
-    near, peaks, end = jobs.buffers.values[: rules.block + 2], jobs.peaks, int(np.intp(0))
-    for _ in range(2 * _RULE.most_stripes):
-        _find_highest_blocks(board, jobs.highest, jobs.chosen)
-        first = -(-end // LANES) * LANES
-        end, looked = first, False
-        for row in range(lines.size):
-            there = jobs.highest[row]
-            if own[row, -1] < 0 and there >= rules.coarse and there > 0:
-                added = _add_job(profiles, board, int(jobs.chosen[row]), row, lines[row], jobs, end, near, rules)
-                # Until the windows are measured, the number of the row.
-                jobs.block[end] = row
-                end, looked = end + added, True
-        if not looked:
-            break
-        _measure_jobs(profiles, jobs, first, end, 1, rules)
-        for m in range(first, end):
-            row, count, known = jobs.block[m], 0, False
-            verdict = _classify_peak(jobs, m, profiles.shape[0], rules)
-            if verdict == _NO_STRIPE and not _is_too_wide(jobs, m, profiles.shape[0], rules):
+    peaks: PeakWindow,
+) -> int:
+    """Fill `found`, `clear` and the windows of all stripes on the given lines; return the number of stripes."""
+    # Not a literal, which Numba would compile further specialisations for.
+    size, border, count = smooth.size, kernel.size // 2, int(np.intp(0))
+    window = pixels[border : border + size]
+    near = window[rules.half - 1 : rules.half + rules.block + 1]
+    for m in range(lines.size):
+        line, blocks, first = lines[m], board[m], count
+        for _ in range(2 * _RULE.most_stripes):
+            there = _find_highest_block(blocks)
+            if there < rules.coarse or there <= 0 or count == first + _RULE.most_stripes:
+                break
+            chosen = _find_first_equal(blocks, there)
+            blocks[chosen] = 0
+            start = (chosen - MARGIN) * rules.block - rules.half
+            if there < _RULE.clear * rules.fine:
+                cut_window(profiles, line, start + rules.half - 1, near)
+                if _is_spike(near, np.float32(there), rules.fine):
+                    continue
+            start, peak = _follow_peak(profiles, line, start, kernel, pixels, window, smooth, rules)
+            verdict = _classify_peak(peak, start, profiles.shape[0], rules)
+            if verdict == _NO_STRIPE and not _is_too_wide(peak, start, profiles.shape[0], rules):
                 continue
-            while own[row, count] >= 0:
-                stripe = own[row, count]
-                widest = max(peaks.sigma[stripe], peaks.sigma[m])
-                known |= _distance(peaks, m, stripe) <= np.float32(FWHM_PER_SIGMA) * widest
-                count += 1
-            if not known:
-                own[row, count], clear[row, count] = m, verdict == _OK
-    for row in range(lines.size):
-        _ignore_minor(own[row], clear[row], rules, peaks)
+            place, known = start + peak.middle, False
+            for k in range(first, count):
+                apart = abs(place - (peaks.start[k] + peaks.middle[k]))
+                known |= apart <= np.float32(FWHM_PER_SIGMA) * max(peaks.sigma[k], peak.sigma)
+            if known:
+                continue
+            found[count], clear[count] = line, verdict == _OK
+            _store_window(peaks, count, start, peak, window)
+            count += 1
+        _ignore_minor(first, count, rules, found, clear, peaks)
+    return count
 
 
 @compiled_part
-def _ignore_minor(own: np.ndarray, clear: np.ndarray, rules: SearchRules, peaks: PeakWindow) -> None:
-    """Remove the stripes of a line that cannot be measured next to a measurable stripe.
+def _ignore_minor(
+    first: int, count: int, rules: SearchRules, found: np.ndarray, clear: np.ndarray, peaks: PeakWindow
+) -> None:
+    """Set `found` to -1 for stripes that cannot be measured next to a measurable stripe.
 
     They are ignored if the other stripe is close and at least as high, or at least twice as high. Only stripes that
     might be the line's own matter.
     """
-    for k in range(own.size):
-        for j in range(own.size):
-            if own[k] >= 0 and own[j] >= 0 and clear[j] and not clear[k]:
-                share = 1.0 if _distance(peaks, own[j], own[k]) <= rules.half + rules.block else _RULE.minor
-                if peaks.height[own[k]] <= share * peaks.height[own[j]]:
-                    own[k] = -1
-
-
-@compiled_part
-def _distance(peaks: PeakWindow, one: int, other: int) -> float:
-    """Return the distance of two peaks on the same line, px."""
-    return abs(peaks.start[one] + peaks.middle[one] - (peaks.start[other] + peaks.middle[other]))
+    for k in range(first, count):
+        for j in range(first, count):
+            apart = abs(peaks.start[j] + peaks.middle[j] - peaks.start[k] - peaks.middle[k])
+            share = 1.0 if apart <= rules.half + rules.block else _RULE.minor
+            if clear[j] and not clear[k] and peaks.height[k] <= share * peaks.height[j]:
+                found[k] = -1
 
 
 @compiled_inline
-def _window_offset(jobs: _Jobs, m: int, size: int, rules: SearchRules) -> int:
+def _follow_peak(
+    profiles: np.ndarray,
+    line: int,
+    start: int,
+    kernel: np.ndarray,
+    pixels: np.ndarray,
+    window: np.ndarray,
+    smooth: np.ndarray,
+    rules: SearchRules,
+) -> tuple[int, Peak]:
+    """Measure the peak in the window at `start`, moved to the peak if necessary; return its start and the peak.
+
+    ``window`` contains the pixels without their borders.
+    """
+    offset = 0
+    while True:
+        cut_window(profiles, line, start + offset, window)
+        filter_window(pixels, kernel, smooth)
+        peak = measure_peak(smooth, start + offset, profiles.shape[0], rules)
+        if offset != 0:
+            break
+        offset = _window_offset(peak, smooth.size, rules)
+        if offset == 0:
+            break
+    return start + offset, peak
+
+
+@compiled_inline
+def _window_offset(peak: Peak, size: int, rules: SearchRules) -> int:
     """Return the shift of a window that does not contain a half-height crossing or a flank of its peak."""
     to_end = np.float32(0.5 * (size - 1))
-    offset = jobs.peaks.middle[m] - to_end
-    outside = abs(offset) + jobs.peaks.reach[m] > to_end - WINDOW_RULE.flank + np.float32(0.5)
-    if (outside or not jobs.shape.closed[m]) and jobs.peaks.height[m] >= rules.fine:
+    offset = peak.middle - to_end
+    outside = abs(offset) + peak.reach > to_end - WINDOW_RULE.flank + np.float32(0.5)
+    if (outside or not peak.closed) and peak.height >= rules.fine:
         return int(np.rint(offset))
     return 0
 
 
-@compiled_part
-def _is_too_wide(jobs: _Jobs, m: int, count: int, rules: SearchRules) -> bool:
+@compiled_inline
+def _is_too_wide(peak: Peak, start: int, count: int, rules: SearchRules) -> bool:
     """Return True for a bright peak inside the image that is too wide to be measured."""
-    wide = not jobs.shape.closed[m] or jobs.peaks.sigma[m] > rules.widest
-    return bool(
-        wide and jobs.peaks.height[m] >= rules.bright and _is_inside(jobs.peaks.start[m] + jobs.shape.top[m], count)
-    )
+    wide = (not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright
+    return bool(wide and _is_inside(start + peak.top, count))
 
 
 @compiled_part
@@ -454,23 +417,53 @@ def _is_inside(highest: int, count: int) -> bool:
     return 1 < highest < count - 2
 
 
+@compiled_inline
+def _store_window(peaks: PeakWindow, number: int, start: int, peak: Peak, window: np.ndarray) -> None:
+    """Store a peak and its window at an index."""
+    peaks.start[number], peaks.middle[number], peaks.sigma[number] = start, peak.middle, peak.sigma
+    peaks.reach[number] = peak.reach
+    peaks.base[number], peaks.slope[number], peaks.height[number] = peak.base, peak.slope, peak.height
+    for k in range(window.size):
+        peaks.window[number, k] = window[k]
+
+
 @compiled_part
-def _choose_block(
-    board: np.ndarray, line: int, highest: np.number, chosen: int, least: float | np.floating, rules: SearchRules
-) -> int:
-    """Return a line's block by the rule, among those of at least `least` contrast; `chosen` is the highest one.
+def _find_highest_block(blocks: np.ndarray) -> np.number:
+    """Return the highest contrast of a line's blocks."""
+    highest = blocks[0]
+    for k in range(blocks.size):
+        highest = max(highest, blocks[k])
+    return highest
+
+
+@compiled_part
+def _find_first_equal(blocks: np.ndarray, height: np.number) -> int:
+    """Return the first block of a given height. All blocks are compared, which is faster in vector units."""
+    chosen = np.int32(blocks.size)
+    for k in range(np.int32(blocks.size)):
+        chosen = min(chosen, np.int32(k) if blocks[k] == height else np.int32(blocks.size))
+    return int(chosen)
+
+
+@compiled_part
+def _choose_block(blocks: np.ndarray, highest: np.number, least: np.float32, rules: SearchRules) -> int:
+    """Return the next block by the rule among those of at least `least` contrast; -1 without such blocks.
 
     First and last are chosen among the blocks whose contrast is a sufficient fraction of the highest one on their line.
     """
+    if highest < least or highest <= 0:
+        return -1
+    if rules.order == STRONGEST:
+        return _find_first_equal(blocks, highest)
+    chosen = 0
     wanted = max(least, np.float32(highest) * np.float32(rules.share * _RULE.coarse_slack))
     if rules.order == FIRST:
-        chosen = 0
-        while board[chosen, line] < wanted:
+        while blocks[chosen] < wanted:
             chosen += 1
-    elif rules.order == LAST:
-        chosen = board.shape[0] - 1
-        while board[chosen, line] < wanted:
-            chosen -= 1
+        return chosen
+    chosen = blocks.size - 1
+    while blocks[chosen] < wanted:
+        chosen -= 1
     return chosen
 
 
@@ -490,18 +483,18 @@ def _is_spike(near: np.ndarray, there: np.float32, fine: float) -> bool:
 
 
 @compiled_part
-def _classify_peak(jobs: _Jobs, m: int, count: int, rules: SearchRules) -> int:
+def _classify_peak(peak: Peak, start: int, count: int, rules: SearchRules) -> int:
     """Return the status; NO_STRIPE for a peak too low, narrow or wide, or one that rises towards the border."""
-    peaks, start = jobs.peaks, jobs.peaks.start[m]
-    if peaks.height[m] < rules.fine:
+    if peak.height < rules.fine:
         return _NO_STRIPE
-    if not jobs.shape.closed[m]:
+    size, highest = 2 * rules.half + rules.block, start + peak.top
+    if not peak.closed:
         # The far side is outside the image.
-        outside = start < 0 or start + peaks.window.shape[1] > count
-        return _BORDER if outside and _is_inside(start + jobs.shape.top[m], count) else _NO_STRIPE
-    if not rules.narrowest <= peaks.sigma[m] <= rules.widest:
+        outside = start < 0 or start + size > count
+        return _BORDER if outside and _is_inside(highest, count) else _NO_STRIPE
+    if not rules.narrowest <= peak.sigma <= rules.widest:
         return _NO_STRIPE
-    middle, extent = start + peaks.middle[m], peaks.reach[m] + WINDOW_RULE.flank - 1
+    middle, extent = start + peak.middle, peak.reach + WINDOW_RULE.flank - 1
     if middle - extent < 0 or middle + extent > count - 1:
         return _BORDER
-    return _AMBIGUOUS if jobs.shape.crowded[m] else _OK
+    return _AMBIGUOUS if peak.crowded else _OK

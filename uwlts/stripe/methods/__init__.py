@@ -15,7 +15,8 @@ from importlib import import_module
 
 import numpy as np
 
-from uwlts.stripe.peak_window import PeakWindow, gaussian_moments
+from uwlts.runtime.compiled import compiled
+from uwlts.stripe.peak_window import WINDOW_RULE, PeakWindow, exponential
 
 _ONE_PIXEL = 0.3
 """Sigma, px, of light within one pixel (1 / sqrt 12, rounded), the narrowest stripe in an image."""
@@ -37,10 +38,36 @@ def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]
 
 def amplitudes(peak: PeakWindow, centre: np.ndarray) -> np.ndarray:
     """Return the height (M,) float32, grey levels, of the best-fitting Gaussian at each centre (M,)."""
-    # Sum over the product of two Gaussians, solved for the height of the first.
-    kernel, sigma = peak.kernel_sigma(), np.maximum(peak.sigma, np.float32(_ONE_PIXEL))
-    joint = np.float32(0.5 / math.pi) * (1 / (sigma * sigma) + 1 / (kernel * kernel))
-    return gaussian_moments(peak, centre, kernel)[0] * np.sqrt(joint)
+    result = np.empty(centre.size, np.float32)
+    _best_heights(peak, centre, result)
+    return result
+
+
+@compiled
+def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> None:
+    """Compute the heights (M,); see `amplitudes`."""
+    size = peak.window.shape[1]
+    for m in range(centre.size):
+        pixels, ground, middle = peak.window[m], peak.base[m], centre[m]
+        sigma = max(peak.sigma[m], np.float32(_ONE_PIXEL))
+        width = max(peak.sigma[m], np.float32(WINDOW_RULE.least_kernel))
+        near = min(max(math.floor(middle + np.float32(0.5)), 0), size - 1)
+        # Gaussian by recurrence on both sides: the ratio of neighbouring values decreases by a constant factor.
+        sharpness, offset, half = np.float32(1.0) / (width * width), np.float32(near) - middle, np.float32(0.5)
+        weight = exponential(-half * sharpness * offset * offset)
+        after, before = exponential(-sharpness * (half + offset)), exponential(-sharpness * (half - offset))
+        falling = after * before
+        total, right, left = weight * (pixels[near] - ground), weight * after, weight * before
+        for k in range(1, math.ceil(np.float32(WINDOW_RULE.tail) * width) + 1):
+            if near + k < size:
+                total += right * (pixels[near + k] - ground)
+            if near - k >= 0:
+                total += left * (pixels[near - k] - ground)
+            after, before = after * falling, before * falling
+            right, left = right * after, left * before
+        # Sum over the product of two Gaussians, solved for the height of the first.
+        joint = np.float32(0.5 / math.pi) * (np.float32(1.0) / (sigma * sigma) + sharpness)
+        result[m] = total * math.sqrt(joint)
 
 
 @lru_cache

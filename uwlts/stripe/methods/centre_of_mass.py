@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
-from uwlts.stripe.peak_window import LANES, PeakWindow, covered_fraction
+from uwlts.stripe.peak_window import PeakWindow, covered_fraction
 
 _ITERATIONS = 6
 """Number of updates of the window's position."""
@@ -37,7 +37,7 @@ def _follow(peak: PeakWindow, half: np.ndarray, centre: np.ndarray) -> None:
             for x in range(max(first, 0), min(last + 1, peak.window.shape[1])):
                 u = x - centre[m]
                 share = covered_fraction(u, half[m]) * (
-                    peak.window[m // LANES, x, m % LANES] - (peak.base[m] + peak.slope[m] * (x - peak.middle[m]))
+                    peak.window[m, x] - (peak.base[m] + peak.slope[m] * (x - peak.middle[m]))
                 )
                 total, moment = total + share, moment + share * u
             step = moment / max(total, 0.1 * peak.height[m])

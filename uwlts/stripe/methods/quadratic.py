@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
-from uwlts.stripe.peak_window import FWHM_PER_SIGMA, LANES, PeakWindow, covered_fraction
+from uwlts.stripe.peak_window import FWHM_PER_SIGMA, PeakWindow, covered_fraction
 
 _ITERATIONS = 6
 """Number of fits, each about the vertex of the previous one."""
@@ -38,7 +38,7 @@ def _fit(peak: PeakWindow, smooth: np.ndarray, half: np.ndarray, centre: np.ndar
             for x in range(max(first, 0), min(last + 1, smooth.shape[1])):
                 u = x - centre[m]
                 w = covered_fraction(u, half[m])
-                f = w * (smooth[m // LANES, x, m % LANES] - (peak.base[m] + peak.slope[m] * (x - peak.middle[m])))
+                f = w * (smooth[m, x] - (peak.base[m] + peak.slope[m] * (x - peak.middle[m])))
                 s0, s1, s2 = s0 + w, s1 + w * u, s2 + w * u * u
                 s3, s4 = s3 + w * u**3, s4 + w * u**4
                 t0, t1, t2 = t0 + f, t1 + f * u, t2 + f * u * u

@@ -23,8 +23,9 @@ def centres(peak: PeakWindow) -> np.ndarray:
 
     A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is subtracted.
     """
-    kernel = peak.kernel_sigma()
-    zeroth, first, second = gaussian_moments(peak, peak.middle, kernel)
+    kernel, moments = peak.kernel_sigma(), np.empty((peak.start.size, 3), np.float32)
+    gaussian_moments(peak, peak.middle, kernel, moments)
+    zeroth, first, second = moments.T
     first = first - peak.slope * math.sqrt(2.0 * math.pi) * kernel * kernel
     step = first / np.maximum(zeroth - second, 0.1 * np.abs(zeroth))
     step = np.minimum(np.maximum(step, -0.5), 0.5)
