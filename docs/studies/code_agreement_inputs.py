@@ -80,24 +80,6 @@ RECORDINGS: dict[str, dict[str, Any]] = {
     "vehicle": {"scene": "vehicle-pipe", "motion": {"waypoints": DRIVE}},
 }
 
-PHOTOGRAPHS = """
-medium = "air"
-laser = "frame*.jpg"
-lamp = "frame*.jpg"
-[stage]
-free = true
-[sensor]
-base = "thesis"
-name = "etna"
-camera = { stripe_along = "height", window = { mounted = false } }
-laser = { origin_mm = [-120.0, 0.0, 0.0], axis = [0.53, 0.0, 0.848] }
-[target]
-kind = "chessboard"
-columns = 7
-rows = 6
-square_mm = 10.0
-margin_mm = 60.0
-"""
 BOARD = 'kind = "chessboard"\ncolumns = 7\nrows = 6\nsquare_mm = 10.0\n'
 
 LOOP_MM = np.array([[0, 0], [1100, 0], [1100, 700], [450, 700], [450, -500]], float)
@@ -146,7 +128,8 @@ def _toml(value: Any) -> str:
 def copy_photographs(source: Path, folder: Path) -> None:
     """Copy the photographs of a board with a laser line, of a robot in air, and describe them."""
     shutil.copytree(source, folder, dirs_exist_ok=True)
-    (folder / "import.toml").write_text(PHOTOGRAPHS, encoding="utf-8")
+    # The description beside this script: the older checkout may have none.
+    shutil.copy(Path(__file__).parents[2] / "tests" / "data" / "etna.toml", folder / "import.toml")
     (folder / "target.toml").write_text(BOARD, encoding="utf-8")
 
 

@@ -48,24 +48,6 @@ LINES, JUMP_PX, BLOCK = 64, 8.0, 8
 """Lines of a window, largest step between its neighbouring lines, and lines of a mean."""
 DOT_DEGREE = 9
 """Degree of the smooth map of dots, as in tests/system/test_real_images.py."""
-ETNA = """
-medium = "air"
-laser = "frame*.jpg"
-lamp = "frame*.jpg"
-[stage]
-free = true
-[sensor]
-base = "thesis"
-name = "etna"
-camera = { stripe_along = "height", window = { mounted = false } }
-laser = { origin_mm = [-120.0, 0.0, 0.0], axis = [0.53, 0.0, 0.848] }
-[target]
-kind = "chessboard"
-columns = 7
-rows = 6
-square_mm = 10.0
-margin_mm = 60.0
-"""
 OPTIONS = CalibrationOptions(poses="free", lens=LensChoice())
 
 
@@ -258,8 +240,7 @@ def sheet_rms(sensor: CalibrationResult, image: TargetImage, pixels: np.ndarray)
 def etna(measured: bool, folder: Path) -> Iterator[Row]:
     """Yield the rows of the photographs of a plate with a board and a stripe."""
     name = "`etna`"
-    (folder / "import.toml").write_text(ETNA)
-    import_images(DATA / "etna", folder / "etna.h5", description=folder / "import.toml")
+    import_images(DATA / "etna", folder / "etna.h5", description=DATA / "etna.toml")
     with Capture(folder / "etna.h5") as capture:
         evidence = gather([capture], [], options=OPTIONS)
         stripes = find_stripes(capture)

@@ -206,34 +206,13 @@ def test_a_wide_saturated_stripe_is_found_along_its_whole_length(frame: str):
         assert scatter < 1.1 * min(_scatter(rows, middle), _scatter(rows, mass))
 
 
-ETNA = """
-medium = "air"
-laser = "frame*.jpg"
-lamp = "frame*.jpg"
-[stage]
-free = true
-[sensor]
-base = "thesis"
-name = "etna"
-camera = { stripe_along = "height", window = { mounted = false } }
-laser = { origin_mm = [-120.0, 0.0, 0.0], axis = [0.53, 0.0, 0.848] }
-[target]
-kind = "chessboard"
-columns = 7
-rows = 6
-square_mm = 10.0
-margin_mm = 60.0
-"""
-
-
 ETNA_OPTIONS = CalibrationOptions(poses="free", lens=LensChoice())
 
 
 @pytest.fixture
 def etna(tmp_path: Path) -> Iterator[Capture]:
     """The photographs as a capture: board and stripe in one image."""
-    (tmp_path / "import.toml").write_text(ETNA)
-    import_images(DATA / "etna", tmp_path / "etna.h5", description=tmp_path / "import.toml")
+    import_images(DATA / "etna", tmp_path / "etna.h5", description=DATA / "etna.toml")
     with Capture(tmp_path / "etna.h5") as capture:
         yield capture
 
