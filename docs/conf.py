@@ -107,10 +107,14 @@ def _copy_notebooks(app, exception: Exception | None) -> None:
 def _require_pictures(notebook: Path) -> None:
     """Stop the build if a cell that shows a plot lacks a picture in its output, or one that shows a cloud its view."""
     for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] != "code":
+            continue
         source = "".join(cell["source"])
-        shown = [each.get("data", {}) for each in cell.get("outputs", ())]
+        shown = [each.get("data", {}) for each in cell["outputs"]]
         if "plt.show()" in source and not any("image/png" in each for each in shown):
-            raise ExtensionError(f"{notebook.name} shows no picture after:\n{source}")
+            raise ExtensionError(
+                f"{notebook.name} shows no picture (an interrupted build? remove docs/_build) after:\n{source}"
+            )
         views = sum("".join(each.get("text/html", "")).count('class="cloud-display"') for each in shown)
         if views < len(re.findall(r"cloud\.show\(", source)):
             raise ExtensionError(f"{notebook.name} shows no view of the cloud after:\n{source}")
