@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
+from twin.backend.arrays import Float, FrozenFunctions, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
 from twin.light.caustics import CELLS, PATCH_MM, Caustics
 from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
@@ -209,6 +209,7 @@ class Renderer:
         self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
         self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
+        self._frozen = FrozenFunctions()
         self._last: _LocatedStripes | None = None
 
     def irradiance(
@@ -274,7 +275,10 @@ class Renderer:
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
         rows, columns = find_marked(self._expand_cells(lit))
         stripe_means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp, lines=lines)
-        walker, walked = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm), None
+        walker, walked = (
+            Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm, self._frozen),
+            None,
+        )
         if walker.finds_light:
             walks = math.ceil(spp * self._walks_per_sample)
             walked = IndirectLight(self.view, walker, lit, seed=seed, walks=walks)
