@@ -498,12 +498,23 @@ class Renderer:
             changes[:] = True  # motion may change any pixel
         image = 0.25 * combine_corners(np.add, nodes)
 
-        def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None, pixel: UInt32) -> tuple[Float]:
-            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
-
         for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
-            image[rows, columns] = self._render_pixels(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
+            even = self._render_pixels(self._even_sum, pose, rows, columns, [], ambient, pattern, spp=spp, shifted=True)
+            image[rows, columns] = even()[0]
         return image
+
+    def _even_sum(
+        self,
+        pose: SensorPose,
+        bundle: Rays,
+        after_s: Float | None,
+        pixel: UInt32,
+        sources: list[Light],
+        ambient: bool,
+        pattern: Float | None,
+    ) -> tuple[Float]:
+        """Return the irradiance per ray of lamp or daylight."""
+        return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
 
     def _compute_even_light(self, segment: RaySegment, ambient: bool, pattern: Float | None) -> Float:
         """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
@@ -644,38 +655,55 @@ class Renderer:
         pose: SensorPose,
         rows: np.ndarray,
         columns: np.ndarray,
+        sources: list[Light],
         *rest: object,
         spp: int,
         shifted: bool = False,
     ) -> Callable[[], np.ndarray]:
         """Render pixels; return a function that fetches the means (K, P) of ``light`` over pixel, pupil and exposure.
 
-        Rendering is asynchronous. ``shifted`` uses different pupil samples in neighbouring pixels, so that a blurred
-        edge shows no steps.
+        Rendering is asynchronous. ``light`` is a method of this renderer. ``shifted`` uses different pupil samples in
+        neighbouring pixels, so that a blurred edge shows no steps.
         """
-        index = dr.arange(mi.UInt32, len(rows) * spp)
-        per_pixel = dr.opaque(mi.UInt32, spp)
-        pixel = index // per_pixel
-        sample = index - pixel * per_pixel
-        # Adjacent values are read together, which is much faster.
         axes = make_lattice(spp, 2 + 2 * self.effects.defocus + (pose.travel is not None))
         places = np.zeros((spp, 4))
         places[:, : 2 + 2 * self.effects.defocus] = axes[: 2 + 2 * self.effects.defocus].T
-        across, down, u, v = dr.gather(mi.Vector4f, to_jit(mi.Float, places), sample)
-        x, y = dr.gather(mi.Point2f, to_jit(mi.Float, np.stack([columns, rows], axis=1)), pixel)
-        pupil = None
-        if self.effects.defocus:
-            if shifted:
-                shift_u, shift_v = dr.gather(mi.Point2f, to_jit(mi.Float, pupil_shifts(rows, columns).T), pixel)
+        shifts = pupil_shifts(rows, columns).T if self.effects.defocus and shifted else None
+        moments = None if pose.travel is None else axes[-1]
+        arrays = places, np.stack([columns, rows], axis=1), shifts, moments
+
+        def trace(
+            index: UInt32,
+            per_pixel: UInt32,
+            places: Float,
+            at: Float,
+            shifts: Float | None,
+            moments: Float | None,
+            *rest: object,
+        ) -> tuple[Float, ...]:
+            pixel = index // per_pixel
+            sample = index - pixel * per_pixel
+            # Adjacent values are read together, which is much faster.
+            across, down, u, v = dr.gather(mi.Vector4f, places, sample)
+            x, y = dr.gather(mi.Point2f, at, pixel)
+            if shifts is not None:
+                shift_u, shift_v = dr.gather(mi.Point2f, shifts, pixel)
                 u, v = u + shift_u, v + shift_v
                 u, v = u - dr.floor(u), v - dr.floor(v)
-            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
-        after_s = None
-        if pose.travel is not None:
-            after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
-        bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
-        values = light(pose, bundle, after_s, pixel, *rest)
-        dr.eval(values)  # together: separate sums would trace the rays again
+            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v)) if self.effects.defocus else None
+            after_s = None if moments is None else pose.compute_times(y, dr.gather(mi.Float, moments, sample))
+            bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
+            return light(pose, bundle, after_s, pixel, sources, *rest)
+
+        values = self._frozen.call(
+            light.__name__,
+            trace,
+            (self.objects, self.scattering, self.view, pose, sources),
+            dr.arange(mi.UInt32, len(rows) * spp),
+            dr.opaque(mi.UInt32, spp),
+            *(None if each is None else to_jit(mi.Float, each) for each in arrays),
+            *rest,
+        )
         sums = [dr.block_sum(value, spp) for value in values]
         dr.eval(sums)
         return lambda: np.stack([each.numpy() / spp for each in sums])

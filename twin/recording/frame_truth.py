@@ -141,9 +141,7 @@ def _distance_slopes(renderer: Renderer, pose: SensorPose, truth: FrameTruth, li
         across = to_jit(mi.Float, truth.centre_px[lines] + aside)
         x, y = (at, across) if camera.stripe_along == "width" else (across, at)
         bundle = renderer.view.trace_bundle(x, y)
-        ray = pose.ray(
-            bundle.origin, bundle.direction, None if pose.travel is None else pose.travel.compute_times(y, 0.5)
-        )
+        ray = pose.ray(bundle.origin, bundle.direction, pose.compute_times(y, 0.5))
         t = dr.dot(normal, point - mi.Vector3f(ray.o)) / dr.dot(normal, ray.d)
         place = mi.Point3f(bundle.origin + bundle.direction * t)
         distance.append(renderer.sheet.evaluate(place).distance_mm.numpy().astype(float))
@@ -185,7 +183,7 @@ def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel:
         return (at, across) if along_width else (across, at)
 
     def travelled(across: Float, at: Float) -> Float | None:
-        return None if travel is None else travel.compute_times(position(across, at)[1], 0.5)
+        return pose.compute_times(position(across, at)[1], 0.5)
 
     def distance(across: Float, at: Float) -> Float:
         bundle = renderer.view.trace_bundle(*position(across, at))
