@@ -116,7 +116,8 @@ class FrozenFunctions:
         body, frozen = self._frozen[key]
         body.function = function
         try:
-            return frozen(list(find_arrays(carriers)), inputs)
+            carried = {id(each): each for each in find_arrays(carriers)}
+            return frozen(list(carried.values()), inputs)
         finally:
             del body.function
 

@@ -15,14 +15,14 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, FrozenFunctions, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
+from twin.backend.arrays import Bool, Float, FrozenFunctions, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
 from twin.light.caustics import CELLS, PATCH_MM, Caustics
 from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
@@ -366,6 +366,13 @@ class Renderer:
         """Return the profile lines (P,) of pixels."""
         return columns if self.sensor.camera.stripe_along == "width" else rows
 
+    def frozen_call(
+        self, name: str, function: Callable[..., Any], pose: SensorPose, carriers: Any, *inputs: Any
+    ) -> Any:
+        """Return ``function(*inputs)`` as `FrozenFunctions.call`; ``carriers`` add to this renderer and the pose."""
+        everything = self.objects, self.scattering, self.view, self._sheets, pose, carriers
+        return self._frozen.call(name, function, everything, *inputs)
+
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
     def _segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
@@ -411,22 +418,11 @@ class Renderer:
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
         surfaces: list[Float] = []
         for moment, sources in self._moments(pose, direct + mirrored):
-            scattered = mi.Float(0.0)
-            for index, segment in enumerate(self._segments(moment, bundle, None)):
-                ends = [light.evaluate(segment.end()) for light in sources]
-                across = [
-                    self._sigmas(here, segment, moment, light.sheet.reach)
-                    for light, here in zip(sources, ends, strict=True)
-                ]
-                straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
-                depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
-                if index == 0 and moment is pose and self._scatters:
-                    surfaces = self._surfaces(pose, segment, ends)
-                    for light, here in zip(sources, ends, strict=True):
-                        crossed = self._crossing(light, bundle)
-                        scattered += compute_haze(crossed, light, self.objects.scene, segment, here)
-                reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
-                dr.eval(depth, scattered, surfaces, *across, *reached)
+            with_haze = moment is pose and self._scatters
+            crossed = [self._crossing(light, bundle) for light in sources] if with_haze else []
+            trace = partial(self._trace_nodes, moment, bundle, sources, crossed)
+            segments, scattered, shown = self.frozen_call("nodes", trace, moment, (sources, bundle, crossed))
+            for index, (depth, across, reached) in enumerate(segments):
                 stripes = [
                     mark_near_sheet(
                         sigmas.numpy().reshape(shape), True if there is None else there.numpy().reshape(shape)
@@ -439,9 +435,34 @@ class Renderer:
                 if self.effects.defocus:
                     reach = np.fmax(reach, self._blur_px(near, depth.numpy().reshape(shape)))
                 lit |= near
-            if moment is pose and dr.width(scattered) > 1:
+            if with_haze:
+                surfaces = shown
                 image = self._expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)))
         return own, dilate_cells(lit, reach), _Nodes(image, [each.numpy().reshape(shape) for each in surfaces])
+
+    def _trace_nodes(
+        self, pose: SensorPose, bundle: Rays, sources: list[Light], crossed: list[SheetCrossing]
+    ) -> tuple[list[tuple[Float, list[Float], list[Bool | None]]], Float | None, list[Float]]:
+        """Return depths, distances in standard deviations and reached points of each segment, haze and lit surfaces.
+
+        Haze and surfaces are those of the first segment, if the intersections ``crossed`` with the sheets are given.
+        """
+        segments, scattered, surfaces = [], None, []
+        for segment in self._segments(pose, bundle, None):
+            ends = [light.evaluate(segment.end()) for light in sources]
+            across = [
+                self._sigmas(here, segment, pose, light.sheet.reach) for light, here in zip(sources, ends, strict=True)
+            ]
+            straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
+            depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
+            if crossed and scattered is None:
+                surfaces = self._surfaces(pose, segment, ends)
+                scattered = mi.Float(0.0)
+                for light, here, crossing in zip(sources, ends, crossed, strict=True):
+                    scattered += compute_haze(crossing, light, self.objects.scene, segment, here)
+            reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
+            segments.append((depth, across, reached))
+        return segments, scattered, surfaces
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
@@ -695,10 +716,11 @@ class Renderer:
             bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
             return light(pose, bundle, after_s, pixel, sources, *rest)
 
-        values = self._frozen.call(
+        values = self.frozen_call(
             light.__name__,
             trace,
-            (self.objects, self.scattering, self.view, pose, sources),
+            pose,
+            sources,
             dr.arange(mi.UInt32, len(rows) * spp),
             dr.opaque(mi.UInt32, spp),
             *(None if each is None else to_jit(mi.Float, each) for each in arrays),
