@@ -9,7 +9,7 @@ seconds, between frames or sensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any, TypeAlias
 
 import drjit as dr
@@ -116,8 +116,7 @@ class FrozenFunctions:
         body, frozen = self._frozen[key]
         body.function = function
         try:
-            carried = {id(each): each for each in find_arrays(carriers)}
-            return frozen(list(carried.values()), inputs)
+            return frozen(find_arrays(carriers), inputs)
         finally:
             del body.function
 
@@ -134,14 +133,20 @@ class _Body:
         return results
 
 
-def find_arrays(thing: object) -> Iterator[object]:
-    """Yield the arrays, transforms and Mitsuba objects in an object of the twin, always in the same order."""
-    if isinstance(thing, (dr.ArrayBase, mi.Object, mi.Transform4f)):
-        yield thing
-    elif isinstance(thing, (list, tuple)):
-        for each in thing:
-            yield from find_arrays(each)
-    elif isinstance(thing, dict):
-        yield from find_arrays(list(thing.values()))
-    elif type(thing).__module__.startswith("twin."):
-        yield from find_arrays(vars(thing))
+def find_arrays(thing: object) -> list[Any]:
+    """Return the arrays, transforms and Mitsuba objects in an object of the twin, always in the same order."""
+    arrays: dict[int, Any] = {}
+    visited: set[int] = set()
+    waiting = [thing]
+    while waiting:
+        each = waiting.pop()
+        if isinstance(each, (dr.ArrayBase, mi.Object, mi.Transform4f)):
+            arrays[id(each)] = each
+        elif isinstance(each, (list, tuple)):
+            waiting += each
+        elif isinstance(each, dict):
+            waiting += each.values()
+        elif type(each).__module__.startswith("twin.") and id(each) not in visited:
+            visited.add(id(each))
+            waiting += vars(each).values()
+    return list(arrays.values())
