@@ -134,14 +134,16 @@ class _Body:
 
 
 def find_arrays(thing: object) -> list[Any]:
-    """Return the arrays, transforms and Mitsuba objects in an object of the twin, always in the same order."""
+    """Return the arrays and Mitsuba objects in an object of the twin, always in the same order."""
     arrays: dict[int, Any] = {}
     visited: set[int] = set()
     waiting = [thing]
     while waiting:
         each = waiting.pop()
-        if isinstance(each, (dr.ArrayBase, mi.Object, mi.Transform4f)):
+        if isinstance(each, (dr.ArrayBase, mi.Object)):
             arrays[id(each)] = each
+        elif isinstance(each, mi.Transform4f):
+            waiting.append(each.matrix)  # its inverse is not computed unless it is used
         elif isinstance(each, (list, tuple)):
             waiting += each
         elif isinstance(each, dict):
