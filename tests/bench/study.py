@@ -45,13 +45,14 @@ def screening() -> tuple[float, float]:
     batches = [Batch(study, None, first, BATCH) for first in range(0, BATCHES * BATCH, BATCH)]
     with tempfile.TemporaryDirectory() as folder, open_workers(workers=WORKERS) as pool:
 
-        def write(judged: tuple[Batch, Any]) -> None:
-            batch, (_, content) = judged
+        def write(judged: tuple[Batch, Any]) -> float:
+            batch, (seconds, content) = judged
             write_part(Path(folder), batch.first, content)
+            return seconds
 
         list(pool.map_unordered(timed, batches[: 2 * WORKERS]))
         start, judging = time.perf_counter(), 0.0
-        for (_, (seconds, _)), _ in map_in_threads(write, pool.map_unordered(timed, batches)):
+        for _, seconds in map_in_threads(write, pool.map_unordered(timed, batches)):
             judging += seconds
         wall = time.perf_counter() - start
         assert len(read_parts(Path(folder))["design"]) == BATCHES * BATCH
