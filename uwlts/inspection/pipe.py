@@ -240,7 +240,8 @@ def _blemish_features(
     def unroll_about(indication: Indication) -> tuple[UnrolledSurface, float]:
         """Return the surface unrolled about an indication, so that it is not cut, and its angle."""
         middle = float(np.angle(np.mean(np.exp(1j * form.angle[chosen[indication.points]]))))
-        angle = np.mod(form.angle[chosen] - middle + np.pi, 2 * np.pi) - np.pi
+        angle = form.angle[chosen] - middle
+        angle -= 2 * np.pi * np.rint(angle / (2 * np.pi))
         return replace(flat, places=np.column_stack([flat.places[:, 0], form.radius_mm * angle])), middle
 
     def measure(indication: Indication, points: np.ndarray, middle: float, measured_by: Callable[[], Blemish]) -> bool:
