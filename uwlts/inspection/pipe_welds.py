@@ -121,7 +121,7 @@ def _average_cells(
     total = np.bincount(flat, heights, count * _RULE.lengths).reshape(shape)
     mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
     filled, window = np.where(np.isfinite(mean), mean, 0.0), 2 * int(0.5 * _RULE.baseline * count) + 1
-    # SciPy moves the window of a single line by its sorted values, which hardly depends on its width.
+    # SciPy moves the window of a single line by its sorted values, almost independent of its width.
     mean -= np.column_stack([ndimage.median_filter(line, window, mode="nearest") for line in filled.T])
     return mean, origin, edges
 
