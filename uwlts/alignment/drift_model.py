@@ -88,6 +88,13 @@ class DriftModel:
         ]
 
 
+def candidates_beside(number: int) -> list[int]:
+    """Return the numbers of a candidate and of those with the next slower or faster rates and walks."""
+    rates, walk = divmod(number, len(_WALKS))
+    near = [range(max(each - 1, 0), min(each + 2, count)) for each, count in ((rates, len(RATES)), (walk, len(_WALKS)))]
+    return [len(_WALKS) * each + share for each, share in product(*near)]
+
+
 def choose_drift_model(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> DriftModel:
     """Return the drift model from the covariance of a trajectory, or from given standard deviations.
 
