@@ -89,10 +89,10 @@ class DriftModel:
 
 
 def candidates_beside(number: int) -> list[int]:
-    """Return the numbers of a candidate and of those with the next slower or faster rates and walks."""
-    rates, walk = divmod(number, len(_WALKS))
-    near = [range(max(each - 1, 0), min(each + 2, count)) for each, count in ((rates, len(RATES)), (walk, len(_WALKS)))]
-    return [len(_WALKS) * each + share for each, share in product(*near)]
+    """Return the numbers of candidates with the same walk as a given one, or with the same rates and the next walks."""
+    walk = number % len(_WALKS)
+    next_walks = [number + step for step in (-1, 1) if 0 <= walk + step < len(_WALKS)]
+    return [len(_WALKS) * each + walk for each in range(len(RATES))] + next_walks
 
 
 def choose_drift_model(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> DriftModel:

@@ -99,9 +99,12 @@ def settle(estimate: PathEstimate) -> PathEstimate:
     """
     still = estimate.options.still
     estimate = solve(refine_nodes(estimate), still=still)
-    crossing = {number for pair in estimate.pairs for number in pair}
+    crossing, selected = {number for pair in estimate.pairs for number in pair}, False
     for _ in range(estimate.options.refits):
-        before, estimate = estimate.numbers, solve(refit(_select_drift(estimate), crossing), still=still)
+        before, drift = estimate.numbers, estimate.prior.drift
+        estimate = estimate if selected else _select_drift(estimate)
+        selected = estimate.prior.drift is drift
+        estimate = solve(refit(estimate, crossing), still=still)
         if _step_size(estimate, before) < estimate.options.settled:
             break
     agreeing = tuple(pair for pair in estimate.pairs if estimate.agrees(pair))
@@ -109,18 +112,18 @@ def settle(estimate: PathEstimate) -> PathEstimate:
 
 
 def _select_drift(estimate: PathEstimate) -> PathEstimate:
-    """Select random walk and rates of maximum marginal likelihood, starting from the present ones, unless stated.
+    """Select random walk and rates of maximum marginal likelihood, by ascent from the present ones, unless stated.
 
     The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992). A normal matrix V L V^T corresponds
     to observations L^(1/2) V^T x of the path x with unit noise. Their covariance is I + L^(1/2) V^T P V L^(1/2) for a
     prior covariance P.
     """
     prior, drift = estimate.prior, estimate.prior.drift
-    if drift.stated:
-        return estimate
     normal, right = _normal_equations(estimate)
-    size = np.repeat(drift.std, prior.count)
     near = np.flatnonzero(normal.any(axis=0))
+    if drift.stated or not len(near):
+        return estimate
+    size = np.repeat(drift.std, prior.count)
     values, vectors = eigh(size[near, None] * normal[np.ix_(near, near)] * size[near])
     used = values > _NEGLIGIBLE / len(near)
     root = np.sqrt(values[used])
