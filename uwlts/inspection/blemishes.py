@@ -27,7 +27,7 @@ from uwlts.fitting.point_spacing import measure_spacing
 from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication
-from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, SEED, FeatureKind, FeatureValue, plain_value
+from uwlts.inspection.features import BIAS_STD, COVERAGE, COVERAGE_FACTOR, SEED, FeatureKind, FeatureValue, plain_value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +146,7 @@ def measure_blemish(
     # Uncertainty by the footprints' size.
     resolved = field.figures(field.depths(heights, share=1 - field.footprint_std), edge, deepest) - seen
     resolved[0] += between
-    random = np.sqrt(random**2 + bias**2 + resolved**2)
+    random = np.sqrt(random**2 + (BIAS_STD * bias) ** 2 + resolved**2)
 
     def changed(pattern: np.ndarray) -> np.ndarray:
         """Return the change of all figures by a pattern of height errors."""
