@@ -120,8 +120,8 @@ class PathPrior:
         """
         count = self.count
         if not self.drift.dead_reckoned:
-            seen = normal.any(axis=0).reshape(6, -1).any(axis=0)[self.order]
-            count -= int(np.argmax(seen[::-1]))
+            seen = np.flatnonzero(normal.any(axis=0)) % self.count
+            count = 1 + int(np.flatnonzero(np.isin(self.order, seen)).max(initial=0))
         first, lead = (
             self.count * np.arange(6)[:, None] + each[:count] for each in (self.order, np.arange(self.count))
         )
