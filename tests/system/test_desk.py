@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import uwlts
+from tests import preloaded
 from tests.system.small_board import small_sensor, turned_board
 from tests.system.test_laser_off_attacked import light
 from tests.waiting import within
@@ -57,11 +58,8 @@ class Desk:
             f'count = {COUNT}\nfeed_mm_per_min = 900.0\n[artefact]\nkind = "plane"\n'
         )
         uwlts.nominal(folder / "sensor.toml", medium="air").save(folder / "nominal.json")
-        words = ["desk", str(folder), "--plan", str(folder / "plan.toml"), "--port", "18300"]
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "uwlts", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        line = self.process.stdout.readline() if self.process.stdout else ""
+        self.process = preloaded.uwlts("desk", str(folder), "--plan", str(folder / "plan.toml"), "--port", "18300")
+        line = self.process.stdout.readline()
         found = re.search(r"open (\S+) to work, (\S+) to look", line)
         assert found, line or self.process.communicate()[1]
         self.operator_address, self.address = found.groups()

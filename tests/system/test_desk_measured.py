@@ -4,8 +4,6 @@ import csv
 import json
 import re
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from tests import preloaded
 from tests.system.test_desk import SLOW_MS, press, says, tab, watched
 from tests.system.test_desk_analyses import choose
 from tests.uwlts.desk.test_analyses import HEIGHT_MM, NOISE_MM, step_cloud
@@ -40,18 +39,17 @@ def place(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def page(place: Path, chromium: "Browser") -> "Iterator[Page]":
-    words = ["desk", str(place), "--port", "0"]
-    with subprocess.Popen([sys.executable, "-m", "uwlts", *words], stdout=subprocess.PIPE, text=True) as desk:
-        try:
-            assert desk.stdout
-            address = desk.stdout.readline().split()[1]
-            with watched(chromium.new_page(viewport={"width": 1280, "height": 800})) as opened:
-                opened.set_default_timeout(SLOW_MS)
-                opened.goto(address)
-                yield opened
-        finally:
-            desk.send_signal(signal.SIGINT)
-        assert desk.wait(60) == 0
+    desk = preloaded.uwlts("desk", str(place), "--port", "0")
+    try:
+        address = desk.stdout.readline().split()[1]
+        with watched(chromium.new_page(viewport={"width": 1280, "height": 800})) as opened:
+            opened.set_default_timeout(SLOW_MS)
+            opened.goto(address)
+            yield opened
+    finally:
+        desk.send_signal(signal.SIGINT)
+        desk.communicate()
+    assert desk.poll() == 0
 
 
 def pick(page: "Page", share: float, before: str) -> str:

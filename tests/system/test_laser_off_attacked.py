@@ -11,8 +11,6 @@ import re
 import resource
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +21,8 @@ from urllib.parse import urlsplit
 import pytest
 from websockets.exceptions import InvalidStatus
 
+from tests.preloaded import Preloaded
+from tests.system.attacked_page import serve_page
 from tests.system.test_page_access import Browser, Place, asked, cookie, opened
 from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
@@ -33,28 +33,6 @@ OFF_S = 2.0
 """Time limit of a press on a busy machine; on an idle one it takes some ms. Without limits it took 7 s or more."""
 HALF = 1300
 LONG_LINE_BYTES = 120 * 2**20
-USUAL_FILES = 1024
-
-PROGRAM = f"""
-import resource, sys
-from uwlts.desk.shown_state import Board
-from uwlts.desk.guided import BoardScreen
-from uwlts.desk.server import DeskServer
-from uwlts.hardware.grbl import GrblStage
-
-resource.setrlimit(resource.RLIMIT_NOFILE, ({USUAL_FILES}, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
-board = Board("attacked")
-screen = BoardScreen(board)
-with DeskServer(board, port=0, switch=screen.switch) as server:
-    with GrblStage(sys.argv[1]) as stage:
-        screen.set_stage(stage)
-        print(server.address, server.operator_address, screen.switch._process.pid, flush=True)
-        sys.stdin.readline()
-        screen.set_stage(None)
-    print("closed", flush=True)
-    sys.stdin.readline()
-print(*(line.text for line in board.lines()), sep="\\n", flush=True)
-"""
 
 
 def light(controller: GrblController, *, steady_s: float = 0.5) -> None:
@@ -80,7 +58,7 @@ class Operated(Place):
     cookie: str
     port: int
     process: int
-    program: subprocess.Popen[str]
+    program: Preloaded
     controller: GrblController
 
     @property
@@ -116,9 +94,7 @@ class Operated(Place):
 @pytest.fixture
 def operated() -> Iterator[Operated]:
     with GrblController(settings={22: 0}, resets_when_opened=False) as controller:
-        program = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, controller.port], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+        program = Preloaded(serve_page, controller.port)
         try:
             address, operator_address, process = program.stdout.readline().split()
             kept = cookie(Place(address, operator_address))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import uwlts
+from tests.system import in_process
 from tests.system.small_board import small_sensor, turned_board
 from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
@@ -52,11 +53,12 @@ def written(folder: Path, served: ServedTwin, *, name: str = "plan", top: str = 
 
 
 def command(plan: Path, out: Path, *more: str) -> list[str]:
+    """The command as a process of its own."""
     return [sys.executable, "-m", "uwlts", "scan", str(plan), "--out", str(out), "--home", *more]
 
 
 def run(plan: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(plan, out, *more), capture_output=True, text=True, timeout=120)
+    return in_process.uwlts("scan", plan, "--out", out, *(more or ["--home"]))
 
 
 def dark(served: ServedTwin) -> bool:
@@ -94,7 +96,7 @@ def test_a_scan_of_the_served_twin_is_the_simulated_one(served, folder, board, s
             f"reconstruct {tmp_path / name}.h5 --calibration {tmp_path / name}.json --out {tmp_path / name}.cloud.h5",
             f"evaluate {tmp_path / name}.cloud.h5 --out {tmp_path / name}.evaluation.json",
         ):
-            judged = subprocess.run([sys.executable, "-m", "uwlts", *line.split()], capture_output=True, text=True)
+            judged = in_process.uwlts(*line.split())
             assert judged.returncode == 0, judged.stderr
         clouds.append((tmp_path / f"{name}.evaluation.json").read_text())
     # The served images have other noise than the simulated ones, so that the spreads differ randomly.
@@ -114,7 +116,8 @@ def test_automatic_exposure_comes_near_that_of_the_twin(served, folder, tmp_path
 
 def test_background_is_subtracted_and_lamp_images_are_kept(served, folder, tmp_path):
     top = 'background = true\nlights = ["lamp", "laser"]\nlaser_ms = 0.3\nlamp_ms = 0.3'
-    done = run(written(folder, served, top=top, count=2), tmp_path / "scan.h5")
+    arguments = command(written(folder, served, top=top, count=2), tmp_path / "scan.h5")
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     with Capture(tmp_path / "scan.h5") as scan:
         assert scan.laser_on.tolist() == [False, True, False, True]
@@ -148,7 +151,7 @@ def test_an_interrupted_scan_is_dark_keeps_its_images_and_goes_on(served, folder
         kept, times = len(part), part.time_s[:]
     assert 2 <= kept < COUNT
     assert "--resume" in run(plan, out).stderr
-    done = run(plan, out, "--resume")
+    done = run(plan, out, "--home", "--resume")
     assert done.returncode == 0, done.stderr
     with Capture(out) as scan:
         assert len(scan) == COUNT
@@ -171,8 +174,7 @@ def test_an_interrupted_scan_is_dark_keeps_its_images_and_goes_on(served, folder
 def test_plans_that_cannot_be_done_are_refused_before_anything_moves(served, folder, tmp_path, stage, top, says):
     before = served.controller.state().position_mm
     plan = written(folder, served, name="wrong", top=top, **stage)
-    arguments = [word for word in command(plan, tmp_path / "scan.h5") if word != "--home"] + ["--unlock"]
-    done = subprocess.run(arguments, capture_output=True, text=True, timeout=60)
+    done = run(plan, tmp_path / "scan.h5", "--unlock")
     assert done.returncode == 2
     assert says in done.stderr and "Traceback" not in done.stderr
     assert served.controller.state().position_mm == before and not (tmp_path / "scan.h5").exists()

@@ -1,0 +1,91 @@
+"""Processes of the desk that begin with its libraries imported, which costs two seconds in each new interpreter."""
+
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import TextIO
+
+from uwlts.cli import main
+
+_CONTEXT = multiprocessing.get_context("forkserver")
+_CONTEXT.set_forkserver_preload(
+    [
+        "pytest",
+        "tests.preloaded",
+        "uwlts.desk.scan",
+        "uwlts.desk.server",
+        "uwlts.desk.guided",
+        "uwlts.desk.operator_page",
+    ]
+)
+
+
+class Preloaded:
+    """A process that calls a function of a module, with pipes as its standard streams.
+
+    Attributes and methods are those of `subprocess.Popen` that the tests use.
+    """
+
+    def __init__(self, function: Callable[..., None], *arguments: str):
+        pipes = [_CONTEXT.Pipe(duplex=False) for _ in range(3)]
+        (read_in, write_in), (read_out, write_out), (read_errors, write_errors) = pipes
+        inner = (read_in, write_out, write_errors)
+        self._process = _CONTEXT.Process(target=_call, args=(inner, function, arguments))
+        self._process.start()
+        for end in inner:
+            end.close()
+        self.stdin, self.stdout, self.stderr = _text(write_in, "w"), _text(read_out, "r"), _text(read_errors, "r")
+
+    @property
+    def pid(self) -> int:
+        assert self._process.pid
+        return self._process.pid
+
+    def poll(self) -> int | None:
+        """Return the exit code, None if the process runs."""
+        return self._process.exitcode
+
+    def send_signal(self, number: signal.Signals) -> None:
+        os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def wait(self, seconds: float | None = None) -> int | None:
+        """Wait for the end, and return the exit code."""
+        self._process.join(seconds)
+        return self.poll()
+
+    def communicate(self) -> tuple[str, str]:
+        """Wait for the end, and return what it wrote."""
+        with self.stdin, self.stdout, self.stderr:
+            written = self.stdout.read(), self.stderr.read()
+        self.wait()
+        return written
+
+
+def uwlts(*words: str) -> Preloaded:
+    """Start the command ``uwlts``."""
+    return Preloaded(_run_uwlts, *words)
+
+
+def _run_uwlts(*words: str) -> None:
+    sys.argv = ["uwlts", *words]
+    main()
+
+
+def _call(streams: tuple, function: Callable[..., None], arguments: tuple[str, ...]) -> None:
+    for number, stream in enumerate(streams):
+        os.dup2(stream.fileno(), number)
+        stream.close()
+    sys.stdin = open(0)
+    function(*arguments)
+
+
+def _text(end, mode: str) -> TextIO:
+    """Return a pipe's end as a text file."""
+    file = os.fdopen(os.dup(end.fileno()), mode)
+    end.close()
+    return file
