@@ -6,10 +6,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from twin.design.screening import Batch, evaluate_batch, read_parts, write_part
 from twin.design.study import Study, load_study
-from uwlts.runtime.workers import open_workers
+from uwlts.runtime.workers import map_in_threads, open_workers
 
 WORKERS = 2
 BATCHES, BATCH = 40, 1000
@@ -43,10 +44,15 @@ def screening() -> tuple[float, float]:
     study = Study.model_validate(study.model_dump() | {"sampling": sampling})
     batches = [Batch(study, None, first, BATCH) for first in range(0, BATCHES * BATCH, BATCH)]
     with tempfile.TemporaryDirectory() as folder, open_workers(workers=WORKERS) as pool:
+
+        def write(judged: tuple[Batch, Any]) -> float:
+            batch, (seconds, content) = judged
+            write_part(Path(folder), batch.first, content)
+            return seconds
+
         list(pool.map_unordered(timed, batches[: 2 * WORKERS]))
         start, judging = time.perf_counter(), 0.0
-        for batch, (seconds, content) in pool.map_unordered(timed, batches):
-            write_part(Path(folder), batch.first, content)
+        for _, seconds in map_in_threads(write, pool.map_unordered(timed, batches)):
             judging += seconds
         wall = time.perf_counter() - start
         assert len(read_parts(Path(folder))["design"]) == BATCHES * BATCH

@@ -31,7 +31,7 @@ from uwlts.errors import CaptureError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import write_atomically
 from uwlts.runtime.progress import ProgressListener, ignore_progress
-from uwlts.runtime.workers import Lost, Workers
+from uwlts.runtime.workers import Lost, Workers, map_in_threads
 
 _MOST_PART_BYTES = 2**28  # thousands of times a usual part, far below the memory
 
@@ -200,8 +200,12 @@ def evaluate_study(
             else:
                 done += batch.count
 
-    for batch, result in workers.map_unordered(evaluate_batch, left()):
+    def write(evaluated: tuple[Batch, bytes | Lost]) -> None:
+        batch, result = evaluated
         write_part(place, batch.first, _content(batch, result), lost=isinstance(result, Lost))
+
+    # In threads: to flush a part to the disk takes as long as to evaluate one.
+    for (batch, _), _ in map_in_threads(write, workers.map_unordered(evaluate_batch, left())):
         done += batch.count
         progress(done, total)
 

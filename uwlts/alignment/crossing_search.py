@@ -77,8 +77,9 @@ def _is_beside(pair: Pair, others: list[Pair], within: int) -> bool:
 
 def accept_hypothesis(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstimate | None:
     """Estimate the path with a hypothesis; return None if the surfaces then disagree."""
-    closed = solve(refine_nodes(solve(bring_together(estimate, hypothesis))))
-    closed = solve(refit(closed, hypothesis.pair))
+    still = estimate.options.still_searching
+    closed = solve(refine_nodes(solve(bring_together(estimate, hypothesis), still=still)), still=still)
+    closed = solve(refit(closed, hypothesis.pair), still=still)
     return closed if closed.agrees(hypothesis.pair) else None
 
 
@@ -98,10 +99,11 @@ def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
                 new += [pair] if len(found.source) >= estimate.options.fewest_patches else []
     if not new:
         return estimate
-    estimate = solve(refine_nodes(replace(estimate, pairs=(*closed, *new))))
-    estimate = solve(refit(estimate, {number for pair in estimate.pairs for number in pair}))
+    still = estimate.options.still_searching
+    estimate = solve(refine_nodes(replace(estimate, pairs=(*closed, *new))), still=still)
+    estimate = solve(refit(estimate, {number for pair in estimate.pairs for number in pair}), still=still)
     agreeing = tuple(pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair))
-    return estimate if len(agreeing) == len(estimate.pairs) else solve(replace(estimate, pairs=agreeing))
+    return estimate if len(agreeing) == len(estimate.pairs) else solve(replace(estimate, pairs=agreeing), still=still)
 
 
 def _search_range(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:

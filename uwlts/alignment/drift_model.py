@@ -88,6 +88,13 @@ class DriftModel:
         ]
 
 
+def candidates_beside(number: int) -> list[int]:
+    """Return the numbers of candidates with the same walk as a given one, or with the same rates and the next walks."""
+    walk = number % len(_WALKS)
+    next_walks = [number + step for step in (-1, 1) if 0 <= walk + step < len(_WALKS)]
+    return [len(_WALKS) * each + walk for each in range(len(RATES))] + next_walks
+
+
 def choose_drift_model(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> DriftModel:
     """Return the drift model from the covariance of a trajectory, or from given standard deviations.
 

@@ -105,7 +105,7 @@ class PathEstimate:
     def relative_covariance(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
         """Return the covariance (6, 6) of the later piece's motion relative to the earlier one at a place (3,)."""
         by = self.prior.times_transposed_root(self.relative_movement(pair, at_mm).T)
-        half = solve_triangular(self.factor, by, lower=True)
+        half = solve_triangular(self.factor, by, lower=True, check_finite=False)
         return half.T @ half
 
     @cached_property

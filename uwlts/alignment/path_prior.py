@@ -32,11 +32,15 @@ class PathPrior:
     nodes_s: np.ndarray
     drift: DriftModel
     trajectory: Trajectory
+    order: np.ndarray
+    """(C,) int; nodes in the order of the whitened coordinates of each component: those in crossings first, so that
+    observations there involve the first coordinates only."""
 
     @classmethod
     def from_times(cls, times_s: np.ndarray, drift: DriftModel, trajectory: Trajectory, *, intervals: int) -> PathPrior:
         """Return the prior with regular nodes over the times (N,) of the points."""
-        return cls(np.linspace(times_s.min(), times_s.max(), intervals + 1), drift, trajectory)
+        nodes = np.linspace(times_s.min(), times_s.max(), intervals + 1)
+        return cls(nodes, drift, trajectory, np.arange(intervals + 1))
 
     def with_nodes(self, times_s: np.ndarray, step_s: float, *, most: int) -> PathPrior:
         """Return the prior with additional nodes around times (N,).
@@ -54,7 +58,8 @@ class PathPrior:
         apart = np.min(np.abs(self.nodes_s[:, None] - closer), axis=1, initial=np.inf) > step_s
         apart[[0, -1]] = True
         inner = closer[(closer > first + step_s / 2) & (closer < last - step_s / 2)]
-        return replace(self, nodes_s=np.union1d(self.nodes_s[apart], inner))
+        nodes = np.union1d(self.nodes_s[apart], inner)
+        return replace(self, nodes_s=nodes, order=np.argsort(~np.isin(nodes, inner), kind="stable"))
 
     @property
     def count(self) -> int:
@@ -80,7 +85,8 @@ class PathPrior:
 
     def times_root(self, matrix: np.ndarray) -> np.ndarray:
         """Return R times a matrix (6 C, K)."""
-        parts = self._times_triangles(matrix, transposed=False)
+        parts = np.empty((6, self.count, matrix.shape[1]))
+        parts[:, self.order] = self._times_triangles(matrix, transposed=False)
         if self.drift.dead_reckoned:
             parts[0] -= self._turned[1] @ parts[5]
             parts[1] += self._turned[0] @ parts[5]
@@ -92,29 +98,50 @@ class PathPrior:
             matrix = matrix.copy()
             parts = matrix.reshape(6, self.count, -1)
             parts[5] += self._turned[0].T @ parts[1] - self._turned[1].T @ parts[0]
-        return self._times_triangles(matrix, transposed=True).reshape(matrix.shape)
+        parts = matrix.reshape(6, self.count, -1)[:, self.order]
+        return self._times_triangles(parts, transposed=True).reshape(matrix.shape)
 
     def _times_triangles(self, matrix: np.ndarray, *, transposed: bool) -> np.ndarray:
-        """Return the products (6, C, K) of the roots, or of their transposes, with the parts of a matrix (6 C, K).
+        """Return products (6, M, K) of the roots of the first M coordinates, or of their transposes, with a matrix.
 
         BLAS multiplies triangles in half the time of full matrices; it takes and returns transposed arrays.
         """
-        parts = np.array(matrix, np.float64, order="C").reshape(6, self.count, -1)
-        for number, root in enumerate(self._roots):
+        parts = np.array(matrix, np.float64, order="C").reshape(6, -1, matrix.shape[-1])
+        for number, root in enumerate(self._roots[:, : parts.shape[1], : parts.shape[1]]):
             flags = {"side": 1, "lower": 0, "trans_a": int(transposed), "overwrite_b": 1}
             parts[number] = _multiply_by_triangle(1.0, root.T, parts[number].T, **flags).T
         return parts
 
-    def with_evidence(self, normal: np.ndarray) -> np.ndarray:
-        """Return the normal matrix (6 C, 6 C) of the whitened coordinates from that of the values without prior."""
-        half = self.times_transposed_root(normal)
-        return np.eye(len(normal)) + self.times_transposed_root(half.T)
+    def factor(self, normal: np.ndarray) -> np.ndarray:
+        """Return the lower Cholesky factor (6 C, 6 C) of the normal matrix of the whitened coordinates.
+
+        ``normal`` (6 C, 6 C) is that of the values without prior. Coordinates after the last node that it contains keep
+        their prior.
+        """
+        count = self.count
+        if not self.drift.dead_reckoned:
+            seen = np.flatnonzero(normal.any(axis=0)) % self.count
+            count = 1 + int(np.flatnonzero(np.isin(self.order, seen)).max(initial=0))
+        first, lead = (
+            self.count * np.arange(6)[:, None] + each[:count] for each in (self.order, np.arange(self.count))
+        )
+        if self.drift.dead_reckoned:
+            half = self.times_transposed_root(normal)
+            inner = self.times_transposed_root(half.T)
+        else:
+            half = self._times_triangles(normal[np.ix_(first.ravel(), first.ravel())], transposed=True)
+            inner = self._times_triangles(half.reshape(6 * count, -1).T, transposed=True).reshape(6 * count, -1)
+        inner[np.diag_indices(len(inner))] += 1
+        result = np.eye(len(normal))
+        result[np.ix_(lead.ravel(), lead.ravel())] = np.linalg.cholesky(inner)
+        return result
 
     @cached_property
     def _roots(self) -> np.ndarray:
         """Lower triangular roots (6, C, C) of the covariance of each component at the nodes."""
         at = self.nodes_s - self.nodes_s[0]
-        covariance = self.drift.covariance(at[:, None], at, at[-1])
+        at, lasting = at[self.order], at[-1]
+        covariance = self.drift.covariance(at[:, None], at, lasting)
         return np.linalg.cholesky(covariance + _EXACT * self.drift.std[:, None, None] ** 2 * np.eye(len(at)))
 
     @cached_property

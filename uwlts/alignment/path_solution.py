@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.linalg import cho_solve, eigh, solve_triangular
 from scipy.sparse import csr_array
 
 from uwlts.alignment.alignment_options import AlignmentOptions
-from uwlts.alignment.drift_model import RATES, DriftModel
+from uwlts.alignment.drift_model import DriftModel, candidates_beside
 from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.pieces import Survey, fit_piece
@@ -51,11 +52,11 @@ def initial_estimate(survey: Survey, prior: PathPrior, options: AlignmentOptions
     return PathEstimate(survey, options, prior, pieces, (), zeros, zeros, np.eye(len(zeros)))
 
 
-def solve(estimate: PathEstimate) -> PathEstimate:
-    """Iterate the least-squares steps until they are negligible."""
+def solve(estimate: PathEstimate, *, still: float) -> PathEstimate:
+    """Iterate the least-squares steps until their root mean square is below ``still``, in standard deviations."""
     for _ in range(estimate.options.rounds):
         before, estimate = estimate.numbers, _solve_step(estimate, *_normal_equations(estimate))
-        if _step_size(estimate, before) < estimate.options.still:
+        if _step_size(estimate, before) < still:
             break
     return estimate
 
@@ -96,10 +97,14 @@ def settle(estimate: PathEstimate) -> PathEstimate:
 
     If no drift model is stated, the most likely random walk and rates are used.
     """
-    estimate = solve(refine_nodes(estimate))
-    crossing = {number for pair in estimate.pairs for number in pair}
+    still = estimate.options.still
+    estimate = solve(refine_nodes(estimate), still=still)
+    crossing, selected = {number for pair in estimate.pairs for number in pair}, False
     for _ in range(estimate.options.refits):
-        before, estimate = estimate.numbers, solve(refit(_select_drift(estimate), crossing))
+        before, drift = estimate.numbers, estimate.prior.drift
+        estimate = estimate if selected else _select_drift(estimate)
+        selected = estimate.prior.drift is drift
+        estimate = solve(refit(estimate, crossing), still=still)
         if _step_size(estimate, before) < estimate.options.settled:
             break
     agreeing = tuple(pair for pair in estimate.pairs if estimate.agrees(pair))
@@ -107,45 +112,53 @@ def settle(estimate: PathEstimate) -> PathEstimate:
 
 
 def _select_drift(estimate: PathEstimate) -> PathEstimate:
-    """Select random walk and rates of maximum marginal likelihood, unless they are stated.
+    """Select random walk and rates of maximum marginal likelihood, by ascent from the present ones, unless stated.
 
     The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992). A normal matrix V L V^T corresponds
     to observations L^(1/2) V^T x of the path x with unit noise. Their covariance is I + L^(1/2) V^T P V L^(1/2) for a
     prior covariance P.
     """
     prior, drift = estimate.prior, estimate.prior.drift
-    if drift.stated:
-        return estimate
     normal, right = _normal_equations(estimate)
-    size = np.repeat(drift.std, prior.count)
     near = np.flatnonzero(normal.any(axis=0))
+    if drift.stated or not len(near):
+        return estimate
+    size = np.repeat(drift.std, prior.count)
     values, vectors = eigh(size[near, None] * normal[np.ix_(near, near)] * size[near])
     used = values > _NEGLIGIBLE / len(near)
     root = np.sqrt(values[used])
     by = np.zeros((len(size), len(root)))
     by[near] = vectors[:, used] * root / size[near, None]
     seen = (vectors[:, used].T @ (size[near] * right[near, 0])) / root
-    parts, at = by.reshape(6, prior.count, -1), prior.nodes_s - prior.nodes_s[0]
+    nodes, at = np.unique(near % prior.count), prior.nodes_s - prior.nodes_s[0]
+    parts = by.reshape(6, prior.count, -1)[:, nodes]
 
     def observed(model: DriftModel) -> np.ndarray:
-        return np.einsum("ckr,cks->rs", parts, model.covariance(at[:, None], at, at[-1]) @ parts, optimize=True)
+        half = model.covariance(at[nodes, None], at[nodes], at[-1]) @ parts
+        return parts.reshape(-1, len(root)).T @ half.reshape(-1, len(root))
 
     walk = observed(replace(drift, walk=np.ones(6)))
-    rates = {
-        (correlation, smooth): observed(replace(drift, walk=np.zeros(6), correlation=correlation, smooth=smooth))
-        for correlation, smooth in RATES
-    }
 
-    def twice_log_likelihood(model: DriftModel) -> float:
-        share = model.walk[0]
-        covariance = (1 - share) * rates[model.correlation, model.smooth] + share * walk
-        factor = np.linalg.cholesky(np.eye(len(root)) + covariance)
-        off = solve_triangular(factor, seen, lower=True)
+    @cache
+    def by_rates(correlation: float, smooth: bool) -> np.ndarray:
+        return observed(replace(drift, walk=np.zeros(6), correlation=correlation, smooth=smooth))
+
+    models = drift.candidates()
+
+    @cache
+    def twice_log_likelihood(number: int) -> float:
+        model = models[number]
+        covariance = (1 - model.walk[0]) * by_rates(model.correlation, model.smooth) + model.walk[0] * walk
+        covariance[np.diag_indices(len(root))] += 1
+        factor = np.linalg.cholesky(covariance)
+        off = solve_triangular(factor, seen, lower=True, check_finite=False)
         return float(-np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor))))
 
-    best = max(drift.candidates(), key=twice_log_likelihood)
-    same = (best.correlation, best.smooth) == (drift.correlation, drift.smooth) and (best.walk == drift.walk).all()
-    return estimate if same else _change_prior(estimate, replace(prior, drift=best))
+    described = (drift.correlation, drift.smooth, drift.walk[0])
+    own = best = [(each.correlation, each.smooth, each.walk[0]) for each in models].index(described)
+    while (better := max(candidates_beside(best), key=twice_log_likelihood)) != best:
+        best = better
+    return estimate if best == own else _change_prior(estimate, replace(prior, drift=models[best]))
 
 
 def _change_prior(estimate: PathEstimate, prior: PathPrior) -> PathEstimate:
@@ -163,7 +176,7 @@ def _step_size(estimate: PathEstimate, before: np.ndarray) -> float:
 def _solve_step(estimate: PathEstimate, normal: np.ndarray, right: np.ndarray) -> PathEstimate:
     """Perform one least-squares step."""
     prior = estimate.prior
-    factor = np.linalg.cholesky(prior.with_evidence(normal))
+    factor = prior.factor(normal)
     numbers = cho_solve((factor, True), prior.times_transposed_root(right))
     return replace(estimate, values=prior.times_root(numbers)[:, 0], numbers=numbers[:, 0], factor=factor)
 
@@ -176,8 +189,7 @@ def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
         for derivatives, weight, distance_mm in _linearise_pair(estimate, pair):
             total += derivatives.T @ derivatives.multiply(weight[:, None]).tocsr()
             gradient += derivatives.T @ (weight * distance_mm)
-    normal = total.toarray()
-    return normal, (normal @ estimate.values - gradient)[:, None]
+    return total.toarray(), (total @ estimate.values - gradient)[:, None]
 
 
 def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_array, np.ndarray, np.ndarray]]:

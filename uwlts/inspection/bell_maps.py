@@ -11,10 +11,11 @@ is measured on a map.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import fft, ndimage, optimize, stats
+from scipy import fft, ndimage, optimize, special, stats
 from scipy.spatial import KDTree
 
 from uwlts.fitting.least_squares import MAD_TO_STD, robust_std
@@ -81,6 +82,51 @@ class UnrolledSurface:
     unknown."""
     footprint_std: float = 0.0  # relative standard uncertainty of the squared footprints
 
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """Least and greatest places (2, 2), mm. NumPy reduces columns ten times as fast as rows of two."""
+        return np.array([[of(column) for column in self.places.T] for of in (np.min, np.max)])
+
+    @cached_property
+    def usual_std(self) -> float:
+        """Median standard deviation of the heights, mm."""
+        return float(np.median(self.std))
+
+    def points_between(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Return the points (K,) int between two corners (2,)."""
+        points = np.flatnonzero((self.places[:, 0] > low[0]) & (self.places[:, 0] < high[0]))
+        return points[(self.places[points, 1] > low[1]) & (self.places[points, 1] < high[1])]
+
+    @cached_property
+    def _cell_sums(self) -> dict[float, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        return {}
+
+    def sum_in_cells(
+        self, counted: np.ndarray, origin: np.ndarray, cell: float, shape: tuple[int, int]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sums (I, J) of weights, and of weighted heights, of the ``counted`` (N,) bool points in cells.
+
+        Weights are relative to a point of median noise: heights stay in mm, and the scatter refers to such a point.
+        The sums are kept for each size of cells, so that later calls only add or subtract points that differ.
+        """
+        before, mass, load = self._cell_sums.get(cell, (np.zeros(len(counted), bool), np.zeros(shape), np.zeros(shape)))
+        for sign, points in ((1.0, np.flatnonzero(counted > before)), (-1.0, np.flatnonzero(before > counted))):
+            if len(points):
+                weight = sign * np.square(self.usual_std / self.std[points])
+                flat = np.ravel_multi_index(_cells_of(self.places[points], origin, cell, shape), shape)
+                mass = mass + np.bincount(flat, weight, mass.size).reshape(shape)
+                load = load + np.bincount(flat, weight * self.heights[points], mass.size).reshape(shape)
+        self._cell_sums[cell] = counted.copy(), mass, load
+        return mass, load
+
+
+def _cells_of(
+    places: np.ndarray, origin: np.ndarray, cell: float, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the row and the column (N,) of the cell nearest to each place (N, 2), on a grid with a given corner."""
+    rows, columns = (np.clip(((places[:, k] - origin[k]) / cell).astype(np.int32), 0, shape[k] - 1) for k in (0, 1))
+    return rows, columns
+
 
 def limit_deviations(surface: UnrolledSurface, tree: KDTree) -> tuple[UnrolledSurface, np.ndarray, float]:
     """Limit the deviations of the points from the medians of their neighbours.
@@ -139,32 +185,22 @@ class BellMap:
         edge = float(self.sides @ self.moments) * bell / (2 * np.pi)
         return 2 * (flat + edge + float(stats.norm.sf(level)))
 
-    def _cells(self, places: np.ndarray) -> tuple[np.ndarray, ...]:
-        at = np.floor((places - self.origin) / self.cell).astype(int)
-        return tuple(np.clip(at.T, 0, np.array(self.z.shape)[:, None] - 1))
-
     def level_at(self, places: np.ndarray) -> np.ndarray:
         """Return the standard deviation (N,) of a bell's height at places."""
-        at = self._cells(places)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(np.isfinite(self.z[at]), self.spread[at] / np.sqrt(self.information[at]), np.nan)
+            level = np.where(np.isfinite(self.z), self.spread / np.sqrt(self.information), np.nan)
+        return level[_cells_of(places, self.origin, self.cell, level.shape)]
 
     def noise_at(self, places: np.ndarray) -> np.ndarray:
         """Return the effective standard deviation (N,) of a point of unit weight at places."""
-        return self.spread[self._cells(places)]
+        return self.spread[_cells_of(places, self.origin, self.cell, self.spread.shape)]
 
 
 def fit_bells(surface: UnrolledSurface, undamaged: np.ndarray, radius: float) -> BellMap:
     cell = radius / SEARCH_RULE.cells_per_radius
-    places = surface.places[undamaged]
-    origin = surface.places.min(axis=0) - 0.5 * cell
-    shape = tuple((np.floor(np.ptp(surface.places, axis=0) / cell).astype(int) + 2).tolist())
-    # Weights relative to a point of median noise: heights stay in mm, and the scatter refers to such a point.
-    weight = np.square(np.median(surface.std) / surface.std[undamaged])
-    flat = np.ravel_multi_index(tuple(np.floor((places - origin) / cell).astype(int).T), shape)
-    size = int(np.prod(shape))
-    mass = np.bincount(flat, weight, size).reshape(shape)
-    load = np.bincount(flat, weight * surface.heights[undamaged], size).reshape(shape)
+    origin = surface.corners[0] - 0.5 * cell
+    shape = tuple((np.floor((surface.corners[1] - surface.corners[0]) / cell).astype(int) + 2).tolist())
+    mass, load = surface.sum_in_cells(undamaged, origin, cell, shape)
     reach = int(np.ceil(SEARCH_RULE.window * SEARCH_RULE.cells_per_radius))
     axis = np.arange(-reach, reach + 1) / SEARCH_RULE.cells_per_radius
     u, v = np.meshgrid(axis, axis, indexing="ij")
@@ -189,17 +225,18 @@ def fit_bells(surface: UnrolledSurface, undamaged: np.ndarray, radius: float) ->
             for number, kernel in enumerate(spectra)
         ]
         filled[here] = sums[0] > 1e-6
-        normal = np.empty((*sums[0].shape, 4, 4))
-        for (i, j), each in zip(pairs, sums, strict=False):
-            normal[..., i, j] = normal[..., j, i] = each
-        right = np.stack(sums[len(pairs) :], axis=-1)
+        normal, right = dict(zip(pairs, sums, strict=False)), sums[len(pairs) :]
         # In a nearly empty window neither the plane nor the bell is determined.
-        inner = normal[..., :3, :3] + 1e-9 * (sums[0] + 1e-9)[..., None, None] * np.eye(3)
-        inner[~filled[here]] = np.eye(3)
-        solved = np.linalg.solve(inner, np.stack([normal[..., :3, 3], right[..., :3]], axis=-1))
-        by_plane = np.einsum("...i,...ij->...j", normal[..., :3, 3], solved)
-        information[here] = normal[..., 3, 3] - by_plane[..., 0]
-        amplitude[here] = right[..., 3] - by_plane[..., 1]
+        ridge = 1e-9 * (sums[0] + 1e-9)
+        # Elimination of the plane for all cells together: a fifth of the time of LAPACK for each.
+        for k in range(3):
+            pivot = np.where(filled[here], normal[k, k] + ridge, 1.0)
+            for i in range(k + 1, 4):
+                share = normal[k, i] / pivot
+                right[i] = right[i] - share * right[k]
+                for j in range(i, 4):
+                    normal[i, j] = normal[i, j] - share * normal[k, j]
+        information[here], amplitude[here] = normal[3, 3], right[3]
     seen = filled & (information > 1e-9)
     usual = float(np.median(information[seen])) if seen.any() else np.inf
     seen &= information > SEARCH_RULE.least_information * usual
@@ -249,12 +286,11 @@ def _standardise(values: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _log_tail_of_t(t: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    tail = stats.t.sf(np.nan_to_num(t), freedom)
-    return np.where(np.isfinite(t), np.log(np.maximum(tail, 1e-300)), np.nan)
+    return np.log(np.maximum(special.stdtr(freedom, -t), 1e-300))
 
 
 def _normal_of_log_tail(log_tail: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(log_tail), -stats.norm.ppf(np.exp(np.nan_to_num(log_tail, nan=np.log(0.5)))), np.nan)
+    return -special.ndtri(np.exp(log_tail))
 
 
 def _spectral_moment(z: np.ndarray, axis: int, cell: float) -> float:

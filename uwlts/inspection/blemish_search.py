@@ -80,10 +80,11 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
     smallest = float(
         np.median(tree.query(places[:: max(1, len(places) // 2000)], k=SEARCH_RULE.points_in_smallest)[0][:, -1])
     )
-    largest = min(SEARCH_RULE.largest_size * float(np.min(np.ptp(places, axis=0))), largest_mm)
+    extent = surface.corners[1] - surface.corners[0]
+    largest = min(SEARCH_RULE.largest_size * float(np.min(extent)), largest_mm)
     largest = max(largest, smallest)
     # The smallest size is larger if its map would not fit into memory.
-    area = float(np.prod(np.ptp(places, axis=0)))
+    area = float(np.prod(extent))
     smallest = max(smallest, SEARCH_RULE.cells_per_radius * float(np.sqrt(area / SEARCH_RULE.most_cells)))
     radii = smallest * SEARCH_RULE.size_ratio ** np.arange(
         1 + max(0, int(np.log(largest / smallest) / np.log(SEARCH_RULE.size_ratio)))

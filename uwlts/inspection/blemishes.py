@@ -27,7 +27,7 @@ from uwlts.fitting.point_spacing import measure_spacing
 from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication
-from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, SEED, FeatureKind, FeatureValue, plain_value
+from uwlts.inspection.features import BIAS_STD, COVERAGE, COVERAGE_FACTOR, SEED, FeatureKind, FeatureValue, plain_value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +124,7 @@ def measure_blemish(
     deepest, between = field.find_deepest(heights)
     depth = float(depths[deepest]) + between
     # Noise of independent points that explains the scatter of local means.
-    noise = indication.noise_mm * surface.std[field.near] / float(np.median(surface.std))
+    noise = indication.noise_mm * surface.std[field.near] / surface.usual_std
     rng, own = np.random.default_rng(SEED), errors[field.near]
     moves = list(replace(own, single_mm=noise).draw(_RULE.draws, rng))
     inside = np.arange(len(noise)) < len(indication.points)
@@ -146,7 +146,7 @@ def measure_blemish(
     # Uncertainty by the footprints' size.
     resolved = field.figures(field.depths(heights, share=1 - field.footprint_std), edge, deepest) - seen
     resolved[0] += between
-    random = np.sqrt(random**2 + bias**2 + resolved**2)
+    random = np.sqrt(random**2 + (BIAS_STD * bias) ** 2 + resolved**2)
 
     def changed(pattern: np.ndarray) -> np.ndarray:
         """Return the change of all figures by a pattern of height errors."""
@@ -253,10 +253,8 @@ class _Field:
         low, high = own.min(axis=0), own.max(axis=0)
         radius = 0.25 * float(np.sum(high - low))
         reach = max(_RULE.ring * radius, 3 * search.smallest_mm)
-        inside = np.all((surface.places > low - reach) & (surface.places < high + reach), axis=1)
-        is_own = np.zeros(len(surface.places), bool)
-        is_own[indication.points] = True
-        around = np.flatnonzero(inside & search.undamaged)
+        around = surface.points_between(low - reach, high + reach)
+        around = around[search.undamaged[around]]
         around = around[KDTree(own).query(surface.places[around])[0] <= reach]
         if len(around) < _RULE.fewest_points:
             raise EvaluationError(f"{len(around)} undamaged points surround it; {_RULE.fewest_points} are needed")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -16,6 +17,9 @@ COVERAGE = 0.95
 """Coverage probability of the intervals of all values."""
 COVERAGE_FACTOR = 1.96
 """Standard normal quantile of (1 + COVERAGE) / 2."""
+BIAS_STD = 1.0 / math.sqrt(3.0)
+"""Standard uncertainty of a corrected bias, as a fraction of the bias. The bias of simulated shapes and noise is known,
+that of the real shape lies between none and twice as much: rectangular distribution (GUM, 4.3.7)."""
 SEED = 635
 """Seed of all noise draws, so that equal clouds give equal values."""
 WITHOUT_UNCERTAINTY = "the cloud does not contain uncertainties: intervals contain the scatter of its points only"

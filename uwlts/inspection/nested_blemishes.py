@@ -144,7 +144,8 @@ def search_within(surface: UnrolledSurface, search: BlemishSearch, large: Indica
     if 0.5 * bandwidth < search.smallest_mm:
         return None
     low, high = low - _RULE.window * radius, high + _RULE.window * radius
-    chosen = np.flatnonzero(np.all((surface.places > low) & (surface.places < high), axis=1) & ~search.outliers)
+    chosen = surface.points_between(low, high)
+    chosen = chosen[~search.outliers[chosen]]
     window = UnrolledSurface(
         surface.places[chosen],
         surface.heights[chosen],

@@ -240,8 +240,10 @@ def _blemish_features(
     def unroll_about(indication: Indication) -> tuple[UnrolledSurface, float]:
         """Return the surface unrolled about an indication, so that it is not cut, and its angle."""
         middle = float(np.angle(np.mean(np.exp(1j * form.angle[chosen[indication.points]]))))
-        angle = np.mod(form.angle[chosen] - middle + np.pi, 2 * np.pi) - np.pi
-        return replace(flat, places=np.column_stack([flat.places[:, 0], form.radius_mm * angle])), middle
+        places, circumference = flat.places.copy(), 2 * np.pi * form.radius_mm
+        places[:, 1] -= form.radius_mm * middle
+        places[:, 1] -= circumference * np.rint(places[:, 1] / circumference)
+        return replace(flat, places=places), middle
 
     def measure(indication: Indication, points: np.ndarray, middle: float, measured_by: Callable[[], Blemish]) -> bool:
         """Add the blemish, or a note and return False; ``points`` are those of the indication."""

@@ -209,7 +209,7 @@ def pipe_features(
     Raises EvaluationError if `section_mm` is not positive.
     """
     used = form.used
-    errors = PointErrors.along_normals(cloud, used, form.outwards[used])
+    errors = PointErrors.along_normals(cloud, used, form.frame.normals_at(form.angle[used]))
     whole = _whole_values(form, errors)
     extent = np.array([2 * form.radius_mm, 2 * form.radius_mm, np.ptp(form.along_mm[used])])
     features = [Feature(FeatureKind.PIPE, "pipe", whole, form.frame.point_mm, form.frame.axes, extent, used)]

@@ -23,6 +23,7 @@ from uwlts.fitting.propagation import PointErrors
 from uwlts.fitting.shapes import fit_plane
 from uwlts.inspection.bead_profiles import NO_WEIGHT, BeadProfiles, interpolation_rows, profile_rows
 from uwlts.inspection.features import (
+    BIAS_STD,
     COVERAGE_FACTOR,
     DEFINITIONS,
     WITHOUT_UNCERTAINTY,
@@ -357,7 +358,7 @@ def measure_bead(bead: Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, .
         values_of(_evaluate_figures(bead, bead.raw_mm, whole, toes, share=1 - bead.footprint_std)),
     ]
     resolved = np.nan_to_num(np.array(resolution) - seen)
-    fixed = np.sqrt(bias**2 + np.sum(resolved**2, axis=0))
+    fixed = np.sqrt((BIAS_STD * bias) ** 2 + np.sum(resolved**2, axis=0))
     plain = np.where(extremes, np.maximum(seen - bias, 0), seen)
     common = errors.by_patterns(
         lambda pattern: values_of(_evaluate_figures(bead, bead.raw_mm + pattern, whole, toes)) - seen

@@ -102,12 +102,18 @@ def test_a_heading_error_adds_to_a_dead_reckoned_position(heading_deg: float):
     np.testing.assert_allclose(with_[2:5, :5], without[2:5, :5], atol=1e-3)
 
 
-def test_the_root_is_one_of_the_covariance():
-    prior = prior_of(correlation=0.3, dead_reckoned=True)
+@pytest.mark.parametrize("dead_reckoned", [False, True])
+def test_the_root_is_one_of_the_covariance(dead_reckoned: bool):
+    even = prior_of(correlation=0.3, dead_reckoned=dead_reckoned)
+    prior = even.with_nodes(np.linspace(9, 11, 200), 0.1, most=400)
     count = 6 * prior.count
     root = prior.times_root(np.eye(count))
     np.testing.assert_allclose(prior.times_transposed_root(np.eye(count)), root.T, atol=1e-9)
-    some = np.random.default_rng(1).standard_normal((count, 30))
+    # Observations of the dense nodes only, as in crossings.
+    some = np.random.default_rng(1).standard_normal((6, prior.count, 30))
+    some[:, (prior.nodes_s < 9) | (prior.nodes_s > 11)] = 0
+    some = some.reshape(count, -1)
     normal = some @ some.T
     expected = np.eye(count) + root.T @ normal @ root
-    np.testing.assert_allclose(prior.with_evidence(normal), expected, rtol=1e-6, atol=1e-6 * expected.max())
+    factor = prior.factor(normal)
+    np.testing.assert_allclose(factor @ factor.T, expected, rtol=1e-6, atol=1e-6 * expected.max())
