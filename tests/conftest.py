@@ -2,11 +2,12 @@
 
 import ctypes
 import fcntl
+import gc
 import os
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -117,17 +118,24 @@ def group(path: Path) -> str:
     return "serving" if path.name in SERVING else "timed" if path.name in TIMED else str(path)
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection(session: pytest.Session) -> None:
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection(session: pytest.Session) -> Generator[None, object, object]:
     """Begin collecting at another file in each test process, which then finds the bytecode that others have written.
 
-    In a new checkout each would otherwise rewrite the assertions of all files.
+    In a new checkout each would otherwise rewrite the assertions of all files. What is imported and collected stays, so
+    that garbage is sought beside it only.
     """
     work = getattr(session.config, "workerinput", None)
     if work and session.config.args_source is pytest.Config.ArgsSource.TESTPATHS:
         files = sorted(str(path) for path in (ROOT / "tests").rglob("test_*.py"))
         start = len(files) * int(work["workerid"].removeprefix("gw")) // work["workercount"]
         session.config.args = files[start:] + files[:start]
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

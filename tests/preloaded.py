@@ -10,16 +10,8 @@ from typing import TextIO
 from uwlts.cli import main
 
 _CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(
-    [
-        "pytest",
-        "tests.preloaded",
-        "uwlts.desk.scan",
-        "uwlts.desk.server",
-        "uwlts.desk.guided",
-        "uwlts.desk.operator_page",
-    ]
-)
+_DESK = [f"uwlts.desk.{name}" for name in ("guided", "operator_page", "scan", "server")]
+_CONTEXT.set_forkserver_preload(["pytest", "tests.preloaded", *_DESK])
 
 
 class Preloaded:
@@ -37,6 +29,7 @@ class Preloaded:
         for end in inner:
             end.close()
         self.stdin, self.stdout, self.stderr = _text(write_in, "w"), _text(read_out, "r"), _text(read_errors, "r")
+        self._written = "", ""
 
     @property
     def pid(self) -> int:
@@ -60,10 +53,11 @@ class Preloaded:
 
     def communicate(self) -> tuple[str, str]:
         """Wait for the end, and return what it wrote."""
-        with self.stdin, self.stdout, self.stderr:
-            written = self.stdout.read(), self.stderr.read()
+        if not self.stdout.closed:
+            with self.stdin, self.stdout, self.stderr:
+                self._written = self.stdout.read(), self.stderr.read()
         self.wait()
-        return written
+        return self._written
 
 
 def uwlts(*words: str) -> Preloaded:
@@ -80,7 +74,7 @@ def _call(streams: tuple, function: Callable[..., None], arguments: tuple[str, .
     for number, stream in enumerate(streams):
         os.dup2(stream.fileno(), number)
         stream.close()
-    sys.stdin = open(0)
+    sys.stdin = os.fdopen(0)
     function(*arguments)
 
 
