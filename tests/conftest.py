@@ -122,8 +122,8 @@ def group(path: Path) -> str:
 def pytest_collection(session: pytest.Session) -> Generator[None, object, object]:
     """Begin collecting at another file in each test process, which then finds the bytecode that others have written.
 
-    In a new checkout each would otherwise rewrite the assertions of all files. What is imported and collected stays, so
-    that garbage is sought beside it only.
+    In a new checkout each would otherwise rewrite the assertions of all files. Imported modules and collected tests
+    stay, so that garbage is sought beside them only.
     """
     work = getattr(session.config, "workerinput", None)
     if work and session.config.args_source is pytest.Config.ArgsSource.TESTPATHS:

@@ -1,5 +1,7 @@
 """Conversion of numbers and arrays between Python and Dr.Jit, such that equal work gives equal kernels.
 
+`FrozenFunctions` launches kernels again without tracing them.
+
 Dr.Jit wraps NumPy's memory without copying and compiles its alignment into the kernel. It also compiles every plain
 number and, if a vector's components are gathered, the size. Any of these would cause recompilation, which takes
 seconds, between frames or sensors.
@@ -7,6 +9,7 @@ seconds, between frames or sensors.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any, TypeAlias
 
 import drjit as dr
@@ -78,3 +81,74 @@ def begin_kernels() -> None:
     shares none with older arrays.
     """
     dr.detail.new_scope(dr.backend_v(mi.Float))
+
+
+class FrozenFunctions:
+    """Functions whose kernels are recorded when they are first called, and then launched without tracing them again.
+
+    Tracing and assembly of large kernels take longer than their execution. The recordings belong to one scene and are
+    kept as long as this object (`drjit.freeze`).
+    """
+
+    def __init__(self) -> None:
+        self._frozen: dict[Hashable, tuple[_Body, Callable[..., Any]]] = {}
+
+    def call(self, key: Hashable, function: Callable[..., Any], carriers: Iterable[object], *inputs: Any) -> Any:
+        """Return ``function(*inputs)``, evaluated.
+
+        Parameters
+        ----------
+        key
+            Identifies the function and whatever changes its operations: later functions with the same key are not
+            called. Numbers within a function are recorded with it, and must be opaque in ``carriers`` or ``inputs`` if
+            they change.
+        function
+            Takes and returns arrays, or lists and data classes of them. No result may be a constant: Dr.Jit would
+            return it with the recorded width.
+        carriers
+            Objects of the twin with all other arrays that the function reads; see `find_arrays`.
+        inputs
+            Arguments of the function; their widths may change.
+        """
+        if key not in self._frozen:
+            body = _Body()
+            self._frozen[key] = body, dr.freeze(lambda carried, inputs: body(*inputs))
+        body, frozen = self._frozen[key]
+        body.function = function
+        try:
+            return frozen(find_arrays(carriers), inputs)
+        finally:
+            del body.function
+
+
+class _Body:
+    """Holder of the function to record: Dr.Jit would compare the function itself with the recorded one."""
+
+    function: Callable[..., Any]
+
+    def __call__(self, *inputs: Any) -> Any:
+        results = self.function(*inputs)
+        constant = dr.VarState.Literal, dr.VarState.Mixed
+        assert all(each.state not in constant for each in find_arrays(results)), "a recorded result is constant"
+        return results
+
+
+def find_arrays(thing: object) -> list[Any]:
+    """Return the arrays and Mitsuba objects in an object of the twin, always in the same order."""
+    arrays: dict[int, Any] = {}
+    visited: set[int] = set()
+    waiting = [thing]
+    while waiting:
+        each = waiting.pop()
+        if isinstance(each, (dr.ArrayBase, mi.Object)):
+            arrays[id(each)] = each
+        elif isinstance(each, mi.Transform4f):
+            waiting.append(each.matrix)  # its inverse is not computed unless it is used
+        elif isinstance(each, (list, tuple)):
+            waiting += each
+        elif isinstance(each, dict):
+            waiting += each.values()
+        elif type(each).__module__.startswith("twin.") and id(each) not in visited:
+            visited.add(id(each))
+            waiting += vars(each).values()
+    return list(arrays.values())

@@ -58,10 +58,10 @@ class AlignmentOptions:
     still: float = 0.03
     """Root-mean-square step, in standard deviations, that ends the rounds; changes of correspondences cause smaller
     steps."""
-    still_searching: float = 0.1  # the same during the search, whose result is refined
     refits: int = 8
     """Largest number of times that patches are refitted along the corrected path, because drift tilts them."""
-    settled: float = 0.1  # root-mean-square step, in standard deviations, that ends the refits
+    settled: float = 0.1
+    """Root-mean-square step, in standard deviations, that ends the refits, and the rounds before the first refit."""
 
     @property
     def gate(self) -> float:

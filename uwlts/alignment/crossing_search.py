@@ -77,9 +77,9 @@ def _is_beside(pair: Pair, others: list[Pair], within: int) -> bool:
 
 def accept_hypothesis(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstimate | None:
     """Estimate the path with a hypothesis; return None if the surfaces then disagree."""
-    still = estimate.options.still_searching
+    still = estimate.options.settled
     closed = solve(refine_nodes(solve(bring_together(estimate, hypothesis), still=still)), still=still)
-    closed = solve(refit(closed, hypothesis.pair), still=still)
+    closed = solve(refit(closed, hypothesis.pair))
     return closed if closed.agrees(hypothesis.pair) else None
 
 
@@ -99,11 +99,10 @@ def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
                 new += [pair] if len(found.source) >= estimate.options.fewest_patches else []
     if not new:
         return estimate
-    still = estimate.options.still_searching
-    estimate = solve(refine_nodes(replace(estimate, pairs=(*closed, *new))), still=still)
-    estimate = solve(refit(estimate, {number for pair in estimate.pairs for number in pair}), still=still)
+    estimate = solve(refine_nodes(replace(estimate, pairs=(*closed, *new))), still=estimate.options.settled)
+    estimate = solve(refit(estimate, {number for pair in estimate.pairs for number in pair}))
     agreeing = tuple(pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair))
-    return estimate if len(agreeing) == len(estimate.pairs) else solve(replace(estimate, pairs=agreeing), still=still)
+    return estimate if len(agreeing) == len(estimate.pairs) else solve(replace(estimate, pairs=agreeing))
 
 
 def _search_range(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:

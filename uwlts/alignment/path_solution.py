@@ -52,8 +52,9 @@ def initial_estimate(survey: Survey, prior: PathPrior, options: AlignmentOptions
     return PathEstimate(survey, options, prior, pieces, (), zeros, zeros, np.eye(len(zeros)))
 
 
-def solve(estimate: PathEstimate, *, still: float) -> PathEstimate:
+def solve(estimate: PathEstimate, *, still: float | None = None) -> PathEstimate:
     """Iterate the least-squares steps until their root mean square is below ``still``, in standard deviations."""
+    still = estimate.options.still if still is None else still
     for _ in range(estimate.options.rounds):
         before, estimate = estimate.numbers, _solve_step(estimate, *_normal_equations(estimate))
         if _step_size(estimate, before) < still:
@@ -97,14 +98,13 @@ def settle(estimate: PathEstimate) -> PathEstimate:
 
     If no drift model is stated, the most likely random walk and rates are used.
     """
-    still = estimate.options.still
-    estimate = solve(refine_nodes(estimate), still=still)
+    estimate = solve(refine_nodes(estimate))
     crossing, selected = {number for pair in estimate.pairs for number in pair}, False
     for _ in range(estimate.options.refits):
         before, drift = estimate.numbers, estimate.prior.drift
         estimate = estimate if selected else _select_drift(estimate)
         selected = estimate.prior.drift is drift
-        estimate = solve(refit(estimate, crossing), still=still)
+        estimate = solve(refit(estimate, crossing))
         if _step_size(estimate, before) < estimate.options.settled:
             break
     agreeing = tuple(pair for pair in estimate.pairs if estimate.agrees(pair))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sensor_at
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
-from twin.recording.frame_truth import find_true_stripe
+from twin.recording.frame_truth import find_true_stripe, measure_line_light
 from twin.recording.sensor_simulator import SensorSimulator
 from twin.rendering_options import NONE, Options
 from uwlts.errors import DesignError
@@ -47,6 +47,39 @@ def test_travel_during_the_exposure_blurs_the_stripe_evenly(renderer, exposure_m
     np.testing.assert_allclose(wide - narrow, (exposure_mm * px_per_mm) ** 2 / 12, rtol=0.01 * exposure_mm)
     np.testing.assert_allclose(moving, to_rest_frame, atol=0.005 * exposure_mm**2)
     assert blurred.sum() == pytest.approx(still.sum(), rel=0.01)
+
+
+def test_frames_do_not_depend_on_earlier_ones(thesis):
+    """Kernels recorded in earlier frames contain none of the numbers of those frames: pose, motion, times, lines."""
+    scene = scene_of(TILTED, {"kind": "sphere", "diameter_mm": 30.0, "position_mm": (0.0, 5.0, 0.0)})
+    effects = replace(NONE, motion=True, defocus=True, haze=True, multiple_scattering=True, secondary_light=True)
+
+    def start() -> Renderer:
+        return Renderer(cropped(thesis, 48, 160), clear(0.1, 0.3), scene, effects=effects)
+
+    turns = [
+        replace(travel(way_mm, row_mm=row_mm), turn_rad_s=np.array(turn))
+        for way_mm, row_mm, turn in ((1.0, 0.002, (0.1, -0.4, 0.3)), (0.4, 0.01, (-0.2, 0.8, -0.6)))
+    ]
+    # Each kind of motion twice, as another kind is recorded again.
+    frames = [(0.0, None, 4), (3.0, None, 5), (3.0, travel(2.0), 4), (-2.0, travel(0.5), 6)]
+    frames += [(1.0, turns[0], 4), (5.0, turns[1], 5), (400.0, None, 4)]
+    used, visible = start(), []
+    for seed, (x, way, spp) in enumerate(frames):
+        found = []
+        for renderer in (used, start()):
+            truth = find_true_stripe(renderer, sensor_at(x=x), travel=way)
+            frame = renderer.laser_frame(
+                sensor_at(x=x), spp=spp, seed=seed, travel=way, lines=truth.surface_lines()
+            ).irradiance()
+            lamp = renderer.irradiance("lamp", sensor_at(x=x), spp=spp, travel=way)
+            truth = measure_line_light(renderer, sensor_at(x=x), truth, spp=spp, travel=way)
+            found.append([frame, lamp, *vars(truth).values()])
+        for mine, fresh in zip(*found, strict=True):
+            np.testing.assert_array_equal(mine, fresh)
+        visible.append(np.isfinite(truth.centroid_px).sum())
+    assert min(visible[:-1]) > 20
+    assert visible[-1] == 0, "nothing but water is in view of the last frame"
 
 
 def test_a_rolling_shutter_shifts_each_row_by_its_delay(renderer):
