@@ -60,8 +60,7 @@ class AlignmentOptions:
     steps."""
     refits: int = 8
     """Largest number of times that patches are refitted along the corrected path, because drift tilts them."""
-    settled: float = 0.1
-    """Root-mean-square step, in standard deviations, that ends the refits, and the rounds before the first refit."""
+    settled: float = 0.1  # root-mean-square step, in standard deviations, that ends the refits
 
     @property
     def gate(self) -> float:

@@ -77,8 +77,7 @@ def _is_beside(pair: Pair, others: list[Pair], within: int) -> bool:
 
 def accept_hypothesis(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstimate | None:
     """Estimate the path with a hypothesis; return None if the surfaces then disagree."""
-    still = estimate.options.settled
-    closed = solve(refine_nodes(solve(bring_together(estimate, hypothesis), still=still)), still=still)
+    closed = solve(refine_nodes(solve(bring_together(estimate, hypothesis))))
     closed = solve(refit(closed, hypothesis.pair))
     return closed if closed.agrees(hypothesis.pair) else None
 
@@ -99,7 +98,7 @@ def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
                 new += [pair] if len(found.source) >= estimate.options.fewest_patches else []
     if not new:
         return estimate
-    estimate = solve(refine_nodes(replace(estimate, pairs=(*closed, *new))), still=estimate.options.settled)
+    estimate = solve(refine_nodes(replace(estimate, pairs=(*closed, *new))))
     estimate = solve(refit(estimate, {number for pair in estimate.pairs for number in pair}))
     agreeing = tuple(pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair))
     return estimate if len(agreeing) == len(estimate.pairs) else solve(replace(estimate, pairs=agreeing))

@@ -52,12 +52,11 @@ def initial_estimate(survey: Survey, prior: PathPrior, options: AlignmentOptions
     return PathEstimate(survey, options, prior, pieces, (), zeros, zeros, np.eye(len(zeros)))
 
 
-def solve(estimate: PathEstimate, *, still: float | None = None) -> PathEstimate:
-    """Iterate the least-squares steps until their root mean square is below ``still``, in standard deviations."""
-    still = estimate.options.still if still is None else still
+def solve(estimate: PathEstimate) -> PathEstimate:
+    """Iterate the least-squares steps until they are negligible."""
     for _ in range(estimate.options.rounds):
         before, estimate = estimate.numbers, _solve_step(estimate, *_normal_equations(estimate))
-        if _step_size(estimate, before) < still:
+        if _step_size(estimate, before) < estimate.options.still:
             break
     return estimate
 

@@ -51,7 +51,7 @@ class BlemishSearchRule:
     tail: float = 1e-3
     """Probability of the outer quantile that determines the tail. Nearer quantiles depend little on the tail."""
     fewest_beyond: int = 4  # fewest independent places beyond this quantile; it is nearer on small surfaces
-    neighbours: int = 9  # nearest points that each point is compared with to find outliers
+    neighbours: int = 9  # odd number of nearest points that each point is compared with to find outliers
     outlier: float = 6.0  # distance of an outlier from the median of its neighbours, in robust standard deviations
     most_deviation: float = 2.0
     """Limit of a point's deviation from this median, in the same unit: 1 % of the efficiency for normal noise is
@@ -150,17 +150,23 @@ def limit_deviations(surface: UnrolledSurface, tree: KDTree) -> tuple[UnrolledSu
         found: Any = tree.query(surface.places[part], k=SEARCH_RULE.neighbours + 1, workers=-1)
         nearest[part] = found[1][:, 1:]
         beside = surface.heights[nearest[part]]
-        middle[part] = np.median(beside, axis=1)
-        spread[part] = MAD_TO_STD * np.median(np.abs(beside - middle[part, None]), axis=1)
+        middle[part] = _median_of_rows(beside)
+        spread[part] = MAD_TO_STD * _median_of_rows(np.abs(beside - middle[part, None]))
     usually = float(np.median(spread))
     # Wild points nearby increase the scatter of one place, a blemish that of many.
-    spread = np.concatenate([np.median(spread[nearest[part]], axis=1) for part in parts])
+    spread = np.concatenate([_median_of_rows(spread[nearest[part]]) for part in parts])
     spread = np.maximum(spread, usually)
     off, most = surface.heights - middle, SEARCH_RULE.most_deviation * spread
     outliers, limited = np.abs(off) > SEARCH_RULE.outlier * spread, np.clip(off, -most, most)
     usual = ~outliers & (spread <= 2 * usually)
     ratio = float(np.std(off[usual]) / max(np.std(limited[usual]), 1e-300)) if usual.any() else 1.0
     return replace(surface, heights=middle + limited), outliers, max(ratio, 1.0)
+
+
+def _median_of_rows(values: np.ndarray) -> np.ndarray:
+    """Return the medians (N,) of rows (N, K) of an odd number of values without NaN, for which NumPy's would look."""
+    middle = values.shape[1] // 2
+    return np.partition(values, middle, axis=1)[:, middle]
 
 
 @dataclass(frozen=True, eq=False)

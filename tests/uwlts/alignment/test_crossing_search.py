@@ -21,7 +21,7 @@ from uwlts.alignment.crossing_search import (
 from uwlts.alignment.drift_model import DriftModel
 from uwlts.alignment.path_estimate import PathEstimate
 from uwlts.alignment.path_prior import PathPrior
-from uwlts.alignment.path_solution import _linearise_pair, _observable_projection, initial_estimate
+from uwlts.alignment.path_solution import _linearise_pair, _observable_projection, initial_estimate, settle
 from uwlts.alignment.pieces import Survey
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import distances_between, rigid_derivatives
@@ -104,6 +104,14 @@ def test_the_gate_is_as_probable_as_three_standard_deviations():
     # Continuous Univariate Distributions 1, 1994, chapter 18). 0.27 % of normal errors exceed three sigmas.
     half = AlignmentOptions().gate / 2
     assert np.exp(-half) * (1 + half + half**2 / 2) == pytest.approx(0.0026998, rel=1e-4)
+
+
+def test_a_pair_of_different_surfaces_is_dropped_and_no_drift_is_chosen():
+    estimate = two_passes(later=lambda x, y: stones(x, y) + 60)
+    drift = DriftModel.of_size(1.0, 0.1)
+    settled = settle(replace(estimate, prior=replace(estimate.prior, drift=drift), pairs=(CROSSING,)))
+    assert settled.pairs == ()
+    assert settled.prior.drift is drift
 
 
 def test_a_hypothesis_is_likely_within_the_gate_only():
