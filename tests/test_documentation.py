@@ -6,6 +6,7 @@ import re
 import subprocess
 import tomllib
 import types
+from functools import cache
 from pathlib import Path
 
 import cyclopts
@@ -13,13 +14,14 @@ import pytest
 
 import twin
 import uwlts
-from tests.documented import APPS, PAGES, README, ROOT, blocks, mentioned_commands, name_of, words_of
+from tests.documented import PAGES, README, ROOT, blocks, mentioned_commands, name_of, words_of
 from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
 
 MOST_README_LINES = 100
 """A README is an introduction; everything longer has a page under docs."""
 MOST_HOW_TO_LINES = 80
+COMMANDS = {"uwlts": uwlts_app, "twin": twin_app}
 FOLDERS = ("uwlts", "twin", "tests", "docs", "scenes")
 WRITTEN_LATER = {"docs/_build/html", "uwlts/targets/plain_circles.py"}
 """Files that the documentation names but its reader creates: the built site, and the example of a new target."""
@@ -31,13 +33,12 @@ def _check(command: str, *, folder: Path = ROOT, abridged: bool = False) -> None
     program, *words = words_of(command)
     match Path(program).name:
         case "uwlts" | "twin":
-            app = {"uwlts": uwlts_app, "twin": twin_app}[program]
             try:
-                app.parse_args(words, exit_on_error=False, print_error=False)
+                COMMANDS[program].parse_args(words, exit_on_error=False, print_error=False)
             except cyclopts.MissingArgumentError:
                 if not abridged:
                     raise
-                known = {name for argument in app[words[0]].assemble_argument_collection() for name in argument.names}
+                known = {name for argument in _arguments(program, words[0]) for name in argument.names}
                 assert {word.split("=")[0] for word in words if word.startswith("--")} <= known
         case "make":
             # A test that make has started must not hand on its settings.
@@ -121,16 +122,22 @@ def test_mentioned_commands_and_options_exist(page):
             pytest.fail(f"{name_of(page)}:{line}: '{command}': {error}")
 
 
-def _accepts(app: cyclopts.App, command: str, words: list[str]) -> bool:
+@cache
+def _arguments(program: str, command: str) -> cyclopts.ArgumentCollection:
+    return COMMANDS[program][command].assemble_argument_collection()
+
+
+def _accepts(program: str, command: str, words: list[str]) -> bool:
     """Return whether a command has an option and, if they are given, accepts its values."""
-    arguments = app[command].assemble_argument_collection()
-    if len(words) == 1:
-        return words[0] in {name for each in arguments for name in each.names}
+    arguments = _arguments(program, command)
+    known = words[0].partition("=")[0] in {name for each in arguments for name in each.names}
+    if len(words) == 1 or not known:
+        return known
     needed = [each for each in arguments if each.required and not set(each.names) & set(words)]
     places = [f"{number}.h5" for number, each in enumerate(needed) if each.field_info.is_positional]
     options = [word for each in needed if not each.field_info.is_positional for word in (each.name, "1.h5")]
     try:
-        app.parse_args([command, *places, *words, *options], exit_on_error=False, print_error=False)
+        COMMANDS[program].parse_args([command, *places, *words, *options], exit_on_error=False, print_error=False)
     except cyclopts.CycloptsError:
         return False
     return True
@@ -139,13 +146,13 @@ def _accepts(app: cyclopts.App, command: str, words: list[str]) -> bool:
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_options_in_sentences_are_accepted_with_their_values(page):
     """Such as `--distortion k1 k2`: by a command, or, on pages of results, by a study's script."""
-    commands = [(app, name) for app in (uwlts_app, twin_app) for name in app if not name.startswith("-")]
+    commands = [(program, name) for program, app in COMMANDS.items() for name in app if not name.startswith("-")]
     studies = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "studies").glob("*.py"))
     for line, text in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
         for words in map(words_of, re.findall(r"`(--[a-z][^`]*)`", text)):
             if words == ["--help"] or any(word.isupper() or "[" in word for word in words):
                 continue  # cyclopts adds it; the others are names of values, not values
-            known = any(_accepts(app, name, words) for app, name in commands)
+            known = any(_accepts(program, name, words) for program, name in commands)
             assert known or f'"{words[0]}"' in studies, f"{name_of(page)}:{line}: no command accepts {' '.join(words)}"
 
 
@@ -190,7 +197,7 @@ def test_a_wrong_option_of_an_abridged_command_is_noticed(command):
         _check(command, abridged=True)
 
 
-@pytest.mark.parametrize("app", [uwlts_app, twin_app], ids=APPS[::-1])
+@pytest.mark.parametrize("app", COMMANDS.values(), ids=COMMANDS)
 def test_all_commands_explain_themselves(app, capsys):
     for command in [name for name in app if not name.startswith("-")]:
         app([command, "--help"], exit_on_error=False, result_action="return_value")

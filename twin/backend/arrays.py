@@ -103,8 +103,8 @@ class FrozenFunctions:
             called. Numbers within a function are recorded with it, and must be opaque in ``carriers`` or ``inputs`` if
             they change.
         function
-            Takes and returns arrays, or lists and data classes of them. No result may be a constant: Dr.Jit would
-            return it with the recorded width.
+            Takes and returns arrays, or lists and data classes of them. If any result is a constant, the function is
+            always traced: Dr.Jit would return the constant with its recorded width.
         carriers
             Objects of the twin with all other arrays that the function reads; see `find_arrays`.
         inputs
@@ -114,6 +114,10 @@ class FrozenFunctions:
             body = _Body()
             self._frozen[key] = body, dr.freeze(lambda carried, inputs: body(*inputs))
         body, frozen = self._frozen[key]
+        if body.has_constants:
+            results = function(*inputs)
+            dr.eval(results)
+            return results
         body.function = function
         try:
             return frozen(find_arrays(carriers), inputs)
@@ -125,11 +129,12 @@ class _Body:
     """Holder of the function to record: Dr.Jit would compare the function itself with the recorded one."""
 
     function: Callable[..., Any]
+    has_constants = False
 
     def __call__(self, *inputs: Any) -> Any:
         results = self.function(*inputs)
         constant = dr.VarState.Literal, dr.VarState.Mixed
-        assert all(each.state not in constant for each in find_arrays(results)), "a recorded result is constant"
+        self.has_constants |= any(each.state in constant for each in find_arrays(results))
         return results
 
 

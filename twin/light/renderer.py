@@ -275,10 +275,8 @@ class Renderer:
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
         rows, columns = find_marked(self._expand_cells(lit))
         stripe_means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp, lines=lines)
-        walker, walked = (
-            Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm, self._frozen),
-            None,
-        )
+        walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm, self._frozen)
+        walked = None
         if walker.finds_light:
             walks = math.ceil(spp * self._walks_per_sample)
             walked = IndirectLight(self.view, walker, lit, seed=seed, walks=walks)

@@ -148,13 +148,8 @@ class Walker:
 
     def _call(self, function: Callable[..., _Traced], *inputs: object) -> _Traced:
         """Return the evaluated result of a method, without tracing it again if possible."""
-        if self.scatters:
-            carriers = self.objects, self.scattering, self.pose, self.lights, self.reach_mm
-            return self.frozen.call(function.__name__, function, carriers, *inputs)
-        # One of the two kinds of light is constant.
-        traced = function(*inputs)
-        dr.eval(traced)
-        return traced
+        carriers = self.objects, self.scattering, self.pose, self.lights, self.reach_mm
+        return self.frozen.call(function.__name__, function, carriers, *inputs)
 
     def _trace_first_segment(
         self, origin: Point3f, direction: Vector3f, weight: Float, cell: UInt32, seed: UInt32
