@@ -24,8 +24,8 @@ export PIP_NO_INPUT := 1
 
 help:
 	@echo "make demo    scan with the simulated sensor and show the result"
-	@echo "make test    check the code and run the tests, without the slow ones"
-	@echo "make test-full   check the code and run all tests, slow studies of statistics and campaigns included"
+	@echo "make test    check the style and run the tests, without the slow ones"
+	@echo "make test-full   make check, and all tests, slow studies of statistics and campaigns included"
 	@echo "make oldest  run documented commands with the oldest allowed libraries, in $(OLDEST) (make test-full does it too)"
 	@echo "make check   only check the code: format, lint, layers of imports, idioms, types, licences of the libraries"
 	@echo "make fuzz    read many damaged files; CASES=5000 of each kind, READERS=\"capture sensor\" only these"
@@ -40,7 +40,7 @@ demo: $(INSTALLED)
 	@$(PYTHON) -m twin demo
 
 test: PYTEST_OPTIONS := -m "not slow"
-test-full: BESIDE := oldest
+test-full: BESIDE := types oldest
 # Threads of several test processes on two cores would wait for each other in every small product of matrices.
 test test-full: export OPENBLAS_NUM_THREADS := 1
 test test-full: style
@@ -50,11 +50,10 @@ test test-full: style
 	@# Beside the tests, in time that those leave: many wait for simulated hardware and for pages.
 	@folder=$$(mktemp -d); jobs=; \
 	trap 'kill $$jobs 2>/dev/null; rm -rf $$folder' EXIT; trap 'exit 130' INT TERM; \
-	nice -n 19 $(VENV)/bin/basedpyright >$$folder/types 2>&1 & jobs="$$jobs $$!"; \
 	for name in $(BESIDE); do nice -n 19 $(BY_ITSELF) $$name >$$folder/$$name 2>&1 & jobs="$$jobs $$!"; done; \
 	$(PYTHON) -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS); failed=$$?; \
 	for job in $$jobs; do wait $$job || failed=$$((failed ? failed : $$?)); done; jobs=; \
-	for name in types $(BESIDE); do echo "$$name:"; cat $$folder/$$name; done; exit $$failed
+	for name in $(BESIDE); do echo "$$name:"; cat $$folder/$$name; done; exit $$failed
 
 # Compiled loops are kept apart: both environments would replace those of the other.
 oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(OLDEST)/numba
