@@ -115,7 +115,8 @@ def measure_blemish(
     wall. ``beneath_mm`` (N,) is the height of a smooth surface, of a dent for example, above which those of ``surface``
     count.
 
-    Raises EvaluationError if too few points around the indication determine the undamaged surface.
+    Raises EvaluationError if too few points around the indication determine the undamaged surface, or if its depth,
+    length or width is not significant.
     """
     field = _Field.about(surface, search, indication)
     sign = float(np.sign(indication.height_mm))
@@ -146,7 +147,8 @@ def measure_blemish(
     # Uncertainty by the footprints' size.
     resolved = field.figures(field.depths(heights, share=1 - field.footprint_std), edge, deepest) - seen
     resolved[0] += between
-    random = np.sqrt(random**2 + (BIAS_STD * bias) ** 2 + resolved**2)
+    without_bias = np.hypot(random, resolved)
+    random = np.hypot(without_bias, BIAS_STD * bias)
 
     def changed(pattern: np.ndarray) -> np.ndarray:
         """Return the change of all figures by a pattern of height errors."""
@@ -164,6 +166,12 @@ def measure_blemish(
         plain_value(kind, name, plain[k], random[k], None if common is None else common[k], least=0.0)
         for k, name in enumerate(names)
     ]
+    # All of the bias counts here: an indication by noise alone consists of it.
+    for k, name in enumerate(names[:3]):
+        shared = None if common is None else common[k]
+        widest = plain_value(kind, name, plain[k], np.hypot(without_bias[k], bias[k]), shared, least=0.0)
+        if widest.low <= 0:
+            raise EvaluationError(f"it is not significant relative to its surroundings: {widest.text()}")
     values.insert(1, plain_value(kind, "edge depth", edge, 0.0, None if common is None else 0.0))
     if wall_mm is not None and sign < 0:
         shared = None if common is None else common[0]

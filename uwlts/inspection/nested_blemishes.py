@@ -124,6 +124,8 @@ class LargeBlemish:
         points, depth = self.chosen[indication.points], found.values[0]
         random = float(np.hypot(depth.random, float(self.std_mm[indication.points].max())))
         values = [plain_value(found.kind, depth.name, depth.value, random, depth.systematic, least=0.0)]
+        if values[0].low <= 0:
+            raise EvaluationError(f"it is not significant relative to the surface below: {values[0].text()}")
         in_hollow = self.own.height_mm < 0 and found.beneath_mm > SEARCH_RULE.edge_share * np.abs(self.height_mm).max()
         if found.kind != FeatureKind.PROTRUSION and in_hollow:
             # The sum of both depths does not depend on the surface between them.

@@ -249,9 +249,6 @@ def _blemish_features(
         """Add the blemish, or a note and return False; ``points`` are those of the indication."""
         try:
             blemish = measured_by()
-            for value in blemish.values:
-                if value.name in ("depth", "height", "length", "width") and value.low <= 0:
-                    raise EvaluationError(f"it is not significant relative to its surroundings: {value.text()}")
         except EvaluationError as error:
             notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
             return False
