@@ -1,7 +1,5 @@
 """Conversion of numbers and arrays between Python and Dr.Jit, such that equal work gives equal kernels.
 
-`FrozenFunctions` launches kernels again without tracing them.
-
 Dr.Jit wraps NumPy's memory without copying and compiles its alignment into the kernel. It also compiles every plain
 number and, if a vector's components are gathered, the size. Any of these would cause recompilation, which takes
 seconds, between frames or sensors.
@@ -9,7 +7,6 @@ seconds, between frames or sensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
 from typing import Any, TypeAlias
 
 import drjit as dr
@@ -81,80 +78,3 @@ def begin_kernels() -> None:
     shares none with older arrays.
     """
     dr.detail.new_scope(dr.backend_v(mi.Float))
-
-
-class FrozenFunctions:
-    """Functions whose kernels are recorded when they are first called, and then launched without tracing them again.
-
-    Tracing and assembly of the kernels of a frame took a quarter of its processor time. The recordings belong to one
-    scene and are kept as long as this object (`drjit.freeze`).
-    """
-
-    def __init__(self) -> None:
-        self._frozen: dict[Hashable, tuple[_Body, Callable[..., Any]]] = {}
-
-    def call(self, key: Hashable, function: Callable[..., Any], carriers: Iterable[object], *inputs: Any) -> Any:
-        """Return ``function(*inputs)``, evaluated.
-
-        Parameters
-        ----------
-        key
-            Identifies the function and whatever changes its operations: later functions with the same key are not
-            called. Numbers within a function are recorded with it, and must be opaque in ``carriers`` or ``inputs`` if
-            they change.
-        function
-            Takes and returns arrays, or lists and data classes of them. If any result is a constant, the function is
-            always traced: Dr.Jit would return the constant with its recorded width.
-        carriers
-            Objects of the twin with all other arrays that the function reads; see `find_arrays`.
-        inputs
-            Arguments of the function; their widths may change.
-        """
-        if key not in self._frozen:
-            body = _Body()
-            # Frames differ in which numbers are 0 and in single pixels: a few recordings are no fault to warn of.
-            self._frozen[key] = body, dr.freeze(lambda carried, inputs: body(*inputs), warn_after=1000)
-        body, frozen = self._frozen[key]
-        if body.has_constants:
-            results = function(*inputs)
-            dr.eval(results)
-            return results
-        body.function = function
-        try:
-            return frozen(find_arrays(carriers), inputs)
-        finally:
-            del body.function
-
-
-class _Body:
-    """Holder of the function to record: Dr.Jit would compare the function itself with the recorded one."""
-
-    function: Callable[..., Any]
-    has_constants = False
-
-    def __call__(self, *inputs: Any) -> Any:
-        results = self.function(*inputs)
-        constant = dr.VarState.Literal, dr.VarState.Mixed
-        self.has_constants |= any(each.state in constant for each in find_arrays(results))
-        return results
-
-
-def find_arrays(thing: object) -> list[Any]:
-    """Return the arrays and Mitsuba objects in an object of the twin, always in the same order."""
-    arrays: dict[int, Any] = {}
-    visited: set[int] = set()
-    waiting = [thing]
-    while waiting:
-        each = waiting.pop()
-        if isinstance(each, (dr.ArrayBase, mi.Object)):
-            arrays[id(each)] = each
-        elif isinstance(each, mi.Transform4f):
-            waiting.append(each.matrix)  # its inverse is not computed unless it is used
-        elif isinstance(each, (list, tuple)):
-            waiting += each
-        elif isinstance(each, dict):
-            waiting += each.values()
-        elif type(each).__module__.startswith("twin.") and id(each) not in visited:
-            visited.add(id(each))
-            waiting += vars(each).values()
-    return list(arrays.values())

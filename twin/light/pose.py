@@ -43,6 +43,11 @@ class Travel:
     row_s: float = 0.0
     middle_row: float = 0.0
 
+    def compute_times(self, row: Float, moment: Float | float) -> Float:
+        """Return the time in s of image rows at a fraction ``moment`` (0 to 1) of their exposure."""
+        exposure, per_row = opaque(self.exposure_s), opaque(self.row_s)
+        return (row - opaque(self.middle_row)) * per_row + (moment - 0.5) * exposure
+
     def time_range(self, rows: int) -> tuple[float, float]:
         """Return the first and last time in s of a frame of ``rows`` rows."""
         at_edges = [(row - self.middle_row) * self.row_s for row in (0, rows - 1)]
@@ -64,8 +69,6 @@ class SensorPose:
         self._to_object = opaque_transform(np.linalg.inv(self.scene_from_object))
         self._axis, self._rate = None, 0.0
         if travel is not None:
-            self._middle_row, self._row_s = opaque(travel.middle_row), opaque(travel.row_s)
-            self._exposure_s = opaque(travel.exposure_s)
             # The motion is expressed in the OCS of the sensor at rest.
             into = self.scene_from_object[:3, :3].T
             self._velocity = mi.Vector3f(opaque_point(into @ travel.velocity_mm_s))
@@ -91,12 +94,6 @@ class SensorPose:
             turned = Rotation.from_rotvec(after_s * self.travel.turn_rad_s).as_matrix()
             transform[:3, :3] = turned @ transform[:3, :3]
         return SensorPose(transform)
-
-    def compute_times(self, row: Float, moment: Float | float) -> Float | None:
-        """Return the time in s of image rows at a fraction ``moment`` (0 to 1) of their exposure; None at rest."""
-        if self.travel is None:
-            return None
-        return (row - self._middle_row) * self._row_s + (moment - 0.5) * self._exposure_s
 
     def to_rest_frame(self, point: Point3f, after_s: Float | None) -> Point3f:
         """Transform points from the moving OCS at a time to the OCS of the sensor at rest."""

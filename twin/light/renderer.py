@@ -15,14 +15,14 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Bool, Float, FrozenFunctions, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
+from twin.backend.arrays import Float, Point3f, UInt32, Vector4f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, trace_segments
 from twin.light.caustics import CELLS, PATCH_MM, Caustics
 from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
@@ -209,7 +209,6 @@ class Renderer:
         self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
         self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
-        self._frozen = FrozenFunctions()
         self._last: _LocatedStripes | None = None
 
     def irradiance(
@@ -275,8 +274,7 @@ class Renderer:
         direct, mirrored = make_lights(self._sheets, pose, self._mirrors)
         rows, columns = find_marked(self._expand_cells(lit))
         stripe_means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp, lines=lines)
-        walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm, self._frozen)
-        walked = None
+        walker, walked = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm), None
         if walker.finds_light:
             walks = math.ceil(spp * self._walks_per_sample)
             walked = IndirectLight(self.view, walker, lit, seed=seed, walks=walks)
@@ -364,13 +362,6 @@ class Renderer:
         """Return the profile lines (P,) of pixels."""
         return columns if self.sensor.camera.stripe_along == "width" else rows
 
-    def frozen_call(
-        self, name: str, function: Callable[..., Any], pose: SensorPose, carriers: Any, *inputs: Any
-    ) -> Any:
-        """Return ``function(*inputs)`` as `FrozenFunctions.call`; ``carriers`` add to this renderer and the pose."""
-        everything = self.objects, self.scattering, self.view, self._sheets, pose, carriers
-        return self._frozen.call(name, function, everything, *inputs)
-
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
     def _segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
@@ -416,11 +407,22 @@ class Renderer:
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
         surfaces: list[Float] = []
         for moment, sources in self._moments(pose, direct + mirrored):
-            with_haze = moment is pose and self._scatters
-            crossed = [self._crossing(light, bundle) for light in sources] if with_haze else []
-            trace = partial(self._trace_nodes, moment, bundle, sources, crossed)
-            segments, scattered, shown = self.frozen_call("nodes", trace, moment, (sources, bundle, crossed))
-            for index, (depth, across, reached) in enumerate(segments):
+            scattered = mi.Float(0.0)
+            for index, segment in enumerate(self._segments(moment, bundle, None)):
+                ends = [light.evaluate(segment.end()) for light in sources]
+                across = [
+                    self._sigmas(here, segment, moment, light.sheet.reach)
+                    for light, here in zip(sources, ends, strict=True)
+                ]
+                straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
+                depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
+                if index == 0 and moment is pose and self._scatters:
+                    surfaces = self._surfaces(pose, segment, ends)
+                    for light, here in zip(sources, ends, strict=True):
+                        crossed = self._crossing(light, bundle)
+                        scattered += compute_haze(crossed, light, self.objects.scene, segment, here)
+                reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
+                dr.eval(depth, scattered, surfaces, *across, *reached)
                 stripes = [
                     mark_near_sheet(
                         sigmas.numpy().reshape(shape), True if there is None else there.numpy().reshape(shape)
@@ -433,34 +435,9 @@ class Renderer:
                 if self.effects.defocus:
                     reach = np.fmax(reach, self._blur_px(near, depth.numpy().reshape(shape)))
                 lit |= near
-            if with_haze:
-                surfaces = shown
+            if moment is pose and dr.width(scattered) > 1:
                 image = self._expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)))
         return own, dilate_cells(lit, reach), _Nodes(image, [each.numpy().reshape(shape) for each in surfaces])
-
-    def _trace_nodes(
-        self, pose: SensorPose, bundle: Rays, sources: list[Light], crossed: list[SheetCrossing]
-    ) -> tuple[list[tuple[Float, list[Float], list[Bool | None]]], Float | None, list[Float]]:
-        """Return depths, distances in standard deviations and reached points of each segment, haze and lit surfaces.
-
-        Haze and surfaces are those of the first segment, if the intersections ``crossed`` with the sheets are given.
-        """
-        segments, scattered, surfaces = [], None, []
-        for segment in self._segments(pose, bundle, None):
-            ends = [light.evaluate(segment.end()) for light in sources]
-            across = [
-                self._sigmas(here, segment, pose, light.sheet.reach) for light, here in zip(sources, ends, strict=True)
-            ]
-            straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
-            depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
-            if crossed and scattered is None:
-                surfaces = self._surfaces(pose, segment, ends)
-                scattered = mi.Float(0.0)
-                for light, here, crossing in zip(sources, ends, crossed, strict=True):
-                    scattered += compute_haze(crossing, light, self.objects.scene, segment, here)
-            reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
-            segments.append((depth, across, reached))
-        return segments, scattered, surfaces
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
@@ -517,23 +494,12 @@ class Renderer:
             changes[:] = True  # motion may change any pixel
         image = 0.25 * combine_corners(np.add, nodes)
 
-        for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
-            even = self._render_pixels(self._even_sum, pose, rows, columns, [], ambient, pattern, spp=spp, shifted=True)
-            image[rows, columns] = even()[0]
-        return image
+        def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None, pixel: UInt32) -> tuple[Float]:
+            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
 
-    def _even_sum(
-        self,
-        pose: SensorPose,
-        bundle: Rays,
-        after_s: Float | None,
-        pixel: UInt32,
-        sources: list[Light],
-        ambient: bool,
-        pattern: Float | None,
-    ) -> tuple[Float]:
-        """Return the irradiance per ray of lamp or daylight."""
-        return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient, pattern),)
+        for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
+            image[rows, columns] = self._render_pixels(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
+        return image
 
     def _compute_even_light(self, segment: RaySegment, ambient: bool, pattern: Float | None) -> Float:
         """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
@@ -674,56 +640,38 @@ class Renderer:
         pose: SensorPose,
         rows: np.ndarray,
         columns: np.ndarray,
-        sources: list[Light],
         *rest: object,
         spp: int,
         shifted: bool = False,
     ) -> Callable[[], np.ndarray]:
         """Render pixels; return a function that fetches the means (K, P) of ``light`` over pixel, pupil and exposure.
 
-        Rendering is asynchronous. ``light`` is a method of this renderer. ``shifted`` uses different pupil samples in
-        neighbouring pixels, so that a blurred edge shows no steps.
+        Rendering is asynchronous. ``shifted`` uses different pupil samples in neighbouring pixels, so that a blurred
+        edge shows no steps.
         """
+        index = dr.arange(mi.UInt32, len(rows) * spp)
+        per_pixel = dr.opaque(mi.UInt32, spp)
+        pixel = index // per_pixel
+        sample = index - pixel * per_pixel
+        # Adjacent values are read together, which is much faster.
         axes = make_lattice(spp, 2 + 2 * self.effects.defocus + (pose.travel is not None))
         places = np.zeros((spp, 4))
         places[:, : 2 + 2 * self.effects.defocus] = axes[: 2 + 2 * self.effects.defocus].T
-        shifts = pupil_shifts(rows, columns).T if self.effects.defocus and shifted else None
-        moments = None if pose.travel is None else axes[-1]
-        arrays = places, np.stack([columns, rows], axis=1), shifts, moments
-
-        def trace(
-            index: UInt32,
-            per_pixel: UInt32,
-            places: Float,
-            at: Float,
-            shifts: Float | None,
-            moments: Float | None,
-            *rest: object,
-        ) -> tuple[Float, ...]:
-            pixel = index // per_pixel
-            sample = index - pixel * per_pixel
-            # Adjacent values are read together, which is much faster.
-            across, down, u, v = dr.gather(mi.Vector4f, places, sample)
-            x, y = dr.gather(mi.Point2f, at, pixel)
-            if shifts is not None:
-                shift_u, shift_v = dr.gather(mi.Point2f, shifts, pixel)
+        across, down, u, v = dr.gather(mi.Vector4f, to_jit(mi.Float, places), sample)
+        x, y = dr.gather(mi.Point2f, to_jit(mi.Float, np.stack([columns, rows], axis=1)), pixel)
+        pupil = None
+        if self.effects.defocus:
+            if shifted:
+                shift_u, shift_v = dr.gather(mi.Point2f, to_jit(mi.Float, pupil_shifts(rows, columns).T), pixel)
                 u, v = u + shift_u, v + shift_v
                 u, v = u - dr.floor(u), v - dr.floor(v)
-            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v)) if self.effects.defocus else None
-            after_s = None if moments is None else pose.compute_times(y, dr.gather(mi.Float, moments, sample))
-            bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
-            return light(pose, bundle, after_s, pixel, sources, *rest)
-
-        values = self.frozen_call(
-            light.__name__,
-            trace,
-            pose,
-            sources,
-            dr.arange(mi.UInt32, len(rows) * spp),
-            dr.opaque(mi.UInt32, spp),
-            *(None if each is None else to_jit(mi.Float, each) for each in arrays),
-            *rest,
-        )
+            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
+        after_s = None
+        if pose.travel is not None:
+            after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
+        bundle = self.view.trace_bundle(x + across - 0.5, y + down - 0.5, pupil)
+        values = light(pose, bundle, after_s, pixel, *rest)
+        dr.eval(values)  # together: separate sums would trace the rays again
         sums = [dr.block_sum(value, spp) for value in values]
         dr.eval(sums)
         return lambda: np.stack([each.numpy() / spp for each in sums])

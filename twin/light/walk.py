@@ -20,26 +20,15 @@ Light that is both reflected by a mirror and scattered or reflected elsewhere is
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias, cast
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import (
-    PCG32,
-    Bool,
-    BSDFPtr,
-    Float,
-    FrozenFunctions,
-    Point2f,
-    Point3f,
-    SurfaceInteraction3f,
-    UInt32,
-    Vector3f,
-)
+from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point2f, Point3f, SurfaceInteraction3f, UInt32, Vector3f
 from twin.light.illumination import Light, Passage, SheetLobe
 from twin.light.pose import CLEAR_MM, Rays, SensorPose
 from twin.light.sheet import SheetLight
@@ -86,16 +75,9 @@ class _Walks:
         return _Walks(*(dr.gather(type(each), each, kept) for each in vars(self).values()))
 
 
-_Traced: TypeAlias = tuple[_Walks, Point2f, Bool]
-"""Walks after their next segments, both kinds of light that these found, and the mask of walks that continue."""
-
-
 @dataclass(frozen=True)
 class Walker:
-    """Tracer of walks for one scene, pose and set of direct lights; rays without a hit end after ``reach_mm``.
-
-    ``frozen`` are recordings of walkers that differ from this one only in pose and lights.
-    """
+    """Tracer of walks for one scene, pose and set of direct lights; rays without a hit end after ``reach_mm``."""
 
     objects: Objects
     scattering: Scattering
@@ -103,7 +85,6 @@ class Walker:
     pose: SensorPose
     lights: list[Light]
     reach_mm: Float
-    frozen: FrozenFunctions = field(default_factory=FrozenFunctions)
 
     @property
     def scatters(self) -> bool:
@@ -121,18 +102,29 @@ class Walker:
         The first kind was scattered by water, the second only reflected between surfaces. Both include the ray's
         weight.
         """
+        width = dr.width(cell)
         if not self.finds_light:
             return
-        rays = bundle.origin, bundle.direction, bundle.weight, cell
-        walks, step, stretches = cast(_Walks, None), 0, 1
+        walks = _Walks(
+            bundle.origin,
+            bundle.direction,
+            dr.full(mi.Float, 1.0, width),
+            bundle.weight,
+            cell,
+            dr.arange(mi.UInt32, width),
+            dr.zeros(mi.Float, width),
+            dr.full(mi.Bool, False, width),
+            dr.full(mi.Bool, False, width),
+            dr.full(mi.Bool, False, width),
+        )
+        step, stretches = 0, 1
         while True:
             number = dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32)
             # Camera rays have a separate kernel, as most of their state is constant.
             walks, found, alive = (
-                self._call(self._trace_segments, walks, number, dr.opaque(mi.UInt32, stretches))
-                if step
-                else self._call(self._trace_first_segment, *rays, number)
+                self._trace_segments(walks, number, stretches) if step else self._trace_segment(walks, number)
             )
+            dr.eval(found, alive, *vars(walks).values())
             # Returned unsummed: parallel sums in Dr.Jit are not reproducible.
             yield walks.cell.numpy(), found.x.numpy(), found.y.numpy()
             step += stretches
@@ -146,31 +138,7 @@ class Walker:
             walks = walks.select(kept)
             stretches = 1 if dr.width(kept) > _FEW else _STEPS - step
 
-    def _call(self, function: Callable[..., _Traced], *inputs: object) -> _Traced:
-        """Return the evaluated result of a method, without tracing it again if possible."""
-        carriers = self.objects, self.scattering, self.pose, self.lights, self.reach_mm
-        return self.frozen.call(function.__name__, function, carriers, *inputs)
-
-    def _trace_first_segment(
-        self, origin: Point3f, direction: Vector3f, weight: Float, cell: UInt32, seed: UInt32
-    ) -> _Traced:
-        """Trace the camera rays."""
-        width = dr.width(cell)
-        walks = _Walks(
-            origin,
-            direction,
-            dr.full(mi.Float, 1.0, width),
-            weight,
-            cell,
-            dr.arange(mi.UInt32, width),
-            dr.zeros(mi.Float, width),
-            dr.full(mi.Bool, False, width),
-            dr.full(mi.Bool, False, width),
-            dr.full(mi.Bool, False, width),
-        )
-        return self._trace_segment(walks, seed)
-
-    def _trace_segments(self, walks: _Walks, seed: UInt32, stretches: UInt32) -> _Traced:
+    def _trace_segments(self, walks: _Walks, seed: UInt32, stretches: int) -> tuple[_Walks, Point2f, Bool]:
         """Trace several segments of the walks in one kernel, which does not depend on their number."""
 
         def following(walks: _Walks, found: Point2f, alive: Bool, seed: UInt32, left: UInt32):
@@ -181,7 +149,13 @@ class Walker:
         # Skip the search for loop invariants, which finds almost none and traces the loop twice.
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             walks, found, alive, _, _ = dr.while_loop(
-                (walks, dr.zeros(mi.Point2f, width), dr.full(mi.Bool, True, width), seed, stretches),
+                (
+                    walks,
+                    dr.zeros(mi.Point2f, width),
+                    dr.full(mi.Bool, True, width),
+                    seed,
+                    dr.opaque(mi.UInt32, stretches),
+                ),
                 lambda walks, found, alive, seed, left: alive & (left > 0),
                 following,
                 mode="symbolic",
@@ -189,7 +163,7 @@ class Walker:
             )
         return walks, found, alive
 
-    def _trace_segment(self, walks: _Walks, seed: UInt32) -> _Traced:
+    def _trace_segment(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Point2f, Bool]:
         """Trace the next segment of all walks; return their new state, both kinds of light, and the live mask."""
         state, sequence = mi.sample_tea_32(seed, walks.number)
         random = cast(Any, mi.PCG32)

@@ -1,13 +1,12 @@
 """Ground truth of a frame: stripe centres, surface points, depths, and image positions of scene points."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, UInt32, Vector3f, to_jit, to_numpy
+from twin.backend.arrays import Float, UInt32, to_jit, to_numpy
 from twin.light.image_sampling import find_marked
 from twin.light.pose import SensorPose, Travel
 from twin.light.renderer import Renderer, SurfaceLines
@@ -133,23 +132,22 @@ def mark_run(light: np.ndarray, centre: np.ndarray, share: float) -> np.ndarray:
 
 def _distance_slopes(renderer: Renderer, pose: SensorPose, truth: FrameTruth, lines: np.ndarray) -> np.ndarray:
     """Return the derivative of the sheet's distance on the lines' tangent planes across the stripe, in mm/px."""
-    camera = renderer.sensor.camera
+    camera, distance = renderer.sensor.camera, []
     point, normal = (
         mi.Vector3f(*(to_jit(mi.Float, axis) for axis in v[lines].T)) for v in (truth.point_mm, truth.normal)
     )
-
-    def distance(at: Float, across: Float, point: Vector3f, normal: Vector3f) -> Float:
+    at = to_jit(mi.Float, lines)
+    for aside in (-0.5, 0.5):
+        across = to_jit(mi.Float, truth.centre_px[lines] + aside)
         x, y = (at, across) if camera.stripe_along == "width" else (across, at)
         bundle = renderer.view.trace_bundle(x, y)
-        ray = pose.ray(bundle.origin, bundle.direction, pose.compute_times(y, 0.5))
+        ray = pose.ray(
+            bundle.origin, bundle.direction, None if pose.travel is None else pose.travel.compute_times(y, 0.5)
+        )
         t = dr.dot(normal, point - mi.Vector3f(ray.o)) / dr.dot(normal, ray.d)
-        return renderer.sheet.evaluate(mi.Point3f(bundle.origin + bundle.direction * t)).distance_mm
-
-    below, above = (
-        renderer.frozen_call("distance", distance, pose, (), to_jit(mi.Float, lines), across, point, normal)
-        for across in (to_jit(mi.Float, truth.centre_px[lines] + aside) for aside in (-0.5, 0.5))
-    )
-    return above.numpy().astype(float) - below.numpy()
+        place = mi.Point3f(bundle.origin + bundle.direction * t)
+        distance.append(renderer.sheet.evaluate(place).distance_mm.numpy().astype(float))
+    return distance[1] - distance[0]
 
 
 def select_brightest(found: Crossings, lines: int) -> FrameTruth:
@@ -187,7 +185,7 @@ def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel:
         return (at, across) if along_width else (across, at)
 
     def travelled(across: Float, at: Float) -> Float | None:
-        return pose.compute_times(position(across, at)[1], 0.5)
+        return None if travel is None else travel.compute_times(position(across, at)[1], 0.5)
 
     def distance(across: Float, at: Float) -> Float:
         bundle = renderer.view.trace_bundle(*position(across, at))
@@ -201,8 +199,7 @@ def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel:
     marked[line, cell] = marked[line, cell + 1] = True
     edge_line, edge = find_marked(marked)
     edges = np.empty(marked.shape, np.float32)
-    place = to_jit(mi.Float, edge - 0.5), to_jit(mi.Float, edge_line)
-    edges[edge_line, edge] = renderer.frozen_call("edges", distance, pose, (), *place).numpy()
+    edges[edge_line, edge] = distance(to_jit(mi.Float, edge - 0.5), to_jit(mi.Float, edge_line)).numpy()
     below, above = edges[line, cell], edges[line, cell + 1]
     bracketed = (below <= 0) != (above <= 0)
     bracketed &= np.isfinite(below) & np.isfinite(above)
@@ -220,35 +217,24 @@ def find_crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel:
         high, above = dr.select(same_side, high, centre), dr.select(same_side, above, found)
         return low, high, below, above, at, left - 1
 
-    def find_roots(low: Float, high: Float, below: Float, above: Float, at: Float) -> tuple[Any, ...]:
-        # Skip the search for loop invariants, as in `Walker`.
-        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-            low, high, below, above, at, _ = dr.while_loop(
-                (low, high, below, above, at, dr.full(mi.UInt32, _FALSE_POSITIONS, dr.width(at))),
-                lambda low, high, below, above, at, left: left > 0,
-                narrowed,
-                mode="symbolic",
-            )
-        centre = low + (high - low) * below / (below - above)
-        dr.eval(centre)
-        bundle = renderer.view.trace_bundle(*position(centre, at))
-        brightness, seen = renderer.laser(pose, bundle, travelled(centre, at))
-        si, offset = seen.si, dr.select(seen.valid, renderer.sheet.evaluate(seen.end()).distance_mm, dr.nan)
-        return (
-            centre,
-            brightness,
-            mi.Point3f(si.p),
-            mi.Vector3f(si.n),
-            offset,
-            renderer.objects.number(si.shape, seen.valid),
+    # Skip the search for loop invariants, as in `Walker`.
+    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+        low, high, below, above, at, _ = dr.while_loop(
+            (low, high, below, above, at, dr.full(mi.UInt32, _FALSE_POSITIONS, len(line))),
+            lambda low, high, below, above, at, left: left > 0,
+            narrowed,
+            mode="symbolic",
         )
-
-    centre, brightness, point, normal, offset, thing = renderer.frozen_call(
-        "roots", find_roots, pose, (), low, high, below, above, at
-    )
+    centre = low + (high - low) * below / (below - above)
+    dr.eval(centre)
+    bundle = renderer.view.trace_bundle(*position(centre, at))
+    brightness, seen = renderer.laser(pose, bundle, travelled(centre, at))
+    si, offset = seen.si, dr.select(seen.valid, renderer.sheet.evaluate(seen.end()).distance_mm, dr.nan)
+    thing = renderer.objects.number(si.shape, seen.valid)
+    dr.eval(centre, brightness, si.p, si.n, offset, thing)
     good = np.abs(offset.numpy()) < _TOLERANCE_MM
     # In the order of `Crossings`' fields.
-    arrays = line, centre.numpy(), brightness.numpy(), to_numpy(point), to_numpy(normal), thing.numpy()
+    arrays = line, centre.numpy(), brightness.numpy(), to_numpy(si.p), to_numpy(si.n), thing.numpy()
     return Crossings(*(values[good] for values in arrays))
 
 

@@ -50,7 +50,7 @@ def test_travel_during_the_exposure_blurs_the_stripe_evenly(renderer, exposure_m
 
 
 def test_frames_do_not_depend_on_earlier_ones(thesis):
-    """Kernels recorded in earlier frames contain none of the numbers of those frames: pose, motion, times, lines."""
+    """What is kept from earlier frames contains none of their numbers: pose, motion, times, lines."""
     scene = scene_of(TILTED, {"kind": "sphere", "diameter_mm": 30.0, "position_mm": (0.0, 5.0, 0.0)})
     effects = replace(NONE, motion=True, defocus=True, haze=True, multiple_scattering=True, secondary_light=True)
 
@@ -61,7 +61,7 @@ def test_frames_do_not_depend_on_earlier_ones(thesis):
         replace(travel(way_mm, row_mm=row_mm), turn_rad_s=np.array(turn))
         for way_mm, row_mm, turn in ((1.0, 0.002, (0.1, -0.4, 0.3)), (0.4, 0.01, (-0.2, 0.8, -0.6)))
     ]
-    # Each kind of motion twice, as another kind is recorded again.
+    # Each kind of motion twice.
     frames = [(0.0, None, 4), (3.0, None, 5), (3.0, travel(2.0), 4), (-2.0, travel(0.5), 6)]
     frames += [(1.0, turns[0], 4), (5.0, turns[1], 5), (400.0, None, 4)]
     used, visible = start(), []

@@ -10,9 +10,11 @@ import twin
 from tests.virtual_sensors import altered, plate, scene_of
 from twin.recording.record_scene import record_scene
 from twin.recording.render import choose_scene
+from twin.recording.sensor_simulator import SensorSimulator
 from twin.rendering_options import NONE, Options
-from twin.scene.description import Scene
+from twin.scene.description import Scene, load_scene
 from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import TruthStatus, read_truth, scene_digest, truth_path
@@ -232,3 +234,14 @@ def test_the_package_offers_its_functions_without_importing_the_renderer():
     )
     child = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert child.stdout.strip() == "No twin attribute absent"
+
+
+def test_images_of_a_target_do_not_depend_on_earlier_ones():
+    sensor, scene = load_sensor("thesis-small"), load_scene("target-through-window")
+    shots = list(scene.motion.shots())[:4]
+    assert [shot.light for shot in shots] == ["lamp", "laser"] * 2
+    used = SensorSimulator(sensor, scene, Options(spp=4))
+    images = [used.image(shot, number) for number, shot in enumerate(shots)]
+    for number in (2, 3):
+        fresh = SensorSimulator(sensor, scene, Options(spp=4))
+        np.testing.assert_array_equal(images[number], fresh.image(shots[number], number))
