@@ -50,7 +50,7 @@ def test_travel_during_the_exposure_blurs_the_stripe_evenly(renderer, exposure_m
 
 
 def test_frames_do_not_depend_on_earlier_ones(thesis):
-    """What is kept from earlier frames contains none of their numbers: pose, motion, times, lines."""
+    """Frames contain no numbers of earlier ones: pose, motion, times, lines."""
     scene = scene_of(TILTED, {"kind": "sphere", "diameter_mm": 30.0, "position_mm": (0.0, 5.0, 0.0)})
     effects = replace(NONE, motion=True, defocus=True, haze=True, multiple_scattering=True, secondary_light=True)
 
