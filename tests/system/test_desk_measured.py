@@ -106,6 +106,14 @@ def test_values_are_measured_limited_undone_and_saved(page, place):
             page.get_by_label(label).nth(1).fill(limit)
             page.keyboard.press("Tab")
         row.nth(1).get_by_text(re.compile(f"^{verdict}")).wait_for()
+    # What is typed before the list has shown the last change stays.
+    upper = page.get_by_label("upper, mm").nth(1)
+    upper.fill("20")
+    page.keyboard.press("Tab")
+    upper.fill("")
+    page.wait_for_timeout(500)
+    assert upper.input_value() == ""
+    page.keyboard.press("Tab")
     # A wrong limit is refused, and the row shows the limits that hold.
     page.get_by_label("lower, mm").nth(0).fill("9")
     page.keyboard.press("Tab")

@@ -326,6 +326,9 @@ class _Row:
             self._show_fields(values.find(self._number), restore=True)
             self._board.say(str(error), "error")
             ui.notify(str(error), type="negative", multi_line=True)
+        else:
+            # At once: the next refresh may come after the user has typed on.
+            self._show_fields(self._measuring.values.find(self._number))
 
     def _rename(self) -> None:
         self._change(lambda values: values.rename(self._number, str(self._name.value or "")))
