@@ -106,7 +106,7 @@ def test_values_are_measured_limited_undone_and_saved(page, place):
             page.get_by_label(label).nth(1).fill(limit)
             page.keyboard.press("Tab")
         row.nth(1).get_by_text(re.compile(f"^{verdict}")).wait_for()
-    # What is typed before the list has shown the last change stays.
+    # A refresh of the list after the last change keeps the text that the user types meanwhile.
     upper = page.get_by_label("upper, mm").nth(1)
     upper.fill("20")
     page.keyboard.press("Tab")

@@ -118,22 +118,17 @@ class PathPrior:
         ``normal`` (6 C, 6 C) is that of the values without prior. Coordinates after the last node that it contains keep
         their prior.
         """
-        count = self.count
-        if not self.drift.dead_reckoned:
-            seen = np.flatnonzero(normal.any(axis=0)) % self.count
-            count = 1 + int(np.flatnonzero(np.isin(self.order, seen)).max(initial=0))
-        first, lead = (
-            self.count * np.arange(6)[:, None] + each[:count] for each in (self.order, np.arange(self.count))
-        )
         if self.drift.dead_reckoned:
             half = self.times_transposed_root(normal)
-            inner = self.times_transposed_root(half.T)
-        else:
-            half = self._times_triangles(normal[np.ix_(first.ravel(), first.ravel())], transposed=True)
-            inner = self._times_triangles(half.reshape(6 * count, -1).T, transposed=True).reshape(6 * count, -1)
-        inner[np.diag_indices(len(inner))] += 1
+            return np.linalg.cholesky(np.eye(len(normal)) + self.times_transposed_root(half.T))
+        seen = np.flatnonzero(normal.any(axis=0)) % self.count
+        count = 1 + int(np.flatnonzero(np.isin(self.order, seen)).max(initial=0))
+        of_component = self.count * np.arange(6)[:, None]
+        nodes, numbers = (of_component + self.order[:count]).ravel(), (of_component + np.arange(count)).ravel()
+        half = self._times_triangles(normal[np.ix_(nodes, nodes)], transposed=True)
+        inner = self._times_triangles(half.reshape(6 * count, -1).T, transposed=True).reshape(6 * count, -1)
         result = np.eye(len(normal))
-        result[np.ix_(lead.ravel(), lead.ravel())] = np.linalg.cholesky(inner)
+        result[np.ix_(numbers, numbers)] = np.linalg.cholesky(np.eye(6 * count) + inner)
         return result
 
     @cached_property

@@ -14,6 +14,9 @@ from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Full width at half maximum of a Gaussian, divided by its standard deviation."""
 
+CONVERGED_PX = 1e-4
+"""Step of a centre below which methods that iterate stop; on noisy stripes each step is about a fifth of the last."""
+
 
 class WindowRule(NamedTuple):
     """Numbers of the measurement of a peak; a named tuple, which compiled code reads as constants.

@@ -7,13 +7,10 @@ import math
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
-from uwlts.stripe.peak_window import PeakWindow, covered_fraction
+from uwlts.stripe.peak_window import CONVERGED_PX, PeakWindow, covered_fraction
 
 _ITERATIONS = 6
 """Most updates of the window's position."""
-
-_CONVERGED_PX = 1e-4
-"""Step below which no further update is made; on noisy stripes each step is about a fifth of the one before."""
 
 _HALF_SIGMAS = 2.25
 """Half width of the window, sigmas: it contains most of the light; further pixels add more noise than light."""
@@ -45,5 +42,5 @@ def _follow(peak: PeakWindow, half: np.ndarray, centre: np.ndarray) -> None:
                 total, moment = total + share, moment + share * u
             step = moment / max(total, 0.1 * peak.height[m])
             centre[m] += min(max(step, -half[m]), half[m])
-            if abs(step) < _CONVERGED_PX:
+            if abs(step) < CONVERGED_PX:
                 break

@@ -7,13 +7,10 @@ import math
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
-from uwlts.stripe.peak_window import FWHM_PER_SIGMA, PeakWindow, covered_fraction
+from uwlts.stripe.peak_window import CONVERGED_PX, FWHM_PER_SIGMA, PeakWindow, covered_fraction
 
 _ITERATIONS = 6
 """Most fits, each about the vertex of the previous one."""
-
-_CONVERGED_PX = 1e-4
-"""Step below which no further fit is made; on noisy stripes each step is about a fifth of the one before."""
 
 
 def centres(peak: PeakWindow) -> np.ndarray:
@@ -50,5 +47,5 @@ def _fit(peak: PeakWindow, smooth: np.ndarray, half: np.ndarray, centre: np.ndar
             a2 = t2 * (s0 * s2 - s1 * s1) - t1 * (s0 * s3 - s1 * s2) + t0 * (s1 * s3 - s2 * s2)
             step = -a1 / min(2.0 * a2, -1e-6 * abs(a1) - 1e-20)
             centre[m] += min(max(step, -half[m]), half[m])
-            if abs(step) < _CONVERGED_PX:
+            if abs(step) < CONVERGED_PX:
                 break
