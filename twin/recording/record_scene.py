@@ -100,6 +100,8 @@ def record_scene(
 
         def take(light: ShotLight, shot: Shot, index: int) -> None:
             writer.append(studio.frame_of(light, shot, index))
+            # This processor is free until the next image: kernels that are running now use it too.
+            dr.set_thread_count(threads)
 
         def end(index: int, taken: Future[None] | None) -> None:
             if taken is not None:
@@ -109,13 +111,16 @@ def record_scene(
         # Expose and write an image while the light of the next one is rendered.
         before: Future[None] | None = None
         for index, shot in enumerate(shots):
-            dr.set_thread_count(_threads_for(shot, threads))
             # The light first: the truth uses the stripe's position that it found.
             light = studio.light(shot, index) if index >= done else None
             truths.append(studio.truth(shot))
             if index > 0:
                 end(index - 1, before)
-            before = None if light is None else camera.submit(take, light, shot, index)
+            before = None
+            if light is not None:
+                following = shots[min(index + 1, len(shots) - 1)]
+                dr.set_thread_count(_threads_beside_camera(following, threads))
+                before = camera.submit(take, light, shot, index)
         end(len(shots) - 1, before)
         if report is not None:
             Trajectory(*report).save(trajectory_path(path), overwrite=overwrite or resume)
@@ -131,8 +136,8 @@ def truth_of_recording(studio: SensorSimulator, truths: Sequence[FrameTruth], sh
     return Truth(**stacked, depth_mm=depth_map(studio.renderer, poses[0]), pose=poses)
 
 
-def _threads_for(shot: Shot, threads: int) -> int:
-    """Return the number of Dr.Jit threads for a shot while another thread exposes and writes the previous one.
+def _threads_beside_camera(shot: Shot, threads: int) -> int:
+    """Return the number of Dr.Jit threads that render a shot while another thread exposes and writes the previous one.
 
     The many small kernels of a laser image would take the processor from that thread; a lamp image has few large
     kernels.
