@@ -2,8 +2,8 @@
 
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,10 @@ class Floor:
 
 @dataclass(frozen=True)
 class Row:
-    """Measured value with its limit, and the same as a ratio to a floor; ``ok`` is True if both limits are kept."""
+    """Measured value with its limit, and the same as a ratio to a floor; ``ok`` is True if both limits are kept.
+
+    ``range`` is that of the values of several runs.
+    """
 
     name: str
     value: float
@@ -29,6 +32,13 @@ class Row:
     ok: bool
     floor: Floor | None = None
     ratio: float | None = None
+    range: tuple[float, float] | None = None
+
+
+def median_row(rows: Sequence[Row]) -> Row:
+    """Return the row with the median value of several runs, and their range."""
+    ordered = sorted(rows, key=lambda row: row.value)
+    return replace(ordered[(len(rows) - 1) // 2], range=(ordered[0].value, ordered[-1].value))
 
 
 def at_most(name: str, value: float, unit: str, limit: float, floor: Floor | None = None) -> Row:
