@@ -20,6 +20,7 @@ from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import StageParameter
+from uwlts.model.sensor import Sensor
 from uwlts.optics.brightness import BLUR_STD, brightness_shift_std
 from uwlts.optics.line_table import LineTable, sum_terms
 from uwlts.reconstruction.path_uncertainty import principal_components
@@ -130,9 +131,9 @@ def point_uncertainty(
 ) -> PointUncertainty:
     """Calculate the uncertainty of points from stripe centres (N,) and a joint calibration.
 
-    It refers to the OCS, or to the scene for frames with poses. It includes errors of the stage's position, scale and
-    direction about its central position, and drift of the water since the calibration, unless the calibration uses this
-    capture. It excludes errors of poses (`uwlts.reconstruction.moving`).
+    It refers to the OCS of the true laser and camera axes, or to the scene for frames with poses. It includes errors of
+    the stage's position, scale and direction about its central position, and drift of the water since the calibration,
+    unless the calibration uses this capture. It excludes errors of poses (`uwlts.reconstruction.moving`).
 
     Parameters
     ----------
@@ -148,7 +149,8 @@ def point_uncertainty(
     mount_by : (6, P), optional
         Derivatives of a calibrated mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), for
         frames with poses of a platform. They correlate the errors of points and mount. By default poses and described
-        mount place the true OCS, from which the calibrated one differs by the errors of camera axis and sheet.
+        mount, or the stage, place the true OCS, from which the calibrated one differs by the errors of camera axis and
+        sheet.
     digest
         Digest of the calibration, if known.
 
@@ -176,12 +178,11 @@ def point_uncertainty(
     by_stage_alone = ~posed[:, 0, 0]
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
-    by_stage = stage_components(known, calibration, header, root)
+    by_stage = np.vstack([stage_components(known, calibration, header, root), np.zeros(3)])
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
-    if mount_by is not None:
-        rigid = _rotate_to_sensor(mount_by, header) @ root[: mount_by.shape[1]]
-    else:
-        rigid = -known.frame_by() @ root if posed.any() else np.zeros((6, root.shape[1]))
+    frame_by = -known.frame_by() if mount_by is None else _rotate_to_sensor(mount_by, header)
+    rigid = frame_by @ root[: frame_by.shape[1]]
+    rigid[0, -1] = _window_shift_std_mm(sensor)
     exact = partial(_derivatives, known, root, rigid)
     of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
     key = None if digest is None else ("uncertainty", digest, known.view, *of_estimate)
@@ -272,6 +273,15 @@ def _fill_errors(
             sums[m, n, 0], sums[m, n, 1], sums[m, n, 2] = value[0, 1 + m], value[1, 1 + m], value[2, 1 + m]
 
 
+def _window_shift_std_mm(sensor: Sensor) -> float:
+    """Return the standard uncertainty of the sheet's offset from the laser's axis by the tilt of the laser's window.
+
+    A plate of thickness t and index n that is tilted by a small angle shifts a ray by t (1 - 1 / n) times that angle.
+    """
+    window, tilt = sensor.laser.window, np.radians(sensor.uncertainty.laser_window_tilt_deg)
+    return window.thickness_mm * (1 - 1 / window.index(sensor.laser.wavelength_nm)) * tilt if window.mounted else 0.0
+
+
 def _rotate_to_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
     """Rotate the derivatives (6, P) of a mount, translation and rotation, from platform axes to sensor axes."""
     turn = np.array(header.T_platform_sensor)[:3, :3]
@@ -294,8 +304,7 @@ def _derivatives(
         points, by = found
         result[:, :, 0] = by[:, :, 0]
         result[:, :, 1:] = by[:, :, 1:] @ root
-        if rigid.any():
-            result[:, :, 1:] += rigid[:3] + np.cross(rigid[3:].T, points[:, None]).swapaxes(1, 2)
+        result[:, :, 1:] += rigid[:3] + np.cross(rigid[3:].T, points[:, None]).swapaxes(1, 2)
     return result.reshape(len(line), -1)
 
 
@@ -318,6 +327,9 @@ def stage_components(
     lean = uncertainty.stage_lean()
     std = dict.fromkeys(SLOPES, lean) | {StageParameter.SCALE: uncertainty.stage_scale}
     within = sum((np.outer(root[keys.index(key)], ways[key]) for key in calibrated), np.zeros((root.shape[1], 3)))
+    if found is not None:
+        # An estimated direction turns with the OCS, a described one does not.
+        within = within - np.cross((known.frame_by()[3:] @ root).T, described)
     besides = [std[key] * way for key, way in ways.items() if key not in calibrated]
     besides.append(known.parameters.value(known.values, StageParameter.SCALE) * described)
     return np.vstack([within, *besides])
