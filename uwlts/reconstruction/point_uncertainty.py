@@ -182,7 +182,7 @@ def point_uncertainty(
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
     frame_by = -known.frame_by() if mount_by is None else _rotate_to_sensor(mount_by, header)
     rigid = frame_by @ root[: frame_by.shape[1]]
-    rigid[0, -1] = _window_shift_std_mm(sensor)
+    rigid[0, -1] = _window_shift_std_mm(sensor) if mount_by is None else 0.0
     exact = partial(_derivatives, known, root, rigid)
     of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
     key = None if digest is None else ("uncertainty", digest, known.view, *of_estimate)
