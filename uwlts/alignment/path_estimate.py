@@ -41,8 +41,12 @@ class PathEstimate:
 
     def rates(self, times_s: np.ndarray) -> np.ndarray:
         """Return the time derivative (N, 6) of translation and rotation, averaged over a patch at times (N,)."""
-        half = self.survey.radius_mm / self.survey.speed_mm_s
-        return (self.corrections(times_s + half) - self.corrections(times_s - half)) / (2 * half)
+        return (self.corrections(times_s + self.half_s) - self.corrections(times_s - self.half_s)) / (2 * self.half_s)
+
+    @property
+    def half_s(self) -> float:
+        """Time in which the stripe moves by the radius of a patch, s."""
+        return self.survey.radius_mm / self.survey.speed_mm_s
 
     @cached_property
     def image_corrections(self) -> np.ndarray:

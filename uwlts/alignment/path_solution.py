@@ -209,22 +209,24 @@ def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_ar
     middle = np.vstack([used.places_mm for _, _, used, _ in ways]).mean(axis=0)
     twists = [rigid_derivatives(used.places_mm, used.normals, middle) for _, _, used, _ in ways]
     observable = _observable_projection([(*way[2:], twist) for way, twist in zip(ways, twists, strict=True)], middle)
-    component = estimate.prior.count * np.arange(6)
+    component, half_s = estimate.prior.count * np.arange(6), estimate.half_s
     for (source, target, used, weight), twist in zip(ways, twists, strict=True):
         seen, columns, values = twist @ observable, [], []
         for number, at, sign in ((source, used.source, 1.0), (target, used.target, -1.0)):
             piece, by = estimate.pieces[number], seen.copy()
             # Points off the centre of a patch were measured slightly earlier or later.
             off = used.places_mm - estimate.surface(number).places_mm[at]
-            later = np.einsum("qi,qi->q", piece.slopes_s_mm[at], off)
-            times = piece.times_s[at] + later
+            later, times = np.einsum("qi,qi->q", piece.slopes_s_mm[at], off), piece.times_s[at]
             # Rotations of the path are about the platform.
             platform = piece.platform_mm[at] + later[:, None] * piece.velocity_mm_s[at]
             by[:, 3:] += np.cross(middle - platform - estimate.corrections(times)[:, :3], by[:, :3])
-            before, after = estimate.prior.weights(times)
-            for node, share in ((before, 1 - after), (before + 1, after)):
-                columns.append(node[:, None] + component)
-                values.append(sign * share[:, None] * by)
+            # The surface of a patch moves with the rates averaged over it.
+            tilt = later / (2 * half_s)
+            for moment, part in ((times, 1.0), (times + half_s, tilt), (times - half_s, -tilt)):
+                before, after = estimate.prior.weights(moment)
+                for node, share in ((before, part * (1 - after)), (before + 1, part * after)):
+                    columns.append(node[:, None] + component)
+                    values.append(sign * share[:, None] * by)
         ends = np.arange(0, 6 * len(columns) * len(weight) + 1, 6 * len(columns))
         places = np.hstack(values).ravel(), np.hstack(columns).ravel(), ends
         yield csr_array(places, shape=(len(weight), len(estimate.values))), weight, used.distance_mm
