@@ -79,17 +79,17 @@ def refine_nodes(estimate: PathEstimate) -> PathEstimate:
     """
     survey, options, drift = estimate.survey, estimate.options, estimate.prior.drift
     even = PathPrior.from_times(survey.moments_s, drift, estimate.prior.trajectory, intervals=options.intervals)
-    if not estimate.pairs:
-        return _change_prior(estimate, even)
     times, std, arms = [], [], []
     for earlier, later in estimate.pairs:
         found, _ = estimate.measure_distances((earlier, later))
-        std.append(found.std_mm)
+        std += found.std_mm.tolist()
         for number, at in ((later, found.source), (earlier, found.target)):
             piece = estimate.pieces[number]
-            times.append(piece.times_s[at])
-            arms.append(np.linalg.norm(piece.places_mm[at] - piece.platform_mm[at], axis=1))
-    noise, arm = (float(np.median(np.concatenate(each))) for each in (std, arms))
+            times += piece.times_s[at].tolist()
+            arms += np.linalg.norm(piece.places_mm[at] - piece.platform_mm[at], axis=1).tolist()
+    if not times:
+        return _change_prior(estimate, even)
+    noise, arm = np.median(std), np.median(arms)
     lasting = float(np.ptp(even.nodes_s))
     step = options.node_spacing * estimate.half_s
     while 2 * step < lasting / options.intervals:
@@ -97,7 +97,7 @@ def refine_nodes(estimate: PathEstimate) -> PathEstimate:
         if np.hypot(deviation[:3].max(), arm * deviation[3:].max()) > noise:
             break
         step *= 2
-    return _change_prior(estimate, even.with_nodes(np.concatenate(times), step, most=options.most_nodes))
+    return _change_prior(estimate, even.with_nodes(np.array(times), step, most=options.most_nodes))
 
 
 def refit(estimate: PathEstimate, numbers: Iterable[int]) -> PathEstimate:
