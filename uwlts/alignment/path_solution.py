@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve, get_lapack_funcs, solve_triangular
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
 from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.drift_model import DriftModel, candidates_beside
@@ -208,17 +208,15 @@ def _solve_step(estimate: PathEstimate, normal: np.ndarray, right: np.ndarray) -
 def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix (6 C, 6 C) and right-hand side (6 C, 1) of the values from all pairs, without prior."""
     count = len(estimate.values)
-    total, gradient = np.zeros((count, count)), np.zeros(count)
-    for pair in estimate.pairs:
-        for derivatives, weight, distance_mm in _linearise_pair(estimate, pair):
-            # Few values belong to one pair: products of their dense columns take half the time of sparse ones.
-            own = np.flatnonzero(np.bincount(derivatives.indices, minlength=count))
-            columns = np.searchsorted(own, derivatives.indices)
-            dense = csr_array((derivatives.data, columns, derivatives.indptr), shape=(len(weight), len(own))).toarray()
-            weighted = weight[:, None] * dense
-            total[np.ix_(own, own)] += dense.T @ weighted
-            gradient[own] += distance_mm @ weighted
-    return total, (total @ estimate.values - gradient)[:, None]
+    parts = [part for pair in estimate.pairs for part in _linearise_pair(estimate, pair)]
+    if not parts:
+        return np.zeros((count, count)), np.zeros((count, 1))
+    derivatives = csr_array(vstack([part[0] for part in parts]))
+    derivatives.sum_duplicates()
+    weight, distance_mm = (np.concatenate([part[which] for part in parts]) for which in (1, 2))
+    weighted = derivatives.multiply(weight[:, None]).tocsr()
+    total = (derivatives.T @ weighted).toarray()
+    return total, (total @ estimate.values - weighted.T @ distance_mm)[:, None]
 
 
 def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_array, np.ndarray, np.ndarray]]:
