@@ -213,6 +213,7 @@ def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((count, count)), np.zeros((count, 1))
     derivatives = csr_array(vstack([part[0] for part in parts]))
     derivatives.sum_duplicates()
+    derivatives.eliminate_zeros()
     weight, distance_mm = (np.concatenate([part[which] for part in parts]) for which in (1, 2))
     weighted = derivatives.multiply(weight[:, None]).tocsr()
     total = (derivatives.T @ weighted).toarray()
