@@ -122,6 +122,7 @@ class PathPrior:
         count = 1 + int(np.flatnonzero(np.isin(self.order, seen)).max(initial=0))
         of_component = self.count * np.arange(6)[:, None]
         nodes, numbers = (of_component + self.order[:count]).ravel(), (of_component + np.arange(count)).ravel()
+        aside = None
         if self.drift.dead_reckoned:
             numbers = np.append(numbers[: 5 * count], 5 * self.count + np.arange(self.count))
             # Position changes (2, N, C) at the first N nodes per unit of each whitened coordinate of the heading.
@@ -130,7 +131,7 @@ class PathPrior:
         def times_seen_root(matrix: np.ndarray) -> np.ndarray:
             parts = matrix.reshape(6, count, -1)
             result = self._times_triangles(parts, transposed=True).reshape(matrix.shape)
-            if self.drift.dead_reckoned:
+            if aside is not None:
                 heading = aside[0].T @ parts[1] - aside[1].T @ parts[0]
                 heading[:count] += result[5 * count :]
                 result = np.vstack([result[: 5 * count], heading])

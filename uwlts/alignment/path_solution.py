@@ -211,10 +211,11 @@ def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
     parts = [part for pair in estimate.pairs for part in _linearise_pair(estimate, pair)]
     if not parts:
         return np.zeros((count, count)), np.zeros((count, 1))
-    derivatives = csr_array(vstack([part[0] for part in parts]))
+    derivatives = csr_array(vstack([derivatives for derivatives, _, _ in parts]))
     derivatives.sum_duplicates()
     derivatives.eliminate_zeros()
-    weight, distance_mm = (np.concatenate([part[which] for part in parts]) for which in (1, 2))
+    weight = np.concatenate([weight for _, weight, _ in parts])
+    distance_mm = np.concatenate([distance_mm for _, _, distance_mm in parts])
     weighted = derivatives.multiply(weight[:, None]).tocsr()
     total = (derivatives.T @ weighted).toarray()
     return total, (total @ estimate.values - weighted.T @ distance_mm)[:, None]
