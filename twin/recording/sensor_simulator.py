@@ -401,9 +401,9 @@ class SensorSimulator:
         parts = [nothing] * 4
         if laser is not None:
             parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
-            parts = [to_electrons(part, self._laser_shares) for part in parts]
+        parts = [*(to_electrons(part, self._laser_shares) for part in parts), to_electrons(even)]
         image = self._expose(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
-        return SimulatedImage(image, exposure_ms, *parts, to_electrons(even))
+        return SimulatedImage(image, exposure_ms, *parts)
 
     def _expose(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
         noise_seed = [self.options.seed, index]

@@ -338,8 +338,10 @@ def register_textures() -> None:
 def _sum_waves(waves: Float, p: Point3f, active: Bool) -> Float:
     """Return the sum of cos(k p + phase) of plane waves at points of the scene; ``waves`` are k and phase, flat."""
 
+    kind = cast(type, mi.ArrayXf)
+
     def add(number: UInt32, total: Float) -> tuple[UInt32, Float]:
-        read = dr.gather(mi.ArrayXf, waves, number, active, shape=(4 * _WAVES_AT_ONCE, dr.width(p)))
+        read = dr.gather(kind, waves, number, active, shape=(4 * _WAVES_AT_ONCE, dr.width(p)))
         for x, y, z, phase in zip(*(iter(read),) * 4, strict=True):
             total = total + dr.cos(dr.fma(x, p.x, dr.fma(y, p.y, dr.fma(z, p.z, phase))))
         return number + 1, total
