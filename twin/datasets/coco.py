@@ -61,10 +61,9 @@ def _names(card: DataCard, split: Any) -> list[str]:
 def _annotations(folder: Path, card: DataCard, split: Any) -> Iterator[dict[str, Any]]:
     count = 0
     for image, sample in enumerate(DataSet(folder, card, split, ("mask",))):
-        for kind in Mask:
+        present = Mask(int(np.bitwise_or.reduce(sample["mask"], axis=None)))
+        for kind in present:
             mask = (sample["mask"] & kind) > 0
-            if not mask.any():
-                continue
             rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
             first = int(columns[0]), int(rows[0])
             box = [*first, int(columns[-1]) + 1 - first[0], int(rows[-1]) + 1 - first[1]]
@@ -86,11 +85,9 @@ def encode_mask(mask: np.ndarray) -> str:
     runs = np.diff(np.concatenate([[0], starts, [mask.size]]))
     written = runs.copy()
     written[3:] -= runs[1:-2]
-    text = []
-    for value in written.tolist():
-        more = True
-        while more:
-            bits, value = value & 31, value >> 5
-            more = value != (-1 if bits & 16 else 0)
-            text.append(chr(48 + (bits | 32 if more else bits)))
-    return "".join(text)
+    # Groups of each number, without those that only repeat the sign.
+    groups = written[:, None] >> 5 * np.arange(mask.size.bit_length() // 5 + 1)
+    bits = groups & 31
+    last = (groups >> 5) == np.where(bits & 16, -1, 0)
+    kept = np.cumsum(last, axis=1) - last == 0
+    return (48 + bits + 32 * ~last)[kept].astype(np.uint8).tobytes().decode("ascii")

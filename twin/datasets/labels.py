@@ -164,14 +164,16 @@ def stripe_quality(
     lines, across = np.flatnonzero(np.isfinite(centre)), len(direct)
     columns = np.arange(len(lines))
     row = np.rint(centre[lines]).astype(int) + np.arange(-_WINDOW_PX, _WINDOW_PX + 1)[:, None]
-    inside, row = (row >= 0) & (row < across), np.clip(row, 0, across - 1)
-    signal = direct[row, lines].astype(float)
-    lit = inside & (signal > _LEAST_E)
-    signal[~lit] = 0.0
-    behind = np.logical_and.accumulate(lit[_WINDOW_PX:], axis=0)
-    before = np.logical_and.accumulate(lit[_WINDOW_PX::-1], axis=0)[::-1]
-    signal[:_WINDOW_PX][~before[:-1]] = 0.0
-    signal[_WINDOW_PX:][~behind] = 0.0
+    inside = (row >= 0) & (row < across)
+    pixel = np.clip(row, 0, across - 1) * direct.shape[1] + lines
+    run = inside & np.take(direct > _LEAST_E, pixel)
+    for side in (run[_WINDOW_PX:], run[_WINDOW_PX::-1]):
+        np.logical_and.accumulate(side, axis=0, out=side)
+    # Only the rows that any stripe reaches, and a dark one on each side.
+    used = np.append(np.flatnonzero(run.any(axis=1)), _WINDOW_PX)
+    rows = slice(max(used.min() - 1, 0), used.max() + 2)
+    run, inside, pixel = run[rows], inside[rows], pixel[rows]
+    signal = np.where(run, np.take(direct, pixel), np.float64(0))
 
     place = np.arange(len(signal))[:, None]
     peak = signal.argmax(axis=0)
@@ -186,11 +188,11 @@ def stripe_quality(
         from_first = (half - signal[start, columns]) / rise
         to_last = (half - signal[end, columns]) / fall
         width = np.where(whole, end - start - from_first - to_last, np.nan)
-    window_noise = noise[row, lines].astype(float)
+    window_noise = np.take(noise, pixel).astype(float)
     # Five-point derivative: for a stripe of 1 px standard deviation, its error is a few percent; two points give 15 %.
     padded = np.pad(signal, ((2, 2), (0, 0)))
     slope = (padded[:-4] - 8 * padded[1:-3] + 8 * padded[3:-1] - padded[4:]) / 12
-    known = inside & informative[row, lines] & (signal > 0)
+    known = inside & np.take(informative, pixel) & (signal > 0)
     information = np.where(known, np.square(slope / window_noise), 0.0).sum(axis=0)
     with np.errstate(divide="ignore"):
         bound = np.where(information > 0, 1 / np.sqrt(information), np.nan)
@@ -204,7 +206,7 @@ def stripe_quality(
 
     return LineQuality(
         *(of_all_lines(values, np.nan) for values in (width, snr, bound)),
-        clipped=of_all_lines((within & clipped[row, lines] & (half > 0)).any(axis=0), False),
+        clipped=of_all_lines((within & np.take(clipped, pixel) & (half > 0)).any(axis=0), False),
     )
 
 

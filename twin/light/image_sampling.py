@@ -117,7 +117,7 @@ def dilate_cells(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NOD
     step = max(1.0, float(radius.max(initial=0)) / 8)
     level = np.ceil(radius / step).astype(int)
     wide = cells.copy()
-    for k in np.unique(level[level > 0]).tolist():
+    for k in (1 + np.flatnonzero(np.bincount(level)[1:])).tolist():
         of_level = np.zeros(cells.shape, np.uint8)
         of_level.ravel()[marked[level == k]] = 1
         wide |= _dilate(of_level, k * step)

@@ -93,20 +93,28 @@ def measure_line_light(
     *pixels, values = renderer.render_line_light(pose, truth.surface_lines(), spp=spp)
     line, across = pixels[::-1] if renderer.sensor.camera.stripe_along == "width" else pixels
     # Pixels across the stripe from its centre, of the visible lines only.
-    offset, column = across - np.rint(truth.centre_px[line]).astype(int), np.searchsorted(lines, line)
+    middle = np.rint(centre)
+    column = np.searchsorted(lines, line)
+    offset = across - middle[column].astype(int)
     reach = int(np.abs(offset[values[0] > 0]).max(initial=0)) + 1
     near = np.abs(offset) <= reach
-    windows = np.zeros((3, 2 * reach + 1, len(lines)))
-    windows[:, offset[near] + reach, column[near]] = values[:, near]
-    place = np.arange(-reach, reach + 1)[:, None] + np.rint(centre) - centre
-    total, other, profile = np.where(mark_run(windows[0], np.full(len(lines), reach), _FAINTEST), windows, 0.0)
-    light = total.sum(axis=0)
+    values, column, offset = values[:, near], column[near], offset[near]
+    window = np.zeros((2 * reach + 1, len(lines)))
+    window[offset + reach, column] = values[0]
+    of_run = mark_run(window, np.full(len(lines), reach), _FAINTEST)[offset + reach, column]
+    values, column, offset = values[:, of_run], column[of_run], offset[of_run]
+
+    def sum_lines(weights: np.ndarray) -> np.ndarray:
+        return np.bincount(column, weights, len(lines))
+
+    total, other, profile = values
+    light = sum_lines(total)
     slope = np.abs(_distance_slopes(renderer, pose, truth, lines))
     with np.errstate(divide="ignore", invalid="ignore"):
         measured = {
-            "centroid_px": centre + (place * total).sum(axis=0) / light,
-            "visible_fraction": np.where(light > 0, np.minimum(slope * profile.sum(axis=0), 1.0), np.nan),
-            "mixed_fraction": other.sum(axis=0) / light,
+            "centroid_px": centre + sum_lines((offset + middle[column] - centre[column]) * total) / light,
+            "visible_fraction": np.where(light > 0, np.minimum(slope * sum_lines(profile), 1.0), np.nan),
+            "mixed_fraction": sum_lines(other) / light,
         }
     measured["mixed_fraction"][measured["mixed_fraction"] < _LEAST_MIXED] = 0.0
     filled = {name: getattr(truth, name).copy() for name in measured}

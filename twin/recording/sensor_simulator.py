@@ -390,14 +390,20 @@ class SensorSimulator:
         even, laser = self.light(shot, index)
         exposure_ms = exposure * self.exposure_ms[shot.light] * shot.exposure
         nothing = np.zeros_like(even)
+
+        def to_electrons(light: np.ndarray, shares: np.ndarray | None = None) -> np.ndarray:
+            if not light.any():
+                return nothing
+            passed = self._apply_lens(light)
+            mean = exposure_ms * self._to_electrons(passed if shares is None else shares * passed)
+            return np.maximum(mean, 0, dtype=np.float32)
+
         parts = [nothing] * 4
         if laser is not None:
             parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
-        shares = 1.0 if self._laser_shares is None else self._laser_shares
-        parts = [shares * self._apply_lens(part) if part.any() else nothing for part in parts]
-        parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._apply_lens(even))]
+        parts = [*(to_electrons(part, self._laser_shares) for part in parts), to_electrons(even)]
         image = self._expose(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
-        return SimulatedImage(image, exposure_ms, *(np.maximum(part, 0, dtype=np.float32) for part in parts))
+        return SimulatedImage(image, exposure_ms, *parts)
 
     def _expose(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
         noise_seed = [self.options.seed, index]

@@ -32,6 +32,8 @@ _CELLS_PER_PATCH = 9
 """Number of grid cells per patch: enough that no cell overlaps two circles of a target."""
 _PATCH_VALUES = 8
 """Columns of the table of patches; the last two are padding, as values are read in groups of four."""
+_WAVES_AT_ONCE = 4
+"""Number of waves read together, which takes a third less time than one by one; more are not read faster."""
 _ROUNDING_MM = 1e-3
 """Bound of the single-precision rounding error of positions on a plate of 1 m."""
 COAT_INDEX = {"painted": 1.50, "pvc": 1.54}
@@ -336,15 +338,19 @@ def register_textures() -> None:
 def _sum_waves(waves: Float, p: Point3f, active: Bool) -> Float:
     """Return the sum of cos(k p + phase) of plane waves at points of the scene; ``waves`` are k and phase, flat."""
 
+    kind = cast(type, mi.ArrayXf)
+
     def add(number: UInt32, total: Float) -> tuple[UInt32, Float]:
-        x, y, z, phase = dr.gather(mi.Vector4f, waves, number, active)
-        return number + 1, total + dr.cos(dr.fma(x, p.x, dr.fma(y, p.y, dr.fma(z, p.z, phase))))
+        read = dr.gather(kind, waves, number, active, shape=(4 * _WAVES_AT_ONCE, dr.width(p)))
+        for x, y, z, phase in zip(*(iter(read),) * 4, strict=True):
+            total = total + dr.cos(dr.fma(x, p.x, dr.fma(y, p.y, dr.fma(z, p.z, phase))))
+        return number + 1, total
 
     # Skip the search for loop invariants, as in `Walker`.
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         _, total = dr.while_loop(
             (dr.zeros(mi.UInt32, dr.width(p)), dr.zeros(mi.Float, dr.width(p))),
-            lambda number, total: number < WAVES,
+            lambda number, total: number < WAVES // _WAVES_AT_ONCE,
             add,
             mode="symbolic",
             label="waves",

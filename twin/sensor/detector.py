@@ -16,6 +16,7 @@ from twin.sensor.random_numbers import add_normal_numbers, poisson_numbers
 from uwlts.errors import ImageError
 from uwlts.model.sensor import Camera, Detector
 from uwlts.runtime.compiled import compiled
+from uwlts.runtime.workers import count_processors
 
 PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0
 """h c in J m (SI, exact)."""
@@ -25,6 +26,8 @@ MOST_ELECTRONS = 1e15
 
 _BANDS = 8
 """Number of bands of rows with independent random numbers, and of parallel tasks."""
+_PARALLEL_PX = 2**19
+"""Number of pixels from which bands are computed in parallel; below, threads cost more time than they save."""
 _STREAM = 1288
 """Random number stream of the pattern, separate from those of the images."""
 
@@ -89,14 +92,15 @@ def grey_values(
         # Seeds derive from the given generator; SFC64 is NumPy's fastest bit generator.
         seeds = cast(np.random.SeedSequence, rng.bit_generator.seed_seq).spawn(count)
         rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
-    with ThreadPoolExecutor() as pool:
-        charges = list(pool.map(_collect, np.array_split(electrons, count), detectors, exposures, patterns, rngs))
+    with ThreadPoolExecutor(count_processors()) as pool:
+        run = pool.map if electrons.size >= _PARALLEL_PX else map
+        charges = list(run(_collect, np.array_split(electrons, count), detectors, exposures, patterns, rngs))
         if detector.blooming > 0:
             bloomed = spread_blooming(
                 np.concatenate(charges), full_well_e=detector.full_well_e, share=detector.blooming
             )
             charges = np.array_split(bloomed, count)
-        return np.concatenate(list(pool.map(_digitise, charges, detectors, patterns, rngs)))
+        return np.concatenate(list(run(_digitise, charges, detectors, patterns, rngs)))
 
 
 def _collect(

@@ -52,8 +52,8 @@ class AlignmentOptions:
     total."""
     most_nodes: int = 400  # largest number of nodes in crossings: normal matrices of 3000 unknowns take 72 MB
     node_spacing: float = 0.5
-    """Spacing of nodes in crossings (unit: patch radius): the walk between nodes stays below the scatter of patches.
-    Chosen on simulated passes with a walk of 30 mm."""
+    """Least spacing of nodes in crossings (unit: patch radius). It is doubled while the drift deviates from a straight
+    line between nodes by less than the noise of patches. Chosen on simulated passes with a walk of 30 mm."""
     rounds: int = 15  # largest number of least-squares rounds
     still: float = 0.03
     """Root-mean-square step, in standard deviations, that ends the rounds; changes of correspondences cause smaller

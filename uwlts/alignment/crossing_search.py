@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
-from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nodes, refit, solve
+from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nodes, refit, select_drift, solve
 from uwlts.fitting.least_squares import rms_distance
 from uwlts.fitting.shapes import perpendicular_to
 from uwlts.model.calibration import rigid_transform
@@ -62,7 +62,7 @@ def accept_crossings(estimate: PathEstimate, progress: ProgressListener = ignore
                 doubtful.append(best.pair)
                 waiting = [each for each in waiting if not _is_beside(each.pair, doubtful, ahead)]
                 continue
-            estimate = add_overlaps(closed, number + 1)
+            estimate = _select_walk(add_overlaps(closed, number + 1))
             waiting = [each for each in waiting if each.pair not in estimate.pairs and _is_likely(estimate, each)]
         progress(number + 1, count)
     estimate = add_overlaps(estimate, count)
@@ -102,6 +102,12 @@ def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
     estimate = solve(refit(estimate, {number for pair in estimate.pairs for number in pair}))
     agreeing = tuple(pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair))
     return estimate if len(agreeing) == len(estimate.pairs) else solve(replace(estimate, pairs=agreeing))
+
+
+def _select_walk(estimate: PathEstimate) -> PathEstimate:
+    """Select the most likely random walk; few nodes follow a small one."""
+    selected = select_drift(estimate, walk_only=True)
+    return estimate if selected is estimate else solve(selected)
 
 
 def _search_range(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:

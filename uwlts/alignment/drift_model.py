@@ -69,6 +69,16 @@ class DriftModel:
             by_rates = (of_t + of_u - of_both) / (2 * of_end)
         return variance * ((1 - walk) * by_rates + walk * np.minimum(t, u))
 
+    def deviation(self, step: float) -> np.ndarray:
+        """Return the standard deviation (6,) of the drift in the middle of a step from the mean of both ends.
+
+        ``step`` is relative to the duration of the path.
+        """
+        by_rates, by_walk = 0.0, step / 4
+        if np.isfinite(self.correlation):
+            by_rates = (self._increment(step / 2) - self._increment(step) / 4) / self._increment(1.0)
+        return self.std * np.sqrt(np.maximum((1 - self.walk) * by_rates + self.walk * by_walk, 0.0))
+
     def _increment(self, t: np.ndarray | float) -> np.ndarray:
         """Return the variance of the integral over a time t of a rate with the correlation exp(-a).
 
@@ -88,11 +98,14 @@ class DriftModel:
         ]
 
 
-def candidates_beside(number: int) -> list[int]:
-    """Return the numbers of candidates with the same walk as a given one, or with the same rates and the next walks."""
+def candidates_beside(number: int, *, walk_only: bool) -> list[int]:
+    """Return the numbers of a given candidate and of those beside it.
+
+    These have the same rates and the next walks or, unless ``walk_only``, the same walk and other rates.
+    """
     walk = number % len(_WALKS)
     next_walks = [number + step for step in (-1, 1) if 0 <= walk + step < len(_WALKS)]
-    return [len(_WALKS) * each + walk for each in range(len(RATES))] + next_walks
+    return ([number] if walk_only else [len(_WALKS) * each + walk for each in range(len(RATES))]) + next_walks
 
 
 def choose_drift_model(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> DriftModel:

@@ -41,8 +41,12 @@ class PathEstimate:
 
     def rates(self, times_s: np.ndarray) -> np.ndarray:
         """Return the time derivative (N, 6) of translation and rotation, averaged over a patch at times (N,)."""
-        half = self.survey.radius_mm / self.survey.speed_mm_s
-        return (self.corrections(times_s + half) - self.corrections(times_s - half)) / (2 * half)
+        return (self.corrections(times_s + self.half_s) - self.corrections(times_s - self.half_s)) / (2 * self.half_s)
+
+    @property
+    def half_s(self) -> float:
+        """Time in which the stripe moves by the radius of a patch, s."""
+        return self.survey.radius_mm / self.survey.speed_mm_s
 
     @cached_property
     def image_corrections(self) -> np.ndarray:
@@ -91,22 +95,37 @@ class PathEstimate:
 
     def relative_movement(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
         """Return the derivatives (6, 6 C) of the later piece's motion relative to the earlier one at a place (3,)."""
-        result = np.zeros((6, 6, self.prior.count))
-        for number, sign in zip(pair, (-1.0, 1.0), strict=True):
-            piece = self.pieces[number]
-            middle = np.argmin(np.abs(piece.times_s - piece.middle_s))
-            time = piece.times_s[middle][None]
-            twist = np.eye(6)
-            platform = piece.platform_mm[middle] + self.corrections(time)[0, :3]
-            twist[:3] = rigid_derivatives(at_mm, np.eye(3), platform)
-            result += sign * twist[:, :, None] * self.prior.basis(time)[0]
-        return result.reshape(6, -1)
+        basis = self.prior.basis(self._middles_s[list(pair)])
+        return np.einsum("ipj,pc->ijc", self._relative_twists(pair, at_mm), basis).reshape(6, -1)
 
     def relative_covariance(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
         """Return the covariance (6, 6) of the later piece's motion relative to the earlier one at a place (3,)."""
-        by = self.prior.times_transposed_root(self.relative_movement(pair, at_mm).T)
+        by = self._relative_twists(pair, at_mm).reshape(6, 12)
+        return by @ self._middle_covariance[np.ix_(pair, range(6), pair, range(6))].reshape(12, 12) @ by.T
+
+    def _relative_twists(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
+        """Return the derivatives (6, 2, 6) of this motion by the corrections in the middle of both pieces."""
+        result = np.zeros((6, 2, 6))
+        for column, number, sign in zip((0, 1), pair, (-1.0, 1.0), strict=True):
+            piece = self.pieces[number]
+            platform = piece.platform_mm[piece.middle_patch]
+            platform = platform + self.corrections(piece.times_s[[piece.middle_patch]])[0, :3]
+            result[:3, column] = sign * rigid_derivatives(at_mm, np.eye(3), platform)
+            result[3:, column, 3:] = sign * np.eye(3)
+        return result
+
+    @cached_property
+    def _middles_s(self) -> np.ndarray:
+        """Times (N,) of the middle patches of all pieces, s."""
+        return np.array([piece.times_s[piece.middle_patch] for piece in self.pieces])
+
+    @cached_property
+    def _middle_covariance(self) -> np.ndarray:
+        """Covariance (N, 6, N, 6) of the corrections in the middle of all N pieces."""
+        basis = self.prior.basis(self._middles_s)
+        by = self.prior.times_transposed_root(np.einsum("ij,pc->icpj", np.eye(6), basis).reshape(len(self.values), -1))
         half = solve_triangular(self.factor, by, lower=True, check_finite=False)
-        return half.T @ half
+        return (half.T @ half).reshape(len(basis), 6, len(basis), 6)
 
     @cached_property
     def covariance(self) -> np.ndarray:

@@ -116,19 +116,31 @@ class PathPrior:
         """Return the lower Cholesky factor (6 C, 6 C) of the normal matrix of the whitened coordinates.
 
         ``normal`` (6 C, 6 C) is that of the values without prior. Coordinates after the last node that it contains keep
-        their prior.
+        their prior, except those of a heading that positions are dead-reckoned with.
         """
-        if self.drift.dead_reckoned:
-            half = self.times_transposed_root(normal)
-            return np.linalg.cholesky(np.eye(len(normal)) + self.times_transposed_root(half.T))
         seen = np.flatnonzero(normal.any(axis=0)) % self.count
         count = 1 + int(np.flatnonzero(np.isin(self.order, seen)).max(initial=0))
         of_component = self.count * np.arange(6)[:, None]
         nodes, numbers = (of_component + self.order[:count]).ravel(), (of_component + np.arange(count)).ravel()
-        half = self._times_triangles(normal[np.ix_(nodes, nodes)], transposed=True)
-        inner = self._times_triangles(half.reshape(6 * count, -1).T, transposed=True).reshape(6 * count, -1)
+        aside = None
+        if self.drift.dead_reckoned:
+            numbers = np.append(numbers[: 5 * count], 5 * self.count + np.arange(self.count))
+            # Position changes (2, N, C) at the first N nodes per unit of each whitened coordinate of the heading.
+            aside = self._turned[:, self.order[:count, None], self.order] @ self._roots[5]
+
+        def times_seen_root(matrix: np.ndarray) -> np.ndarray:
+            parts = matrix.reshape(6, count, -1)
+            result = self._times_triangles(parts, transposed=True).reshape(matrix.shape)
+            if aside is not None:
+                heading = aside[0].T @ parts[1] - aside[1].T @ parts[0]
+                heading[:count] += result[5 * count :]
+                result = np.vstack([result[: 5 * count], heading])
+            return result
+
+        inner = times_seen_root(times_seen_root(normal[np.ix_(nodes, nodes)]).T)
+        inner[np.diag_indices(len(inner))] += 1
         result = np.eye(len(normal))
-        result[np.ix_(numbers, numbers)] = np.linalg.cholesky(np.eye(6 * count) + inner)
+        result[np.ix_(numbers, numbers)] = np.linalg.cholesky(inner)
         return result
 
     @cached_property

@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve, eigh, solve_triangular
-from scipy.sparse import csr_array
+from scipy.linalg import cho_solve, get_lapack_funcs, solve_triangular
+from scipy.sparse import csr_array, vstack
 
 from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.drift_model import DriftModel, candidates_beside
@@ -27,6 +28,7 @@ from uwlts.fitting.patches import (
     slope_information,
 )
 
+_pivoted_cholesky: Any = get_lapack_funcs("pstrf", dtype=np.float64)
 _NEGLIGIBLE = 1e-3
 """Information of all nodes together in units of the drift's variance, below which an observation shows nothing."""
 
@@ -70,16 +72,32 @@ def bring_together(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstima
 
 
 def refine_nodes(estimate: PathEstimate) -> PathEstimate:
-    """Return the same correction with dense nodes where pairs overlap; `solve` continues from it."""
-    survey, options, times = estimate.survey, estimate.options, []
+    """Return the same correction with dense nodes where pairs overlap; `solve` continues from it.
+
+    Between nodes, the drift deviates from a straight line by less than the noise of patches, or the spacing is
+    ``node_spacing``.
+    """
+    survey, options, drift = estimate.survey, estimate.options, estimate.prior.drift
+    even = PathPrior.from_times(survey.moments_s, drift, estimate.prior.trajectory, intervals=options.intervals)
+    times, std, arms = [], [], []
     for earlier, later in estimate.pairs:
         found, _ = estimate.measure_distances((earlier, later))
-        times += [estimate.pieces[later].times_s[found.source], estimate.pieces[earlier].times_s[found.target]]
-    step = options.node_spacing * survey.radius_mm / survey.speed_mm_s
-    even = PathPrior.from_times(
-        survey.moments_s, estimate.prior.drift, estimate.prior.trajectory, intervals=options.intervals
-    )
-    return _change_prior(estimate, even.with_nodes(np.concatenate([[], *times]), step, most=options.most_nodes))
+        std += found.std_mm.tolist()
+        for number, at in ((later, found.source), (earlier, found.target)):
+            piece = estimate.pieces[number]
+            times += piece.times_s[at].tolist()
+            arms += np.linalg.norm(piece.places_mm[at] - piece.platform_mm[at], axis=1).tolist()
+    if not times:
+        return _change_prior(estimate, even)
+    noise, arm = np.median(std), np.median(arms)
+    lasting = float(np.ptp(even.nodes_s))
+    step = options.node_spacing * estimate.half_s
+    while 2 * step < lasting / options.intervals:
+        deviation = drift.deviation(2 * step / lasting)
+        if np.hypot(deviation[:3].max(), arm * deviation[3:].max()) > noise:
+            break
+        step *= 2
+    return _change_prior(estimate, even.with_nodes(np.array(times), step, most=options.most_nodes))
 
 
 def refit(estimate: PathEstimate, numbers: Iterable[int]) -> PathEstimate:
@@ -100,41 +118,46 @@ def settle(estimate: PathEstimate) -> PathEstimate:
     estimate = solve(refine_nodes(estimate))
     crossing, selected = {number for pair in estimate.pairs for number in pair}, False
     for _ in range(estimate.options.refits):
-        before, drift = estimate.numbers, estimate.prior.drift
-        estimate = estimate if selected else _select_drift(estimate)
-        selected = estimate.prior.drift is drift
-        estimate = solve(refit(estimate, crossing))
-        if _step_size(estimate, before) < estimate.options.settled:
+        if not selected:
+            drift, estimate = estimate.prior.drift, select_drift(estimate)
+            selected = estimate.prior.drift is drift
+        before, estimate = estimate.numbers, solve(refit(estimate, crossing))
+        if selected and _step_size(estimate, before) < estimate.options.settled:
             break
     agreeing = tuple(pair for pair in estimate.pairs if estimate.agrees(pair))
     return estimate if len(agreeing) == len(estimate.pairs) else settle(replace(estimate, pairs=agreeing))
 
 
-def _select_drift(estimate: PathEstimate) -> PathEstimate:
+def select_drift(estimate: PathEstimate, *, walk_only: bool = False) -> PathEstimate:
     """Select random walk and rates of maximum marginal likelihood, by ascent from the present ones, unless stated.
 
-    The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992). A normal matrix V L V^T corresponds
-    to observations L^(1/2) V^T x of the path x with unit noise. Their covariance is I + L^(1/2) V^T P V L^(1/2) for a
-    prior covariance P.
+    With ``walk_only``, the rates are kept. A new drift has its own nodes and is without a solution.
+
+    The path is marginalised (empirical Bayes: MacKay, Neural Computation 4, 1992). A normal matrix B B^T corresponds
+    to observations B^T x of the path x with unit noise. Their covariance is I + B^T P B for a prior covariance P.
     """
     prior, drift = estimate.prior, estimate.prior.drift
+    if drift.stated or not estimate.pairs:
+        return estimate
     normal, right = _normal_equations(estimate)
     near = np.flatnonzero(normal.any(axis=0))
-    if drift.stated or not len(near):
+    if not len(near):
         return estimate
-    size = np.repeat(drift.std, prior.count)
-    values, vectors = eigh(size[near, None] * normal[np.ix_(near, near)] * size[near])
-    used = values > _NEGLIGIBLE / len(near)
-    root = np.sqrt(values[used])
-    by = np.zeros((len(size), len(root)))
-    by[near] = vectors[:, used] * root / size[near, None]
-    seen = (vectors[:, used].T @ (size[near] * right[near, 0])) / root
+    size = np.repeat(drift.std, prior.count)[near]
+    # Cholesky factor with pivots, which ends before negligible observations.
+    packed, order, rank, _ = _pivoted_cholesky(
+        size[:, None] * normal[np.ix_(near, near)] * size, tol=_NEGLIGIBLE / len(near), lower=1
+    )
+    half, order = np.tril(packed)[:, :rank], order - 1
+    seen = solve_triangular(half[:rank], (size * right[near, 0])[order[:rank]], lower=True, check_finite=False)
+    by = np.zeros((len(normal), rank))
+    by[near[order]] = half / size[order, None]
     nodes, at = np.unique(near % prior.count), prior.nodes_s - prior.nodes_s[0]
     parts = by.reshape(6, prior.count, -1)[:, nodes]
 
     def observed(model: DriftModel) -> np.ndarray:
-        half = model.covariance(at[nodes, None], at[nodes], at[-1]) @ parts
-        return parts.reshape(-1, len(root)).T @ half.reshape(-1, len(root))
+        each = model.covariance(at[nodes, None], at[nodes], at[-1]) @ parts
+        return parts.reshape(-1, rank).T @ each.reshape(-1, rank)
 
     walk = observed(replace(drift, walk=np.ones(6)))
 
@@ -148,16 +171,18 @@ def _select_drift(estimate: PathEstimate) -> PathEstimate:
     def twice_log_likelihood(number: int) -> float:
         model = models[number]
         covariance = (1 - model.walk[0]) * by_rates(model.correlation, model.smooth) + model.walk[0] * walk
-        covariance[np.diag_indices(len(root))] += 1
+        covariance[np.diag_indices(rank)] += 1
         factor = np.linalg.cholesky(covariance)
         off = solve_triangular(factor, seen, lower=True, check_finite=False)
         return float(-np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor))))
 
     described = (drift.correlation, drift.smooth, drift.walk[0])
     own = best = [(each.correlation, each.smooth, each.walk[0]) for each in models].index(described)
-    while (better := max(candidates_beside(best), key=twice_log_likelihood)) != best:
+    while (better := max(candidates_beside(best, walk_only=walk_only), key=twice_log_likelihood)) != best:
         best = better
-    return estimate if best == own else _change_prior(estimate, replace(prior, drift=models[best]))
+    if best == own:
+        return estimate
+    return refine_nodes(_change_prior(estimate, replace(prior, drift=models[best])))
 
 
 def _change_prior(estimate: PathEstimate, prior: PathPrior) -> PathEstimate:
@@ -183,12 +208,17 @@ def _solve_step(estimate: PathEstimate, normal: np.ndarray, right: np.ndarray) -
 def _normal_equations(estimate: PathEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal matrix (6 C, 6 C) and right-hand side (6 C, 1) of the values from all pairs, without prior."""
     count = len(estimate.values)
-    total, gradient = csr_array((count, count)), np.zeros(count)
-    for pair in estimate.pairs:
-        for derivatives, weight, distance_mm in _linearise_pair(estimate, pair):
-            total += derivatives.T @ derivatives.multiply(weight[:, None]).tocsr()
-            gradient += derivatives.T @ (weight * distance_mm)
-    return total.toarray(), (total @ estimate.values - gradient)[:, None]
+    parts = [part for pair in estimate.pairs for part in _linearise_pair(estimate, pair)]
+    if not parts:
+        return np.zeros((count, count)), np.zeros((count, 1))
+    derivatives = csr_array(vstack([derivatives for derivatives, _, _ in parts]))
+    derivatives.sum_duplicates()
+    derivatives.eliminate_zeros()
+    weight = np.concatenate([weight for _, weight, _ in parts])
+    distance_mm = np.concatenate([distance_mm for _, _, distance_mm in parts])
+    weighted = derivatives.multiply(weight[:, None]).tocsr()
+    total = (derivatives.T @ weighted).toarray()
+    return total, (total @ estimate.values - weighted.T @ distance_mm)[:, None]
 
 
 def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_array, np.ndarray, np.ndarray]]:
@@ -209,22 +239,24 @@ def _linearise_pair(estimate: PathEstimate, pair: Pair) -> Iterator[tuple[csr_ar
     middle = np.vstack([used.places_mm for _, _, used, _ in ways]).mean(axis=0)
     twists = [rigid_derivatives(used.places_mm, used.normals, middle) for _, _, used, _ in ways]
     observable = _observable_projection([(*way[2:], twist) for way, twist in zip(ways, twists, strict=True)], middle)
-    component = estimate.prior.count * np.arange(6)
+    component, half_s = estimate.prior.count * np.arange(6), estimate.half_s
     for (source, target, used, weight), twist in zip(ways, twists, strict=True):
         seen, columns, values = twist @ observable, [], []
         for number, at, sign in ((source, used.source, 1.0), (target, used.target, -1.0)):
             piece, by = estimate.pieces[number], seen.copy()
             # Points off the centre of a patch were measured slightly earlier or later.
             off = used.places_mm - estimate.surface(number).places_mm[at]
-            later = np.einsum("qi,qi->q", piece.slopes_s_mm[at], off)
-            times = piece.times_s[at] + later
+            later, times = np.einsum("qi,qi->q", piece.slopes_s_mm[at], off), piece.times_s[at]
             # Rotations of the path are about the platform.
             platform = piece.platform_mm[at] + later[:, None] * piece.velocity_mm_s[at]
             by[:, 3:] += np.cross(middle - platform - estimate.corrections(times)[:, :3], by[:, :3])
-            before, after = estimate.prior.weights(times)
-            for node, share in ((before, 1 - after), (before + 1, after)):
-                columns.append(node[:, None] + component)
-                values.append(sign * share[:, None] * by)
+            # The surface of a patch moves with the rates averaged over it.
+            tilt = later / (2 * half_s)
+            for moment, part in ((times, 1.0), (times + half_s, tilt), (times - half_s, -tilt)):
+                before, after = estimate.prior.weights(moment)
+                for node, share in ((before, part * (1 - after)), (before + 1, part * after)):
+                    columns.append(node[:, None] + component)
+                    values.append(sign * share[:, None] * by)
         ends = np.arange(0, 6 * len(columns) * len(weight) + 1, 6 * len(columns))
         places = np.hstack(values).ravel(), np.hstack(columns).ravel(), ends
         yield csr_array(places, shape=(len(weight), len(estimate.values))), weight, used.distance_mm

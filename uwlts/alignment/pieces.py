@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -92,6 +93,11 @@ class Piece:
     def middle_s(self) -> float:
         """Median time of the piece, s."""
         return float(np.median(self.times_s))
+
+    @cached_property
+    def middle_patch(self) -> int:
+        """Number of the patch nearest to the median time."""
+        return int(np.argmin(np.abs(self.times_s - self.middle_s)))
 
     def along(self, corrections: np.ndarray, rates: np.ndarray) -> Patches:
         """Return the patches along the path with corrections (P, 6) and their rates per second (P, 6).

@@ -249,16 +249,17 @@ def _fit_discs(discs: _Discs, axes: np.ndarray, radius: float) -> _DiscFit:
     weight = discs.weight
     u, v, w = np.einsum("pij,pkj->ipk", axes, discs.about_mm) / radius
     columns = _columns(u, v)
-    normal = np.einsum("pka,pk,pkb->pab", columns, weight, columns)
+    weighted = weight[:, :, None] * columns
+    normal = weighted.transpose(0, 2, 1) @ columns
     # Points on a line leave second-order terms undetermined. A ridge of 1e-6 of the total weight sets these to zero.
     ridge = 1e-6 * weight.sum(axis=1)[:, None, None] * np.eye(6)
     inverse = np.linalg.inv(normal + ridge)
-    shape = np.einsum("pab,pkb,pk,pk->pa", inverse, columns, weight, w)
-    left = np.where(discs.held, w - np.einsum("pka,pa->pk", columns, shape), 0.0)
+    shape = (inverse @ (weighted.transpose(0, 2, 1) @ w[:, :, None]))[:, :, 0]
+    left = np.where(discs.held, w - (columns @ shape[:, :, None])[:, :, 0], 0.0)
     freedom = np.maximum(discs.held.sum(axis=1) - 6, 1)
     # Variance of one point: the variance of an average of n points is 1/n of it.
-    variance = np.einsum("pk,pk,pk->p", weight, left, left) / freedom
-    heights = np.einsum("pb,pkb,pk->pk", inverse[:, 0], columns, weight)
+    variance = np.sum(weight * left**2, axis=1) / freedom
+    heights = (weighted @ inverse[:, 0, :, None])[:, :, 0]
     return _DiscFit(shape, inverse, variance, heights.astype(np.float32))
 
 
@@ -345,7 +346,8 @@ def distances_between(
     good = (facing > _SAME_WAY) & (np.hypot(u, v) < target.radius_mm) & (np.abs(distance) < reach_mm)
     rows, nearest, columns = rows[good], nearest[good], columns[good]
     covariance = target.covariance[nearest]
-    variance = source.covariance[rows, 0, 0] + np.einsum("qa,qab,qb->q", columns, covariance, columns)
+    of_target = np.einsum("qa,qa->q", columns, (covariance @ columns[:, :, None])[:, :, 0])
+    variance = source.covariance[rows, 0, 0] + of_target
     variance += source.image_variance_mm2[rows] + target.image_variance_mm2[nearest]
     return PatchDistances(
         rows,
@@ -467,7 +469,7 @@ def _principal_frames(about: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return right-handed principal axes (rows of (P, 3, 3)) of weighted points (P, K, 3), the normal last."""
     middle = np.einsum("pk,pki->pi", weight, about) / weight.sum(axis=1)[:, None]
     centred = about - middle[:, None]
-    vectors = np.linalg.eigh(np.einsum("pk,pki,pkj->pij", weight, centred, centred))[1]
+    vectors = np.linalg.eigh((weight[:, :, None] * centred).transpose(0, 2, 1) @ centred)[1]
     first, normal = vectors[:, :, 2], vectors[:, :, 0]
     return np.stack([first, np.cross(normal, first), normal], axis=1)
 

@@ -31,8 +31,11 @@ from uwlts.storage.hdf5_file import DAMAGE, find_dataset, require_small_chunks
 Format = Literal["webdataset", "hdf5"]
 SUFFIXES: dict[Format, str] = {"webdataset": ".tar", "hdf5": ".h5"}
 _PICTURES = ("mask", "object_map")
-_PNG_EFFORT = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-"""Level of compression. Noise is incompressible: higher levels save a few percent and take several times longer."""
+_PNG_UNFILTERED = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
+_NOISY = [*_PNG_UNFILTERED, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+"""PNG of an image. Noise has no repetitions and no gradients: a search for them takes longer and saves nothing."""
+_UNIFORM = [*_PNG_UNFILTERED, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+"""PNG of a map of few values, which consists of runs."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +79,10 @@ class _TarWriter:
 
     def add(self, sample: Sample) -> None:
         """Write a sample."""
-        self._write_member(f"{sample.key}.png", _png(sample.image))
+        self._write_member(f"{sample.key}.png", _png(sample.image, _NOISY))
         for name, values in sample.arrays.items():
             if name in _PICTURES:
-                self._write_member(f"{sample.key}.{name}.png", _png(values))
+                self._write_member(f"{sample.key}.{name}.png", _png(values, _UNIFORM))
             else:
                 self._write_member(f"{sample.key}.{name}.npy", _npy(values))
         self._write_member(f"{sample.key}.json", json.dumps(sample.info, allow_nan=False).encode())
@@ -115,8 +118,8 @@ class _Hdf5Writer:
             self._file.create_dataset(name, data=np.array(texts, dtype=np.bytes_), chunks=(1,), compression="gzip")
 
 
-def _png(values: np.ndarray) -> bytes:
-    return cv2.imencode(".png", values, _PNG_EFFORT)[1].tobytes()
+def _png(values: np.ndarray, settings: list[int]) -> bytes:
+    return cv2.imencode(".png", values, settings)[1].tobytes()
 
 
 def _npy(values: np.ndarray) -> bytes:

@@ -21,7 +21,13 @@ from uwlts.alignment.crossing_search import (
 from uwlts.alignment.drift_model import DriftModel
 from uwlts.alignment.path_estimate import PathEstimate
 from uwlts.alignment.path_prior import PathPrior
-from uwlts.alignment.path_solution import _linearise_pair, _observable_projection, initial_estimate, settle
+from uwlts.alignment.path_solution import (
+    _linearise_pair,
+    _observable_projection,
+    initial_estimate,
+    refine_nodes,
+    settle,
+)
 from uwlts.alignment.pieces import Survey
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import distances_between, rigid_derivatives
@@ -213,6 +219,56 @@ def test_distances_change_by_their_derivatives(turned_deg: float):
         expected, seen = (by @ values)[first], moved.distance_mm[second] - before[first]
         # Some patches are matched with others after the motion.
         assert np.median(np.abs(seen - expected)) < 0.03 * np.std(expected)
+
+
+def test_distances_change_by_their_derivatives_with_several_nodes_in_a_patch():
+    estimate = two_passes()
+    step = estimate.half_s / 2
+    prior = estimate.prior.with_nodes(np.linspace(0, SECONDS, 1000), step, most=1000)
+    assert prior.count > 0.9 * SECONDS / step
+    values = 0.02 * np.repeat([1, 1, 1, 2e-3, 2e-3, 2e-3], prior.count)
+    values *= np.random.default_rng(2).standard_normal(len(values))
+    dense = replace(estimate, prior=prior, values=np.zeros(len(values)))
+    for (source, target), (by, _, before) in zip(
+        (CROSSING[::-1], CROSSING), _linearise_pair(dense, CROSSING), strict=True
+    ):
+        found, held_out = dense.distances(source, target, reach_mm=dense.reach_mm)
+        moved, _ = replace(dense, values=values).distances(source, target, reach_mm=dense.reach_mm)
+        _, first, second = np.intersect1d(found[~held_out].source, moved.source, return_indices=True)
+        expected, seen = (by @ values)[first], moved.distance_mm[second] - before[first]
+        same = found[~held_out].target[first] == moved.target[second]
+        assert np.count_nonzero(same) > 50
+        assert np.median(np.abs(seen - expected)[same]) < 0.03 * np.std(expected)
+
+
+def test_the_search_selects_the_walk_but_keeps_the_rates():
+    estimate = two_passes((15.0, -21.0, 9.0))
+    drift = DriftModel.of_size(30.0, 0.001)
+    search = accept_crossings(replace(estimate, prior=replace(estimate.prior, drift=drift)))
+    found = search.estimate.prior.drift
+    assert CROSSING in search.estimate.pairs
+    # The drift is a constant rate.
+    assert (found.walk < drift.walk).all()
+    assert (found.correlation, found.smooth, found.stated) == (drift.correlation, drift.smooth, False)
+
+
+def test_nodes_are_as_far_apart_as_the_drift_permits():
+    estimate = replace(two_passes(), pairs=(CROSSING,), options=AlignmentOptions(intervals=10))
+    found, _ = estimate.measure_distances(CROSSING)
+    noise, counts = np.median(found.std_mm), []
+    for walk in (1e-12, 1e-5, 1e-4, 1e-3, 0.1):
+        drift = replace(estimate.prior.drift, walk=np.full(6, walk))
+        refined = refine_nodes(replace(estimate, prior=replace(estimate.prior, drift=drift)))
+        step = float(np.diff(refined.prior.nodes_s).min())
+        counts.append(refined.prior.count)
+        least = estimate.options.node_spacing * estimate.half_s
+        assert step > 0.99 * least
+        if step > 1.01 * least:
+            # At the middle of a step, a random walk deviates by half the root of its variance over the step.
+            assert STD[0] * np.sqrt(walk * step / SECONDS) / 2 < noise
+        if step < SECONDS / 10 / 4:
+            assert STD[0] * np.sqrt(walk * 2 * step / SECONDS) / 2 > 0.9 * noise
+    assert counts == sorted(counts) and len(set(counts)) > 2
 
 
 @pytest.mark.parametrize("along_deg", [0.0, 37.0])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.alignment.drift_model import DriftModel, choose_drift_model
+from uwlts.alignment.drift_model import RATES, DriftModel, candidates_beside, choose_drift_model
 from uwlts.errors import EvaluationError
 from uwlts.model.trajectory import Trajectory
 
@@ -98,6 +98,30 @@ def test_a_path_without_covariance_needs_the_size_of_its_drift():
         choose_drift_model(Trajectory(path.times_s, path.poses), None, None)
     with pytest.raises(EvaluationError, match="give both"):
         choose_drift_model(path, 300.0, None)
+
+
+@pytest.mark.parametrize(("correlation", "smooth"), [(0.03, False), (1.0, False), (0.3, True), (np.inf, False)])
+def test_a_drift_deviates_from_a_straight_line_by_its_covariance(correlation: float, smooth: bool):
+    drift = DriftModel(
+        np.arange(1.0, 7.0), np.array([0.0, 1e-4, 0.01, 0.1, 0.5, 1.0]), correlation, smooth, False, False
+    )
+    for step in (0.01, 0.2):
+        t = np.array([0.5, 0.5 + step / 2, 0.5 + step])
+        line = np.array([-0.5, 1.0, -0.5])
+        expected = line @ drift.covariance(t[:, None], t, 1.0) @ line
+        np.testing.assert_allclose(drift.deviation(step) ** 2, expected, rtol=1e-3, atol=1e-12)
+
+
+def test_candidates_beside_another_keep_its_rates_if_only_the_walk_is_selected():
+    models = DriftModel.of_size(300.0, 1.0).candidates()
+    described = [(each.correlation, each.smooth, each.walk[0]) for each in models]
+    own = described.index((1.0, False, 0.01))
+    walks = {described[number] for number in candidates_beside(own, walk_only=True)}
+    assert walks == {(1.0, False, share) for share in (0.003, 0.01, 0.03)}
+    both = {described[number] for number in candidates_beside(own, walk_only=False)}
+    assert both == walks | {(*rate, 0.01) for rate in RATES}
+    # The smallest walk has one neighbour.
+    assert len(candidates_beside(described.index((1.0, False, 0.0)), walk_only=True)) == 2
 
 
 @pytest.mark.parametrize("correlation", [None, 0.1, 0.3, 1.0, np.inf])

@@ -117,3 +117,16 @@ def test_the_root_is_one_of_the_covariance(dead_reckoned: bool):
     expected = np.eye(count) + root.T @ normal @ root
     factor = prior.factor(normal)
     np.testing.assert_allclose(factor @ factor.T, expected, rtol=1e-6, atol=1e-6 * expected.max())
+
+
+@pytest.mark.parametrize("dead_reckoned", [False, True])
+def test_observations_between_some_nodes_add_to_the_prior(dead_reckoned: bool):
+    even = prior_of(dead_reckoned=dead_reckoned)
+    prior = even.with_nodes(np.concatenate([np.linspace(4, 5, 50), np.linspace(14, 15, 50)]), 0.1, most=400)
+    times, rng = np.append(np.linspace(4, 5, 30), np.linspace(14, 15, 30)), np.random.default_rng(3)
+    by = np.einsum("qi,qc->qic", rng.standard_normal((60, 6)) / STD, prior.basis(times)).reshape(60, -1)
+    normal = by.T @ by
+    factor = prior.factor(normal)
+    root = prior.times_root(np.eye(6 * prior.count))
+    np.testing.assert_allclose(factor, np.tril(factor))
+    np.testing.assert_allclose(factor @ factor.T, np.eye(len(root)) + root.T @ normal @ root, atol=1e-9)
