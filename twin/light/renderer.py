@@ -417,7 +417,8 @@ class Renderer:
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
                 if index == 0 and moment is pose and self._scatters:
-                    surfaces = self._surfaces(pose, segment, ends)
+                    if self.effects.multiple_scattering:
+                        surfaces = self._surfaces(pose, segment, ends)
                     for light, here in zip(sources, ends, strict=True):
                         crossed = self._crossing(light, bundle)
                         scattered += compute_haze(crossed, light, self.objects.scene, segment, here)
