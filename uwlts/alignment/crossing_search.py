@@ -19,7 +19,15 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
-from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nodes, refit, select_drift, solve
+from uwlts.alignment.path_solution import (
+    Hypothesis,
+    bring_together,
+    refine_nodes,
+    refit,
+    select_drift,
+    solve,
+    with_drift,
+)
 from uwlts.fitting.least_squares import rms_distance
 from uwlts.fitting.shapes import perpendicular_to
 from uwlts.model.calibration import rigid_transform
@@ -56,6 +64,7 @@ def accept_crossings(estimate: PathEstimate, progress: ProgressListener = ignore
             closed = accept_hypothesis(estimate, best)
             if closed is None:
                 continue
+            closed = _select_walk(closed)
             if _has_rival(
                 estimate, closed, best, [each for each in waiting if _is_beside(each.pair, [best.pair], ahead)]
             ):
@@ -161,7 +170,11 @@ def _is_likely(estimate: PathEstimate, seen: Hypothesis) -> bool:
 
 
 def _has_rival(before: PathEstimate, closed: PathEstimate, best: Hypothesis, beside: list[Hypothesis]) -> bool:
-    """Check whether another hypothesis contradicts the accepted one and fits the previous estimate as well."""
+    """Check whether another hypothesis contradicts the accepted one and fits the previous estimate as well.
+
+    Both have the drift that was selected with the accepted one.
+    """
+    before = with_drift(before, closed.prior.drift)
     for rival in beside:
         if rival.patches < before.options.rival_share * best.patches or _is_likely(closed, rival):
             continue

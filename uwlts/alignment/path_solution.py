@@ -180,9 +180,12 @@ def select_drift(estimate: PathEstimate, *, walk_only: bool = False) -> PathEsti
     own = best = [(each.correlation, each.smooth, each.walk[0]) for each in models].index(described)
     while (better := max(candidates_beside(best, walk_only=walk_only), key=twice_log_likelihood)) != best:
         best = better
-    if best == own:
-        return estimate
-    return refine_nodes(_change_prior(estimate, replace(prior, drift=models[best])))
+    return estimate if best == own else refine_nodes(with_drift(estimate, models[best]))
+
+
+def with_drift(estimate: PathEstimate, drift: DriftModel) -> PathEstimate:
+    """Return the same correction with another drift, without a solution."""
+    return _change_prior(estimate, replace(estimate.prior, drift=drift))
 
 
 def _change_prior(estimate: PathEstimate, prior: PathPrior) -> PathEstimate:
