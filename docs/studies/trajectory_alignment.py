@@ -7,7 +7,7 @@ The vehicle and the sea bed are those of `tests/uwlts/path_views.py`, with a dri
 the drift is given to the alignment. ``--walk`` adds a random walk, a multiple of the drift; ``--loop`` uses 4 m with
 one crossing. With ``--navigation``, vehicle, sea and navigation are those of `scenes/vehicle-pass.toml`, and the
 navigation states its covariance. ``--crossings-given`` closes the crossings at their true poses instead of searching
-for them, with fewer nodes: a tenth of the time. First it prints the factors (`bounds`) that three exact crossings can
+for them, with fewer nodes. First it prints the factors (`bounds`) that three exact crossings can
 reduce the path error by, for several kinds of drift.
 """
 
@@ -155,7 +155,7 @@ def given_crossings(
 ) -> str:
     """Return, as text, errors of the path with each crossing closed at its true pose, without a search.
 
-    Fewer nodes than usual take a tenth of the time. They cannot follow a random walk within a crossing.
+    The few nodes cannot follow a random walk within a crossing.
     """
     assert cloud.time_s is not None
     options = AlignmentOptions(intervals=50, most_nodes=120)
