@@ -180,7 +180,7 @@ def point_uncertainty(
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     by_stage = np.vstack([stage_components(known, calibration, header, root), np.zeros(3)])
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
-    frame_by = -known.frame_by() if mount_by is None else _rotate_to_sensor(mount_by, header)
+    frame_by = -known.frame_by if mount_by is None else _rotate_to_sensor(mount_by, header)
     rigid = frame_by @ root[: frame_by.shape[1]]
     rigid[0, -1] = _window_shift_std_mm(sensor) if mount_by is None else 0.0
     exact = partial(_derivatives, known, root, rigid)
@@ -329,7 +329,7 @@ def stage_components(
     within = sum((np.outer(root[keys.index(key)], ways[key]) for key in calibrated), np.zeros((root.shape[1], 3)))
     if found is not None:
         # An estimated direction turns with the OCS, a described one does not.
-        within = within - np.cross((known.frame_by()[3:] @ root).T, described)
+        within = within - np.cross((known.frame_by[3:] @ root).T, described)
     besides = [std[key] * way for key, way in ways.items() if key not in calibrated]
     besides.append(known.parameters.value(known.values, StageParameter.SCALE) * described)
     return np.vstack([within, *besides])

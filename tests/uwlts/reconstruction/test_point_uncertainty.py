@@ -441,20 +441,23 @@ def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, th
         np.linalg.cholesky(covariance + 1e-24 * np.eye(len(covariance))),
     )
     place = parameters.keys.index(StageParameter.SCALE)
-    along = covariance[place, place] + values[place] ** 2
     lean = np.tan(np.radians(thesis.uncertainty.stage_alignment_deg))
-    beside = lean**2 * np.eye(2)
+    expected = np.zeros((3, 3))
     if calibrated:
-        turn, seen = calibration.object_transform()[:3, :3], []
-        for drawn in np.random.default_rng(5).multivariate_normal(values, covariance, DRAWS, method="svd"):
-            # The estimated direction is fixed in the camera frame.
-            seen.append(own_frame(known, drawn)[:3, :3].T @ turn @ [1.0, *drawn[-2:]])
-        beside = np.cov(np.transpose(seen)[1:])
-    by_stage = found.T @ found
-    assert by_stage[0, 0] == pytest.approx(along, rel=1e-6)
-    # A covariance of 400 draws is right to 5 to 7 % (one sigma).
-    size = np.sqrt(np.diag(beside))
-    assert np.all(np.abs(by_stage[1:, 1:] - beside) < 0.3 * np.outer(size, size))
+        # The estimated direction is fixed in the camera frame.
+        turn, steps, by = calibration.object_transform()[:3, :3], 1e-5 * np.eye(len(values)), []
+        for step in steps:
+            after, before = (
+                own_frame(known, each)[:3, :3].T @ turn @ [1.0 + each[place], *each[-2:]]
+                for each in (values + step, values - step)
+            )
+            by.append((after - before) / 2e-5)
+        expected = np.transpose(by) @ covariance @ by
+    else:
+        expected[0, 0] = covariance[place, place]
+        expected[1:, 1:] = lean**2 * np.eye(2)
+    expected[0, 0] += values[place] ** 2
+    np.testing.assert_allclose(found.T @ found, expected, rtol=1e-6, atol=1e-15)
 
 
 def test_a_sequential_calibration_gives_no_uncertainty(calibration, thesis):
@@ -474,8 +477,12 @@ def test_residual_shifts_by_blur_and_stray_light_are_common_to_all_points(calibr
     # Any part of what blur may do is as likely; the sheet's thickness, known to 10 %, counts by its square.
     added = [per_px * blur[:, None] / np.sqrt(3), 0.2 * beside]
     expected = sum(np.stack([each[:, i] * each[:, j] for i, j in PAIRS], axis=1) for each in added)
-    # Patterns that move the points by less than 0.05 um together are left out; variances of 0.3 mm2 are float32.
-    np.testing.assert_allclose(known.systematic_mm2() - plain.systematic_mm2(), expected, atol=3e-7, rtol=1e-2)
+    # Patterns that move the points by less than 0.05 um together are left out.
+    together = [each.patterns_mm.astype(float) for each in (known, plain)]
+    variances = [
+        np.stack([np.sum(each[:, :, i] * each[:, :, j], axis=0) for i, j in PAIRS], axis=1) for each in together
+    ]
+    np.testing.assert_allclose(variances[0] - variances[1], expected, atol=1e-7, rtol=1e-2)
 
 
 def test_water_does_not_drift_before_its_own_scan(calibration, stripes, thesis, tmp_path):

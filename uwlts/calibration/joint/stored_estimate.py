@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from pydantic import JsonValue
@@ -158,8 +159,9 @@ class StoredEstimate:
         frame = self.calibration.object_transform()
         return (found.points.T - frame[:3, 3]) @ frame[:3, :3], np.einsum("ji,njr->nir", frame[:3, :3], found.by)
 
+    @cached_property
     def frame_by(self) -> np.ndarray:
-        """Return derivatives (6, P) of the OCS by the parameters: shift, mm, and rotation, rad, along its own axes.
+        """Derivatives (6, P) of the OCS by the parameters: shift, mm, and rotation, rad, along its own axes.
 
         The OCS is defined by the sheet, so it changes with the sheet's parameters.
         """

@@ -122,7 +122,7 @@ def _add_sensor_uncertainty(
     besides = known.covariance.copy()
     besides[:count, :count] -= joint.covariance_matrix()
     apart = own + by_parameters @ besides @ by_parameters.T
-    in_true_frame, frame = by_parameters.copy(), known.frame_by()
+    in_true_frame, frame = by_parameters.copy(), known.frame_by
     in_true_frame[:6] += np.vstack([rotation @ frame[:3], rotation @ frame[3:]])
     total = own + in_true_frame @ known.covariance @ in_true_frame.T
     share = SensorShare(
