@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+Profile = Literal["cosine", "paraboloid", "bell", "pan"]
 PROFILES = {
     "cosine": lambda t: 0.5 * (1 + np.cos(np.pi * np.minimum(t, 1))),
     "paraboloid": lambda t: np.maximum(1 - t * t, 0),
@@ -32,7 +33,7 @@ class Bump:
     angle: float
     diameter_mm: float
     height_mm: float
-    profile: Literal["cosine", "paraboloid", "bell", "pan"] = "cosine"
+    profile: Profile = "cosine"
 
     def heights(self, along_mm: np.ndarray, angle: np.ndarray, radius_mm: float) -> np.ndarray:
         """Return heights (N,) above the plain pipe at positions along and around it."""
@@ -65,6 +66,59 @@ class WeldBead:
             length = along_mm
         crest = self.height_mm + self.ripple_mm * np.sin(2 * np.pi * length / 6.0)
         return crest * np.maximum(1 - np.square(2 * across / self.width_mm), 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gouge:
+    """A groove of parabolic section along a helix: middle (mm along, rad around), direction, length, width and depth.
+
+    ``turn`` is the angle of its direction to the pipe's axis, rad. Its ends run out over a width.
+    """
+
+    along_mm: float
+    angle: float
+    turn: float
+    length_mm: float
+    width_mm: float
+    depth_mm: float
+
+    def heights(self, along_mm: np.ndarray, angle: np.ndarray, radius_mm: float) -> np.ndarray:
+        """Return heights (N,) above the plain pipe at positions along and around it."""
+        around = radius_mm * (np.mod(angle - self.angle + np.pi, 2 * np.pi) - np.pi)
+        along = along_mm - self.along_mm
+        cosine, sine = np.cos(self.turn), np.sin(self.turn)
+        down, across = along * cosine + around * sine, around * cosine - along * sine
+        run_out = np.clip((0.5 * self.length_mm - np.abs(down)) / self.width_mm, 0, 1)
+        ends = 0.5 - 0.5 * np.cos(np.pi * run_out)
+        return -self.depth_mm * ends * np.maximum(1 - np.square(2 * across / self.width_mm), 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Patch:
+    """An area of general corrosion: rough ground that is nowhere above the plain pipe, level at its rim.
+
+    The ground is a sum of waves of random direction and phase, of lengths about ``grain_mm``.
+    """
+
+    along_mm: float
+    angle: float
+    length_mm: float
+    width_mm: float
+    depth_mm: float
+    grain_mm: float
+    seed: int
+
+    def heights(self, along_mm: np.ndarray, angle: np.ndarray, radius_mm: float) -> np.ndarray:
+        """Return heights (N,) above the plain pipe at positions along and around it."""
+        around = radius_mm * (np.mod(angle - self.angle + np.pi, 2 * np.pi) - np.pi)
+        along, rng = along_mm - self.along_mm, np.random.default_rng(self.seed)
+        waves = np.zeros(np.shape(along))
+        for _ in range(8):
+            turn, phase, size = rng.uniform(0, np.pi), rng.uniform(0, 2 * np.pi), self.grain_mm * rng.uniform(0.7, 1.5)
+            waves = waves + np.cos(2 * np.pi / size * (along * np.cos(turn) + around * np.sin(turn)) + phase)
+        ground = np.clip(0.6 + 0.1 * waves, 0.2, 1.0)
+        t2 = np.square(2 * along / self.length_mm) + np.square(2 * around / self.width_mm)
+        return -self.depth_mm * ground * np.clip(3 * (1 - np.sqrt(t2)), 0, 1)
 
 
 Noise = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]

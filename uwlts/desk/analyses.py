@@ -137,7 +137,8 @@ def _inspect(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
         verdict = judge_feature(each, order.limits)[0]
         place = (float(each.place_mm[0]), float(each.place_mm[1]), float(each.place_mm[2]))
         values = tuple(f"{value.name} {format_interval(value)} {value.unit}" for value in each.values)
-        findings.append(AnalysisFinding(each.name, "" if verdict == "no limit" else verdict, place, values))
+        values += (each.reason,) if each.reason else ()
+        findings.append(AnalysisFinding(each.title, "" if verdict == "no limit" else verdict, place, values))
     return AnalysisOutcome(tuple(f"note: {note}" for note in found.notes), tuple(findings))
 
 

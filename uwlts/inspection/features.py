@@ -148,7 +148,8 @@ class FeatureValue:
     systematic : float or None
         Standard uncertainty by errors common to all points; None if the cloud does not contain such errors.
     low, high : float
-        Ends of the 95 % coverage interval; never below zero for values that cannot be negative.
+        Ends of the 95 % coverage interval; never below zero for values that cannot be negative. A bound has an
+        infinite other end.
     """
 
     name: str
@@ -177,8 +178,23 @@ class FeatureValue:
             self, random=float(np.hypot(self.random, random)), systematic=common, low=float(low), high=float(high)
         )
 
+    def as_bound(self) -> FeatureValue:
+        """Return the value as a bound: at least its lower end, or for a remaining wall at most its upper end."""
+        if self.name == "remaining wall":
+            return replace(self, low=-math.inf)
+        return replace(self, high=math.inf)
+
+    @property
+    def bound(self) -> tuple[str, float] | None:
+        """Words and the number of a bound; None for a value with two ends."""
+        if math.isinf(self.high):
+            return "at least", self.low
+        return ("at most", self.high) if math.isinf(self.low) else None
+
     def text(self) -> str:
         """Return name, value and interval as text."""
+        if self.bound:
+            return f"{self.name} {self.bound[0]} {self.bound[1]:.4g} {self.unit}"
         return f"{self.name} {self.value:.4g} ({self.low:.4g} to {self.high:.4g}) {self.unit}"
 
 
@@ -209,6 +225,8 @@ class Feature:
         Closed contour of a blemish at its edge depth, in the cloud's frame; empty for other features.
     hollows_mm : (H, 3) float64
         Deepest (or highest) places of neighbours that the search joined, in the cloud's frame; empty for a single one.
+    reason : str or None
+        Why its values are bounds only; None if it is seen whole and sized.
     """
 
     kind: FeatureKind
@@ -221,6 +239,12 @@ class Feature:
     false_alarm: float | None = None
     outline_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     hollows_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    reason: str | None = None
+
+    @property
+    def title(self) -> str:
+        """Name with the number of joined neighbours, such as "pit 1 (2 joined)"."""
+        return f"{self.name} ({len(self.hollows_mm)} joined)" if len(self.hollows_mm) else self.name
 
     def __getitem__(self, name: str) -> FeatureValue:
         """Return the value of a name; raise KeyError if it does not exist."""
@@ -244,8 +268,8 @@ class Feature:
                     "unit": v.unit,
                     "random": v.random,
                     "systematic": v.systematic,
-                    "low": v.low,
-                    "high": v.high,
+                    "low": v.low if math.isfinite(v.low) else None,
+                    "high": v.high if math.isfinite(v.high) else None,
                     "definition": defined[v.name].text,
                     "source": defined[v.name].source,
                 }
@@ -258,6 +282,7 @@ class Feature:
             "false_alarm": self.false_alarm,
             "outline_mm": np.round(self.outline_mm, 3).tolist(),
             "hollows_mm": np.round(self.hollows_mm, 3).tolist(),
+            "reason": self.reason,
         }
 
 
@@ -311,7 +336,11 @@ class Inspection(Brief, RecordFile):
 
     def lines(self) -> list[str]:
         """Return the inspection as text, one line per feature."""
-        lines = [f"{each.name:16}{', '.join(value.text() for value in each.values)}" for each in self.features]
+        lines = [
+            f"{each.title:16}{', '.join(value.text() for value in each.values)}"
+            + (f"; {each.reason}" if each.reason else "")
+            for each in self.features
+        ]
         return [*lines, *(f"note: {note}" for note in self.notes)]
 
 

@@ -286,7 +286,7 @@ def _page(
         repeated=_rows(repeated),
         by_hand=None if by_hand is None else (COLUMNS, [each.row() for each in by_hand.values]),
         map=_map(found, cloud, parts),
-        pictures=[(each.name, _picture(each, found, cloud)) for each in drawn],
+        pictures=[(each.title, _picture(each, found, cloud)) for each in drawn],
         left_out=len(parts) - len(drawn),
         notes=found.notes,
         sources=[(each.role, each.name, each.note, each.sha256) for each in sources],
@@ -354,10 +354,10 @@ def _finding_rows(
         size = {value.name: format_interval(value) for value in each.values}
         first = next(iter(names), each.values[0].name)
         said = f"{verdict} ({', '.join(names)})" if names else verdict
+        said = f"{said}; {each.reason}" if each.reason else said
         main = next((size[name] for name in ("depth", "height") if name in size), f"{first} {size[first]}")
         more = tuple(size.get(name, MISSING) for name in ("remaining wall", "length", "width"))
-        joined = f"{each.name} ({len(each.hollows_mm)} neighbours)" if len(each.hollows_mm) else each.name
-        rows.append((joined, said, *at, main, *more))
+        rows.append((each.title, said, *at, main, *more))
     heads = "finding", "verdict", clock, "from datum / mm", "depth or height / mm"
     return (*heads, "remaining wall / mm", "length / mm", "width / mm"), rows
 
@@ -365,6 +365,9 @@ def _finding_rows(
 def format_interval(value: FeatureValue) -> str:
     """Return a value with its 95 % coverage interval as text, with two digits of the uncertainty and no unit."""
     half = COVERAGE_FACTOR * value.uncertainty
+    if value.bound:
+        words, number = value.bound
+        return f"{words} {format_to_scale(number, max(half, _SMALLEST_MM), digits=2)}"
     if half <= _SMALLEST:
         return f"{value.value:.4g}"
     shown = format_to_scale(value.value, half, digits=2)
@@ -394,7 +397,7 @@ def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str,
     rows = []
     for each in features:
         place = " ".join(f"{number:.1f}" for number in each.place_mm)
-        rows.append((each.name, place, *(format_interval(each[name]) if name in each else MISSING for name in units)))
+        rows.append((each.title, place, *(format_interval(each[name]) if name in each else MISSING for name in units)))
     return ("finding", "place / mm", *(f"{name} / {unit}" for name, unit in units.items())), rows
 
 
@@ -493,7 +496,7 @@ def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
     cut.axhline(0, color=INK, linewidth=0.8)
     value = feature.values[0]
     sign = 1 if feature.kind == FeatureKind.PROTRUSION else -1
-    cut.axhline(sign * value.value, color=RED, linewidth=1)
+    cut.axhline(sign * (value.bound[1] if value.bound else value.value), color=RED, linewidth=1)
     cut.set(xlabel="along its length / mm", ylabel="deviation / mm")
     cut.set_title(f"{value.name} {format_interval(value)} {value.unit}; cut ±{width:.2g} mm", fontsize=8)
     return png_data_uri(figure_png(figure, dpi=110, few_colours=True))

@@ -1,0 +1,149 @@
+"""Verdicts of inspections of damaged pipes and parts like them, for 20 seeds a kind (tests/oracles/damaged_pipes.py).
+
+    python -m docs.studies.inspection_verdicts --write
+    python -m docs.studies.inspection_verdicts --kinds gouges --seeds chosen
+
+Each depth is judged with limits of 0.9 and 1.1 times its true value. Thresholds are chosen on seeds 0 to 19 and judged
+on seeds 100 to 119.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from cyclopts import App
+
+import uwlts
+from docs.studies.result_tables import publish, table
+from tests.oracles.damaged_pipes import KINDS, Part, Truth
+from uwlts.errors import EvaluationError
+from uwlts.inspection.features import Feature, FeatureKind, Inspection
+from uwlts.report.findings_order import FindingLimits, judge_feature
+from uwlts.storage.cloud import PointCloud
+
+SEEDS = {"chosen": range(20), "judged": range(100, 120)}
+LIMITS = 0.9, 1.1
+"""Limits divided by the true depth."""
+JUDGED = FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION, FeatureKind.WELD
+HEAD = ["kind", "seeds", "truths", "sized", "bounded", "not mentioned", "false within", "false exceeds"]
+HEAD += ["within 95 % interval", "invented, in parts", "refused or named"]
+
+
+def inspect(part: Part) -> Inspection:
+    """Inspect a part as a pipe."""
+    cloud = PointCloud(part.points_mm, np.ones(len(part.points_mm)), part.frame, part.line)
+    return uwlts.inspect_pipe(cloud, **part.options)
+
+
+def count_verdicts(part: Part) -> Counter[str]:
+    """Return the counts of a part by the names in the table."""
+    counts = Counter[str](truths=len(part.truths))
+    try:
+        found = inspect(part)
+    except EvaluationError as error:
+        right = any(name in str(error) for name in part.names)
+        return counts + Counter({"refused" if right else "refused without reason": 1})
+    if any(name in note for name in part.names for note in found.notes):
+        counts["refused"] += 1
+    features = found.select(*JUDGED)
+    places = np.array([each.place_mm for each in features]).reshape(-1, 3)
+    taken = np.zeros(len(features), bool)
+    for truth in part.truths:
+        own = np.flatnonzero(truth.covers(places) & ~taken) if len(features) else np.zeros(0, int)
+        if not len(own):
+            counts["not mentioned"] += 1
+            continue
+        # Features are in the order of their depths.
+        taken[own[0]] = True
+        counts += count_values(features[own[0]], truth)
+    counts["invented"] += int(np.count_nonzero(~taken))
+    counts["parts with invented"] += int(not taken.all())
+    return counts
+
+
+def count_values(feature: Feature, truth: Truth) -> Counter[str]:
+    """Return the counts of one finding of something that is there."""
+    bounded = feature.reason is not None
+    counts = Counter({"bounded" if bounded else "sized": 1})
+    for name, true in truth.values.items():
+        if name not in feature:
+            continue
+        value = feature[name]
+        inside = value.low <= true <= value.high
+        counts["wrong bound"] += int(bounded and not inside)
+        counts["values"] += int(not bounded)
+        counts["inside"] += int(not bounded and inside)
+    if (true := truth.values.get("depth")) is not None:
+        for share in LIMITS:
+            verdict = judge_feature(feature, FindingLimits(depth_mm=share * true))[0]
+            counts["false within"] += int(verdict == "within the limit" and share < 1)
+            counts["false exceeds"] += int(verdict == "exceeds the limit" and share > 1)
+    return counts
+
+
+def count_drawn(kind: str, seed: int) -> Counter[str]:
+    """Return the counts of the part of a kind with a seed."""
+    return count_verdicts(KINDS[kind](np.random.default_rng([seed, list(KINDS).index(kind)])))
+
+
+def row(kind: str, seeds: range, counts: Counter[str]) -> list[str]:
+    """Return a row of the table."""
+    bounds = f" ({counts['wrong bound']} wrong)" if counts["wrong bound"] else ""
+    refused = f"{counts['refused']}"
+    if counts["refused without reason"]:
+        refused += f" ({counts['refused without reason']} without reason)"
+    numbers = [counts[name] for name in ("not mentioned", "false within", "false exceeds")]
+    return [
+        kind,
+        f"{seeds.start} to {seeds.stop - 1}",
+        f"{counts['truths']}",
+        f"{counts['sized']}",
+        f"{counts['bounded']}{bounds}",
+        *map(str, numbers),
+        f"{counts['inside']} of {counts['values']}",
+        f"{counts['invented']}, {counts['parts with invented']}",
+        refused,
+    ]
+
+
+def main(
+    *, kinds: Sequence[str] = (), seeds: Literal["chosen", "judged", "both"] = "both", workers: int = 2,
+    each: bool = False, write: bool = False,
+) -> None:  # fmt: skip
+    """Print or write the table.
+
+    Parameters
+    ----------
+    kinds
+        Kinds of parts; all by default.
+    seeds
+        Seeds on which thresholds were chosen, on which they are judged, or both.
+    workers
+        Processes that inspect parts.
+    each
+        Also print the counts of each part.
+    write
+        Write the table into the page of results.
+    """
+    rows, total = [], {name: Counter[str]() for name in SEEDS}
+    chosen = [(name, kind) for kind, name in product(kinds or KINDS, SEEDS) if seeds in (name, "both")]
+    with ProcessPoolExecutor(workers) as pool:
+        for name, kind in chosen:
+            counted = list(pool.map(count_drawn, [kind] * len(SEEDS[name]), SEEDS[name]))
+            if each:
+                for seed, counts in zip(SEEDS[name], counted, strict=True):
+                    print(kind, seed, {key: number for key, number in counts.items() if number}, flush=True)
+            summed = sum(counted, Counter[str]())
+            total[name] += summed
+            rows.append(row(kind, SEEDS[name], summed))
+            if not write:
+                print("\t".join(rows[-1]), flush=True)
+    rows += [row("all", SEEDS[name], counts) for name, counts in total.items() if counts]
+    publish({"verdicts of inspections": table(HEAD, rows)}, write=write)
+
+
+if __name__ == "__main__":
+    App(help=__doc__, help_format="plaintext", default_command=main)()
