@@ -31,7 +31,6 @@ from twin.design.figures_of_merit import (
     evaluate_field,
     find_depths_in_view,
 )
-from twin.design.geometry import Array, standoff_mm
 from twin.design.sensor_arrays import (
     PARAMETER_OF,
     SensorArrays,
@@ -42,6 +41,7 @@ from twin.design.sensor_arrays import (
 from twin.design.study import Study
 from twin.rendering_options import use_variant
 from uwlts.errors import DesignError, Error, EvaluationError, RangeError
+from uwlts.optics.design import Array, standoff_mm
 
 
 def find_pareto_front(values: np.ndarray) -> np.ndarray:

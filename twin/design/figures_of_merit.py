@@ -12,44 +12,38 @@ from typing import Any
 import numpy as np
 
 from twin.backend.llvm import prepare_llvm, preserve_threads
-from twin.design.geometry import (
+from twin.design.sensor_arrays import Follow, SensorArrays, compute_adjustments
+from twin.scene.vehicle import GRAVITY_M_S2
+from twin.sensor.detector import PLANCK_TIMES_LIGHT
+from uwlts.errors import RangeError
+from uwlts.optics.design import (
     Array,
     ImagePoints,
-    LaserFan,
+    SheetGeometry,
     Vector,
-    WindowGeometry,
     across_mm,
     add_vectors,
     direction_outside,
     dot,
     length_outside_mm,
     pixels_per_mm,
-    project_points,
     scale_vector,
     select,
     slopes_per_mm,
     snell_root,
     standoff_mm,
     trace_to_points,
+    window_thickness_mm,
 )
-from twin.design.sensor_arrays import Follow, SensorArrays, compute_adjustments
-from twin.scene.vehicle import GRAVITY_M_S2
-from twin.sensor.detector import PLANCK_TIMES_LIGHT
-from uwlts.errors import RangeError
 
 DEPTHS = 5
 """Number of evaluated depths, evenly spaced over the part of the measuring volume in the camera's view."""
 PLACES = 7
 """Number of evaluated points along the stripe at each depth."""
-_EDGE_STEPS = 5  # Newton steps to an edge of the image; converges quadratically from a close start
 _MANY = 200
 """Least number of designs that is worth the time to compile the formulas."""
 _BLOCK = 1000
 """Number of designs in a block of the compiled formulas."""
-_NEAREST_MM = 1.0
-"""Least distance of the sheet's entry into the image from the window's outer face."""
-_FARTHEST_MM = 1e6
-"""Largest distance of the sheet's exit from the image, from the pupil; no water is transparent as far."""
 _BRIGHT_LINES = 2.05
 """Level of automatic exposure in standard deviations of speckle above the mean: 2 % of the lines are brighter."""
 _UNMODELLED = 0.02
@@ -84,14 +78,7 @@ class StripeModel:
 
 
 def model_stripe(
-    xp: ModuleType,
-    p: SensorArrays,
-    pose: LaserFan,
-    window: WindowGeometry,
-    point: Vector,
-    view: ImagePoints,
-    *,
-    reflectance: float,
+    xp: ModuleType, p: SensorArrays, geometry: SheetGeometry, point: Vector, view: ImagePoints, *, reflectance: float
 ) -> StripeModel:
     """Model the stripe at points of the sheet.
 
@@ -102,15 +89,16 @@ def model_stripe(
 
     ``xp`` is NumPy or Dr.Jit, ``point`` is in the camera frame.
     """
-    xa, xb, ya, yb = view.jacobian
-    across = p.across((xa, ya)), p.across((xb, yb))
+    pose, window, (xa, xb, ya, yb) = geometry.laser, geometry.window, view.jacobian
+    across = geometry.across((xa, ya)), geometry.across((xb, yb))
     from_laser = add_vectors(point, scale_vector(pose.origin, -1.0))
     away = xp.sqrt(dot(from_laser, from_laser))
     rayleigh = math.pi * p.waist_mm * p.waist_mm * p.medium_index / (p.beam_quality * p.wavelength_mm)
     sheet = 0.5 * p.waist_mm * xp.sqrt(1 + ((away - p.waist_distance_mm) / rayleigh) ** 2)
     # Width on a profile line, for a constant pixel along the stripe.
     by_x, by_y = (pixels_per_mm(view, window, direction) for direction in (pose.normal, pose.fan))
-    thick = abs(p.across(by_x) - p.across(by_y) * p.select_along_stripe(by_x) / p.select_along_stripe(by_y)) * sheet
+    turned = geometry.across(by_y) * geometry.along(by_x) / geometry.along(by_y)
+    thick = abs(geometry.across(by_x) - turned) * sheet
 
     number = p.working_f_number()
     radius = 0.5 * p.focal_mm / number
@@ -230,70 +218,41 @@ class Field:
 def find_depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
     """Return the ends of the part of the measuring volume in the camera's view, in the middle of the line.
 
-    The depths are measured from the window's outer face. Newton's method finds the depths at the image's edges. Its
-    unknown is the inverse of the depth: the pixel is a nearly linear function of it, exactly linear without a window.
+    The depths are measured from the window's outer face.
     """
-    pose, window, lens = p.pose(xp), p.window(xp), p.lens()
-    standoff, outer = standoff_mm(pose), p.outer_mm(xp)
-    ends = []
-    for edge in (-0.5, p.across((p.width_px, p.height_px)) - 0.5):
-        inverse = 1 / standoff
-        for _ in range(_EDGE_STEPS):
-            depth = 1 / inverse
-            middle = scale_vector(pose.axis, (depth - standoff) / pose.axis[2])
-            view = project_points(xp, lens, window, add_vectors((0.0 * standoff, 0.0 * standoff, standoff), middle))
-            by_z = pixels_per_mm(view, window, pose.axis)
-            change = -(depth**2) / pose.axis[2] * p.across(by_z)
-            inverse = inverse + (edge - p.across((view.x, view.y))) / change
-            inverse = xp.minimum(xp.maximum(inverse, 1 / _FARTHEST_MM), 1 / (outer + _NEAREST_MM))
-        ends.append(1 / inverse - outer)
-    near, far = xp.minimum(ends[0], ends[1]), xp.maximum(ends[0], ends[1])
-    return xp.maximum(p.near_mm, near), xp.minimum(p.far_mm, far)
+    outer = p.outer_mm(xp)
+    near, far = p.geometry(xp).depths_in_view(xp, outer)
+    return xp.maximum(p.near_mm, near - outer), xp.minimum(p.far_mm, far - outer)
 
 
 def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
     """Evaluate designs at depths and places along the stripe.
 
-    An error d of the stripe's centre on its profile line causes the error (dY, dZ) = J^-1 (d, 0) of the point. J is the
-    Jacobian of the pixel across and along the stripe with respect to Y and Z.
+    An error of the stripe's centre on its profile line moves the point as `SheetGeometry.mm_per_pixel` states.
 
     ``xp`` is NumPy, or Dr.Jit for derivatives. Depths count from the window's outer face; places along the stripe are
     -1 to 1 between its ends.
     """
-    pose, window, lens = p.pose(xp), p.window(xp), p.lens()
-    standoff = standoff_mm(pose)
-    z = (p.outer_mm(xp) + depth_mm - standoff) / pose.axis[2]
-    middle = add_vectors((0.0 * standoff, 0.0 * standoff, standoff), scale_vector(pose.axis, z))
-
-    def evaluate(y: Array) -> Vector:
-        return add_vectors(middle, scale_vector(pose.fan, y))
-
-    ends = []
-    for edge in (-0.5, p.select_along_stripe((p.width_px, p.height_px)) - 0.5):
-        y = 0.0 * z
-        for _ in range(_EDGE_STEPS):
-            view = project_points(xp, lens, window, evaluate(y))
-            y = y + (edge - p.select_along_stripe((view.x, view.y))) / p.select_along_stripe(
-                pixels_per_mm(view, window, pose.fan)
-            )
-        ends.append(y)
+    geometry = p.geometry(xp)
+    pose, window = geometry.laser, geometry.window
+    z = (p.outer_mm(xp) + depth_mm - standoff_mm(pose)) / pose.axis[2]
+    left, right = geometry.line_ends(xp, z)
     laser_window = p.laser_window(pose.axis)
-    from_origin = add_vectors(middle, scale_vector(pose.origin, -1.0))
+    from_origin = add_vectors(geometry.point(z), scale_vector(pose.origin, -1.0))
     offset, height = dot(from_origin, pose.fan), dot(from_origin, pose.axis)
     edges = [across_mm(xp, laser_window, height, xp.tan(angle)) - offset for angle in (p.lit_from_rad, p.lit_to_rad)]
-    low = xp.maximum(xp.minimum(ends[0], ends[1]), edges[0])
-    high = xp.minimum(xp.maximum(ends[0], ends[1]), edges[1])
+    low, high = xp.maximum(left, edges[0]), xp.minimum(right, edges[1])
     half = 0.5 * (high - low)
     y = 0.5 * (high + low) + half * places
 
-    point = evaluate(y)
-    view = project_points(xp, lens, window, point)
-    by_y, by_z = pixels_per_mm(view, window, pose.fan), pixels_per_mm(view, window, pose.axis)
-    determinant = p.across(by_y) * p.select_along_stripe(by_z) - p.across(by_z) * p.select_along_stripe(by_y)
-    stripe = model_stripe(xp, p, pose, window, point, view, reflectance=reflectance)
-    u = p.across((view.x, view.y))
+    point = geometry.point(z, y)
+    view = geometry.project(xp, point)
+    along_per_mm = geometry.along(pixels_per_mm(view, window, pose.fan))
+    y_per_px, z_per_px = geometry.mm_per_pixel(view)
+    stripe = model_stripe(xp, p, geometry, point, view, reflectance=reflectance)
+    u = geometry.across((view.x, view.y))
     lit = (half > 0) & (height > laser_window.outer_mm) & xp.isfinite(u)
-    inside = lit & (u >= -0.5) & (u <= p.across((p.width_px, p.height_px)) - 0.5)
+    inside = lit & (u >= -0.5) & (u <= geometry.across((p.width_px, p.height_px)) - 0.5)
     rate = select(xp, lit, stripe.rate_e_per_ms, 0.0)
     # For derivatives of a single design, all points are in one dimension.
     brightest = xp.max(rate, axis=(1, 2))[:, None, None] if len(rate.shape) == 3 else xp.max(rate)
@@ -308,10 +267,10 @@ def evaluate_field(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Arr
         y_mm=y,
         z_mm=z,
         half_line_mm=half,
-        sigma_y_mm=noise * abs(p.select_along_stripe(by_z) / determinant),
-        sigma_z_mm=noise * abs(p.select_along_stripe(by_y) / determinant),
-        depth_per_px_mm=abs(p.select_along_stripe(by_y) / determinant),
-        along_per_px_mm=1 / abs(p.select_along_stripe(by_y)),
+        sigma_y_mm=noise * abs(y_per_px),
+        sigma_z_mm=noise * abs(z_per_px),
+        depth_per_px_mm=abs(z_per_px),
+        along_per_px_mm=1 / abs(along_per_mm),
         centre_px=noise,
         stripe_px=stripe.sigma_px,
         blur_px=stripe.blur_px,
@@ -589,9 +548,6 @@ _CLASS_3B_W = 0.5
 
 _WATER_KG_PER_M3 = 1030.0
 """Density of sea water."""
-# As in thesis Eq. 3.2.
-_CLAMPED = 0.75
-_SAFETY = 4.0
 
 
 def laser_class(p: SensorArrays) -> np.ndarray:
@@ -615,10 +571,12 @@ def laser_class(p: SensorArrays) -> np.ndarray:
 
 
 def window_needed_mm(p: SensorArrays, *, water_depth_m: float) -> np.ndarray:
-    """Return the thickness of a clamped round window of the camera's glass, t = A / 2 sqrt(K f P / S).
+    """Return the thickness of a clamped round window of the camera's glass.
 
-    Source: Harris 1999, thesis Eq. 3.2. The strength S is that of the named glass, or of fused silica if it is unknown.
+    The strength is that of the named glass, or of fused silica if it is unknown.
     """
     pressure_mpa = 1e-6 * GRAVITY_M_S2 * _WATER_KG_PER_M3 * water_depth_m
     opening = np.where(np.isfinite(p.window_aperture_mm), p.window_aperture_mm, 0.0)
-    return 0.5 * opening * np.sqrt(_CLAMPED * _SAFETY * pressure_mpa / p.window_strength_mpa)
+    return window_thickness_mm(
+        pressure_mpa=pressure_mpa, unsupported_diameter_mm=opening, strength_mpa=p.window_strength_mpa
+    )

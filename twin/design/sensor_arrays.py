@@ -12,10 +12,15 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial import Chebyshev
 
-from twin.design.geometry import (
+from twin.sensor.speckle import coherence, pixel_contrast
+from uwlts.errors import DescriptionError
+from uwlts.model.placement import laser_pose
+from uwlts.model.sensor import Medium, Sensor
+from uwlts.optics.design import (
     Array,
     LaserFan,
     Lens,
+    SheetGeometry,
     Vector,
     WindowGeometry,
     dot,
@@ -24,10 +29,6 @@ from twin.design.geometry import (
     standoff_mm,
     trace_to_points,
 )
-from twin.sensor.speckle import coherence, pixel_contrast
-from uwlts.errors import DescriptionError
-from uwlts.model.placement import laser_pose
-from uwlts.model.sensor import Medium, Sensor
 
 Follow = Literal["focus", "waist", "volume"]
 
@@ -152,18 +153,12 @@ class SensorArrays:
         pairs = (zip(given, found, strict=True) for given, found in zip(self.placed, vectors, strict=True))
         return LaserFan(*(tuple(select(xp, xp.isfinite(own), own, other) for own, other in pair) for pair in pairs))
 
-    def select_along_stripe(self, pixels: tuple[Array, Array]) -> Array:
-        """Return the element of a pair (x, y) that belongs to the direction along the stripe."""
-        return self.along_width * pixels[0] + (1 - self.along_width) * pixels[1]
-
-    def across(self, pixels: tuple[Array, Array]) -> Array:
-        """Return the element of a pair (x, y) that belongs to the direction across the stripe."""
-        return self.along_width * pixels[1] + (1 - self.along_width) * pixels[0]
-
-    def lens(self) -> Lens:
-        """Return the camera's lens."""
+    def geometry(self, xp: ModuleType) -> SheetGeometry:
+        """Return the geometry of camera and sheet."""
         fx = self.focal_mm / self.pixel_mm
-        return Lens(fx, self.pixel_aspect * fx, *self.principal_px, *self.distortion)
+        lens = Lens(fx, self.pixel_aspect * fx, *self.principal_px, *self.distortion)
+        size = self.width_px, self.height_px
+        return SheetGeometry(lens, self.window(xp), self.pose(xp), self.along_width, *size)
 
     def _normal(self, xp: ModuleType) -> Vector:
         """Return the unit normal of the camera's window, as `uwlts.model.sensor.Window.normal`."""

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.design.geometry import Array, Lens, WindowGeometry, dot, project_points
 from twin.scene.description import Scene
 from uwlts.errors import DesignError
 from uwlts.model.library import validate_description
 from uwlts.model.placement import camera_from_object, check_design, laser_pose
 from uwlts.model.sensor import Camera, Exposure, Medium, Sensor, Volume
+from uwlts.optics.design import Array, Lens, WindowGeometry, dot, project_points
 
 
 @dataclass(frozen=True, eq=False)

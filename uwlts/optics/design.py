@@ -1,212 +1,449 @@
-"""Design formulas of a laser triangulation sensor: depth, resolution, line length, volume, tilt, speckle, window.
+"""Design formulas of camera and sheet: rays through flat windows, distortion, resolution, view, speckle, strength.
 
-"Thesis" is G. S. de Matos, UFSC 2017, chapters 2 and 3. In its camera frame, depth Z runs along the camera's axis from
-the entrance pupil. Image coordinates in pixels start at the principal point: ``u_px`` runs across the stripe, positive
-away from the laser, and ``v_px`` along it. The triangulation angle is the angle between the laser's and the camera's
-axes. The camera's window is normal to the camera's axis. The laser's window does not turn the sheet, because the sheet
-contains the normal of that window.
+The formulas accept arrays of any library ``xp`` with sqrt, sin and cos: NumPy, for many designs at once, or Dr.Jit,
+which differentiates them. All quantities are in the camera frame, in mm; vectors are tuples of three arrays. The
+renderer uses another method, ray tracing through real faces, so that each can be checked against the other.
 
-In air a ray has the slope (p, e) = (u, v) s / f. By Snell's law, in a medium of index n the slope is
-(p, e) / sqrt(n^2 + (n^2 - 1) (p^2 + e^2)). With it, the thesis's formulas for air hold exactly behind a window.
+"Thesis" is G. S. de Matos, UFSC 2017, chapters 2 and 3. Its equations hold in air, for a laser without roll. The pixel
+is u across and v along the stripe from the principal point. Baseline is B, angle theta_t, focal length f, pixel size s.
+
+- Eq. 2.8, Z = B f / (f tan theta_t - s u), is the depth along the camera's axis.
+- Eq. 2.9, dZ/du = Z^2 s / (B f), is its derivative. Eqs. 2.11 and 3.1 are wrong: their denominators subtract
+  s B cos theta_t (mm^2 per pixel) from a length, instead of s u, and the factor cos theta_t is not justified.
+- Eq. 2.10 for the position along the stripe, Y = Z s v / f, has a superfluous factor f cos theta_t (mm^2).
+
+Behind a window, `project_points` and `pixels_per_mm` replace them.
 """
+
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from uwlts.errors import DesignError, RangeError
 from uwlts.model.placement import camera_from_object, laser_pose
-from uwlts.model.sensor import Medium, Sensor
-from uwlts.optics.window import tangent_ratio
+from uwlts.model.sensor import Camera, Medium, Sensor, Window
 
+Array = Any
+"""NumPy array, Dr.Jit array, or number."""
+Vector = tuple[Array, Array, Array]
+
+_NEWTON_STEPS = 4  # of the ray through the window; converges quadratically
+_UNDISTORTING_STEPS = 100
+"""Largest number of iterations; strong distortion converges slowly."""
+_UNDISTORTED_PX = 1e-3
+"""Tolerance of undistorted points, sufficient for a drawing."""
+_TINY_MM = 1e-9
+"""Offset that avoids an undefined direction for a point on the window's normal; negligible."""
+_EDGE_STEPS = 5  # Newton steps to an edge of the image; converges quadratically from a close start
+_NEAREST_MM = 1.0
+"""Least distance of the sheet's entry into the image from the window's outer face."""
+FARTHEST_MM = 1e6
+"""Largest distance of the sheet's exit from the image, from the pupil; no water is transparent as far."""
 CLAMPED, UNCLAMPED = 0.75, 1.125
-"""K_w of Eq. 3.2. Plate theory (Timoshenko) gives 3/4 for a clamped edge and 3 (3 + nu) / 8 for a supported edge.
+"""K_w of thesis Eq. 3.2. Plate theory (Timoshenko) gives 3/4 for a clamped edge and 3 (3 + nu) / 8 for a supported one.
 The value 1.125 assumes Poisson's ratio nu = 0; glass with nu = 0.2 would have 1.2."""
+DEPOLARISED_CONTRAST = math.sqrt(0.5)
+"""Speckle contrast of a depolarising surface such as paint: the sum of two independent patterns of equal mean (Goodman,
+Speckle Phenomena in Optics, section 3.4)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FlatWindow:
-    """Layers in front of the camera: air from the pupil to the inner face, glass, and medium. The default is air only.
+def select(xp: ModuleType, mask: Array, true: Array, false: Array) -> Array:
+    """Select elements of two arrays by a mask."""
+    return (xp.where if xp is np else xp.select)(mask, true, false)
 
-    Refractive indices are relative to air. With ``paraxial``, the slope in a medium is the slope in air divided by the
-    index.
+
+def dot(a: Vector, b: Vector) -> Array:
+    """Return the inner product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def scale_vector(a: Vector, factor: Array) -> Vector:
+    """Multiply a vector by a number."""
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+def add_vectors(a: Vector, b: Vector) -> Vector:
+    """Add two vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@dataclass(frozen=True)
+class LaserFan:
+    """Laser fan: origin, and unit vectors along its axis, along the stripe and across the sheet."""
+
+    origin: Vector
+    axis: Vector
+    fan: Vector
+    normal: Vector
+
+
+def place_laser(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> LaserFan:
+    """Return the fan of a laser that is placed by baseline and triangulation angle.
+
+    The result is that of `uwlts.model.placement.laser_pose`, but differentiable.
+
+    ``xp`` is NumPy or Dr.Jit, ``towards`` the direction (x, y, 0) of the baseline, and ``roll_rad`` the rotation of the
+    fan about the laser's axis.
     """
+    sine, cosine = xp.sin(angle_rad), xp.cos(angle_rad)
+    axis = (-sine * towards[0], -sine * towards[1], cosine)
+    across = (cosine * towards[0], cosine * towards[1], sine)
+    along = (-towards[1], towards[0], 0.0 * sine)
+    turn, keep = xp.sin(roll_rad), xp.cos(roll_rad)
+    normal = add_vectors(scale_vector(across, keep), scale_vector(along, turn))
+    fan = add_vectors(scale_vector(along, keep), scale_vector(across, -turn))
+    return LaserFan(scale_vector(towards, baseline_mm), axis, fan, normal)
 
-    distance_mm: float = 0.0
-    thickness_mm: float = 0.0
-    glass_index: float = 1.0
-    medium_index: float = 1.0
-    paraxial: bool = False
 
-    def __post_init__(self) -> None:
-        lengths, indices = (self.distance_mm, self.thickness_mm), (self.glass_index, self.medium_index)
-        if not (all(0 <= a < math.inf for a in lengths) and all(1 <= n < math.inf for n in indices)):
-            raise RangeError(f"{self}: lengths must not be negative, and indices must be at least 1")
-        if self.distance_mm == 0 and not self.paraxial and max(indices) > 1:
-            raise RangeError(f"{self}: the window is in the pupil; give the distance from the pupil to the window")
+def standoff_mm(pose: LaserFan) -> Array:
+    """Return the depth of the sheet on the camera's axis, from the entrance pupil."""
+    return dot(pose.normal, pose.origin) / pose.normal[2]
+
+
+@dataclass(frozen=True)
+class WindowGeometry:
+    """Window: unit normal away from the module, distance of the inner face along the normal, thickness, indices."""
+
+    normal: Vector
+    distance_mm: Array
+    thickness_mm: Array
+    glass_index: Array
+    medium_index: Array
+
+    @classmethod
+    def from_description(
+        cls, window: Window, medium: Medium, wavelength_nm: float, rotation: np.ndarray
+    ) -> WindowGeometry:
+        """Make a mounted window; ``rotation`` (3, 3) rotates from its module's frame to the frame of the result."""
+        normal = rotation @ window.normal()
+        distance = window.distance_mm * float(rotation[:, 2] @ normal)
+        indices = window.index(wavelength_nm), medium.refractive_index(wavelength_nm)
+        return cls((normal[0], normal[1], normal[2]), distance, window.thickness_mm, *indices)
 
     @property
-    def outer_mm(self) -> float:
-        """Distance from the pupil to the outer face."""
+    def outer_mm(self) -> Array:
+        """Distance of the outer face along the normal, mm."""
         return self.distance_mm + self.thickness_mm
 
-    def slope(self, index: float, slope_squared: np.ndarray | float) -> np.ndarray:
-        """Return the slope in a layer divided by the slope in air, from the squared slope in air."""
-        squared = np.asarray(slope_squared, dtype=float)
-        return tangent_ratio(index**2, 0.0 * squared if self.paraxial else squared)
-
-    def layers(self, depth_mm: np.ndarray | float) -> tuple[tuple[np.ndarray, float], ...]:
-        """Return the extent along the axis and the index of air, glass, and medium up to a depth."""
-        extents = self.distance_mm, self.thickness_mm, depth_mm - self.outer_mm
-        return tuple(zip(map(np.asarray, extents), (1.0, self.glass_index, self.medium_index), strict=True))
-
-    def reach_mm(self, depth_mm: np.ndarray | float, slope_squared: np.ndarray | float = 0.0) -> np.ndarray:
-        """Return a ray's lateral offset at a depth divided by its slope in air; for slope 0 the apparent distance."""
-        offsets = [extent * self.slope(index, slope_squared) for extent, index in self.layers(depth_mm)]
-        return offsets[0] + offsets[1] + offsets[2]
-
-
-def thesis_factor(index: float = 1.33) -> FlatWindow:
-    """Return the window of the thesis's approximation (section 3.1.2): a medium that begins at the pupil.
-
-    The medium then magnifies by its index everywhere. The resolution of the thesis's sensor comes out 5 % too fine,
-    because air and glass in front of the water do not magnify.
-    """
-    return FlatWindow(medium_index=index, paraxial=True)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Triangulation:
-    """Baseline B, angle theta_t, focal length f (the pinhole's image distance), pixel size s, and the window."""
-
-    baseline_mm: float
-    triangulation_angle_rad: float
-    focal_length_mm: float
-    pixel_size_mm: float
-    window: FlatWindow = FlatWindow()
-
-    def __post_init__(self) -> None:
-        _require_positive(
-            baseline_mm=self.baseline_mm, focal_length_mm=self.focal_length_mm, pixel_size_mm=self.pixel_size_mm
+    def layers(self, height_mm: Array) -> tuple[tuple[Array, Array], ...]:
+        """Return the extent along the normal up to a height, and the index, of air, glass and medium."""
+        return (
+            (self.distance_mm, 1.0),
+            (self.thickness_mm, self.glass_index),
+            (height_mm - self.outer_mm, self.medium_index),
         )
-        _require_acute(self.triangulation_angle_rad)
-
-    def slopes(self, u_px: ArrayLike, v_px: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return the slopes p across and e along the stripe of the rays of pixels in air."""
-        u, v = np.broadcast_arrays(np.asarray(u_px, dtype=np.float64), np.asarray(v_px, dtype=np.float64))
-        if not (np.isfinite(u).all() and np.isfinite(v).all()):
-            raise RangeError("pixel coordinates must be finite")
-        return u * self.pixel_size_mm / self.focal_length_mm, v * self.pixel_size_mm / self.focal_length_mm
 
 
-def depth_mm(setup: Triangulation, u_px: ArrayLike, v_px: ArrayLike = 0.0) -> np.ndarray:
-    """Return the depth Z of the sheet at pixels, broadcast.
+@dataclass(frozen=True)
+class Path:
+    """Rays from a module's origin through its window to points outside."""
 
-    In air, Z = B f / (f tan theta_t - s u) (thesis Eq. 2.8). Behind a window, Z tan theta_t - B = p M(Z), where M is
-    `FlatWindow.reach_mm`, linear in Z.
+    # Tangent of the angle to the window's normal, in air and in the medium.
+    slope: Array
+    slope_outside: Array
+    across: Vector  # unit vector of the ray's lateral direction, perpendicular to the normal
+    height_mm: Array  # distance of the point from the origin along the normal
+    apparent_mm: Array
+    """Lateral distance of the point divided by the slope in air: apparent distance perpendicular to the plane of
+    incidence."""
+    growth_mm: Array
+    """Derivative of the lateral distance with respect to the slope in air: apparent distance in the plane of
+    incidence."""
 
-    Raises RangeError if a pixel is not finite, or its ray does not meet the sheet beyond the window.
+
+def snell_root(xp: ModuleType, index: Array, slope: Array) -> Array:
+    """Return sqrt(n^2 + (n^2 - 1) p^2), the ratio of a ray's slope p in air to its slope in a medium of index n.
+
+    From n sin(b) = sin(a) with p = tan(a) follows tan(b) = p / sqrt(n^2 + (n^2 - 1) p^2).
     """
-    depth = _depth_or_inf(setup, *setup.slopes(u_px, v_px))
-    if not ((depth >= setup.window.outer_mm) & (depth < math.inf)).all():
-        raise RangeError(
-            "the ray of a pixel does not meet the sheet beyond the window: use pixels that see the measuring volume"
-        )
-    return depth
+    return xp.sqrt(index * index + (index * index - 1) * slope * slope)
 
 
-def depth_per_pixel_mm(setup: Triangulation, u_px: ArrayLike, v_px: ArrayLike = 0.0) -> np.ndarray:
-    """Return the depth resolution dZ/du in mm per pixel, broadcast.
+def across_mm(xp: ModuleType, window: WindowGeometry, height_mm: Array, slope: Array) -> Array:
+    """Return the lateral distance, at a height along the normal, of rays with a slope in air."""
+    return sum(extent * slope / snell_root(xp, n, slope) for extent, n in window.layers(height_mm))
 
-    In air, dZ/du = B f s / (f tan theta_t - s u)^2 = Z^2 s / (B f) (thesis Eq. 2.9, the derivative of Eq. 2.8).
-    Eqs. 2.11 and 3.1 are wrong. Their denominators subtract s B cos theta_t (mm^2 per pixel) from a length, instead of
-    s u, and the factor cos theta_t in the numerator is not justified.
 
-    Z runs along the camera's axis. Along the laser's axis (Z of the object coordinate system) the resolution is larger
-    by 1 / cos theta_t. The thesis's 0.22 mm per pixel is this value in water (0.221).
+def trace_rays(window: WindowGeometry, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Trace rays (N, 3) from an origin through a window.
+
+    Return the points (N, 3, 3) of the rays at the origin and at both faces, and the directions behind the window. Rays
+    away from the window are NaN.
     """
-    p, e = setup.slopes(u_px, v_px)
-    slope = setup.window.slope(setup.window.medium_index, p**2 + e**2)
-    shift = _growth_mm(setup.window, depth_mm(setup, u_px, v_px), p, e)
-    return shift * setup.pixel_size_mm / setup.focal_length_mm / (math.tan(setup.triangulation_angle_rad) - p * slope)
+    normal = np.array(window.normal)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ahead = directions @ normal
+        sideways = directions / np.where(ahead > 0, ahead, np.nan)[:, None] - normal
+        slope = np.sqrt((sideways**2).sum(axis=1))
+        leaning = sideways / np.maximum(slope, 1e-300)[:, None]
+    asides = window.distance_mm * slope, across_mm(np, window, window.outer_mm, slope)
+    heights = window.distance_mm, window.outer_mm
+    points = [origin + h * normal + aside[:, None] * leaning for h, aside in zip(heights, asides, strict=True)]
+    outside = slope / snell_root(np, window.medium_index, slope)
+    return np.stack([np.broadcast_to(origin, directions.shape), *points], axis=1), normal + outside[:, None] * leaning
 
 
-def pixel_of_depth(setup: Triangulation, z_mm: ArrayLike, v_px: ArrayLike = 0.0) -> np.ndarray:
-    """Return the pixel u of the sheet at depths Z, broadcast: the inverse of `depth_mm`.
+def trace_to_points(xp: ModuleType, window: WindowGeometry, point: Vector) -> Path:
+    """Return the rays from the module's origin, 0, to points beyond a window, by Snell's law.
 
-    In air, u = f (tan theta_t - B / Z) / s. Behind a window, Newton's method solves for p. The lateral offset p M is a
-    concave function of p, so that steps from a start below the solution never overshoot.
-
-    Raises RangeError if a depth is not finite, is not beyond the window's outer face, or appears too far from the axis.
+    A ray of slope p in air has the slope p S(n) in a layer of index n. Here S(n) = 1 / sqrt(n^2 + (n^2 - 1) p^2). Its
+    lateral distance is p M(p), where M is the sum over the layers of extent times S. Newton's method solves
+    p M = rho. The derivative of p M is the sum of extent times n^2 S^3.
     """
-    depth = np.asarray(z_mm, dtype=np.float64)
-    if not ((depth > setup.window.outer_mm) & (depth < math.inf)).all():
-        raise RangeError(f"depths must be finite and beyond the window's outer face at {setup.window.outer_mm:g} mm")
-    depth, v = np.broadcast_arrays(depth, np.asarray(v_px, dtype=np.float64))
-    _, e = setup.slopes(0.0, v)
-    across = depth * math.tan(setup.triangulation_angle_rad) - setup.baseline_mm
-    p = across / setup.window.reach_mm(depth, e**2)
-    for _ in range(100):
-        miss = across - p * setup.window.reach_mm(depth, p**2 + e**2)
-        step = miss / _growth_mm(setup.window, depth, p, e)
-        p = p + step
-        # The remaining error is of the order of the squared step.
-        if (np.abs(step) <= 1e-10 * (1 + np.abs(p))).all():
-            return p * setup.focal_length_mm / setup.pixel_size_mm
-    raise RangeError(
-        f"the sheet appears up to {np.abs(p).max():.3g} focal lengths from the principal point, outside every image: "
-        "give depths within the measuring volume"
+    height = dot(point, window.normal)
+    sideways = add_vectors(point, scale_vector(window.normal, -height))
+    rho = xp.sqrt(dot(sideways, sideways) + _TINY_MM**2)
+    layers = window.layers(height)
+
+    def reach(p: Array) -> tuple[Array, Array, Array]:
+        total, growth, last = 0.0, 0.0, None
+        for extent, n in layers:
+            last = 1 / snell_root(xp, n, p)
+            total, growth = total + extent * last, growth + extent * n * n * last**3
+        return total, growth, last
+
+    p = rho / reach(0.0 * rho)[0]
+    for _ in range(_NEWTON_STEPS):
+        total, growth, _ = reach(p)
+        p = p + (rho - p * total) / growth
+    total, growth, last = reach(p)
+    return Path(p, p * last, scale_vector(sideways, 1 / rho), height, total, growth)
+
+
+def direction_outside(xp: ModuleType, window: WindowGeometry, path: Path) -> Vector:
+    """Return the unit vectors of rays in the medium, away from the module."""
+    p = path.slope_outside
+    return scale_vector(add_vectors(window.normal, scale_vector(path.across, p)), 1 / xp.sqrt(1 + p * p))
+
+
+def length_outside_mm(xp: ModuleType, window: WindowGeometry, path: Path) -> Array:
+    """Return the path length of rays in the medium."""
+    return (path.height_mm - window.outer_mm) * xp.sqrt(1 + path.slope_outside * path.slope_outside)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Pinhole with the distortion of `uwlts.model.sensor.Distortion`; focal lengths and principal point in px."""
+
+    fx_px: Array
+    fy_px: Array
+    cx: Array
+    cy: Array
+    k1: Array
+    k2: Array
+    p1: Array
+    p2: Array
+    k3: Array
+    k4: Array
+    k5: Array
+    k6: Array
+
+    @classmethod
+    def from_description(cls, camera: Camera) -> Lens:
+        """Make the lens of a camera's description."""
+        return cls(*camera.focal_lengths_px(), *camera.principal_point(), *camera.distortion.model_dump().values())
+
+    def radial(self, r2: Array) -> tuple[Array, Array]:
+        """Return the radial factor at squared radii, and twice its derivative with respect to them."""
+        below = 1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
+        factor = (1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))) / below
+        slope = self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3)
+        return factor, 2 * (slope - factor * (self.k4 + r2 * (2 * self.k5 + r2 * 3 * self.k6))) / below
+
+
+@dataclass(frozen=True)
+class ImagePoints:
+    """Images of points: pixels x and y, rays, and their slopes (a, b) in air before distortion.
+
+    ``jacobian`` contains the derivatives of the pixels, dx/da, dx/db, dy/da, dy/db in px.
+    """
+
+    x: Array
+    y: Array
+    path: Path
+    slopes: tuple[Array, Array]
+    jacobian: tuple[Array, Array, Array, Array]
+
+
+def distort(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Return image points (x, y) of slopes (a, b), and the radial factor; OpenCV's distortion model."""
+    r2 = a * a + b * b
+    radial, _ = lens.radial(r2)
+    x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
+    y = b * radial + 2 * lens.p2 * a * b + lens.p1 * (r2 + 2 * b * b)
+    return x, y, radial
+
+
+def undistort_pixels(lens: Lens, pixels: np.ndarray) -> np.ndarray:
+    """Return the rays (N, 3) of pixels (N, 2), undistorted by fixed-point iteration; NaN without convergence."""
+    wanted = (pixels - (lens.cx, lens.cy)) / (lens.fx_px, lens.fy_px)
+    found = wanted.copy()
+    missed = np.full(len(found), np.inf)
+    with np.errstate(all="ignore"):
+        for _ in range(_UNDISTORTING_STEPS):
+            x, y, radial = distort(lens, *found.T)
+            image = np.stack([x, y], axis=1)
+            missed = np.abs(image - wanted).max(axis=1)
+            found += (wanted - image) / radial[:, None]
+        found[~(missed * lens.fx_px < _UNDISTORTED_PX)] = np.nan
+    return np.column_stack([found, np.ones(len(found))])
+
+
+def project_points(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> ImagePoints:
+    """Project points beyond the window into the image."""
+    path = trace_to_points(xp, window, point)
+    ray = add_vectors(window.normal, scale_vector(path.across, path.slope))
+    a, b = ray[0] / ray[2], ray[1] / ray[2]
+    r2 = a * a + b * b
+    x, y, radial = distort(lens, a, b)
+    _, slope = lens.radial(r2)
+    mixed = slope * a * b + 2 * lens.p1 * a + 2 * lens.p2 * b
+    jacobian = (
+        lens.fx_px * (radial + slope * a * a + 2 * lens.p1 * b + 6 * lens.p2 * a),
+        lens.fx_px * mixed,
+        lens.fy_px * mixed,
+        lens.fy_px * (radial + slope * b * b + 2 * lens.p2 * a + 6 * lens.p1 * b),
     )
+    return ImagePoints(lens.fx_px * x + lens.cx, lens.fy_px * y + lens.cy, path, (a, b), jacobian)
 
 
-def position_along_mm(setup: Triangulation, u_px: ArrayLike, v_px: ArrayLike) -> np.ndarray:
-    """Return the position Y along the stripe of the sheet's points at pixels, broadcast: in air Y = Z s v / f.
+def slopes_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> tuple[Array, Array]:
+    """Return the derivatives of the slopes (a, b) per mm of a point's motion along a direction.
 
-    Thesis Eq. 2.10 has a superfluous factor f cos theta_t, which gives mm^2. Z of Eq. 2.8 needs no cosine.
+    In the plane of incidence, p M(p, h) = rho gives dp = (d rho - p S dh) / growth, where h is the point's height.
+    Motion perpendicular to it is divided by the apparent distance M.
     """
-    p, e = setup.slopes(u_px, v_px)
-    return e * setup.window.reach_mm(depth_mm(setup, u_px, v_px), p**2 + e**2)
+    path = view.path
+    up = dot(along, window.normal)
+    sideways = add_vectors(along, scale_vector(window.normal, -up))
+    radial = dot(sideways, path.across)
+    steeper = (radial - path.slope_outside * up) / path.growth_mm
+    turned = scale_vector(add_vectors(sideways, scale_vector(path.across, -radial)), 1 / path.apparent_mm)
+    change = add_vectors(scale_vector(path.across, steeper), turned)
+    ray_z = window.normal[2] + path.across[2] * path.slope
+    a, b = view.slopes
+    return (change[0] - a * change[2]) / ray_z, (change[1] - b * change[2]) / ray_z
 
 
-def line_length_mm(setup: Triangulation, z_mm: ArrayLike, *, side_px: float) -> np.ndarray:
-    """Return the visible stripe length at depths Z on a plane normal to the laser's axis.
+def pixels_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> tuple[Array, Array]:
+    """Return the derivatives of the pixels (x, y) per mm of a point's motion along a direction."""
+    da, db = slopes_per_mm(view, window, along)
+    xa, xb, ya, yb = view.jacobian
+    return xa * da + xb * db, ya * da + yb * db
 
-    ``side_px`` is the image side along the stripe, with the principal point in its middle. Thesis section 3.1.2
-    multiplies the last term of Eq. 2.11 by the number of pixels. Because of the factor cos theta_t, the result is 18 %
-    too short (see `position_along_mm`).
 
-    The thesis measured 184 and 185.27 mm "at the stand-off". Its drawings give 204 mm in air and 160 mm in water at the
-    stand-off, and 184 mm in water 60 mm beyond it.
+@dataclass(frozen=True)
+class SheetGeometry:
+    """Geometry of a camera that sees a laser sheet: lens, window, laser fan, and image.
+
+    ``along_width`` is 1 if the stripe runs along the image's width, else 0.
     """
-    _require_positive(side_px=side_px)
-    return 2 * position_along_mm(setup, pixel_of_depth(setup, z_mm, side_px / 2), side_px / 2)
 
+    lens: Lens
+    window: WindowGeometry
+    laser: LaserFan
+    along_width: Array
+    width_px: Array
+    height_px: Array
 
-class MeasuringVolume(NamedTuple):
-    """Limits of the sheet's visible part: depth Z from the pupil along the camera's axis."""
+    @classmethod
+    def from_description(cls, sensor: Sensor, medium: Medium) -> SheetGeometry:
+        """Make the nominal geometry of a sensor in a medium; a window that is not mounted is left out.
 
-    near_mm: float
-    far_mm: float
-
-
-def measuring_volume(setup: Triangulation, *, side_px: float) -> MeasuringVolume:
-    """Return the limits of depth in the middle of the line (Eq. 2.8).
-
-    ``side_px`` is the image side across the stripe. The near limit is not below the window's outer face. The far limit
-    is infinite if the ray at the image's edge does not meet the sheet.
-
-    Raises RangeError if the camera does not see the sheet beyond the window.
-    """
-    _require_positive(side_px=side_px)
-    near, far = _depth_or_inf(setup, *setup.slopes(np.array([-0.5, 0.5]) * side_px, 0.0))
-    if not far > setup.window.outer_mm:
-        raise RangeError(
-            f"the sheet leaves the camera's view at {far:.1f} mm, before the window's outer face: increase the baseline"
+        Raises DesignError if the sheet does not cross the camera's axis beyond the window, or the stripe runs along the
+        other side of the image. The same if no window is mounted although the medium is not air.
+        """
+        camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
+        camera_from_object(sensor)
+        pose, index = laser_pose(sensor), medium.refractive_index(wavelength)
+        if not camera.window.mounted and index != 1:
+            raise DesignError(f"the camera's window is not mounted, but the medium's index is {index:.4f}: mount it")
+        if abs(pose.normal[1 if camera.stripe_along == "width" else 0]) < 1e-6:
+            raise DesignError(
+                f"the stripe runs across the image's {camera.stripe_along}, not along it: turn the camera"
+            )
+        window = WindowGeometry((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
+        if camera.window.mounted:
+            window = WindowGeometry.from_description(camera.window, medium, wavelength, np.eye(3))
+        return cls(
+            Lens.from_description(camera),
+            window,
+            LaserFan(tuple(pose.origin_mm), tuple(pose.axis), tuple(pose.fan), tuple(pose.normal)),
+            float(camera.stripe_along == "width"),
+            camera.width_px,
+            camera.height_px,
         )
-    return MeasuringVolume(float(max(near, setup.window.outer_mm)), float(far))
+
+    def along(self, pair: tuple[Array, Array]) -> Array:
+        """Return the element of a pair (x, y) that belongs to the direction along the stripe."""
+        return self.along_width * pair[0] + (1 - self.along_width) * pair[1]
+
+    def across(self, pair: tuple[Array, Array]) -> Array:
+        """Return the element of a pair (x, y) that belongs to the direction across the stripe."""
+        return self.along_width * pair[1] + (1 - self.along_width) * pair[0]
+
+    def point(self, z_mm: Array, y_mm: Array = 0.0) -> Vector:
+        """Return points of the sheet, from its crossing of the camera's axis along laser axis (Z) and stripe (Y)."""
+        standoff = standoff_mm(self.laser)
+        crossing = (0.0 * standoff, 0.0 * standoff, standoff)
+        along_axis = add_vectors(crossing, scale_vector(self.laser.axis, z_mm))
+        return add_vectors(along_axis, scale_vector(self.laser.fan, y_mm))
+
+    def project(self, xp: ModuleType, point: Vector) -> ImagePoints:
+        """Project points beyond the window into the image."""
+        return project_points(xp, self.lens, self.window, point)
+
+    def depths_in_view(self, xp: ModuleType, outer_mm: Array) -> tuple[Array, Array]:
+        """Return the depths from the pupil, near and far, where the middle of the line appears at the image's edges.
+
+        ``outer_mm`` is the depth of the window's outer face, which limits the near end. Newton's method finds the
+        depths. Its unknown is the inverse of the depth: the pixel is a nearly linear function of it, exactly linear
+        without a window.
+        """
+        standoff, axis = standoff_mm(self.laser), self.laser.axis
+        ends = []
+        for edge in (-0.5, self.across((self.width_px, self.height_px)) - 0.5):
+            inverse = 1 / standoff
+            for _ in range(_EDGE_STEPS):
+                depth = 1 / inverse
+                image = self.project(xp, self.point((depth - standoff) / axis[2]))
+                change = -(depth**2) / axis[2] * self.across(pixels_per_mm(image, self.window, axis))
+                inverse = inverse + (edge - self.across((image.x, image.y))) / change
+                inverse = xp.minimum(xp.maximum(inverse, 1 / FARTHEST_MM), 1 / (outer_mm + _NEAREST_MM))
+            ends.append(1 / inverse)
+        return xp.minimum(ends[0], ends[1]), xp.maximum(ends[0], ends[1])
+
+    def line_ends(self, xp: ModuleType, z_mm: Array) -> tuple[Array, Array]:
+        """Return the positions Y along the stripe of the image's edges, at distances Z along the laser's axis."""
+        ends = []
+        for edge in (-0.5, self.along((self.width_px, self.height_px)) - 0.5):
+            y = 0.0 * z_mm
+            for _ in range(_EDGE_STEPS):
+                image = self.project(xp, self.point(z_mm, y))
+                per_mm = pixels_per_mm(image, self.window, self.laser.fan)
+                y = y + (edge - self.along((image.x, image.y))) / self.along(per_mm)
+            ends.append(y)
+        return xp.minimum(ends[0], ends[1]), xp.maximum(ends[0], ends[1])
+
+    def mm_per_pixel(self, image: ImagePoints) -> tuple[Array, Array]:
+        """Return the motion (Y, Z) in the sheet for a pixel across the stripe, on a fixed profile line.
+
+        The motion is J^-1 (1, 0) with the Jacobian J of the pixel across and along the stripe for Y and Z.
+        """
+        by_y, by_z = (pixels_per_mm(image, self.window, along) for along in (self.laser.fan, self.laser.axis))
+        determinant = self.across(by_y) * self.along(by_z) - self.across(by_z) * self.along(by_y)
+        return self.along(by_z) / determinant, -self.along(by_y) / determinant
+
+    def crossing_motion(self) -> np.ndarray:
+        """Return the motion (3,) in the sheet per pixel across the stripe, where the camera's axis meets the sheet."""
+        crossing = self.point(0.0)
+        y, z = self.mm_per_pixel(self.project(np, crossing))
+        return np.ravel(y) * np.array(self.laser.fan) + np.ravel(z) * np.array(self.laser.axis)
 
 
 def scheimpflug_angle_rad(*, triangulation_angle_rad: float, magnification: float) -> float:
@@ -223,14 +460,10 @@ def scheimpflug_angle_rad(*, triangulation_angle_rad: float, magnification: floa
 
     Behind a flat window the sheet appears at tan theta = n tan theta_t, and k follows from the apparent distance.
     """
-    _require_acute(triangulation_angle_rad)
+    if not 0 < triangulation_angle_rad < math.pi / 2:
+        raise RangeError(f"the triangulation angle is {triangulation_angle_rad:g} rad; expected 0 to pi / 2")
     _require_positive(magnification=magnification)
     return math.atan(math.tan(triangulation_angle_rad) / magnification)
-
-
-DEPOLARISED_CONTRAST = math.sqrt(0.5)
-"""Speckle contrast of a depolarising surface such as paint: the sum of two independent patterns of equal mean (Goodman,
-Speckle Phenomena in Optics, section 3.4)."""
 
 
 def speckle_limit_um(
@@ -263,30 +496,18 @@ def speckle_limit_um(
 
 
 def window_thickness_mm(
-    *,
-    pressure_mpa: float,
-    unsupported_diameter_mm: float,
-    strength_mpa: float,
-    support: float = CLAMPED,
-    safety: float = 4.0,
-) -> float:
+    *, pressure_mpa: Array, unsupported_diameter_mm: Array, strength_mpa: Array, support: float = CLAMPED
+) -> Array:
     """Return the thickness of a round window, t = A / 2 sqrt(K_w f_s dP / S_f) (Harris 1999, thesis Eq. 3.2).
+
+    A is ``unsupported_diameter_mm``, dP ``pressure_mpa``, S_f ``strength_mpa``; K_w follows from the edge's
+    ``support``, and the safety factor f_s is 4.
 
     The thesis prints 5.53 mm for 1 MPa without A, K_w and S_f. Its Figure 34 lists only fused silica (60 MPa). With
     f_s = 4, the diameter A is then 49.5 mm if clamped and 40.4 mm if not. The bore of 63 mm would need 7.0 mm if
     clamped.
-
-    A is ``unsupported_diameter_mm``, dP ``pressure_mpa``, S_f ``strength_mpa``, f_s ``safety``; K_w follows from the
-    edge's ``support``.
     """
-    _require_positive(
-        pressure_mpa=pressure_mpa,
-        unsupported_diameter_mm=unsupported_diameter_mm,
-        strength_mpa=strength_mpa,
-        support=support,
-        safety=safety,
-    )
-    return 0.5 * unsupported_diameter_mm * math.sqrt(support * safety * pressure_mpa / strength_mpa)
+    return 0.5 * unsupported_diameter_mm * np.sqrt(support * 4.0 * pressure_mpa / strength_mpa)
 
 
 def line_needed_mm(*, pipe_diameter_mm: float, passes: int) -> float:
@@ -297,68 +518,7 @@ def line_needed_mm(*, pipe_diameter_mm: float, passes: int) -> float:
     return pipe_diameter_mm * math.sin(math.pi / passes)
 
 
-def _depth_or_inf(setup: Triangulation, p: np.ndarray, e: np.ndarray) -> np.ndarray:
-    """Return the depth of the sheet on rays of slopes p, e in air; infinite on rays that do not meet the sheet."""
-    window, squared = setup.window, p**2 + e**2
-    slope = window.slope(window.medium_index, squared)
-    # Distance from the baseline's end to the ray in the medium, extended back to the depth of the pupil.
-    start = setup.baseline_mm + p * (window.reach_mm(window.outer_mm, squared) - window.outer_mm * slope)
-    closing = math.tan(setup.triangulation_angle_rad) - p * slope
-    return np.where(closing > 0, start / np.where(closing > 0, closing, 1.0), math.inf)
-
-
-def _growth_mm(window: FlatWindow, depth_mm: np.ndarray, p: np.ndarray, e: np.ndarray) -> np.ndarray:
-    """Return the derivative of p M(depth, p^2 + e^2) with respect to p."""
-    if window.paraxial:
-        return window.reach_mm(depth_mm) + 0 * p
-    slopes = ((extent, n, window.slope(n, p**2 + e**2)) for extent, n in window.layers(depth_mm))
-    return np.sum([extent * (n**2 + (n**2 - 1) * e**2) * slope**3 for extent, n, slope in slopes], axis=0)
-
-
 def _require_positive(**values: float) -> None:
     for name, value in values.items():
         if not 0 < value < math.inf:
             raise RangeError(f"{name} is {value:g}; expected a positive number")
-
-
-def _require_acute(angle_rad: float) -> None:
-    if not 0 < angle_rad < math.pi / 2:
-        raise RangeError(f"the triangulation angle is {angle_rad:g} rad; expected one between 0 and pi / 2")
-
-
-def nominal_setup(sensor: Sensor, medium: Medium) -> tuple[Triangulation, float]:
-    """Return the sensor's triangulation behind its window, and Z along the laser's axis per depth along the camera's.
-
-    Baseline and angle are measured in the plane through the pupil and the image's middle line across the stripe. There,
-    a laser that is placed by its axis, or rolled, has the baseline and angle of the sheet's trace. Lens distortion and
-    tilts are neglected, and pixels are square.
-
-    Raises
-    ------
-    DesignError
-        The sheet does not cross the camera's axis beyond the window, or the stripe runs along the other side of the
-        image. The medium is not air, but the camera's window is not mounted.
-    """
-    camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
-    pose, index = laser_pose(sensor), medium.refractive_index(wavelength)
-    standoff = camera_from_object(sensor)[2, 3]
-    if not camera.window.mounted and index != 1:
-        raise DesignError(f"the camera's window is not mounted, but the medium's index is {index:.4f}: mount it")
-    side = 1 if camera.stripe_along == "width" else 0
-    if abs(pose.normal[side]) < 1e-6:
-        raise DesignError(f"the stripe runs across the image's {camera.stripe_along}, not along it: turn the camera")
-    trace = np.array([0.0, 0.0, 1.0])
-    trace[side] = -pose.normal[2] / pose.normal[side]
-    setup = Triangulation(
-        baseline_mm=standoff * abs(trace[side]),
-        triangulation_angle_rad=math.atan(abs(trace[side])),
-        focal_length_mm=camera.focal_length_mm,
-        pixel_size_mm=1e-3 * camera.pixel_size_um,
-        window=FlatWindow(
-            distance_mm=camera.window.distance_mm,
-            thickness_mm=camera.window.thickness_mm,
-            glass_index=camera.window.index(wavelength) if camera.window.mounted else 1.0,
-            medium_index=index,
-        ),
-    )
-    return setup, float(abs(trace @ pose.axis))

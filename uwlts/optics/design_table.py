@@ -1,25 +1,23 @@
 """Table of the design formulas' results for a sensor: resolution, line length, depth range, speckle limit."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from uwlts.errors import DesignError
 from uwlts.model.library import load_sensor
 from uwlts.model.media import GLASSES
 from uwlts.model.sensor import Sensor
 from uwlts.optics.design import (
-    depth_mm,
-    depth_per_pixel_mm,
-    line_length_mm,
+    FARTHEST_MM,
+    SheetGeometry,
     line_needed_mm,
-    measuring_volume,
-    nominal_setup,
     scheimpflug_angle_rad,
     speckle_limit_um,
-    thesis_factor,
+    standoff_mm,
+    trace_to_points,
     window_thickness_mm,
 )
 
@@ -55,32 +53,33 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
     DescriptionError
         The sensor or the medium is unknown, or the description cannot be read.
     DesignError
-        As `uwlts.optics.design.nominal_setup`.
+        As `uwlts.optics.design.SheetGeometry.from_description`.
     """
     sensor = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
-    camera = sensor.camera
-    setup, leaning = nominal_setup(sensor, sensor.medium(medium))
-    window, tangent = setup.window, math.tan(setup.triangulation_angle_rad)
-    sides = {"width": camera.width_px, "height": camera.height_px}
-    along = sides.pop(camera.stripe_along)
-    (across,) = sides.values()
-    standoff, outer = float(depth_mm(setup, 0.0)), window.outer_mm
-    per_pixel = float(depth_per_pixel_mm(setup, 0.0))
-    by_factor = float(depth_per_pixel_mm(replace(setup, window=thesis_factor(window.medium_index)), 0.0))
-    near, far = measuring_volume(setup, side_px=across)
-    near_line, line, far_line = line_length_mm(
-        setup, np.array([sensor.volume.near_mm + outer, standoff, sensor.volume.far_mm + outer]), side_px=along
-    )
-    apparent = float(window.reach_mm(standoff))
-    tilt = scheimpflug_angle_rad(
-        triangulation_angle_rad=math.atan(window.medium_index * tangent),
-        magnification=camera.focal_length_mm / apparent,
-    )
+    camera, geometry = sensor.camera, SheetGeometry.from_description(sensor, sensor.medium(medium))
+    window, standoff = geometry.window, float(standoff_mm(geometry.laser))
+    outer = camera.window.distance_mm + camera.window.thickness_mm / window.normal[2] if camera.window.mounted else 0.0
+    near, far = map(float, geometry.depths_in_view(np, outer))
+    if not far > outer + 1:
+        raise DesignError("the sheet leaves the camera's view before the window's outer face: increase the baseline")
+    far = far if far < FARTHEST_MM else math.inf
+    motion = geometry.crossing_motion()
+    depth, along_laser = float(abs(motion[2])), float(abs(motion @ geometry.laser.axis))
+    leaning, tangent = along_laser / depth, float(abs(motion[int(geometry.along_width)])) / depth
+    apparent = float(trace_to_points(np, window, geometry.point(0.0)).apparent_mm)
     speckle = speckle_limit_um(
         wavelength_nm=sensor.laser.wavelength_nm,
         focal_length_mm=camera.focal_length_mm,
         f_number=camera.f_number,
         distance_mm=apparent,
+    )
+    depths = np.array([sensor.volume.near_mm + outer, standoff, sensor.volume.far_mm + outer])
+    low, high = geometry.line_ends(np, (depths - standoff) / geometry.laser.axis[2])
+    near_line, line, far_line = high - low
+    index = window.medium_index
+    by_factor = standoff * camera.pixel_size_um * 1e-3 / (camera.focal_length_mm * tangent * index)
+    tilt = scheimpflug_angle_rad(
+        triangulation_angle_rad=math.atan(index * tangent), magnification=camera.focal_length_mm / apparent
     )
     needed = line_needed_mm(pipe_diameter_mm=300.0, passes=5)
     snell = "with Snell's law"
@@ -91,8 +90,8 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
         DesignRow("sheet in view, farthest from the window", far - outer, "mm", f"Eq. 2.8 {snell}"),
         DesignRow("depth in view", far - near, "mm", f"Eq. 2.8 {snell}"),
         DesignRow("depth in view along the laser's axis", (far - near) * leaning, "mm", "over cos theta_t"),
-        DesignRow("depth per pixel at the stand-off", per_pixel, "mm/px", f"Eq. 2.9 {snell}"),
-        DesignRow("depth per pixel along the laser's axis", per_pixel * leaning, "mm/px", "over cos theta_t"),
+        DesignRow("depth per pixel at the stand-off", depth, "mm/px", f"Eq. 2.9 {snell}"),
+        DesignRow("depth per pixel along the laser's axis", along_laser, "mm/px", "over cos theta_t"),
         DesignRow("depth per pixel by the thesis's factor n", by_factor, "mm/px", "Eq. 2.9 over n, section 3.1.2"),
         DesignRow("line length at the volume's near end", float(near_line), "mm", f"Eq. 2.10, corrected, {snell}"),
         DesignRow("line length at the stand-off", float(line), "mm", f"Eq. 2.10, corrected, {snell}"),

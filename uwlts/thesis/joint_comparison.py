@@ -8,7 +8,6 @@ The errors are those of the other half, and of all scans in air.
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from itertools import count, groupby
 from pathlib import Path
@@ -28,7 +27,8 @@ from uwlts.files.writing import write_atomically
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
-from uwlts.optics.design import nominal_setup, speckle_limit_um
+from uwlts.model.placement import apparent_depth_mm
+from uwlts.optics.design import SheetGeometry, speckle_limit_um
 from uwlts.pages.toolkit import COLOURS, figure_svg, legend_below, new_figure, render_page
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -168,18 +168,22 @@ def _evaluate_plane(scan: ScanFile, joint: Calibration) -> PlaneScatter:
         header = capture.header
         cloud = reconstruct_stripes(capture, find_stripes(capture), joint)
         std_mm = evaluate_cloud(cloud, parse_artefact(header.artefact or {})).figures_mm["STD"]
-        setup, leaning = nominal_setup(header.sensor, header.medium)
+        geometry = SheetGeometry.from_description(header.sensor, header.medium)
         frame = joint.object_transform()
         depth = float(np.mean(cloud.points_mm @ frame[2, :3]) + frame[2, 3])
-        camera = header.sensor.camera
-        window = setup.window if joint.window is None else replace(setup.window, distance_mm=joint.window.distance_mm)
+        camera, window = header.sensor.camera, geometry.window
+        distance = window.distance_mm if joint.window is None else joint.window.distance_mm
+        apparent = apparent_depth_mm(
+            depth, distance, window.thickness_mm, glass_index=window.glass_index, medium_index=window.medium_index
+        )
         across = 1e-3 * speckle_limit_um(
             wavelength_nm=joint.wavelength_nm,
             focal_length_mm=camera.focal_length_mm,
             f_number=camera.f_number,
-            distance_mm=float(window.reach_mm(depth)),
+            distance_mm=apparent,
         )
-    limit = across * leaning / np.tan(setup.triangulation_angle_rad)
+    motion = geometry.crossing_motion()
+    limit = across * abs(motion @ geometry.laser.axis / motion[int(geometry.along_width)])
     return PlaneScatter(scan.placement, scan.medium, std_mm, float(std_mm / limit))
 
 

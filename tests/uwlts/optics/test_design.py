@@ -2,207 +2,203 @@
 
 import math
 import sys
-from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 
 from tests.oracles import fermat
 from tests.virtual_sensors import altered
 from uwlts import cli
 from uwlts.errors import DesignError, RangeError
-from uwlts.model.placement import view_of_sheet
-from uwlts.optics.design import (
-    CLAMPED,
-    UNCLAMPED,
-    FlatWindow,
-    Triangulation,
-    depth_mm,
-    depth_per_pixel_mm,
-    line_length_mm,
-    line_needed_mm,
-    measuring_volume,
-    nominal_setup,
-    pixel_of_depth,
-    position_along_mm,
-    scheimpflug_angle_rad,
-    speckle_limit_um,
-    thesis_factor,
-    window_thickness_mm,
-)
+from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
+from uwlts.model.sensor import Sensor
+from uwlts.optics import design as g
 from uwlts.optics.design_table import design, format_table
 
 ANGLE = math.radians(35)
-AIR = Triangulation(baseline_mm=265, triangulation_angle_rad=ANGLE, focal_length_mm=12.5, pixel_size_mm=0.0053)
-WATER = replace(AIR, window=FlatWindow(distance_mm=62.8, thickness_mm=5.93, glass_index=1.52, medium_index=1.3312))
 STANDOFF = 265 / math.tan(ANGLE)
-SETUPS = {
-    "air": AIR,
-    "window in air": replace(WATER, window=replace(WATER.window, medium_index=1.0)),
-    "water": WATER,
-    "dense and close": replace(
-        AIR, window=FlatWindow(distance_mm=20.0, thickness_mm=25.0, glass_index=1.8, medium_index=1.6)
-    ),
-    "wide": Triangulation(
-        baseline_mm=300,
-        triangulation_angle_rad=math.radians(60),
-        focal_length_mm=4.0,
-        pixel_size_mm=0.0055,
-        window=FlatWindow(distance_mm=40.0, thickness_mm=8.0, glass_index=1.49, medium_index=1.34),
-    ),
-}
-every_setup = pytest.mark.parametrize("setup", SETUPS.values(), ids=SETUPS.keys())
+TILTED = {"camera": {"window": {"tilt_x_deg": 8.0, "tilt_y_deg": -5.0}}}
+HEIGHT = {"camera": {"stripe_along": "height"}}
+ROLLED = {"laser": {"roll_deg": 12.0}}
+OBLONG = {"camera": {"pixel_aspect": 1.05}}
+RATIONAL = {"camera": {"distortion": {"p1": 0.004, "k3": 0.05, "k4": 0.6, "k5": -0.2, "k6": 0.3}}}
+THICK = {"camera": {"window": {"distance_mm": 20.0, "thickness_mm": 25.0}}}
 
 
-def in_the_image(setup: Triangulation) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels over 1024 x 1280 that see the sheet before the window."""
-    volume = measuring_volume(setup, side_px=1024)
-    lowest = float(pixel_of_depth(setup, volume.near_mm + 1.0))
-    assert -512 <= lowest < 0
-    return tuple(g.ravel() for g in np.meshgrid(np.linspace(lowest, 500, 11), np.linspace(-640, 640, 9)))
+def geometry_of(sensor: Sensor, medium: str = "water") -> g.SheetGeometry:
+    return g.SheetGeometry.from_description(sensor, sensor.media[medium])
 
 
-def faces_of(window: FlatWindow) -> tuple[list[fermat.Face], list[float]]:
-    faces = fermat.plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=np.array([0.0, 0.0, 1.0]))
-    return faces, [1.0, window.glass_index, window.medium_index]
+def column(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return tuple(points[:, k] for k in range(3))
 
 
-def seen_at(setup: Triangulation, points: np.ndarray) -> np.ndarray:
-    """Pixels u, v (N, 2) of points (N, 3) by least time; x points away from the laser."""
-    rays = fermat.directions_seen(points, *faces_of(setup.window))
-    return rays[:, :2] / rays[:, 2:] * setup.focal_length_mm / setup.pixel_size_mm
+def rows(point: tuple) -> np.ndarray:
+    return np.stack(np.broadcast_arrays(*point), axis=-1).reshape(-1, 3)
 
 
-def on_the_sheet(setup: Triangulation, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of the sheet; the laser stands at -x."""
-    y, z = np.broadcast_arrays(y, z)
-    return np.stack([z * math.tan(setup.triangulation_angle_rad) - setup.baseline_mm, y, z], axis=1)
+def seen_at(sensor: Sensor, medium: str, points: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) of points (N, 3) in the camera frame, by least time and OpenCV's lens."""
+    window, camera = sensor.camera.window, sensor.camera
+    faces = fermat.plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=window.normal())
+    index = sensor.media[medium].refractive_index(635.0)
+    rays = fermat.directions_seen(points, faces, [1.0, window.index(635.0), index])
+    (fx, fy), (cx, cy) = camera.focal_lengths_px(), camera.principal_point()
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    coefficients = np.array(list(camera.distortion.model_dump().values()))
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
 
 
-@every_setup
-def test_pixels_see_the_sheet_where_light_takes_the_least_time(setup):
-    u, v = in_the_image(setup)
-    z, y = depth_mm(setup, u, v), position_along_mm(setup, u, v)
-    assert np.ptp(z) > 100
-    if setup is AIR:  # nothing bends the rays, and the formulas are the thesis's own
-        bracket = 12.5 * math.tan(ANGLE) - 0.0053 * u
-        np.testing.assert_allclose(z, 265 * 12.5 / bracket, rtol=1e-14)
-        np.testing.assert_allclose(y, 265 * 0.0053 * v / bracket, rtol=1e-13, atol=1e-13)
-        np.testing.assert_allclose(depth_per_pixel_mm(setup, u, v), 265 * 12.5 * 0.0053 / bracket**2, rtol=1e-13)
-        return
-    # The oracle finds crossings to 1e-11 mm in some 100 mm: 1e-13 of 4000 px and more at grazing angles.
-    np.testing.assert_allclose(seen_at(setup, on_the_sheet(setup, y, z)), np.stack([u, v], axis=1), rtol=0, atol=1e-8)
+def points_of_sheet(sensor: Sensor, count: int = 200) -> np.ndarray:
+    """Random points of the sheet in the camera frame, beyond the window."""
+    rng = np.random.default_rng(3)
+    own = np.stack([np.zeros(count), rng.uniform(-80, 80, count), rng.uniform(-60, 90, count)], axis=1)
+    transform = camera_from_object(sensor)
+    return own @ transform[:3, :3].T + transform[:3, 3]
 
 
-@every_setup
-def test_depth_per_pixel_is_the_derivative_of_depth(setup):
-    u, v = in_the_image(setup)
-    h = 0.01
-    difference = (depth_mm(setup, u + h, v) - depth_mm(setup, u - h, v)) / (2 * h)
-    # The third derivative gives about (h s / f / 0.1)^2, below 2e-8 for the shortest lens; 1e-13 of a depth over the
-    # step gives 1e-9 of a slope above 0.05 mm.
-    np.testing.assert_allclose(depth_per_pixel_mm(setup, u, v), difference, rtol=1e-7)
+@pytest.mark.parametrize("changes", [{}, TILTED, HEIGHT, ROLLED])
+def test_points_of_the_sheet_lie_in_it(thesis, changes):
+    sensor = altered(thesis, changes)
+    geometry, pose, transform = geometry_of(sensor), laser_pose(sensor), camera_from_object(sensor)
+    assert float(g.standoff_mm(geometry.laser)) == pytest.approx(transform[2, 3], rel=1e-12)
+    y, z = np.array([-30.0, 0.0, 50.0]), np.array([-20.0, 10.0, 60.0])
+    expected = np.stack([0 * y, y, z], axis=1) @ transform[:3, :3].T + transform[:3, 3]
+    np.testing.assert_allclose(rows(geometry.point(z, y)), expected, atol=1e-10)
+    np.testing.assert_allclose((expected - pose.origin_mm) @ pose.normal, 0.0, atol=1e-10)
 
 
-@settings(deadline=None)
-@given(
-    distance=st.floats(1, 200),
-    thickness=st.floats(0, 50),
-    glass=st.floats(1, 2),
-    index=st.floats(1, 2),
-    angle=st.floats(0.1, 1.2),
-    beyond=st.floats(1, 2000),
-    v=st.floats(-2000, 2000),
-)
-def test_the_pixel_of_a_depth_sees_that_depth(distance, thickness, glass, index, angle, beyond, v):
-    window = FlatWindow(distance_mm=distance, thickness_mm=thickness, glass_index=glass, medium_index=index)
-    setup = Triangulation(
-        baseline_mm=200, triangulation_angle_rad=angle, focal_length_mm=10.0, pixel_size_mm=0.005, window=window
+@pytest.mark.parametrize("changes", [{}, TILTED, HEIGHT, OBLONG, RATIONAL, THICK])
+def test_points_appear_where_light_of_least_time_comes_from(thesis_as_built, changes):
+    sensor = altered(thesis_as_built, changes)
+    points = points_of_sheet(sensor)
+    image = geometry_of(sensor).project(np, column(points))
+    # The oracle ends its search at 1e-10 mm or so of path: 1e-8 of a slope, some 1e-5 px.
+    np.testing.assert_allclose(np.stack([image.x, image.y], axis=1), seen_at(sensor, "water", points), atol=5e-5)
+
+
+def test_the_lens_is_opencvs_and_undistorted_by_iteration(thesis_as_built):
+    camera = altered(thesis_as_built, {"camera": OBLONG["camera"] | RATIONAL["camera"]}).camera
+    (fx, fy), (cx, cy), lens = camera.focal_lengths_px(), camera.principal_point(), g.Lens.from_description(camera)
+    points, coefficients = points_of_sheet(thesis_as_built), np.array(list(camera.distortion.model_dump().values()))
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
+    none = g.WindowGeometry((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
+    seen = g.project_points(np, lens, none, column(points))
+    np.testing.assert_allclose(np.stack([seen.x, seen.y], axis=1), expected, atol=1e-9)
+    np.testing.assert_allclose(g.undistort_pixels(lens, expected), points / points[:, 2:], atol=1e-6)
+
+
+@pytest.mark.parametrize("changes", [{}, TILTED, OBLONG, RATIONAL])
+def test_pixels_per_mm_are_the_differences_of_pixels(thesis_as_built, changes):
+    sensor, step = altered(thesis_as_built, changes), 1e-3
+    points, geometry = points_of_sheet(sensor), geometry_of(sensor)
+    image = geometry.project(np, column(points))
+    rng = np.random.default_rng(5)
+    for direction in rng.normal(size=(4, 3)):
+        direction /= np.linalg.norm(direction)
+        ahead, behind = (geometry.project(np, column(points + s * step * direction)) for s in (1, -1))
+        dx, dy = g.pixels_per_mm(image, geometry.window, tuple(direction))
+        # Central differences leave f''' step^2 / 6, below 1e-9 px/mm here, and 1e-13 * 1000 px / step of rounding.
+        np.testing.assert_allclose(dx, (ahead.x - behind.x) / (2 * step), atol=1e-6)
+        np.testing.assert_allclose(dy, (ahead.y - behind.y) / (2 * step), atol=1e-6)
+        assert np.abs(dx).max() > 0.1
+
+
+@pytest.mark.parametrize("changes", [{}, TILTED, HEIGHT, ROLLED])
+def test_a_pixel_across_the_stripe_moves_the_point_in_the_sheet(thesis_as_built, changes):
+    geometry, step = geometry_of(altered(thesis_as_built, changes)), 1e-3
+    y, z = np.meshgrid(np.linspace(-50, 50, 7), np.linspace(-40, 60, 7))
+    image = geometry.project(np, geometry.point(z, y))
+    y_per_px, z_per_px = geometry.mm_per_pixel(image)
+    ahead, behind = (
+        geometry.project(np, geometry.point(z + s * step * z_per_px, y + s * step * y_per_px)) for s in (1, -1)
     )
-    z = window.outer_mm + beyond
-    u = pixel_of_depth(setup, z, v)
-    # Rounding of 1e-16, grown at most by Z / B and by slopes in air that a window close to the pupil makes some 1000.
-    assert depth_mm(setup, u, v) == pytest.approx(z, rel=1e-11)
+    moved = ahead.x - behind.x, ahead.y - behind.y
+    # Rounding of 1e-13 * 1000 px, and the third derivative's 1e-6 of the step.
+    np.testing.assert_allclose(geometry.across(moved), 2 * step, atol=1e-8)
+    np.testing.assert_allclose(geometry.along(moved), 0.0, atol=1e-8)
 
 
-@every_setup
-def test_the_ends_of_the_line_appear_at_the_edge_of_the_image(setup):
-    if setup is AIR:
-        np.testing.assert_allclose(
-            line_length_mm(setup, [300.0, 400.0], side_px=1280), 6.784 / 12.5 * np.array([300, 400])
-        )
-        return
-    z = setup.window.outer_mm + np.array([100.0, 200.0, 350.0])
-    half = line_length_mm(setup, z, side_px=1280) / 2
-    np.testing.assert_allclose(seen_at(setup, on_the_sheet(setup, half, z))[:, 1], 640, rtol=0, atol=1e-8)
+@pytest.mark.parametrize("medium", ["air", "water"])
+@pytest.mark.parametrize("changes", [{}, TILTED, HEIGHT, ROLLED])
+def test_line_and_view_end_at_the_edges_of_the_image(thesis_as_built, changes, medium):
+    sensor = altered(thesis_as_built, changes)
+    geometry, camera = geometry_of(sensor, medium), sensor.camera
+    z = np.array([-40.0, 0.0, 60.0])
+    ends = [seen_at(sensor, medium, rows(geometry.point(z, y))) for y in geometry.line_ends(np, z)]
+    sides = np.array([camera.width_px, camera.height_px])
+    along = 0 if camera.stripe_along == "width" else 1
+    found = np.sort(np.stack([end[:, along] for end in ends]), axis=0)
+    # Five Newton steps from the middle; the oracle contributes 1e-5 px.
+    np.testing.assert_allclose(found, np.array([[-0.5], [sides[along] - 0.5]]) * np.ones(3), atol=1e-4)
+    outer = camera.window.distance_mm + camera.window.thickness_mm
+    depths = np.array(geometry.depths_in_view(np, outer))
+    assert outer < depths[0] < depths[1]
+    middle = (depths - g.standoff_mm(geometry.laser)) / geometry.laser.axis[2]
+    edges = np.sort(seen_at(sensor, medium, rows(geometry.point(middle)))[:, 1 - along])
+    np.testing.assert_allclose(edges, [-0.5, sides[1 - along] - 0.5], atol=1e-4)
 
 
-@every_setup
-def test_the_volume_ends_at_the_edges_of_the_image(setup):
-    near, far = measuring_volume(setup, side_px=600)
-    assert setup.window.outer_mm < near < far < math.inf
-    np.testing.assert_allclose(pixel_of_depth(setup, [near, far]), [-300, 300], rtol=0, atol=1e-9)
+def test_in_air_the_equations_are_the_thesis(thesis):
+    sensor = altered(thesis, {"camera": {"window": {"mounted": False}}})
+    geometry, camera = geometry_of(sensor, "air"), sensor.camera
+    points = points_of_sheet(sensor)
+    image = geometry.project(np, column(points))
+    cx, cy = camera.principal_point()
+    u, v, f, s = image.y - cy, image.x - cx, camera.focal_length_mm, 1e-3 * camera.pixel_size_um
+    bracket = f * math.tan(ANGLE) - s * u
+    np.testing.assert_allclose(points[:, 2], 265 * f / bracket, rtol=1e-11)  # Eq. 2.8
+    np.testing.assert_allclose(points[:, 0], 265 * s * v / bracket, atol=1e-9)  # Eq. 2.10, corrected
+    y, z = geometry.mm_per_pixel(image)
+    depth = y * geometry.laser.fan[2] + z * geometry.laser.axis[2]
+    np.testing.assert_allclose(np.abs(depth), 265 * f * s / bracket**2, rtol=1e-9)  # Eq. 2.9
 
 
-def test_a_volume_without_an_end_and_one_that_begins_at_the_window():
-    # The edge of a large image looks along the sheet where its slope is tan 35 deg: 1651 px from the middle.
-    edge = math.tan(ANGLE) * 12.5 / 0.0053
-    assert measuring_volume(AIR, side_px=2 * edge + 1).far_mm == math.inf
-    assert 1e5 < measuring_volume(AIR, side_px=2 * edge - 1).far_mm < math.inf
-    close = replace(AIR, window=FlatWindow(distance_mm=350.0))
-    assert measuring_volume(close, side_px=1024).near_mm == 350.0
-    with pytest.raises(RangeError, match=r"leaves the camera's view at 548\.5 mm, before the window"):
-        measuring_volume(replace(AIR, window=FlatWindow(distance_mm=549.0)), side_px=1024)
-
-
-def test_the_thesis_resolution_is_that_along_the_laser_in_water():
+def test_the_thesis_resolution_is_that_along_the_laser_in_water(thesis):
     # Printed to 0.01, "in the Z direction at the stand-off", in the budget for water.
-    in_water = float(depth_per_pixel_mm(WATER, 0.0))
+    table = {row.name: row.value for row in design(thesis, medium="water")}
+    in_water = table["depth per pixel at the stand-off"]
     assert in_water / math.cos(ANGLE) == pytest.approx(0.22, abs=0.005)
     assert in_water / math.cos(ANGLE) == pytest.approx(0.2213, abs=5e-5)
     # By hand: a pixel spans 0.0053 / 12.5 of the apparent distance 62.8 + 5.93 / 1.52 + 309.73 / 1.3312 = 299.37 mm,
     # 0.12693 mm, and the sheet leaves the axis by tan 35 deg.
     assert in_water == pytest.approx(0.12693 / 0.70021, abs=2e-5)
-    # In air it would be 0.28, along the camera's axis 0.18: neither is what the thesis prints.
-    assert depth_per_pixel_mm(AIR, 0.0) / math.cos(ANGLE) == pytest.approx(0.2798, abs=1e-4)
-
-
-def test_the_factor_n_divides_resolution_and_line_length():
-    factor = replace(AIR, window=thesis_factor(1.33))
-    assert depth_per_pixel_mm(factor, 0.0) == pytest.approx(float(depth_per_pixel_mm(AIR, 0.0)) / 1.33, rel=1e-14)
-    assert line_length_mm(factor, STANDOFF, side_px=1280) == pytest.approx(
-        float(line_length_mm(AIR, STANDOFF, side_px=1280)) / 1.33, rel=1e-14
-    )
-    assert pixel_of_depth(factor, depth_mm(factor, 300.0, 200.0), 200.0) == pytest.approx(300.0, rel=1e-12)
     # Air and glass before the water do not magnify: the factor makes the pixel 5 % too fine.
-    assert depth_per_pixel_mm(factor, 0.0) / depth_per_pixel_mm(WATER, 0.0) == pytest.approx(0.95, abs=0.002)
+    assert table["depth per pixel by the thesis's factor n"] / in_water == pytest.approx(0.95, abs=0.002)
 
 
-def test_the_thesis_line_is_longer_than_its_drawings_give():
-    # By hand, in test_design_checks.py: 80.226 mm to each side in water.
-    assert line_length_mm(WATER, STANDOFF, side_px=1280) == pytest.approx(160.45, abs=0.01)
-    assert line_length_mm(AIR, STANDOFF, side_px=1280) == pytest.approx(STANDOFF * 6.784 / 12.5)
+def test_the_thesis_line_and_volume(thesis):
+    water = {row.name: row.value for row in design(thesis, medium="water")}
+    # By hand, in test_design_checks.py: 80.226 mm to each side, 234.92 to 429.39 mm. The thesis prints 200 to 420 mm.
+    assert water["line length at the stand-off"] == pytest.approx(160.45, abs=0.01)
+    names = ("sheet in view, nearest to the window", "sheet in view, farthest from the window")
+    assert [water[name] for name in names] == pytest.approx([234.92, 429.39], abs=0.15)
     # The published 184 mm are between the values for water and air at the stand-off. In water, they occur 60 mm behind.
-    assert line_length_mm(WATER, STANDOFF + 59.9, side_px=1280) == pytest.approx(184.0, abs=0.05)
+    low, high = geometry_of(thesis).line_ends(np, 59.9 / math.cos(ANGLE))
+    assert high - low == pytest.approx(184.0, abs=0.05)
+    bare = altered(thesis, {"camera": {"window": {"mounted": False}}})
+    air = {row.name: row.value for row in design(bare, medium="air")}
+    assert air["line length at the stand-off"] == pytest.approx(STANDOFF * 6.784 / 12.5)
+    # Its 330 mm of depth in air are along the laser; the drawings give 4 % less.
+    assert air["depth in view along the laser's axis"] == pytest.approx(330, rel=0.045)
     # The thesis's own recipe has cos 35 deg too much: 168 mm in air.
     assert 1280 * 0.0053 * 265 * math.cos(ANGLE) / (12.5 * math.tan(ANGLE)) == pytest.approx(168.25, abs=0.005)
 
 
-def test_the_thesis_volume():
-    near, far = (z - WATER.window.outer_mm for z in measuring_volume(WATER, side_px=1024))
-    # By hand, in test_design_checks.py. The thesis prints 200 to 420 mm, of the built sensor.
-    assert (near, far) == pytest.approx((234.92, 429.39), abs=0.15)
-    # Its 330 mm of depth in air are along the laser; the drawings give 4 % less.
-    volume = measuring_volume(AIR, side_px=1024)
-    assert (volume.far_mm - volume.near_mm) / math.cos(ANGLE) == pytest.approx(330, rel=0.045)
-    assert volume == pytest.approx((265 / (0.70021 + 0.21709), 265 / (0.70021 - 0.21709)), rel=2e-5)
+def test_a_view_without_an_end(thesis):
+    # The edge of a large image looks along the sheet where its slope is tan 35 deg: 1651 px from the middle.
+    for height, far in ((3306, math.inf), (3298, 1e5)):
+        camera = {"height_px": height, "window": {"mounted": False}}
+        row = {r.name: r.value for r in design(altered(thesis, {"camera": camera}), medium="air")}
+        assert row["sheet in view, farthest from the window"] >= far
 
 
 def test_the_thesis_scheimpflug_angle():
     def degrees(angle_deg: float, magnification: float) -> float:
         return math.degrees(
-            scheimpflug_angle_rad(triangulation_angle_rad=math.radians(angle_deg), magnification=magnification)
+            g.scheimpflug_angle_rad(triangulation_angle_rad=math.radians(angle_deg), magnification=magnification)
         )
 
     # Printed to 0.1: from 250 mm with the complement of the angle, or from the stand-off with the factor 1.33.
@@ -221,73 +217,57 @@ def test_object_plane_lens_plane_and_image_plane_meet_in_one_line():
     m = f / (z - f)
     slopes = np.diff(-x * m) / np.diff(z * m)
     assert slopes[0] == pytest.approx(slopes[1])
-    angle = scheimpflug_angle_rad(triangulation_angle_rad=ANGLE, magnification=m[1])
+    angle = g.scheimpflug_angle_rad(triangulation_angle_rad=ANGLE, magnification=m[1])
     # The image plane leaves the axis by tan beta.
     assert abs(slopes[0]) == pytest.approx(math.tan(angle), rel=1e-9)
 
 
 def test_the_thesis_speckle_limit():
     thesis = {"wavelength_nm": 635, "focal_length_mm": 12.5, "f_number": 4, "distance_mm": 250}
-    across = speckle_limit_um(**thesis, contrast=1.0)
+    across = g.speckle_limit_um(**thesis, contrast=1.0)
     assert across == pytest.approx(16, abs=0.5)
     # sin u = 12.5 / 8 / 250 = 1 / 160 but for 2e-5: 160 * 0.635 / (2 pi).
     assert across == pytest.approx(16.170, abs=0.001)
     assert across / math.sin(ANGLE) == pytest.approx(28.2, abs=0.05)
-    assert speckle_limit_um(**thesis, contrast=0.5) == pytest.approx(across / 2)
+    assert g.speckle_limit_um(**thesis, contrast=0.5) == pytest.approx(across / 2)
     # Of two independent patterns of equal mean the variances add: 2 (1/2)^2.
-    assert speckle_limit_um(**thesis) == pytest.approx(across * math.sqrt(0.5))
+    assert g.speckle_limit_um(**thesis) == pytest.approx(across * math.sqrt(0.5))
 
 
 def test_the_thesis_window_thickness_needs_a_smaller_opening_than_the_bore():
     def thickness(diameter: float, support: float, strength: float = 60.0) -> float:
-        return window_thickness_mm(
+        return g.window_thickness_mm(
             pressure_mpa=1.0, unsupported_diameter_mm=diameter, strength_mpa=strength, support=support
         )
 
     # Printed to 0.01 mm; a diameter given to 0.1 mm changes the thickness by that much.
-    assert thickness(49.5, CLAMPED) == pytest.approx(5.53, abs=0.01)
-    assert thickness(40.4, UNCLAMPED) == pytest.approx(5.53, abs=0.01)
-    assert thickness(63.0, CLAMPED) == pytest.approx(7.04, abs=0.005)
+    assert thickness(49.5, g.CLAMPED) == pytest.approx(5.53, abs=0.01)
+    assert thickness(40.4, g.UNCLAMPED) == pytest.approx(5.53, abs=0.01)
+    assert thickness(63.0, g.CLAMPED) == pytest.approx(7.04, abs=0.005)
     # Over the whole bore it would take stronger glass than there is.
-    assert thickness(63.0, CLAMPED, 97.3) == pytest.approx(5.53, abs=0.01)
-    assert thickness(63.0, UNCLAMPED, 146.0) == pytest.approx(5.53, abs=0.01)
+    assert thickness(63.0, g.CLAMPED, 97.3) == pytest.approx(5.53, abs=0.01)
+    assert thickness(63.0, g.UNCLAMPED, 146.0) == pytest.approx(5.53, abs=0.01)
     # The usual rules of makers of windows for a safety factor of 4: 0.866 and 1.06 D sqrt(P / S).
-    assert thickness(1.0, CLAMPED, 1.0) == pytest.approx(0.866, abs=5e-4)
-    assert thickness(1.0, UNCLAMPED, 1.0) == pytest.approx(1.06, abs=5e-3)
+    assert thickness(1.0, g.CLAMPED, 1.0) == pytest.approx(0.866, abs=5e-4)
+    assert thickness(1.0, g.UNCLAMPED, 1.0) == pytest.approx(1.06, abs=5e-3)
 
 
 def test_a_fifth_of_the_pipe_needs_176_mm():
-    assert line_needed_mm(pipe_diameter_mm=300, passes=5) == pytest.approx(176.3, abs=0.05)
-    assert line_needed_mm(pipe_diameter_mm=300, passes=6) == pytest.approx(150.0)
-    assert line_needed_mm(pipe_diameter_mm=300, passes=2) == pytest.approx(300.0)
+    assert g.line_needed_mm(pipe_diameter_mm=300, passes=5) == pytest.approx(176.3, abs=0.05)
+    assert g.line_needed_mm(pipe_diameter_mm=300, passes=6) == pytest.approx(150.0)
+    assert g.line_needed_mm(pipe_diameter_mm=300, passes=2) == pytest.approx(300.0)
 
 
 SPECKLE = {"wavelength_nm": 635, "focal_length_mm": 12.5, "f_number": 4, "distance_mm": 250}
-GLASS = {"pressure_mpa": 1, "unsupported_diameter_mm": 63, "strength_mpa": 60}
 
 
 @pytest.mark.parametrize(
     ("refused", "message"),
     [
-        (lambda: replace(AIR, baseline_mm=0.0), "baseline_mm is 0"),
-        (lambda: replace(AIR, pixel_size_mm=math.nan), "pixel_size_mm is nan"),
-        (lambda: replace(AIR, triangulation_angle_rad=35), "angle is 35 rad"),
-        (lambda: FlatWindow(distance_mm=-1.0), "must not be negative"),
-        (lambda: FlatWindow(distance_mm=1.0, medium_index=0.9), "must be at least 1"),
-        (lambda: FlatWindow(medium_index=1.33), "in the pupil;"),
-        (lambda: depth_mm(AIR, [0.0, math.nan]), "finite"),
-        (lambda: depth_mm(AIR, 1652.0), "does not meet the sheet"),
-        (lambda: depth_mm(WATER, -1e6), "does not meet the sheet"),
-        (lambda: pixel_of_depth(WATER, 68.72), r"outer face at 68\.73 mm"),
-        (lambda: pixel_of_depth(WATER, math.inf), "finite"),
-        (lambda: pixel_of_depth(WATER, 300.0, math.nan), "finite"),
-        (lambda: line_length_mm(WATER, 300.0, side_px=0), "side_px is 0"),
-        (lambda: measuring_volume(WATER, side_px=-5), "side_px is -5"),
-        (lambda: scheimpflug_angle_rad(triangulation_angle_rad=ANGLE, magnification=0.0), "magnification is 0"),
-        (lambda: scheimpflug_angle_rad(triangulation_angle_rad=math.nan, magnification=0.1), "angle is nan"),
-        *((lambda n=n: speckle_limit_um(**SPECKLE | {n: -1}), f"{n} is -1") for n in SPECKLE),
-        *((lambda n=n: window_thickness_mm(**GLASS | {n: math.inf}), f"{n} is inf") for n in GLASS),
-        (lambda: line_needed_mm(pipe_diameter_mm=300, passes=1), "passes is 1"),
+        (lambda: g.scheimpflug_angle_rad(triangulation_angle_rad=ANGLE, magnification=0.0), "magnification is 0"),
+        (lambda: g.scheimpflug_angle_rad(triangulation_angle_rad=math.nan, magnification=0.1), "angle is nan"),
+        *((lambda n=n: g.speckle_limit_um(**SPECKLE | {n: -1}), f"{n} is -1") for n in SPECKLE),
+        (lambda: g.line_needed_mm(pipe_diameter_mm=300, passes=1), "passes is 1"),
     ],
 )
 def test_numbers_without_a_meaning_are_refused(refused, message):
@@ -356,22 +336,18 @@ def test_z_of_a_laser_beside_the_camera_runs_along_its_own_axis(thesis):
     # the sheet, Z grows with the distance along the laser's axis.
     laser = PLACED | {"origin_mm": (-150.0, -265.0, 0.0), "axis": (150.0, 265.0, 378.5)}
     sensor = altered(thesis, {"laser": laser})
-    setup, leaning = nominal_setup(sensor, sensor.media["air"])
+    motion = geometry_of(sensor, "air").crossing_motion()
     axis = np.array(laser["axis"]) / np.linalg.norm(laser["axis"])
     normal = np.array([0.0, -1.0, 0.0]) + axis[1] * axis
     crossing = np.cross([1.0, 0.0, 0.0], normal)
     crossing /= crossing[2]
-    assert math.tan(setup.triangulation_angle_rad) == pytest.approx(crossing[1])
-    assert leaning == pytest.approx(crossing @ axis)
+    assert motion / motion[2] == pytest.approx(crossing, abs=1e-9)
 
 
 def test_sensors_without_a_design_are_refused(thesis):
     bare = altered(thesis, {"camera": {"window": {"mounted": False}}})
     with pytest.raises(DesignError, match=r"index is 1\.3312: mount it"):
         design(bare, medium="water")
-    # In air the unmounted window does nothing.
-    air = nominal_setup(bare, bare.media["air"])[0]
-    assert depth_mm(air, 100.0, 100.0) == pytest.approx(float(depth_mm(AIR, 100.0, 100.0)))
     # A sheet turned by 90 deg about a laser's axis that leans sideways too.
     laser = PLACED | {"origin_mm": (-150.0, 0.0, 0.0), "axis": (150.0, 0.0, 378.5), "roll_deg": 90.0}
     with pytest.raises(DesignError, match="runs across the image's width"):

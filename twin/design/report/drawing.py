@@ -15,12 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.design.figures_of_merit import evaluate_field, find_depths_in_view
-from twin.design.geometry import Lens, WindowGeometry, trace_rays, undistort_pixels
 from twin.design.report.study_tables import number_text
 from twin.design.sensor_arrays import SensorArrays, extract_parameters
 from uwlts.errors import DesignError
 from uwlts.model.placement import LaserPose, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
+from uwlts.optics.design import Lens, WindowGeometry, trace_rays, undistort_pixels
 from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 
 _BEYOND = 1.06
