@@ -1,6 +1,7 @@
 """Uncertainty of an artefact's figures and of a cloud's position, including correlations between points."""
 
 from dataclasses import replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quan
 from uwlts.evaluation.spheres import SphereEvaluation
 from uwlts.evaluation.step_faces import StepFace
 from uwlts.fitting.propagation import PointErrors, noise_shifts
-from uwlts.fitting.shapes import FlatFit, fit_cylinder, fit_plane, fit_sphere
+from uwlts.fitting.shapes import CylinderFit, FlatFit, SphereFit, fit_cylinder, fit_plane, fit_sphere
 from uwlts.model.artefacts import StepStandard
 from uwlts.storage.cloud import PointCloud
 
@@ -85,26 +86,30 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     return np.sqrt(np.sum(moved**2, axis=0)) / count
 
 
-class _LinearisedFit:
-    """Linearised fit of a shape to the ``used`` (K,) of N points.
+ShapeT = TypeVar("ShapeT", bound=FlatFit | SphereFit | CylinderFit)
 
-    A point's shift along ``outward`` (K, 3) changes its distance from the shape. ``design`` (K, P) are the distances'
-    derivatives by the shape's parameters. Both are constant, since shifts are small compared with the shape.
+
+class _LinearisedFit(Generic[ShapeT]):
+    """Linearised fit of a shape to the ``used`` (K,) of points (N, 3).
+
+    A point's shift along the normal changes its distance from the shape. Normals and the distances' derivatives by the
+    shape's parameters are constant, since shifts are small compared with the shape.
     """
 
-    def __init__(self, used: np.ndarray, outward: np.ndarray, design: np.ndarray, residuals_mm: np.ndarray):
-        self.used, self._outward, self._design, self._residuals = used, outward, design, residuals_mm
-        self._solve = np.linalg.solve(design.T @ design, design.T)
+    def __init__(self, shape: ShapeT, points: np.ndarray, used: np.ndarray):
+        self.used, self.shape, self._outward = used, shape, shape.normals_at(points[used])
+        self._design = -shape.derivatives(points[used])
+        self._solve = np.linalg.solve(self._design.T @ self._design, self._design.T)
 
     def shift(self, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return changes (P,) of the parameters and residuals (K,) after shifts (N, 3) of points."""
         change = np.einsum("ni,ni->n", self._outward, moves[self.used])
         step = self._solve @ change
-        return step, self._residuals + change - self._design @ step
+        return step, self.shape.residuals_mm + change - self._design @ step
 
-    def parameter_count(self) -> int:
-        """Return the number of parameters."""
-        return len(self._solve)
+    def std_mm(self, residuals: np.ndarray) -> float:
+        """Return the standard deviation of residuals (K,), with the degrees of freedom of the fit."""
+        return float(np.sqrt(residuals @ residuals / (len(residuals) - len(self._solve))))
 
     def gradient(self, weights: np.ndarray, count: int) -> np.ndarray:
         """Return the derivatives (N, 3) of a weighted sum of the parameters by the shifts of N = ``count`` points."""
@@ -113,40 +118,19 @@ class _LinearisedFit:
         return result
 
 
-def _linearise_sphere(
-    points: np.ndarray, used: np.ndarray, radius_mm: float | None
-) -> tuple[np.ndarray, _LinearisedFit]:
-    """Return the centre (3,) of a sphere of free or known radius, and its linearised fit.
-
-    The parameters are the centre and the free radius.
-    """
-    fit = fit_sphere(points[used], radius_mm)
-    outward = points[used] - fit.centre_mm
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    free = np.ones((len(used), 1 if radius_mm is None else 0))
-    return fit.centre_mm, _LinearisedFit(used, outward, np.hstack([outward, free]), fit.residuals_mm)
-
-
-def _flat_design(fit: FlatFit, points: np.ndarray) -> np.ndarray:
-    """Return the derivatives (N, 3) of distances of points from a plane by its offset and slopes."""
-    return np.column_stack([np.ones(len(points)), (points - fit.point_mm) @ fit.axes.T])
-
-
 class _LinearisedPlane:
     """Linearised plane of an evaluation of points (N, 3), mm, with fixed outliers."""
 
     def __init__(self, points: np.ndarray, evaluation: PlaneEvaluation):
         used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
-        plane = fit_plane(points[used], towards=np.array(evaluation.normal))
-        outward = np.broadcast_to(plane.normal, (len(used), 3))
         self._evaluation = evaluation
-        self._fit = _LinearisedFit(used, outward, _flat_design(plane, points[used]), plane.residuals_mm)
+        self._fit = _LinearisedFit(fit_plane(points[used], towards=np.array(evaluation.normal)), points, used)
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
         """Return the evaluation's figures after shifts (N, 3) of all points."""
         _, residuals = self._fit.shift(moves)
-        std = float(np.sqrt(residuals @ residuals / (len(residuals) - 3)))
-        return replace(self._evaluation, re_mm=spread_mm(residuals), std_mm=std).figures_mm
+        std_mm = self._fit.std_mm(residuals)
+        return replace(self._evaluation, re_mm=spread_mm(residuals), std_mm=std_mm).figures_mm
 
     def gradients(self) -> dict[str, np.ndarray]:
         """Return the derivatives (N, 3) of figures that are linear in the points; here none."""
@@ -160,12 +144,7 @@ class _LinearisedPipe:
         used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
         self._points, self._evaluation, self._count = points[used], evaluation, len(points)
         self._pipe = fit_cylinder(points[used], axis_start=evaluation.axis)
-        off = points[used] - self._pipe.point_mm
-        circle = off @ self._pipe.across.T
-        circle /= np.linalg.norm(circle, axis=1, keepdims=True)
-        along = (off @ self._pipe.axis)[:, None]
-        design = np.hstack([circle, along * circle, np.ones_like(along)])
-        self._fit = _LinearisedFit(used, circle @ self._pipe.across, design, self._pipe.residuals_mm)
+        self._fit = _LinearisedFit(self._pipe, points, used)
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
         """Return the evaluation's figures after shifts (N, 3) of all points."""
@@ -174,7 +153,7 @@ class _LinearisedPipe:
             self._evaluation,
             diameter_error_mm=self._evaluation.diameter_error_mm + 2 * float(step[4]),
             range_mm=spread_mm(residuals),
-            std_mm=float(np.sqrt(residuals @ residuals / (len(residuals) - 5))),
+            std_mm=self._fit.std_mm(residuals),
             ovality_mm=measure_ovality(self._points, replace(self._pipe, residuals_mm=residuals)),
         ).figures_mm
 
@@ -202,9 +181,8 @@ class _LinearisedStep:
         points, base = self._cloud.points_mm, StepFace[self._artefact.reference.upper()]
         used, across = (np.flatnonzero(self._labels == face) for face in (base, base.other))
         plane = fit_plane(points[used])
-        design = _flat_design(plane, points[used])
-        fit = _LinearisedFit(used, np.broadcast_to(plane.normal, (len(used), 3)), design, plane.residuals_mm)
-        result = -fit.gradient(_flat_design(plane, points[across]).mean(axis=0), len(points))
+        fit = _LinearisedFit(plane, points, used)
+        result = fit.gradient(plane.derivatives(points[across]).mean(axis=0), len(points))
         result[across] = plane.normal / len(across)
         (name,) = (f.key.name for f in self._evaluation.figures if f.key.quantity is Quantity.HEIGHT_ERROR)
         return {name: np.sign(plane.distances_mm(points[across]).mean()) * result}
@@ -221,25 +199,26 @@ class LinearisedSpheres:
         radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
         off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
         members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
-        free = [_linearise_sphere(points, own, None) for own in members]
-        known = [_linearise_sphere(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
-        self._centres, self._free = [centre for centre, _ in free], [fit for _, fit in free]
-        self._known_centres, self._known = [centre for centre, _ in known], [fit for _, fit in known]
+        self._free = [_LinearisedFit(fit_sphere(points[own]), points, own) for own in members]
+        self._known = [
+            _LinearisedFit(fit_sphere(points[own], d / 2), points, own)
+            for own, d in zip(members, diameters, strict=True)
+        ]
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
         """Return the evaluation's figures after shifts (N, 3) of all points."""
         free = [fit.shift(moves) for fit in self._free]
-        moved = [centre + step[:3] for centre, (step, _) in zip(self._centres, free, strict=True)]
-        known = [c + fit.shift(moves)[0] for c, fit in zip(self._known_centres, self._known, strict=True)]
+        moved = [fit.shape.centre_mm + step[:3] for fit, (step, _) in zip(self._free, free, strict=True)]
+        known = [fit.shape.centre_mm + fit.shift(moves)[0] for fit in self._known]
         spheres = [
             replace(
                 sphere,
                 diameter_mm=sphere.diameter_mm + 2 * step[3],
                 diameter_error_mm=sphere.diameter_error_mm + 2 * step[3],
                 pe_mm=spread_mm(residuals),
-                std_mm=float(np.sqrt(residuals @ residuals / (len(residuals) - 4))),
+                std_mm=fit.std_mm(residuals),
             )
-            for sphere, (step, residuals) in zip(self._evaluation.spheres, free, strict=True)
+            for sphere, fit, (step, residuals) in zip(self._evaluation.spheres, self._free, free, strict=True)
         ]
         spacings = []
         for number, spacing in enumerate(self._evaluation.spacings):
@@ -259,17 +238,15 @@ class LinearisedSpheres:
                     by_radius = np.array([0.0, 0.0, 0.0, 2.0])
                     found[key.name] = self._free[key.spheres[0] - 1].gradient(by_radius, self._count)
                 case Quantity.SPACING_ERROR:
-                    found[key.name] = self._spacing_gradient(key.spheres, self._free, self._centres)
+                    found[key.name] = self._spacing_gradient(key.spheres, self._free)
                 case Quantity.SPACING_ERROR_KNOWN_RADIUS:
-                    found[key.name] = self._spacing_gradient(key.spheres, self._known, self._known_centres)
+                    found[key.name] = self._spacing_gradient(key.spheres, self._known)
                 case _:
                     pass  # ranges and standard deviations are not linear in the points
         return found
 
-    def _spacing_gradient(
-        self, spheres: tuple[int, ...], fits: list[_LinearisedFit], centres: list[np.ndarray]
-    ) -> np.ndarray:
-        first = spheres[0] - 1 if spheres else 0
-        between = centres[first + 1] - centres[first]
-        along = np.append(between / np.linalg.norm(between), 0.0)[: fits[first].parameter_count()]
-        return fits[first + 1].gradient(along, self._count) - fits[first].gradient(along, self._count)
+    def _spacing_gradient(self, spheres: tuple[int, ...], fits: list[_LinearisedFit[SphereFit]]) -> np.ndarray:
+        first, second = fits[spheres[0] - 1 if spheres else 0 :][:2]
+        between = second.shape.centre_mm - first.shape.centre_mm
+        along = np.append(between / np.linalg.norm(between), 0.0)[: len(first.shape.covariance)]
+        return second.gradient(along, self._count) - first.gradient(along, self._count)

@@ -25,6 +25,10 @@ _DIRECTIONS = 80
 """Number of axis directions tried on the half sphere, about 15 deg apart."""
 _TRIED = 5
 """Number of best directions that are refined."""
+_CIRCLE_STEPS = 20
+"""Largest number of Gauss-Newton steps to a circle; they converge in about five."""
+_LARGEST_CIRCLE = 1e6
+"""Radius of a circle, relative to the extent of its points, above which they are collinear within rounding errors."""
 _LARGEST_SLOPE_STD = 0.2
 """Largest standard uncertainty of the axis slope (11 deg); beyond, the direction is undetermined."""
 
@@ -54,6 +58,14 @@ class FlatFit:
     def distances_mm(self, points: np.ndarray) -> np.ndarray:
         """Return the distances (M,) of points (M, D), as in `residuals_mm`."""
         return _norms((np.asarray(points, dtype=np.float64) - self.point_mm) @ self.normals.T)
+
+    def normals_at(self, points: np.ndarray) -> np.ndarray:
+        """Return the unit normals (M, D) of the distances of points (M, D) from a plane, or from a line in a plane."""
+        return np.broadcast_to(self.normal, points.shape)
+
+    def derivatives(self, points: np.ndarray) -> np.ndarray:
+        """Return the derivatives (M, K + 1) of these distances by the parameters, in the order of the covariance."""
+        return -np.column_stack([np.ones(len(points)), (points - self.point_mm) @ self.axes.T])
 
 
 def fit_plane(points: Any, towards: Any = None) -> FlatFit:
@@ -115,6 +127,18 @@ class SphereFit:
     def distances_mm(self, points: np.ndarray) -> np.ndarray:
         """Return the signed distances (M,) of points (M, 3), as in `residuals_mm`."""
         return np.linalg.norm(np.asarray(points, dtype=np.float64) - self.centre_mm, axis=1) - self.radius_mm
+
+    def normals_at(self, points: np.ndarray) -> np.ndarray:
+        """Return the unit normals (M, 3) of the distances of points (M, 3), outwards."""
+        return _unit_vectors(points - self.centre_mm)
+
+    def derivatives(self, points: np.ndarray) -> np.ndarray:
+        """Return the derivatives (M, 4) or (M, 3) of the distances by the parameters, in the order of the covariance.
+
+        The derivative of |p - c| - r is minus the unit vector from the centre, and -1 for a free radius.
+        """
+        by_radius = np.full((len(points), len(self.covariance) - 3), -1.0)
+        return np.hstack([-self.normals_at(points), by_radius])
 
 
 def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
@@ -179,6 +203,17 @@ class CylinderFit:
         """Return the signed distances (M,) of points (M, 3), as in `residuals_mm`."""
         across = (np.asarray(points, dtype=np.float64) - self.point_mm) @ self.across.T
         return np.hypot(across[:, 0], across[:, 1]) - self.radius_mm
+
+    def normals_at(self, points: np.ndarray) -> np.ndarray:
+        """Return the unit normals (M, 3) of the distances of points (M, 3), outwards."""
+        return _unit_vectors((points - self.point_mm) @ self.across.T) @ self.across
+
+    def derivatives(self, points: np.ndarray) -> np.ndarray:
+        """Return the derivatives (M, 5) or (M, 4) of the distances by the parameters, ordered as the covariance."""
+        offsets = -self.normals_at(points) @ self.across.T
+        along = ((points - self.point_mm) @ self.axis)[:, None]
+        by_radius = np.full((len(points), len(self.covariance) - 4), -1.0)
+        return np.hstack([offsets, along * offsets, by_radius])
 
 
 def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = None) -> CylinderFit:
@@ -321,6 +356,27 @@ def fit_algebraic_centres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     centres = -vector[..., 1:] / (2.0 * curvature[..., None])
     radii = np.sqrt(np.sum(centres**2, axis=-1) + mean)
     return centres, radii
+
+
+def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Fit a circle to points (N, 2) by least squares of the distances; return its centre (2,) and radius.
+
+    Gauss-Newton steps from the algebraic circle. EvaluationError if the points are on a line within rounding errors, or
+    the fit does not converge.
+    """
+    middle = points.mean(axis=0)
+    extent = float(np.ptp(points, axis=0).max())
+    offset, radius = fit_algebraic_centres(points - middle)
+    result = np.append(middle + offset, radius)
+    for _ in range(_CIRCLE_STEPS):
+        away = points - result[:2]
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-12 * extent)
+        design = np.column_stack([away / distance[:, None], np.ones(len(away))])
+        step = np.linalg.lstsq(design, distance - result[2], rcond=None)[0]
+        result = result + step
+        if np.abs(step).max() <= 1e-9 * extent and 0 < result[2] < _LARGEST_CIRCLE * extent:
+            return result[:2], float(result[2])
+    raise EvaluationError(f"no circle fits the {len(points)} points: they lie on a line, or the fit does not converge")
 
 
 def initial_centre(points: np.ndarray, radius: float) -> np.ndarray:

@@ -23,7 +23,7 @@ from uwlts.evaluation.step_faces import StepFace, label_step_faces
 from uwlts.fitting.least_squares import fit_robustly, robust_std, thin_evenly
 from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors, group_neighbours
-from uwlts.fitting.shapes import fit_plane
+from uwlts.fitting.shapes import fit_circle, fit_plane
 from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, FeatureValue, Inspection, plain_value
 from uwlts.inspection.noisy_extremes import BIAS_FACTOR
 from uwlts.storage.cloud import PointCloud
@@ -68,9 +68,6 @@ class FlatRule:
 
 
 _RULE = FlatRule()
-
-_LARGEST_CIRCLE = 1e6
-"""Radius of a circle, relative to the extent of its places, above which they are collinear within rounding errors."""
 
 _facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
 
@@ -520,14 +517,14 @@ def _fit_hole(edges: _Edges) -> _Hole:
     """
     if len(edges.places) < _RULE.fewest_edges:
         raise EvaluationError(f"its edge has {len(edges.places)} points, at least {_RULE.fewest_edges} are needed")
-    solved = _fit_circle(edges.places)
-    away = edges.places - solved[:2]
+    middle, radius = fit_circle(edges.places)
+    away = edges.places - middle
     distance = np.linalg.norm(away, axis=1)
-    left = distance - solved[2]
+    left = distance - radius
     angle = np.sort(np.degrees(np.arctan2(away[:, 1], away[:, 0])))
     seen = 360 - float(np.max(np.diff(np.append(angle, angle[0] + 360))))
     scatter = float(np.sqrt(np.sum(left**2) / (len(left) - 3)))
-    if scatter > (limit := max(_RULE.roundness * solved[2], 1.5 * edges.spacing)):
+    if scatter > (limit := max(_RULE.roundness * radius, 1.5 * edges.spacing)):
         raise EvaluationError(
             f"it is not round: its edge scatters about a circle by {scatter:.2g} mm, more than {limit:.2g} mm"
         )
@@ -538,24 +535,7 @@ def _fit_hole(edges: _Edges) -> _Hole:
     moved = None
     if edges.patterns is not None:
         moved = np.einsum("mej,ej->me", edges.patterns, away / distance[:, None]) @ rows.T
-    return _Hole(solved[:2], float(solved[2]), random, moved, edges.points, _RULE.edge_blur * edges.spacing)
-
-
-def _fit_circle(places: np.ndarray) -> np.ndarray:
-    """Return middle and radius (3,) of the least-squares circle (Gauss-Newton from the algebraic circle)."""
-    centre = places.mean(axis=0)
-    local = places - centre
-    solved = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), np.sum(local**2, axis=1), rcond=None)[0]
-    result = np.array([*(centre + solved[:2]), np.sqrt(max(solved[2] + solved[:2] @ solved[:2], 1e-12))])
-    for _ in range(20):
-        away = places - result[:2]
-        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-12)
-        design = np.column_stack([away / distance[:, None], np.ones(len(away))])
-        step = np.linalg.lstsq(design, distance - result[2], rcond=None)[0]
-        result = result + step
-        if np.abs(step).max() < 1e-9 and result[2] < _LARGEST_CIRCLE * np.ptp(local, axis=0).max():
-            return result
-    raise EvaluationError(f"no circle fits the {len(places)} places: they lie on a line, or the fit does not converge")
+    return _Hole(middle, radius, random, moved, edges.points, _RULE.edge_blur * edges.spacing)
 
 
 def _make_diameter(kind: FeatureKind, name: str, hole: _Hole) -> FeatureValue:
@@ -568,8 +548,8 @@ def _make_diameter(kind: FeatureKind, name: str, hole: _Hole) -> FeatureValue:
 def _measure_bolt_circle(bolts: list[_Hole]) -> tuple[FeatureValue, list[float]]:
     """Return the bolt circle's diameter, and each hole's distance from its place on an even division."""
     middles = np.array([hole.middle for hole in bolts])
-    circle = _fit_circle(middles)
-    away = middles - circle[:2]
+    centre, radius = fit_circle(middles)
+    away = middles - centre
     units = away / np.linalg.norm(away, axis=1, keepdims=True)
     rows = np.linalg.pinv(np.column_stack([units, np.ones(len(bolts))]))
     std = np.array([np.sqrt(u @ hole.random[:2, :2] @ u) for u, hole in zip(units, bolts, strict=True)])
@@ -578,14 +558,14 @@ def _measure_bolt_circle(bolts: list[_Hole]) -> tuple[FeatureValue, list[float]]
     if len(moves) == len(bolts):
         along = np.array([move[:, :2] @ u for move, u in zip(moves, units, strict=True)])
         common = 2 * float(np.linalg.norm(rows[2] @ along))
-    value = plain_value(FeatureKind.FLANGE, "bolt circle", 2 * float(circle[2]), random, common)
+    value = plain_value(FeatureKind.FLANGE, "bolt circle", 2 * radius, random, common)
     angle = np.arctan2(away[:, 1], away[:, 0])
     # Holes may be missing: the smallest angle between two holes gives the division.
     between = np.diff(np.sort(np.append(angle, angle.min() + 2 * np.pi)))
     count = max(len(bolts), round(2 * np.pi / float(np.min(between))))
     phase = np.angle(np.mean(np.exp(1j * count * angle))) / count
     nearest = phase + 2 * np.pi / count * np.round((angle - phase) * count / (2 * np.pi))
-    even = circle[:2] + circle[2] * np.column_stack([np.cos(nearest), np.sin(nearest)])
+    even = centre + radius * np.column_stack([np.cos(nearest), np.sin(nearest)])
     return value, np.linalg.norm(middles - even, axis=1).tolist()
 
 

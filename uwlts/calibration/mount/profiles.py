@@ -7,8 +7,9 @@ from typing import Self
 
 import numpy as np
 
+from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import MAD_TO_STD, robust_std
-from uwlts.fitting.shapes import fit_algebraic_centres
+from uwlts.fitting.shapes import fit_circle
 
 LEAST_POINTS = 12
 """Points on the artefact that a profile needs: four for each of a circle's three parameters."""
@@ -189,13 +190,16 @@ def _refit_inliers(
 
 def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
     def off(some: np.ndarray) -> np.ndarray:
-        centre, radius = _fit_circle(points[some])
+        centre, radius = fit_circle(points[some])
         return np.linalg.norm(points - centre, axis=1) - radius
 
-    if (found := _refit_inliers(members, tolerance, off)) is None:
-        return None
-    members, std = found
-    centre, radius = _fit_circle(points[members])
+    try:
+        if (found := _refit_inliers(members, tolerance, off)) is None:
+            return None
+        members, std = found
+        centre, radius = fit_circle(points[members])
+    except EvaluationError:
+        return None  # the points are on a line
     if _arc_angle(points[members] - centre) < _LEAST_ARC:
         return None
     # Scattered points fill the band of 2 tolerances evenly: their robust standard deviation is 1.5 tolerances, that of
@@ -206,21 +210,6 @@ def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Pr
         return None
     part = np.zeros(len(points), dtype=int)
     return ProfileArc(members=members, part=part, std_mm=std, centre_mm=centre, radius_mm=radius)
-
-
-def _fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Fit a circle by least squares of the distances, with Gauss-Newton steps from the algebraic solution."""
-    middle = points.mean(axis=0)
-    centre, radius = fit_algebraic_centres(points - middle)
-    centre = middle + centre
-    radius = float(radius)
-    for _ in range(5):
-        away = points - centre
-        distance = np.linalg.norm(away, axis=1)
-        design = np.column_stack([away / distance[:, None], np.ones(len(points))])
-        step, *_ = np.linalg.lstsq(design, distance - radius, rcond=None)
-        centre, radius = centre + step[:2], radius + float(step[2])
-    return centre, abs(radius)
 
 
 def _arc_angle(away: np.ndarray) -> float:

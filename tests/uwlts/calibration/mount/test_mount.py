@@ -25,9 +25,10 @@ from tests.uwlts.mount_views import (
 )
 from uwlts.calibration.mount import restricted_likelihood
 from uwlts.calibration.mount.artefact_shapes import RingShape
-from uwlts.calibration.mount.profiles import ProfileLine, _fit_circle, _line_distance
+from uwlts.calibration.mount.profiles import ProfileLine, _line_distance
 from uwlts.cli import main
 from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.fitting.shapes import fit_circle
 from uwlts.model.mount import Mount, PlaneFound, RingFound, SphereFound, StepFound
 from uwlts.storage.mount_files import read_mount, read_profiles
 from uwlts.storage.pose_files import read_poses
@@ -92,7 +93,7 @@ def test_a_short_arc_is_fitted_by_its_distances(rng):
     fit = least_squares(
         lambda circle: np.linalg.norm(points - circle[:2], axis=1) - circle[2], [300, -70, 20], xtol=1e-12
     )
-    centre, found = _fit_circle(points)
+    centre, found = fit_circle(points)
     np.testing.assert_allclose(np.append(centre, found), fit.x, atol=1e-4)
 
 
