@@ -51,8 +51,6 @@ JOBS: dict[str, str] = {
         uwlts calibrate --air inputs/scans/target-bare.h5 --target-poses stage --out sequential/air.json""",
     "polynomials": "uwlts polynomials --captures inputs/scans/target-water.h5 --out polynomials/calibration.json",
     "refresh": "uwlts refresh joint/calibration.json --step inputs/scans/step-today.h5 --out refresh/calibration.json",
-    "models": "uwlts models --air inputs/scans/target-bare.h5 --water inputs/scans/target-water.h5 \
-        --step inputs/scans/step-near.h5 --workers 1 --out models/models.html",
     "camera": "uwlts camera inputs/photographs --out camera/camera.yaml",
     "import": """
         uwlts import inputs/photographs --out import/photographs.h5

@@ -37,7 +37,7 @@ TESTS = {
     "uwlts/calibration/mount": ["tests/uwlts/calibration/mount"],
     "uwlts/calibration": [
         f"tests/uwlts/calibration/{name}"
-        for name in ("camera", "guidance", "sequential", "polynomial", "model_comparison", "test_target_stripes.py")
+        for name in ("camera", "guidance", "sequential", "polynomial", "test_target_stripes.py")
     ],
     "uwlts/reconstruction": ["tests/uwlts/reconstruction", "tests/uwlts/report", "tests/system/test_joint_command.py"],
     "uwlts/fitting": [

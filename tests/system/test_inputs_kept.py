@@ -77,7 +77,6 @@ def test_all_commands_with_outputs_are_covered():
         "uwlts camera",
         "uwlts refresh",
         "uwlts polynomials",
-        "uwlts models",
         "uwlts certificate",
         "uwlts nominal",
         "uwlts import",

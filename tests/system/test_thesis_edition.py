@@ -5,14 +5,12 @@ to speckle, noise and the methods only. Images depend on the seeds only, so limi
 Tests with injected errors show that a change of 0.02 mm does not pass.
 """
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.system.in_process import uwlts
 from twin.recording.campaigns import record_campaigns
 from twin.scene.campaign import Campaign, load_campaign
 from uwlts.model.calibration import Calibration
@@ -197,19 +195,3 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
     assert set(summary.coverage_95) == {"joint_same_evidence", "joint_with_target_in_water", JOINT}
     assert not summary.air.spacing_error_mm
     assert summary_lines(summary)[0].startswith("water, error of the sphere spacing")
-
-
-def test_models_are_chosen_as_the_sensor_was_built(edition: CampaignFolder, tmp_path: Path):
-    """Camera's and laser's windows are tilted by 0.08 and 0.1 deg, the lens has k1 and k2, and the sheet no bow."""
-    page, folder = tmp_path / "models.html", edition.path
-    steps = sorted(folder.glob("step-*-water.h5"))
-    water = ("--water", folder / "target-water.h5", "--step", *steps)
-    done = uwlts("models", "--air", folder / "target-bare.h5", "--out", page, *water)
-    assert done.returncode == 0, done.stderr
-    content = json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))
-    assert content["simplest"] == "sheet without bow"
-    needed = {"one refraction", "window not tilted", "laser window not turned", "no distortion", "distortion k1"}
-    adds = {model["model"]: model["outside"]["adds_mm"] or 0.0 for model in content["models"]}
-    assert {name for name, more in adds.items() if more > 0.002} == needed
-    assert "polynomials" in done.stdout
-    assert "<svg" in page.read_text(encoding="utf-8")

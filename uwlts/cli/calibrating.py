@@ -1,4 +1,4 @@
-"""Commands for calibration and its quality: model comparison, certificate and verification."""
+"""Commands for calibration and its quality: certificate and verification."""
 
 import sys
 from pathlib import Path
@@ -138,18 +138,6 @@ def polynomials(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False
     found = call()
     found.calibration.save(out, overwrite=overwrite)
     wrote(polynomial_lines(found.calibration), found.warnings, out)
-
-
-@command_from(app, uwlts.report, "write_models", job="Calibrate", shortcuts=STRIPE)
-def models(call: Call) -> None:
-    """Example: uwlts models --air target-air.h5 --water target-water.h5 --out models.html"""
-    from uwlts.report.model_comparison import format_lines, make_content
-
-    comparison = call()
-    show(format_lines(make_content(comparison)))
-    warn(*comparison.warnings)
-    if out := call.given.get("out"):
-        wrote_page(Path(out))
 
 
 @command_from(app, uwlts.report, "write_certificate", job="Calibrate")

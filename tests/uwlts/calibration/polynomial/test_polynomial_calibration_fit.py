@@ -11,11 +11,6 @@ from tests.oracles.fermat import directions_seen, plate
 from tests.uwlts.calibration_views import WATER, built_sensor, inside, lattice, lens_of, turn
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
-from uwlts.calibration.joint.gathering import Series
-from uwlts.calibration.joint.parameters import ViewMedium
-from uwlts.calibration.joint.residuals import STRIPE
-from uwlts.calibration.model_comparison.comparison import score_polynomials
-from uwlts.calibration.model_comparison.held_out import Misses, Prediction
 from uwlts.calibration.polynomial.polynomial_calibration_fit import (
     MOST_SMOOTH,
     calibrate_polynomials,
@@ -288,16 +283,11 @@ def test_offset_of_the_position_changes_nothing(evidence):
     assert np.abs(there.coefficients - here.coefficients).max() < 1e-9
 
 
-def test_held_out_images_are_predicted_within_the_others_only(sensor, evidence):
-    """Inside, errors are those at unseen depths; the outermost images are beyond the polynomials of the others."""
-    series = Series(ViewMedium(True, 0), evidence, True, ["target"])
-    misses = [Misses((0, 5), STRIPE, np.ones(200), np.tile([0.03, 0.05], 100))]
-    model, inside_, ends = Prediction(misses, None, None, None), [(0, 5), (0, 9)], [(0, 0), (0, len(DEPTHS) - 1)]
-    score = score_polynomials(series, header_of(sensor), inside_, model)
-    assert score.all_mm < CLOSE_MM and score.images == 2
-    assert score.model_mm == pytest.approx(np.sqrt((0.03**2 + 0.05**2) / 2))
-    rows = np.concatenate([evidence.stripes[k] for _, k in ends])
-    others = [stripe for k, stripe in enumerate(evidence.stripes) if (0, k) not in ends]
+def test_polynomials_of_lines_do_not_extrapolate(evidence):
+    """The outermost images are beyond the polynomials of the others."""
+    ends = [0, len(DEPTHS) - 1]
+    rows = np.concatenate([evidence.stripes[k] for k in ends])
+    others = [stripe for k, stripe in enumerate(evidence.stripes) if k not in ends]
     flat, depths = np.concatenate(others), np.repeat(DEPTHS[1:-1], [len(each) for each in others])
     fit = fit_line_polynomials(flat[:, 0].astype(int), flat[:, 1], depths, degree=6)
     np.testing.assert_allclose(

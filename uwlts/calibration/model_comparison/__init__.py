@@ -1,1 +1,0 @@
-"""Comparison of models of the sensor, judged by images that the calibration does not use."""
