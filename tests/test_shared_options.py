@@ -17,7 +17,6 @@ APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
 
 MEANING = {
     "uwlts": {
-        "--air": "target in air",
         "--calibration": "[Cc]alibration",
         "--camera": "[Aa]ddress of (the|a) camera",
         "--captures": "[Cc]aptures",
@@ -55,7 +54,6 @@ MEANING = {
         "--stripe": "stripe",
         "--stripe-method": "Method for the stripe's centre",
         "--stripe-peak": "Which of several stripes",
-        "--target-poses": "every image has its own pose",
         "--trajectory": "times and poses of the platform",
         "--trust-edited": "edited after they were written",
         "--unlock": "Accept the stage's position",
@@ -63,7 +61,6 @@ MEANING = {
         "--wall-mm": "wall",
         "--false-alarm": "Probability of any finding",
         "--largest-ovality": "ovality",
-        "--water": "target in the medium of use",
         "--workers": "Number of .*(parallel|processes)",
     },
     "twin": {

@@ -12,7 +12,6 @@ from .desk.scan import scan as scan
 from .doctor import examine as examine
 from .errors import Error as Error
 from .evaluation.evaluate import Evaluation as Evaluation, evaluate as evaluate
-from .evaluation.gauge import gauge_study as gauge_study
 from .inspection.features import Inspection as Inspection
 from .inspection.flat import inspect_flange as inspect_flange, inspect_gap as inspect_gap, inspect_step as inspect_step
 from .inspection.pipe import inspect_pipe as inspect_pipe

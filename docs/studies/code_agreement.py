@@ -151,7 +151,6 @@ JOBS: dict[str, str] = {
         copy evaluate/spheres.json report/spheres.evaluation.json
         copy evaluate/spheres.full.ply report/spheres.full.ply
         uwlts report report --published thesis""",
-    "gauge": "uwlts gauge inputs/diameters.csv --tolerance 0.5 --out gauge/study.json",
     "info": """
         uwlts info joint/calibration.json
         uwlts info reconstruct/spheres.full.ply

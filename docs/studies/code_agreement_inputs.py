@@ -98,7 +98,6 @@ def main() -> None:
     copy_photographs(checkout / "tests" / "data" / "etna", folder / "photographs")
     write_mounts(folder)
     write_crossing(folder)
-    write_gauge(folder / "diameters.csv")
     write_network(folder / "centroid.onnx")
 
 
@@ -166,16 +165,6 @@ def write_crossing(folder: Path) -> None:
             thing.save(folder / name, overwrite=True)
         else:
             getattr(uwlts, write)(folder / name, thing, overwrite=True)
-
-
-def write_gauge(path: Path) -> None:
-    """Write diameters of five parts by three operators, three times each."""
-    rng, lines = np.random.default_rng(SEED), ["part,operator,value"]
-    for part in range(5):
-        for operator in ("Ana", "Ben", "Cem"):
-            size = 300 + 0.1 * part + 0.01 * len(lines) ** 0.5
-            lines += [f"pipe {part},{operator},{size + 0.02 * error:.4f}" for error in rng.standard_normal(3)]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_network(path: Path) -> None:

@@ -39,7 +39,6 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.comparison.change_reference import read_datums, read_reference
 from uwlts.comparison.ideal_shapes import read_shape
 from uwlts.evaluation.evaluate import read_evaluation
-from uwlts.evaluation.gauge import gauge_study
 from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
 from uwlts.model.artefacts import read_artefact
@@ -444,11 +443,6 @@ def _lines(path: Path) -> None:
         np.savetxt(path, numbers, delimiter=",")
 
 
-def _gauge(path: Path) -> None:
-    rows = [f"{part},{who},{part + 0.01 * k * part**k}" for part in range(1, 5) for who in "AB" for k in (1, 2)]
-    path.write_text("part,operator,value\n" + "".join(f"{row}\n" for row in rows))
-
-
 READERS = {
     each.name: each
     for each in (
@@ -546,7 +540,6 @@ READERS = {
         Reader("data-set", ".toml", "toml", _shipped("datasets/stripe-turbid.toml"), load_data_set),
         Reader("centre-lines-npy", ".npy", "bytes", _lines, lambda path: read_centre_lines(path, 6)),
         Reader("centre-lines-csv", ".csv", "lines", _lines, lambda path: read_centre_lines(path, 6)),
-        Reader("gauge", ".csv", "lines", _gauge, gauge_study),
         Reader(
             "shape",
             ".toml",

@@ -52,12 +52,6 @@ NEEDS_ROS = "needs ROS 2: tests/ros_node.py runs it"
 NEEDS_LEARN = "needs the extra learn, with some 1 GB of libraries, and minutes of training"
 THREE_VIEWS = {"top.cloud.h5": "pipe.cloud.h5", "left.cloud.h5": "pipe.cloud.h5", "right.cloud.h5": "pipe.cloud.h5"}
 NO_MOVEMENT = "1,0,0,0,0,1,0,0,0,0,1,0\n" * 3
-GAUGE = "part,operator,value\n" + "".join(
-    f"pipe {part},{operator},{299.8 + 0.05 * part + 0.01 * (7 * part * turn % 5):.2f}\n"
-    for part in range(1, 6)
-    for operator in ("Ana", "Ben")
-    for turn in (1, 2, 3)
-)
 PLATES = """
 title = "Two plates with a gap of 3 mm along the scan"
 medium = "water"
@@ -225,10 +219,6 @@ PAGES_RUN = {
     ),
     "docs/how-to/describe-your-sensor.md": Page(tables={"reef.toml": 0, "reef-close.toml": 1}),
     "docs/how-to/follow-a-sensor.md": Page(tables={"wall.toml": 0}, again=("uwlts radiometry wall.h5",)),
-    "docs/how-to/gauge-study.md": Page(
-        texts={"diameters.csv": GAUGE, "runs/gauge/heights.csv": GAUGE},
-        not_run={"python docs/studies/gauge_twin.py": "renders 18 scans"},
-    ),
     "docs/how-to/predict-uncertainty.md": Page(
         texts={
             "my-sensor.toml": 'base = "thesis-small"\nname = "mine"\n',

@@ -1,4 +1,4 @@
-"""Commands that evaluate measured objects: changes, features, gauge studies, and reports."""
+"""Commands that evaluate measured objects: changes, features and reports."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -109,21 +109,6 @@ def inspect(
         found.save(out, overwrite=overwrite)
     if out or coloured:
         wrote_files(coloured, out)
-
-
-@command_from(app, uwlts, "gauge_study", job="Inspect")
-def gauge(
-    call: Call,
-    *,
-    out: Annotated[Path | None, a_file(".json"), Parameter(help="Study to write (JSON).")] = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """Example: uwlts gauge diameters.csv --tolerance 0.2 --out gauge.json"""
-    study = call()
-    show(study.lines())
-    if out:
-        study.save(out, overwrite=overwrite)
-        wrote_files(out)
 
 
 @command_from(app, uwlts.report, "write_findings", job="Inspect", also=_INSPECTIONS)

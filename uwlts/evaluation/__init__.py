@@ -1,1 +1,1 @@
-"""Artefacts in point clouds: figures with uncertainty, comparison with ground truth, gauge studies."""
+"""Artefacts in point clouds: figures with uncertainty, and comparison with ground truth."""
