@@ -2,6 +2,7 @@
 
 import math
 import shlex
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -18,8 +19,9 @@ from twin.scene.campaign import Campaign, Take, list_takes, load_campaign, repla
 from twin.scene.description import Scene, medium_of
 from twin.scene.forms import PittedPipe, Weld
 from twin.scene.motion import Motion
+from twin.scene.stated_deviations import Understated, find_understated
 from uwlts._version import __version__
-from uwlts.errors import CaptureError, DescriptionError
+from uwlts.errors import CaptureError, DescriptionError, DescriptionWarning
 from uwlts.files.json_files import read_json, write_model
 from uwlts.model.artefacts import PlaneStandard, parse_artefact
 from uwlts.model.brief import Brief, align_columns
@@ -99,6 +101,8 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
         All figures with a known true value, by scan.
     detections : tuple of ProbabilityOfDetection
         Probabilities of detection, by kind and width of the flaws.
+    understated : tuple of Understated
+        Deviations of the campaign that are larger than the sensor states: U does not contain them.
     """
 
     campaign: str
@@ -108,6 +112,7 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
     seeds: tuple[int, ...]
     figures: tuple[PredictedFigure, ...]
     detections: tuple[ProbabilityOfDetection, ...] = ()
+    understated: tuple[Understated, ...] = ()
 
     def covered_share(self) -> float:
         """Return the fraction of all errors within their expanded uncertainty."""
@@ -115,9 +120,11 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
 
     def verdict(self) -> str:
         """Return the main result as a sentence."""
-        return (
-            f"{100 * self.covered_share():.0f} % of all errors are within U" if self.figures else "no errors to judge"
-        )
+        if not self.figures:
+            return "no errors to judge"
+        share = f"{100 * self.covered_share():.0f} % of all errors are within U"
+        doubted = ", ".join(each.quantity for each in self.understated)
+        return f"{share}, which is too small: the sensor understates {doubted}" if doubted else share
 
     def validity(self) -> list[str]:
         """Return where each statement was checked, one line for each scan."""
@@ -139,6 +146,7 @@ class PredictedUncertainty(Brief, BaseModel, frozen=True):
             *align_columns([("scan", "figure", "U / mm", "found", "within U"), *figures], right=(2, 3)),
             self.verdict(),
             "U: expanded uncertainty (k = 2) by propagation; found: twice the rms error of the campaigns",
+            *(f"understated: {each.text()}" for each in self.understated),
         ]
         if self.detections:
             lines += align_columns([_DETECTION_HEAD, *map(_detection_row, self.detections)], right=range(2, 7))
@@ -221,6 +229,12 @@ def predict(
         The sensor's software failed; its output gives the reason.
     CaptureError
         A result cannot be read.
+
+    Warns
+    -----
+    DescriptionWarning
+        The campaign deviates by more than the sensor's table ``[uncertainty]`` states. The warning comes before
+        anything is rendered, and is repeated in the result.
     """
     require_at_least(1, campaigns=campaigns, every=every, workers=workers)
     require_at_least(0, first=first)
@@ -232,6 +246,10 @@ def predict(
     folder = Path(out or Path("runs") / f"predict-{Path(described.sensor).stem}")
     evidence, scans = _sort_recordings(described, every)
     seeds = range(first, first + campaigns)
+    takes = [{take.name: take for take in list_takes(described, seed=seed, every=every)} for seed in seeds]
+    understated = find_understated(described, [*takes[0].values()])
+    for each in understated:
+        warnings.warn(each.text(), DescriptionWarning, stacklevel=2)
     folders = record_campaigns(
         described,
         folder,
@@ -243,7 +261,6 @@ def predict(
         overwrite=overwrite,
         progress=progress,
     )
-    takes = [{take.name: take for take in list_takes(described, seed=seed, every=every)} for seed in seeds]
     by_folder = [_command_lines(place, evidence, scans) for place in folders]
     with open_workers(workers=AT_ONCE) as processes:
         for number, stage in enumerate(zip(*by_folder, strict=True)):
@@ -262,6 +279,7 @@ def predict(
         seeds=tuple(seeds),
         figures=(*figures, *of_flaws),
         detections=detections,
+        understated=understated,
     )
     write_model(folder / RESULT, result, file_format="twin-prediction", version=2, overwrite=True)
     write_page(folder / PAGE, _page(result), overwrite=True)
@@ -459,6 +477,7 @@ def _page(result: PredictedUncertainty) -> str:
             *water,
             ("seeds", f"{result.seeds[0]} to {result.seeds[-1]}"),
         ],
+        understated=[each.text() for each in result.understated],
         figure=figure_svg(figure),
         rows=[
             (

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import escape
 
 import twin
 from twin.recording.detection import ProbabilityOfDetection
 from twin.recording.predict import PredictedFigure, PredictedUncertainty
-from uwlts.errors import CommandFailed, DescriptionError
+from uwlts.errors import CommandFailed, DescriptionError, DescriptionWarning
 
 FIGURE = PredictedFigure(
     scan="spheres", name="SSE", checked="two spheres", expanded_mm=(0.03, 0.04), errors_mm=(-0.035, 0.005)
@@ -84,6 +85,79 @@ def test_campaigns_that_predict_nothing_are_refused_before_rendering(recordings,
     with pytest.raises(DescriptionError, match=says):
         twin.predict(campaign=described, out=tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
+
+
+def write_results(folder: Path, name: str, *, error_mm: float, random_mm: float, systematic_mm: float) -> None:
+    """Write the evaluation of spheres with one spacing, or the inspection of a plane, as the software does."""
+    expanded = 2 * math.hypot(random_mm, systematic_mm)
+    parts = {"random_mm": random_mm, "systematic_mm": systematic_mm, "expanded_mm": expanded}
+    evaluation = {
+        "format": "uwlts-evaluation",
+        "artefact": {"kind": "spheres", "spacing_uncertainty_mm": 0.05},
+        "evaluation": {"figures_mm": {"SSE": error_mm, "PE": 0.1}},
+        "uncertainty": {"SSE": parts},
+    }
+    flatness = {"value": 0.02 + error_mm, "random": random_mm, "systematic": systematic_mm}
+    inspection = {"format": "uwlts-findings", "features": [{"values": {"flatness": flatness}}]}
+    (folder / f"{name}.evaluation.json").write_text(json.dumps(evaluation), encoding="utf-8")
+    (folder / f"{name}.inspection.json").write_text(json.dumps(inspection), encoding="utf-8")
+
+
+def predict_without_rendering(campaign: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> PredictedUncertainty:
+    """Predict from results that are written instead of rendered and measured ones, of two campaigns."""
+
+    def written(*_: object, seeds: range, **__: object) -> list[Path]:
+        folders = [out / f"campaign-{seed}" for seed in seeds]
+        for folder, systematic_mm in zip(folders, (0.12, 0.05), strict=True):
+            folder.mkdir(parents=True)
+            for name in ("spheres", "plane"):
+                write_results(folder, name, error_mm=0.1, random_mm=0.03, systematic_mm=systematic_mm)
+        return folders
+
+    monkeypatch.setattr("twin.recording.predict.record_campaigns", written)
+    monkeypatch.setattr("twin.recording.predict.run_lines", lambda *_, **__: None)
+    return twin.predict(campaign=campaign, out=out, campaigns=2)
+
+
+PLANE = """
+[[recordings]]
+name = "plane"
+scene = "plane"
+"""
+
+
+def test_predicted_uncertainties_contain_systematic_parts_and_certificates(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    described = tmp_path / "small.toml"
+    described.write_text(CAMPAIGN + TARGET + SPHERES + PLANE, encoding="utf-8")
+    result = predict_without_rendering(described, tmp_path / "out", monkeypatch)
+    spacing, flatness = result.figures
+    assert (spacing.scan, spacing.name, flatness.scan, flatness.name) == ("spheres", "SSE", "plane", "flatness error")
+    assert flatness.expanded_mm == pytest.approx([2 * math.hypot(0.03, part) for part in (0.12, 0.05)])
+    assert spacing.expanded_mm == pytest.approx([math.hypot(2 * 0.03, 2 * part, 0.05) for part in (0.12, 0.05)])
+    assert not result.understated
+
+
+def test_deviations_beyond_the_stated_uncertainty_are_told_on_all_outputs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    described = tmp_path / "small.toml"
+    larger = CAMPAIGN.replace("[imperfections]", "[imperfections]\ntemperature_half_width_c = 30.0")
+    described.write_text(larger + TARGET + SPHERES + PLANE, encoding="utf-8")
+    with pytest.warns(DescriptionWarning, match="temperature of the water") as told:
+        result = predict_without_rendering(described, tmp_path / "out", monkeypatch)
+    assert [each.key for each in result.understated] == ["temperature_k", "drift_k"]
+    sentences = [each.text() for each in result.understated]
+    assert [str(each.message) for each in told] == sentences
+    assert "which is too small" in result.verdict()
+    assert [line for line in result.lines() if line.startswith("understated: ")] == [
+        f"understated: {text}" for text in sentences
+    ]
+    page = (tmp_path / "out" / "prediction.html").read_text(encoding="utf-8")
+    assert all(str(escape(text)) in page for text in sentences)
+    written = json.loads((tmp_path / "out" / "prediction.json").read_text(encoding="utf-8"))
+    assert [each["key"] for each in written["understated"]] == ["temperature_k", "drift_k"]
 
 
 @pytest.mark.slow
