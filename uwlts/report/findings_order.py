@@ -39,13 +39,14 @@ class FindingLimits(Description):
 class FindingDatum(Description):
     """Datum of places: its name and place, the direction in which distances count, and that of 12 o'clock.
 
-    Coordinates are those of the cloud. Without a place, distances count from the first scanned point.
+    Coordinates are those of the cloud. Without a place, distances count from the first scanned point. Directions that
+    are not given are chosen by `resolve_datum`.
     """
 
     name: str = "first scanned point"
     place_mm: Vector | None = None
-    direction: Vector = (1.0, 0.0, 0.0)
-    twelve_o_clock: Vector = (0.0, 0.0, -1.0)
+    direction: Vector | None = None
+    twelve_o_clock: Vector | None = None
 
 
 class FindingOrder(Description):
@@ -97,6 +98,47 @@ def sort_by_severity(features: list[Feature], limits: FindingLimits) -> list[Fea
     )
 
 
+_SIDES = np.array([4.0, 2.0, 1.0])
+"""Weights of X, Y and Z that choose the direction of a pipe. Axes along edges or diagonals of a cube, where pipes
+usually lie, are at least 7 deg away from those at which the choice changes."""
+_ACROSS = 0.1
+"""Least component of a direction along a pipe, or of 12 o'clock across it: nearer ones (6 deg) follow the noise."""
+_UPRIGHT = 0.3
+"""Component of 12 o'clock (-Z) across a pipe below which +X replaces it: pipes within 17 deg of Z."""
+
+
+def resolve_datum(datum: FindingDatum, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray, str | None]:
+    """Return the direction of distances along a pipe's axis (3,), that of 12 o'clock across it, and a note on a choice.
+
+    If the datum states no direction, the larger one of 4 X + 2 Y + Z is taken. If it states no 12 o'clock, this is -Z,
+    or +X for a pipe along Z. The note is None if the datum states both.
+
+    Raises EvaluationError if stated directions do not determine them.
+    """
+    along = _SIDES if datum.direction is None else np.array(datum.direction)
+    direction = axis * np.copysign(1.0, float(axis @ along))
+    if (up := datum.twelve_o_clock) is None:
+        up = (0.0, 0.0, -1.0) if np.hypot(*axis[:2]) > _UPRIGHT else (1.0, 0.0, 0.0)
+    across = np.array(up) - (axis @ np.array(up)) * axis
+    slope = 1.0 if datum.direction is None else abs(float(axis @ along)) / max(float(np.linalg.norm(along)), 1e-300)
+    if slope < _ACROSS or np.linalg.norm(across) < _ACROSS * np.linalg.norm(up):
+        raise EvaluationError(
+            "the order's datum does not determine the clock: expected a direction along the pipe's axis and a "
+            f"twelve_o_clock across it; the axis is {np.round(axis, 3).tolist()}"
+        )
+    across = across / np.linalg.norm(across)
+    chosen = [
+        f"{said} ({', '.join(f'{number:.2f}' for number in way + 0.0)})"
+        for said, given, way in (
+            ("distances increase along", datum.direction, direction),
+            ("12 o'clock is", datum.twelve_o_clock, across),
+        )
+        if given is None
+    ]
+    note = f"chosen by the pipe's axis, as the order does not state it: {', '.join(chosen)}" if chosen else None
+    return direction, across, note
+
+
 def format_place(feature: Feature, whole: Feature | None, start_mm: np.ndarray, datum: FindingDatum) -> tuple[str, str]:
     """Return clock position and distance from the datum, mm, as text; for objects other than pipes X and Y.
 
@@ -108,14 +150,7 @@ def format_place(feature: Feature, whole: Feature | None, start_mm: np.ndarray, 
     away = feature.place_mm - (start_mm if datum.place_mm is None else np.array(datum.place_mm))
     if whole is None or whole.kind != FeatureKind.PIPE:
         return f"X {away[0]:.0f}, Y {away[1]:.0f}", f"{np.linalg.norm(away):.0f}"
-    slope = float(whole.axes[2] @ np.array(datum.direction))
-    axis = whole.axes[2] * np.sign(slope)
-    up = np.array(datum.twelve_o_clock) - (axis @ np.array(datum.twelve_o_clock)) * axis
-    if abs(slope) < 1e-6 or np.linalg.norm(up) < 1e-6:
-        raise EvaluationError(
-            "the order's datum does not determine the clock: expected a direction along the pipe's axis and a "
-            f"twelve_o_clock across it; the axis is {np.round(whole.axes[2], 3).tolist()}"
-        )
+    axis, up, _ = resolve_datum(datum, whole.axes[2])
     about = feature.place_mm - whole.place_mm
     minutes = round(720 * float(np.arctan2(about @ np.cross(axis, up), about @ up)) / (2 * np.pi)) % 720
     return f"{minutes // 60 or 12}:{minutes % 60:02d}", f"{away @ axis:.0f}"

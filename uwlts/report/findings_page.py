@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,14 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import check_certificate
-from uwlts.report.findings_order import FindingOrder, format_place, judge_feature, load_order, sort_by_severity
+from uwlts.report.findings_order import (
+    FindingOrder,
+    format_place,
+    judge_feature,
+    load_order,
+    resolve_datum,
+    sort_by_severity,
+)
 from uwlts.report.measured_values import COLUMNS, MeasuredValues, read_measured
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
@@ -174,6 +181,8 @@ def write_findings(
     if measured is not None:
         sources.append(Source("measured values", Path(measured).name, hash_file(measured), "measured by hand"))
     found = inspect_cloud(points, kind, **options)
+    if kind == "pipe" and (note := resolve_datum(stated.datum, found.features[0].axes[2])[2]):
+        found = replace(found, notes=(*found.notes, note))
     made, title = datetime.now(UTC).isoformat(timespec="seconds"), title or f"Inspection of {path.name}"
     text = _page(found, points, sources, checks, stated, by_hand, title=title, made=made)
     record: Table = {
@@ -344,8 +353,9 @@ def _finding_rows(
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Return headings and rows of the first page: verdict, place and size of every finding."""
     whole = found.features[0]
-    along = cloud.points_mm @ whole.axes[2] * np.sign(whole.axes[2] @ np.array(order.datum.direction))
-    start = cloud.points_mm[int(np.argmin(along))] if whole.kind == FeatureKind.PIPE else cloud.points_mm.min(axis=0)
+    start = cloud.points_mm.min(axis=0)
+    if whole.kind == FeatureKind.PIPE:
+        start = cloud.points_mm[int(np.argmin(cloud.points_mm @ resolve_datum(order.datum, whole.axes[2])[0]))]
     clock = "clock" if whole.kind == FeatureKind.PIPE else "place / mm"
     rows = []
     for each in listed:

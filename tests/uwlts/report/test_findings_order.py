@@ -1,5 +1,7 @@
 """Verdicts on findings by their intervals, and places by the clock."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from uwlts.report.findings_order import (
     format_place,
     judge_feature,
     judge_value,
+    resolve_datum,
     sort_by_severity,
 )
 
@@ -65,3 +68,25 @@ def test_the_clock_is_read_along_the_direction(place, clock):
 def test_directions_that_do_not_determine_the_clock_are_refused():
     with pytest.raises(EvaluationError, match="does not determine the clock"):
         format_place(pit("pit", 1), PIPE, np.zeros(3), FindingDatum(direction=(0, 0, 1), twelve_o_clock=(0, 0, 1)))
+
+
+@pytest.mark.parametrize("axis", [axis for axis in product((-1, 0, 1), repeat=3) if any(axis)])
+def test_a_datum_without_directions_does_not_depend_on_noise(axis):
+    """Axes turned by 2 deg either way, and with either sign, give directions that differ by no more than that."""
+    rng, found = np.random.default_rng(4), []
+    for sign in (1, -1) * 20:
+        turned = np.array(axis) / np.linalg.norm(axis) + np.radians(2) / np.sqrt(3) * rng.uniform(-1, 1, 3)
+        *ways, note = resolve_datum(FindingDatum(), sign * turned / np.linalg.norm(turned))
+        assert note is not None and "distances increase along (" in note and "12 o'clock is (" in note
+        found.append(ways)
+    # The part of 12 o'clock across the axis is at least 0.3, by which its error grows.
+    spread = np.max(np.linalg.norm(np.array(found) - found[0], axis=2), axis=0)
+    assert spread[0] < np.radians(4) and spread[1] < np.radians(4) / 0.3
+
+
+def test_stated_directions_are_kept_and_noise_does_not_decide_them():
+    axis = np.array([1e-4, 1.0, 0.0]) / np.hypot(1e-4, 1)
+    direction, up, note = resolve_datum(FindingDatum(direction=(0, -5, 0), twelve_o_clock=(0, 0, 1)), axis)
+    assert direction == pytest.approx(-axis) and up == pytest.approx([0, 0, 1]) and note is None
+    with pytest.raises(EvaluationError, match="does not determine the clock"):
+        resolve_datum(FindingDatum(direction=(1, 0, 0)), axis)
