@@ -93,12 +93,7 @@ JOBS: dict[str, str] = {
         uwlts mount inputs/scans/rotary-sphere.h5 {TAKEN} --axis=-y --radius-mm 19.05 --out moving/table.json""",
     "mount": "\n".join(
         f"uwlts mount inputs/{name}-profiles.csv inputs/{name}-poses.csv {PROFILED} {options} --out mount/{name}.json"
-        for name, options in (
-            ("sphere", "--radius-mm 20"),
-            ("plane", "--artefact-kind plane"),
-            ("step", "--artefact-kind step"),
-            ("ring", "--artefact-kind ring --radius-mm 25"),
-        )
+        for name, options in (("sphere", "--radius-mm 20"), ("plane", "--artefact-kind plane"))
     ),
     "evaluate": """
         uwlts evaluate reconstruct/spheres.full.ply --truth inputs/scans/spheres.truth.h5 --out evaluate/spheres.json \

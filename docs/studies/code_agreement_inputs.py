@@ -133,14 +133,12 @@ def copy_photographs(source: Path, folder: Path) -> None:
 
 
 def write_mounts(folder: Path) -> None:
-    """Write profiles of a sphere, plane, step and ring by another maker's profiler on a robot, with its poses."""
-    from tests.uwlts.mount_views import ring_campaign, sphere_campaign, step_campaign
+    """Write profiles of a sphere and a plane by another maker's profiler on a robot, with its poses."""
+    from tests.uwlts.mount_views import sphere_campaign
 
     campaigns = {
         "sphere": sphere_campaign(np.random.default_rng(SEED), robot_mm=0.03),
         "plane": sphere_campaign(np.random.default_rng(SEED + 1), poses=20, plane_only=True),
-        "step": step_campaign(np.random.default_rng(SEED + 2), height_mm=12.0),
-        "ring": ring_campaign(np.random.default_rng(SEED + 3)),
     }
     for name, campaign in campaigns.items():
         rows = [(n, *p) for n, profile in enumerate(campaign.profiles) for p in profile.tolist()]

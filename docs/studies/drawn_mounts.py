@@ -61,7 +61,7 @@ if __name__ == "__main__":
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--fixed-mm", type=float, default=0.0, help="form error that is the same in all profiles")
-    parser.add_argument("--artefact", choices=["sphere", "plane", "step", "ring"], default="sphere")
+    parser.add_argument("--artefact", choices=["sphere", "plane"], default="sphere")
     for flag in ("--size-known", "--short-arcs", "--halves"):
         parser.add_argument(flag, action="store_true")
     own = vars(parser.parse_args())

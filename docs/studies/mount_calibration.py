@@ -1,33 +1,21 @@
 """Mounts calibrated from simulated profiles of a sphere: errors, coverage, and points on a sphere that was held out.
 
     python docs/studies/mount_calibration.py 60
-    python docs/studies/mount_calibration.py 30 --artefact ring
     python docs/studies/mount_calibration.py 40 --sensors
 
-The second has a ring gauge of 50 mm in place of the sphere, or a step of 12 mm; the third draws a sensor for each
-campaign from the covariance of its calibration (`tests/uwlts/sensor_profiles.py`).
+The second draws a sensor for each campaign from the covariance of its calibration (`tests/uwlts/sensor_profiles.py`).
 """
 
 import argparse
 import sys
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from result_tables import publish, table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tests.uwlts.mount_views import (
-    MOUNT,
-    RADIUS_MM,
-    RING_MM,
-    Campaign,
-    errors_of,
-    ring_campaign,
-    sphere_campaign,
-    step_campaign,
-)
+from tests.uwlts.mount_views import MOUNT, RADIUS_MM, Campaign, errors_of, sphere_campaign
 from tests.uwlts.sensor_profiles import captured_by, joint_estimate
 from uwlts.calibration.mount.calibrate_mount import calibrate_mount
 from uwlts.model.library import load_sensor
@@ -76,24 +64,6 @@ def by_sensors(campaigns: int, *, write: bool) -> None:
     head = [*ERRORS, "within 95 % interval", "with the sensor taken as exact"]
     row = [*_errors(shifts, turns), *(f"{100 * within.mean():.1f} %" for within in (own, exact))]
     publish({"mount by other sensors": table(head, [row])}, write=write)
-
-
-def by_faces(campaigns: int, artefact: Literal["step", "ring"], *, write: bool) -> None:
-    """Publish the errors and coverage of mounts by a step or ring, by ideal robots and, for the ring, others."""
-    cells = []
-    for robot in (0.0, 0.05) if artefact == "ring" else (0.0,):
-        rows = []
-        for seed in range(campaigns):
-            rng = np.random.default_rng([seed, 24])
-            campaign = ring_campaign(rng, robot_mm=robot) if artefact == "ring" else step_campaign(rng, height_mm=12.0)
-            radius = RING_MM["inner"] if artefact == "ring" else None
-            mount = calibrate_mount(*_of(campaign), artefact_kind=artefact, radius_mm=radius)
-            shift, turn = errors_of(mount.transform())
-            within = np.mean(np.abs([*shift, *turn]) < mount.coverage_factor * mount.std())
-            rows.append((np.linalg.norm(shift), np.degrees(np.linalg.norm(turn)), within))
-        shifts, turns, within = np.transpose(rows)
-        cells.append([f"{robot:g}", *_errors(shifts, turns), f"{100 * within.mean():.1f} %"])
-    publish({f"mount by a {artefact}": table(["robot mm", *ERRORS, "within 95 % interval"], cells)}, write=write)
 
 
 def by_sphere(campaigns: int, *, write: bool) -> None:
@@ -150,12 +120,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("campaigns", type=int)
     parser.add_argument("--sensors", action="store_true")
-    parser.add_argument("--artefact", choices=["sphere", "step", "ring"], default="sphere")
     parser.add_argument("--write", action="store_true", help="put the tables into their page of docs/results")
     given = parser.parse_args()
-    if given.artefact != "sphere":
-        by_faces(given.campaigns, given.artefact, write=given.write)
-    elif given.sensors:
+    if given.sensors:
         by_sensors(given.campaigns, write=given.write)
     else:
         by_sphere(given.campaigns, write=given.write)

@@ -1,4 +1,4 @@
-"""Profiles of spheres, boards, steps and rings by a laser profiler on a robot, with NumPy only.
+"""Profiles of spheres and boards by a laser profiler on a robot, with NumPy only.
 
 The profiler has noise, smooth errors, gaps and scattered points; the robot's poses have errors.
 """
@@ -8,20 +8,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-Kind = Literal["sphere", "plane", "step", "ring"]
+Kind = Literal["sphere", "plane"]
 
 _STEEPEST = np.radians(65)
 """Angle between a ray and a surface's normal beyond which a profiler returns no point."""
-_BORE = 0.6
-"""Inner radius of a ring, relative to its outer one."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProfilerSet:
     """Profiles (N, 2) with NaN for missing points, reported poses (P, 4, 4) in mm, and the truth.
 
-    ``surface`` (N,) is the surface of each point of a profile, 0 or 1, and -1 for background, scattered points and
-    missing ones. ``artefact`` is the pose (4, 4) of the artefact, its z axis normal to the face.
+    ``surface`` (N,) is 0 for points of a profile on the artefact, and -1 for background, scattered points and missing
+    ones. ``artefact`` is the pose (4, 4) of the artefact, its z axis normal to the face.
     """
 
     kind: Kind
@@ -112,12 +110,8 @@ def draw_set(
     far = float(rng.uniform(150, 350))
     half = np.radians(rng.uniform(12, 20))
     wide = far * np.tan(half)
-    size = {
-        "sphere": rng.uniform(0.3, 0.8) * wide,
-        "plane": rng.uniform(4.0, 10.0),
-        "step": rng.uniform(0.1, 0.3) * wide,
-        "ring": rng.uniform(0.3, 0.5) * wide,
-    }[kind]
+    size = {"sphere": rng.uniform(0.3, 0.8) * wide, "plane": rng.uniform(4.0, 10.0)}[kind]
+    rng.random(2)  # unused: the sets of a seed are those of the published tables
     mount = pose_of(turn_by(rng.uniform(-2, 2, 3)), rng.uniform(-150, 150, 3))
     artefact = pose_of(turn_by(rng.uniform(-0.4, 0.4, 3)), rng.uniform(-600, 600, 3))
     fixed = _draw_form(rng)
@@ -130,8 +124,6 @@ def draw_set(
             place[1] = rng.uniform(-0.7, 0.7) * size
             place[2] += size
         seen = pose_of(turn_by(tilt) @ np.diag([1.0, -1.0, -1.0]), place)
-        if kind == "ring":
-            seen[:3, 3] -= seen[:3, :3] @ [0, rng.uniform(-0.5, 0.5) * size, 0]
         profile, surface = _cut(
             kind, float(size), seen, half, drawn["points"], background=drawn["background"], steepest=steepest
         )
@@ -205,22 +197,6 @@ def _cut(
             add_level(0.0, 0)
             for middle in (-25.0, 25.0):
                 add_level(size, -1, lambda at, middle=middle: np.abs(at[:, 0] - middle) < 6)
-        case "step":
-            add_level(0.0, 0)
-            add_level(size, 1, lambda at: (at[:, 0] < 0) & (at[:, 0] > -60))
-            _add_wall(hits, origin, directions, size)
-        case "ring":
-            radius = np.array([size, size / _BORE])
-
-            def annulus(at: np.ndarray) -> np.ndarray:
-                away = np.hypot(at[:, 0], at[:, 1])
-                return (away > radius[0]) & (away < radius[1])
-
-            add_level(0.0, 0, annulus)
-            if background:
-                add_level(-size, -1)
-            for each, label in zip(radius, (1, -1), strict=True):
-                _add_cylinder(hits, origin, directions, float(each), size, label)
     lengths = np.array([each for each, _, _ in hits])
     first = np.argmin(lengths, axis=0)
     length = lengths[first, np.arange(count)]
@@ -229,31 +205,6 @@ def _cut(
     missing = ~np.isfinite(length) | steep
     profile = np.column_stack([rays[:, 0], rays[:, 2]]) * np.where(missing, np.nan, length)[:, None]
     return profile, np.where(missing, -1, np.array([label for _, _, label in hits])[first])
-
-
-def _add_wall(hits: list[Any], origin: np.ndarray, directions: np.ndarray, height: float) -> None:
-    """Add the side of a step at x = 0, and that at x = -60."""
-    for place in (0.0, -60.0):
-        with np.errstate(divide="ignore"):
-            lengths = (place - origin[0]) / directions[:, 0]
-        high = origin[2] + np.where(np.isfinite(lengths), lengths, 0) * directions[:, 2]
-        there = np.isfinite(lengths) & (lengths > 0) & (high > 0) & (high < height)
-        hits.append((np.where(there, lengths, np.inf), np.broadcast_to([1.0, 0.0, 0.0], directions.shape), -1))
-
-
-def _add_cylinder(
-    hits: list[Any], origin: np.ndarray, directions: np.ndarray, radius: float, depth: float, label: int
-) -> None:
-    """Add both intersections of each ray with a cylinder below z = 0."""
-    a = np.sum(directions[:, :2] ** 2, axis=1)
-    b = directions[:, :2] @ origin[:2]
-    root = b**2 - a * (origin[:2] @ origin[:2] - radius**2)
-    for side in (-1.0, 1.0):
-        lengths = np.where(root > 0, (-b + side * np.sqrt(np.maximum(root, 0))) / a, 0.0)
-        at = origin + lengths[:, None] * directions
-        there = (root > 0) & (lengths > 0) & (at[:, 2] < 0) & (at[:, 2] > -depth)
-        normals = np.column_stack([at[:, :2] / radius, np.zeros(len(at))])
-        hits.append((np.where(there, lengths, np.inf), normals, label))
 
 
 def scatter_mm(
@@ -265,13 +216,5 @@ def scatter_mm(
         rows = surface >= 0
         points = np.column_stack([profile[rows, 0], np.zeros(np.count_nonzero(rows)), profile[rows, 1]])
         away = points @ (pose @ mount)[:3, :3].T + (pose @ mount)[:3, 3] - place
-        if given.kind == "sphere":
-            off.append(np.linalg.norm(away, axis=1) - size_mm)
-            continue
-        height = away @ axis
-        if given.kind == "ring":
-            wall = np.linalg.norm(away - np.outer(height, axis), axis=1) - size_mm
-            off.append(np.where(surface[rows] == 0, height, wall))
-        else:
-            off.append(height - size_mm * surface[rows] * (given.kind == "step"))
+        off.append(np.linalg.norm(away, axis=1) - size_mm if given.kind == "sphere" else away @ axis)
     return np.concatenate(off)

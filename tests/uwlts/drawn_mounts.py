@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 
 import uwlts
 from tests.oracles.profilers import ProfilerSet, pose_of, scatter_mm, turn_between, turn_by
-from uwlts.model.mount import Mount, PlaneFound, RingFound, SphereFound, StepFound
+from uwlts.model.mount import Mount, PlaneFound, SphereFound
 
 SHORT_ARCS: dict[str, Any] = {
     "points": 2000,
@@ -23,11 +23,8 @@ SHORT_ARCS: dict[str, Any] = {
 
 def mount_of(given: ProfilerSet, *, size_known: bool = True) -> Mount:
     """Calibrate the mount of a set."""
-    radius_mm = given.size_mm if size_known and given.kind in ("sphere", "ring") else None
-    height_mm = given.size_mm if size_known and given.kind == "step" else None
-    return uwlts.calibrate_mount(
-        given.profiles, given.poses, artefact_kind=given.kind, radius_mm=radius_mm, height_mm=height_mm
-    )
+    radius_mm = given.size_mm if size_known and given.kind == "sphere" else None
+    return uwlts.calibrate_mount(given.profiles, given.poses, artefact_kind=given.kind, radius_mm=radius_mm)
 
 
 def rms_mm(given: ProfilerSet, mount: Mount) -> float:
@@ -35,12 +32,6 @@ def rms_mm(given: ProfilerSet, mount: Mount) -> float:
     found = mount.artefact
     if isinstance(found, SphereFound):
         place, axis, size = np.array(found.centre_mm), np.zeros(3), found.radius_mm
-    elif isinstance(found, RingFound):
-        place, axis, size = np.array(found.centre_mm), np.array(found.axis), found.radius_mm
-    elif isinstance(found, StepFound):
-        # Its first face is the nearer one, which is the upper one of a drawn step.
-        axis = np.array(found.normal)
-        place, size = axis * (found.distance_mm + found.height_mm), -found.height_mm
     else:
         assert isinstance(found, PlaneFound)
         axis = np.array(found.normal)
@@ -56,9 +47,9 @@ def differences(mount: np.ndarray, other: np.ndarray) -> np.ndarray:
 def least_squares_mount(given: ProfilerSet, *, size_known: bool) -> tuple[np.ndarray, float]:
     """Return the mount (4, 4) by plain least squares from the true values, and the rms distance of the points, mm."""
     axes = given.artefact[:3, :3]
-    # Along a plane, or about an axis, nothing changes: these steps are not parameters.
-    free = {"sphere": (0, 1, 2), "ring": (0, 1, 2, 3, 4), "plane": (2, 3, 4), "step": (2, 3, 4)}[given.kind]
-    sized = given.kind != "plane" and not size_known
+    # Along a plane nothing changes: these steps are not parameters.
+    free = {"sphere": (0, 1, 2), "plane": (2, 3, 4)}[given.kind]
+    sized = given.kind == "sphere" and not size_known
 
     def moved(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         step = np.zeros(5)

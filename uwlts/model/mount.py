@@ -1,7 +1,7 @@
 """Mount of a laser profiler on a moving platform: the result of `uwlts.calibrate_mount`, stored in `mount.json`."""
 
 from pathlib import Path
-from typing import Annotated, Literal, assert_never
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -60,26 +60,6 @@ class PlaneFound(Description):
     distance_mm: float
 
 
-class StepFound(Description):
-    """Estimated step: the face at smaller z as in `PlaneFound`, and the offset of the other face along the normal."""
-
-    kind: Literal["step"] = "step"
-    normal: Vector
-    distance_mm: float
-    height_mm: float
-    height_std_mm: NotNegative | None = None
-
-
-class RingFound(Description):
-    """Estimated ring: axis of its cylinder, and centre and radius of the cylinder's circle in the plane of the face."""
-
-    kind: Literal["ring"] = "ring"
-    axis: Vector
-    centre_mm: Vector
-    radius_mm: Positive
-    radius_std_mm: NotNegative | None = None
-
-
 class BoardFound(Description):
     """Estimated target: ``T_base_target`` (4, 4), mm."""
 
@@ -119,7 +99,7 @@ class Mount(Brief, Description):
     T_platform_sensor: Rows
     covariance: Rows
     coverage_factor: Positive
-    artefact: Annotated[SphereFound | PlaneFound | StepFound | RingFound | BoardFound, Field(discriminator="kind")]
+    artefact: Annotated[SphereFound | PlaneFound | BoardFound, Field(discriminator="kind")]
     robot_scale: Positive | None = None
     robot_scale_std: NotNegative | None = None
     time_offset_s: float | None = None
@@ -164,17 +144,9 @@ class Mount(Brief, Description):
         """Return the standard uncertainties (6,) of the translation, mm, and of the rotation, rad."""
         return np.sqrt(np.diag(np.array(self.covariance)))
 
-    def size_mm(self) -> float:
-        """Return the radius or height of the artefact; 0 for a plane or target."""
-        match self.artefact:
-            case SphereFound() | RingFound():
-                return self.artefact.radius_mm
-            case StepFound():
-                return abs(self.artefact.height_mm)
-            case PlaneFound() | BoardFound():
-                return 0.0
-            case _:
-                assert_never(self.artefact)
+    def radius_mm(self) -> float:
+        """Return the radius of the sphere; 0 for a plane or target."""
+        return self.artefact.radius_mm if isinstance(self.artefact, SphereFound) else 0.0
 
     def independent_covariance(self, calibration: str) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the part (6, 6) of the covariance that is independent of a sensor calibration, given by its digest.

@@ -14,7 +14,7 @@ from uwlts.evaluation.evaluate import EvaluationRecord, TruthComparisons
 from uwlts.files.json_files import trusting
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
-from uwlts.model.mount import BoardFound, Mount, RingFound, SphereFound, StepFound
+from uwlts.model.mount import BoardFound, Mount, SphereFound
 from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
@@ -246,14 +246,6 @@ def mount_lines(mount: Mount) -> list[str]:
     elif isinstance(found, SphereFound):
         known = within(found.radius_std_mm)
         lines.append(f"sphere, mm                at {_vector(found.centre_mm)}, radius {found.radius_mm:.3f} ({known})")
-    elif isinstance(found, StepFound):
-        known = within(found.height_std_mm)
-        place = f"normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm"
-        lines.append(f"step                      {place}, height {abs(found.height_mm):.3f} mm ({known})")
-    elif isinstance(found, RingFound):
-        known = within(found.radius_std_mm)
-        place = f"axis {_vector(found.axis)} through {_vector(found.centre_mm)}"
-        lines.append(f"ring, mm                  {place}, radius {found.radius_mm:.3f} ({known})")
     else:
         lines.append(f"plane                     normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm")
     if mount.robot_scale is not None and mount.robot_scale_std is not None:

@@ -19,9 +19,7 @@ from uwlts.storage.cloud_files import is_cloud, read_cloud
 from uwlts.storage.number_tables import NumberTable, Unit, read_number_table
 from uwlts.storage.pose_files import FARTHEST_MM, check_matrices, read_poses
 
-Artefact = Literal["sphere", "plane", "step", "ring"]
-_SIZES: dict[Artefact, str] = {"sphere": "radius", "step": "height", "ring": "radius"}
-"""Name of the size of each artefact that has one."""
+Artefact = Literal["sphere", "plane"]
 SensorAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 SENSOR_AXES: dict[SensorAxis, np.ndarray] = {
     sign + name: (-1.0 if sign else 1.0) * direction  # pyright: ignore[reportAssignmentType]
@@ -45,7 +43,6 @@ class MountDescription(Description):
     poses: str
     artefact: Artefact = "sphere"
     radius_mm: Positive | None = None
-    height_mm: Positive | None = None
     pose_format: str = "matrix"
     profile_unit: Unit | None = None
     pose_unit: Unit | None = None
@@ -61,7 +58,7 @@ class MountEvidence:
     profiles: list[np.ndarray]
     poses: np.ndarray
     artefact: Artefact
-    size_mm: float | None = None
+    radius_mm: float | None = None
     names: list[str]
     axis: SensorAxis | None = None
     scale: bool = False
@@ -70,11 +67,6 @@ class MountEvidence:
     pose_times_s: np.ndarray | None = None
     digests: dict[str, str] = field(default_factory=dict)
 
-    @property
-    def size(self) -> str:
-        """Name of the artefact's size."""
-        return _SIZES.get(self.artefact, "size")
-
 
 def read_mount_evidence(
     profiles: str | Path | Sequence[np.ndarray],
@@ -82,7 +74,6 @@ def read_mount_evidence(
     *,
     artefact: Artefact | None,
     radius_mm: float | None,
-    height_mm: float | None,
     pose_format: str,
     profile_unit: Unit | None,
     pose_unit: Unit | None,
@@ -108,7 +99,6 @@ def read_mount_evidence(
         options = {
             "artefact": artefact,
             "radius_mm": radius_mm,
-            "height_mm": height_mm,
             "pose_format": None if pose_format == "matrix" else pose_format,
             "profile_unit": profile_unit,
             "pose_unit": pose_unit,
@@ -123,22 +113,15 @@ def read_mount_evidence(
             )
         given = validate_description(MountDescription, read_table(path), path)
         profiles, poses = path.parent / given.profiles, path.parent / given.poses
-        artefact, radius_mm, height_mm = given.artefact, given.radius_mm, given.height_mm
+        artefact, radius_mm = given.artefact, given.radius_mm
         pose_format = given.pose_format
         profile_unit, pose_unit, scale, time = given.profile_unit, given.pose_unit, given.scale, given.time
         axis = given.axis
     artefact = artefact or "sphere"
     if artefact not in get_args(Artefact):
         raise DescriptionError(f"the artefact is {artefact!r}; expected one of {', '.join(get_args(Artefact))}")
-    for name, size in (("radius", radius_mm), ("height", height_mm)):
-        if size is not None and not (np.isfinite(size) and size > 0 and _SIZES.get(artefact) == name):
-            kinds = " or ".join(kind for kind, own in _SIZES.items() if own == name)
-            raise DescriptionError(f"{name}_mm is {size:g} for a {artefact}; expected the positive {name} of a {kinds}")
-    if artefact == "ring" and radius_mm is None:
-        raise DescriptionError(
-            "the radius of the ring is missing: give `radius_mm`, that of the wall which the sheet meets. From its "
-            "profiles alone it cannot be distinguished from another wall"
-        )
+    if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0 and artefact == "sphere"):
+        raise DescriptionError(f"radius_mm is {radius_mm:g} for a {artefact}; expected the positive radius of a sphere")
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):
@@ -172,7 +155,7 @@ def read_mount_evidence(
         profiles=checked,
         poses=matrices,
         artefact=artefact,
-        size_mm=radius_mm if height_mm is None else height_mm,
+        radius_mm=radius_mm,
         names=names or [str(number + 1) for number in range(len(checked))],
         axis=axis,
         scale=scale,

@@ -21,7 +21,7 @@ from uwlts.calibration.mount.restricted_likelihood import (
     settle,
     settle_agreeing,
 )
-from uwlts.calibration.mount.start import NoFit, require_surfaces, start
+from uwlts.calibration.mount.start import NoFit, start
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.files.json_files import trusting
 from uwlts.model.calibration import Calibration, rigid_transform
@@ -38,7 +38,7 @@ _MOST_POINTS = 100_000
 _NO_FIT = 0.1
 """Pose error divided by the sphere's radius that no platform has; a wrong pose format exceeds it."""
 _OTHER_SIZE = 0.03
-"""Relative difference from the given size that proves another size: scale errors of profilers are smaller."""
+"""Relative difference from the given radius that proves another radius: scale errors of profilers are smaller."""
 _SURE = 5.0
 """The same in standard uncertainties (one in a million for normal errors); the larger limit applies."""
 
@@ -50,7 +50,6 @@ def calibrate_mount(
     *,
     artefact_kind: Artefact | None = None,
     radius_mm: float | None = None,
-    height_mm: float | None = None,
     calibration: Calibration | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
     profile_unit: Unit | None = None,
@@ -62,7 +61,7 @@ def calibrate_mount(
     pose_times_s: np.ndarray | None = None,
     trust_edited: bool = False,
 ) -> Mount:
-    """Calibrate the mount of a laser profiler on a robot or stage, from its profiles of a sphere, plane, step or ring.
+    """Calibrate the mount of a laser profiler on a robot or stage, from its profiles of a sphere or plane.
 
     Also calibrates the mount of a calibrated sensor, from a capture of such an artefact or of a target, or the axis of
     a rotary table. The result is ``T_platform_sensor`` with its uncertainty, the rejected poses, the weakly determined
@@ -85,12 +84,9 @@ def calibrate_mount(
         CSV file with the pose of the platform in the base frame for each profile or target image, or
         ``T_base_platform`` (P, 4, 4), mm. Default: the poses of the capture.
     artefact_kind
-        Artefact in the profiles: a sphere, a plane, a step (two parallel faces), or a ring (a face and a perpendicular
-        cylindrical wall of given radius). Default: a sphere, unless the capture or description has another.
+        Artefact in the profiles: a sphere or a plane. Default: a sphere, unless the description names the other.
     radius_mm
-        Radius of the sphere, or of the ring's wall. Default: that of a sphere is estimated.
-    height_mm
-        Height of the step. Default: it is estimated.
+        Radius of the sphere. Default: it is estimated.
     calibration
         Calibration of the sensor that took the capture. It is not changed; the covariance of a joint calibration is
         propagated to the mount.
@@ -124,7 +120,7 @@ def calibrate_mount(
     Raises
     ------
     DescriptionError
-        Files or options cannot be read or contradict each other, or a ring has no radius.
+        Files or options cannot be read or contradict each other.
     CalibrationError
         Too few profiles show the artefact, or the motions do not determine the mount. The message names the missing
         motions.
@@ -151,10 +147,8 @@ def calibrate_mount(
         assert not isinstance(table, str | Path)
         with Capture(profiles) as capture:
             if capture.header.target is not None and not capture.laser_on.all():
-                if artefact_kind or radius_mm is not None or height_mm is not None or scale or time:
-                    raise DescriptionError(
-                        "the capture shows a target: give no artefact, radius, height, scale or time"
-                    )
+                if artefact_kind or radius_mm is not None or scale or time:
+                    raise DescriptionError("the capture shows a target: give no artefact, radius, scale or time")
                 return mount_by_board(capture, known, table, axis=axis)
             profiles = reconstruct_profiles(capture, known, table, times)
     captured = None
@@ -166,7 +160,6 @@ def calibrate_mount(
         poses,
         artefact=artefact_kind,
         radius_mm=radius_mm,
-        height_mm=height_mm,
         pose_format=pose_format,
         profile_unit=profile_unit,
         pose_unit=pose_unit,
@@ -183,14 +176,14 @@ def calibrate_mount(
 
 
 def _advice(evidence: MountEvidence) -> str:
-    """Return advice on the usual mistakes; a wrong artefact size is tested by estimating it."""
-    if evidence.size_mm is not None and evidence.artefact != "ring":
+    """Return advice on the usual mistakes; a wrong radius is tested by estimating it."""
+    if evidence.radius_mm is not None:
         with suppress(CalibrationError):
-            found = _Calibration(replace(evidence, size_mm=None)).make_result()
+            found = _Calibration(replace(evidence, radius_mm=None)).make_result()
             if 2 * sum(pose.reason is None for pose in found.poses) > len(found.poses):
                 return (
-                    f"The profiles fit with {found.rms_mm:.3g} mm rms if the {evidence.artefact} has another "
-                    f"{evidence.size}, {found.size_mm():.3f} mm"
+                    f"The profiles fit with {found.rms_mm:.3g} mm rms if the sphere has another radius, "
+                    f"{found.radius_mm():.3f} mm"
                 )
     return (
         "Check that the poses are T_base_platform, not their inverses T_platform_base; their format (Euler angles "
@@ -205,7 +198,7 @@ class _Calibration:
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
         self.captured = captured
-        self.shape = SHAPES[evidence.artefact](evidence.size_mm)
+        self.shape = SHAPES[evidence.artefact](evidence.radius_mm)
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
         self.rows = [_thin(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
@@ -232,21 +225,20 @@ class _Calibration:
             if shape is None:
                 self.reasons[number] = f"no {self.evidence.artefact} found in the profile"
         self._require_enough()
-        kept = np.array([shape is not None for shape in shapes])
         whole = Problem(
             self.profiles,
             _motion(self.evidence),
             self.sheet[:3, 1],
             self.shape,
-            [np.zeros(len(each), dtype=int) for each in self.profiles],
             self.evidence.scale,
             self.evidence.time,
             self.evidence.axis is not None,
         )
+        kept = np.array([shape is not None for shape in shapes])
         problem = whole.select_detected(shapes)
         seen = [shape for shape in shapes if shape is not None]
         towards = None if self.evidence.axis is None else SENSOR_AXES[self.evidence.axis]
-        state, problem = start(problem, whole.select(kept), seen, self.sheet, towards, self.rng)
+        state = start(problem, seen, self.sheet, towards, self.rng)
         misfit = problem.rms_mm(state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
         typical = max(float(np.median(misfit)), noise, 1e-6)
@@ -255,7 +247,6 @@ class _Calibration:
         scatter = Scatter(max(noise, 1e-6), typical, typical, typical, 1e-3)
         # Detect the artefact again, near the place that the other profiles give, to correct errors of the first search.
         for _ in range(2):
-            require_surfaces(problem.select(good))
             found = settle(problem.select(good), [(state, np.array(scatter))])
             scatter = Scatter(*found.scatter)
             reach = 4 * float(np.hypot(np.hypot(scatter.point_mm, scatter.smooth_mm), 2 * scatter.pose_mm))
@@ -266,13 +257,11 @@ class _Calibration:
             good = np.ones(len(problem.points), dtype=bool)
             self._require_enough(np.flatnonzero(kept))
 
-        def require(good: np.ndarray) -> None:
-            self._require_enough(np.flatnonzero(kept)[good])
-            require_surfaces(problem.select(good))
-
         # Select the likelier estimate of two starts: this one, and unweighted least squares of all distances.
         starts = [(each, np.array(scatter)) for each in (state, problem.solve_unweighted(state))]
-        found, good = settle_agreeing(problem, starts, require=require)
+        found, good = settle_agreeing(
+            problem, starts, require=lambda good: self._require_enough(np.flatnonzero(kept)[good])
+        )
         used, state = problem.select(good), found.state
         numbers = np.flatnonzero(kept)
         names = self.evidence.names
@@ -309,16 +298,16 @@ class _Calibration:
     def _require_fit(self, used: Problem, estimate: RestrictedEstimate[MountState]) -> None:
         state, scatter = estimate.state, Scatter(*estimate.scatter)
         self._require_small(float(np.hypot(scatter.pose_mm, scatter.smooth_mm)), state, len(used.points))
-        if self.shape.size_mm is None:
+        if self.shape.radius_mm is None:
             return
         free = replace(used, shape=SHAPES[self.evidence.artefact]())
         other = RestrictedEstimate(free, state, estimate.scatter)
         at = free.size - free.scale - free.time - 1
         step, std = float(other.propagate(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
-        if abs(step) > max(_OTHER_SIZE * self.shape.size_mm, _SURE * std):
+        if abs(step) > max(_OTHER_SIZE * self.shape.radius_mm, _SURE * std):
             raise NoFit(
-                f"no mount fits the profiles of a {self.evidence.artefact} of {self.evidence.size} "
-                f"{self.shape.size_mm:g} mm: the profiles show one that differs by {step:.2g} mm (standard uncertainty "
+                f"no mount fits the profiles of a sphere of radius {self.shape.radius_mm:g} mm: the "
+                f"profiles show one that differs by {step:.2g} mm (standard uncertainty "
                 f"{std:.2g} mm)"
             )
 
@@ -366,7 +355,7 @@ class _Calibration:
                 )
             )
         std, at = np.sqrt(np.diag(covariance)), 6 + self.shape.count
-        found = self.shape.to_stored(state.artefact, float(std[at - 1]) if self.shape.size_unknown else None)
+        found = self.shape.to_stored(state.artefact, float(std[at - 1]) if self.shape.radius_unknown else None)
         transform = rigid_transform(Rotation.from_matrix(state.rotation).as_matrix(), state.translation)
         weights = used.counts / used.counts.sum()
         return Mount(

@@ -66,7 +66,7 @@ def next_pose(
             else:
                 normal = state.artefact[:3]
                 there = turned @ platform + state.scale * positions[nearest]
-                off = problem.shape.distances(state.artefact, there[None], np.zeros(1, dtype=int))[0]
+                off = problem.shape.distances(state.artefact, there[None])[0]
                 position = positions[nearest] - off * normal / state.scale
                 points = _on_plane(points, seen, turned @ state.rotation, normal, sheet)
             if points is None:
@@ -94,8 +94,7 @@ def next_pose(
 
 def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> Problem:
     # Without a trajectory the pose has no information on the time offset.
-    part = [np.zeros(len(points), dtype=int)]
-    return replace(problem, points=[points], part=part, motion=lambda offset: (rotation[None], position[None]))
+    return replace(problem, points=[points], motion=lambda offset: (rotation[None], position[None]))
 
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:

@@ -59,7 +59,7 @@ class Problem(GroupedEvidence[MountState]):
     """Points (n, 3) of every pose in the sensor's frame, mm, and the choice of unknowns.
 
     The parameters are steps from a `MountState`: translation (3), rotation about the platform's axes (3), those of the
-    artefact, then scale and time offset. ``part`` is the artefact's surface number of each point (n,).
+    artefact, then scale and time offset.
     """
 
     points: Sequence[np.ndarray]
@@ -67,7 +67,6 @@ class Problem(GroupedEvidence[MountState]):
     across: np.ndarray
     """Normal (3,) of the sheet in the sensor's frame: points have no noise along it."""
     shape: Shape
-    part: Sequence[np.ndarray]
     scale: bool = False
     time: bool = False
     table: bool = False
@@ -97,47 +96,34 @@ class Problem(GroupedEvidence[MountState]):
         """Return the root mean square distance (P,) of the points of each pose."""
         return np.sqrt(np.bincount(self.poses, self.distances(state) ** 2) / self.counts)
 
-    @cached_property
-    def _parts(self) -> np.ndarray:
-        return np.concatenate(self.part)
-
-    def select(
-        self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None, part: Sequence[np.ndarray] | None = None
-    ) -> Self:
+    def select(self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None) -> Self:
         """Return the problem of some poses, optionally with other points of all poses."""
-        motion, numbers = self.motion, np.arange(len(self.points))[kept]
-        given, parts = points or self.points, part or self.part
+        motion, numbers, given = self.motion, np.arange(len(self.points))[kept], points or self.points
         return replace(
             self,
             points=[given[number] for number in numbers.tolist()],
-            part=[parts[number] for number in numbers.tolist()],
             motion=lambda offset: tuple(each[numbers] for each in motion(offset)),
         )
 
     def select_detected(self, seen: Sequence[Detection | None]) -> "Problem":
         """Return the problem of the points on the artefact; poses with None are removed."""
-        pairs = [(n, each) for n, each in enumerate(seen) if each is not None]
-        points, part = list(self.points), list(self.part)
-        for number, each in pairs:
-            points[number], part[number] = self.points[number][each.members], each.part[each.members]
-        return self.select(np.array([each is not None for each in seen]), points, part)
+        points = [own if each is None else own[each.members] for own, each in zip(self.points, seen, strict=True)]
+        return self.select(np.array([each is not None for each in seen]), points)
 
     def detect_again(
         self, state: MountState, flat: Sequence[np.ndarray], reach_mm: float, rng: np.random.Generator
     ) -> list[Detection | None]:
         """Find the artefact again in the profiles (N, 2) of all poses, near its place in a state; else None."""
-        off = np.split(self.shape.surface_distances(state.artefact, self.to_base(state)), np.cumsum(self.counts)[:-1])
+        off = np.split(self.distances(state), np.cumsum(self.counts)[:-1])
         again = [self.shape.find_again(each, own, reach_mm, rng) for each, own in zip(flat, off, strict=True)]
         again = [each and each.without_isolated(own) for each, own in zip(again, flat, strict=True)]
         return [each if each is not None and each.members.sum() >= LEAST_POINTS else None for each in again]
 
     def thin(self, most: int) -> "Problem":
         """Return the problem with at most ``most`` evenly chosen points of each pose."""
-        rows = [np.unique(np.linspace(0, len(each) - 1, most).astype(int)) for each in self.points]
-        points, part = (
-            [each[own] for each, own in zip(given, rows, strict=True)] for given in (self.points, self.part)
+        return replace(
+            self, points=[each[np.unique(np.linspace(0, len(each) - 1, most).astype(int))] for each in self.points]
         )
-        return replace(self, points=points, part=part)
 
     def apply_step(self, state: MountState, step: np.ndarray) -> MountState:
         step = self.free @ step
@@ -155,7 +141,7 @@ class Problem(GroupedEvidence[MountState]):
     def distances(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
         """Return signed distances (N,) of all points from the artefact, mm, after a step from a state."""
         state = state if step is None else self.apply_step(state, step)
-        return self.shape.distances(state.artefact, self.to_base(state), self._parts)
+        return self.shape.distances(state.artefact, self.to_base(state))
 
     def to_base(self, state: MountState) -> np.ndarray:
         """Transform all points to the base frame; return (N, 3), mm."""
@@ -189,7 +175,7 @@ class Problem(GroupedEvidence[MountState]):
 
     def _normals(self, base: np.ndarray, state: MountState) -> np.ndarray:
         """Return normals (N, 3) of the artefact at points of the base frame."""
-        return self.shape.normals(state.artefact, base, self._parts)
+        return self.shape.normals(state.artefact, base)
 
     def _derivatives(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, K) by all values."""
@@ -198,7 +184,7 @@ class Problem(GroupedEvidence[MountState]):
         normals = self._normals(base, state)
         in_platform = np.einsum("nij,ni->nj", rotations[self.poses], normals)
         columns = [in_platform, np.cross(turned, in_platform)]
-        columns.append(self.shape.derivatives(state.artefact, base, self._parts))
+        columns.append(self.shape.derivatives(state.artefact, base))
         if self.scale:
             columns.append(np.sum(normals * positions[self.poses], axis=1, keepdims=True))
         if self.time:
@@ -209,24 +195,14 @@ class Problem(GroupedEvidence[MountState]):
         return self.project_on_lines(np.hstack(columns))
 
     @cached_property
-    def _along(self) -> np.ndarray:
-        """Positions (N,) along the parallel lines or the wall of each profile, from the middle, mm."""
-        along = []
-        for own, part in zip(self.points, self.part, strict=True):
-            result = np.zeros(len(own))
-            for rows in self.shape.group_parallel(part):
-                lines = [own[rows & (part == face)] for face in np.unique(part[rows])]
-                centred = np.vstack([line - line.mean(axis=0) for line in lines])
-                direction = np.linalg.svd(centred, full_matrices=False)[2][0]
-                result[rows] = (own[rows] - own[rows].mean(axis=0)) @ direction
-            along.append(result)
-        return np.concatenate(along)
-
-    @cached_property
     def _lines(self) -> list[np.ndarray]:
-        """Orthonormal bases (n, K) of the noise-free changes of each profile."""
-        along = np.split(self._along, np.cumsum(self.counts)[:-1])
-        return [np.linalg.qr(self.shape.basis_lines(own, part))[0] for own, part in zip(along, self.part, strict=True)]
+        """Orthonormal bases (n, 2) of the noise-free changes of each profile of a flat artefact."""
+        bases = []
+        for own in self.points:
+            centred = own - own.mean(axis=0)
+            along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+            bases.append(np.linalg.qr(np.column_stack([np.ones(len(along)), along]))[0])
+        return bases
 
     def project_on_lines(self, values: np.ndarray) -> np.ndarray:
         """Project values (N, ...) of a flat artefact onto the lines of the profiles; return others unchanged.
@@ -252,38 +228,30 @@ class Problem(GroupedEvidence[MountState]):
 
     @cached_property
     def _bins(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Order (N,) of the points by pose and surface, and start (B,), pose and number of each bin in it."""
-        order, starts, poses, places, first = [], [], [], [], 0
-        for pose, part in enumerate(self.part):
-            rows = np.argsort(part, kind="stable")
-            ends = np.flatnonzero(np.diff(part[rows])) + 1
-            place = 0
-            for run in np.split(rows, ends):
-                count = min(max(round(_BINS * len(run) / len(part)), 1), len(run))
-                begins = np.linspace(0, len(run), count, endpoint=False).astype(int)
-                starts.append(first + begins)
-                poses.append(np.full(count, pose))
-                places.append(place + np.arange(count))
-                place += count
-                order.append(int(self.counts[:pose].sum()) + run)
-                first += len(run)
-        return np.concatenate(order), np.concatenate(starts), np.concatenate(poses), np.concatenate(places)
+        """First point (B,) of each bin, its number of points, its pose, and its number in the profile."""
+        starts, poses, places = [], [], []
+        for pose, (count, end) in enumerate(zip(self.counts.tolist(), np.cumsum(self.counts).tolist(), strict=True)):
+            bins = min(_BINS, count)
+            starts.append(end - count + np.linspace(0, count, bins, endpoint=False).astype(int))
+            poses.append(np.full(bins, pose))
+            places.append(np.arange(bins))
+        first = np.concatenate(starts)
+        return first, np.diff(first, append=len(self._all)), np.concatenate(poses), np.concatenate(places)
 
     def bin_means(self, values: np.ndarray) -> np.ndarray:
         """Return means (P, K, ...) of values (N, ...) in bins along the profiles, padded with 0."""
-        order, starts, poses, places = self._bins
-        counts = np.diff(starts, append=len(order)).reshape(-1, *[1] * (values.ndim - 1))
+        starts, counts, poses, places = self._bins
         result = np.zeros((len(self.points), int(places.max()) + 1, *values.shape[1:]))
-        result[poses, places] = np.add.reduceat(values[order], starts, axis=0) / counts
+        result[poses, places] = np.add.reduceat(values, starts, axis=0) / counts.reshape(-1, *[1] * (values.ndim - 1))
         return result
 
     @cached_property
     def _apart(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Masks (P, K) of the bins with points, their numbers of points (P, K), and distances (P, K, K) of bins, mm."""
-        order, starts, poses, places = self._bins
+        _, sizes, poses, places = self._bins
         middles = self.bin_means(self._all)
         counts = np.zeros(middles.shape[:2])
-        counts[poses, places] = np.diff(starts, append=len(order))
+        counts[poses, places] = sizes
         return counts > 0, counts, np.linalg.norm(middles[:, :, None] - middles[:, None], axis=3)
 
     def bounds(self) -> np.ndarray:
@@ -366,11 +334,10 @@ class Problem(GroupedEvidence[MountState]):
 
     def pool_repeats(self, state: MountState) -> tuple[int, float]:
         """Return degrees of freedom and sum of squares of the points' noise within the bins."""
-        order, starts, _, _ = self._bins
-        values = (self.distances(state) / self.noise_along(state)[:, 0])[order]
-        counts = np.diff(starts, append=len(order))
+        starts, counts, _, _ = self._bins
+        values = self.distances(state) / self.noise_along(state)[:, 0]
         means = np.repeat(np.add.reduceat(values, starts) / counts, counts)
-        return len(order) - len(starts), float(np.sum((values - means) ** 2))
+        return len(values) - len(starts), float(np.sum((values - means) ** 2))
 
     def pose_directions(self, state: MountState) -> list[np.ndarray]:
         return [np.eye(each.shape[1])[:, each.any(axis=0)] for each in self.basis(state)]

@@ -1,14 +1,13 @@
-"""Detection of the artefact in a profile: arc of a sphere, line of a plane, lines of a step or ring."""
+"""Detection of the artefact in a profile: arc of a sphere or line of a plane."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Self
 
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import MAD_TO_STD, robust_std
+from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.shapes import fit_circle
 
 LEAST_POINTS = 12
@@ -29,37 +28,27 @@ _REFINED = 5
 """Best supported circles that are refined until one is an arc of the sphere."""
 _LEAST_ARC = np.radians(30)
 """Shorter arcs are like straight lines; their centres shift by more than the noise along the sagitta."""
-LEAST_WALL = 6
-"""Points on a ring's wall that are used: twice the three parameters of their curve."""
-_LARGEST_GAP = 5
-"""Largest gap within one wall, relative to the usual distance between neighbours, in number and in space."""
+_LARGEST_GAP = 5  # largest distance of points that are beside each other, relative to the usual one
 _LARGEST_ROUNDS = 20  # a set of inliers that still changes then alternates between two
 _NEIGHBOURS, _LEAST_BESIDE = 8, 0.25
 """Neighbours of a point on each side, and their least fraction on the artefact; half at the end of an arc or line.
 
 Scattered points on the continuation of a curve, or on the rear of a circle, have none. They would shift it most.
 """
-_LINES = 4
-"""Lines sought in a profile of a step or ring: its faces, and background beside them."""
-_PARALLEL = 2e-3
-"""Largest apparent rotation between faces of a step besides noise, rad: bow of the profiler."""
-_LEAST_SEEN = 0.95  # smallest apparent height of a step, relative to its height: scale errors of profilers are smaller
-_LEAST_SEEN_COSINE = 0.5  # cosine of the largest angle between the sheet and a step's normal: 60 deg
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Detection:
-    """Points of a profile on the artefact: mask (N,), surface number (N,) of each (from 0), scatter in mm."""
+    """Points of a profile on the artefact: mask (N,), scatter in mm."""
 
     members: np.ndarray
-    part: np.ndarray
     std_mm: float
 
     def expand(self, chosen: np.ndarray) -> Self:
         """Return the same points in the full profile; ``chosen`` is its mask of the points searched."""
-        members, part = np.zeros(len(chosen), dtype=bool), np.zeros(len(chosen), dtype=int)
-        members[chosen], part[chosen] = self.members, self.part
-        return replace(self, members=members, part=part)
+        members = np.zeros(len(chosen), dtype=bool)
+        members[chosen] = self.members
+        return replace(self, members=members)
 
     def without_isolated(self, points: np.ndarray) -> Self:
         """Return the detection without points of the profile (N, 2) that have few others beside them."""
@@ -86,18 +75,10 @@ class ProfileArc(Detection):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProfileLine(Detection):
-    """Points on a line: middle (2,), direction (2,) and length of the line; for a step or ring, of the first face.
-
-    The points are on both faces of a step, or on face and wall of a ring.
-    """
+    """Points on a line: its middle (2,) and direction (2,)."""
 
     middle_mm: np.ndarray
     direction: np.ndarray
-    length_mm: float
-
-    def with_parts(self, others: np.ndarray) -> "ProfileLine":
-        """Return the line with points of other surfaces, whose numbers (N,) are not 0."""
-        return replace(self, members=self.members | (others > 0), part=np.where(others > 0, others, self.part))
 
 
 def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generator) -> ProfileArc | None:
@@ -116,7 +97,7 @@ def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generat
     span = np.exp(rng.uniform(np.log(LEAST_POINTS // 2), np.log(widest), size=_TRIALS)).astype(int)
     first = (rng.random(_TRIALS) * np.maximum(count - 2 * span, 1)).astype(int)
     picked = points[np.minimum(first[:, None] + span[:, None] * np.arange(3), count - 1)]
-    centres, radii = circles_through(picked)
+    centres, radii = _circles_through(picked)
     fits = np.isfinite(radii) & (radii < largest)
     if not fits.any():
         return None
@@ -159,7 +140,7 @@ def _fits_radius(arc: ProfileArc, points: np.ndarray, radius_mm: float, toleranc
     return largest - own < 2 * tolerance
 
 
-def circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (M, 2) and radii (M,) of circles through triples (M, 3, 2); infinite for collinear points."""
     b, c = triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -208,8 +189,7 @@ def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Pr
     chance = np.count_nonzero((away > 2 * tolerance) & (away < 4 * tolerance)) / 2
     if std > tolerance or np.count_nonzero(members) < LEAST_POINTS + chance + _REJECTED_BEYOND * np.sqrt(chance):
         return None
-    part = np.zeros(len(points), dtype=int)
-    return ProfileArc(members=members, part=part, std_mm=std, centre_mm=centre, radius_mm=radius)
+    return ProfileArc(members=members, std_mm=std, centre_mm=centre, radius_mm=radius)
 
 
 def _arc_angle(away: np.ndarray) -> float:
@@ -243,103 +223,4 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
         return None
     members, std = found
     middle, direction = line(members)
-    return ProfileLine(
-        members=members,
-        part=np.zeros(len(points), dtype=int),
-        std_mm=std,
-        middle_mm=middle,
-        direction=direction,
-        length_mm=float(np.ptp(points[members] @ direction)),
-    )
-
-
-def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Generator) -> ProfileLine | None:
-    """Find the two best supported parallel lines in an ordered profile (N, 2), mm, or None.
-
-    The first line is at smaller z. For a step of known height, their distance must fit an angle of at most 60 deg
-    between the sheet and the step's normal.
-    """
-    best: tuple[int, float, np.ndarray, np.ndarray, ProfileLine] | None = None
-    for (rows, first), (others, second) in combinations(_find_lines(points, rng), 2):
-        apart = _line_distance(first, second)
-        if apart is None:
-            continue
-        if height_mm is not None and not _LEAST_SEEN * height_mm < abs(apart) < height_mm / _LEAST_SEEN_COSINE:
-            continue
-        if best is None or len(rows) + len(others) > best[0]:
-            nearer, farther, line = (rows, others, first) if apart > 0 else (others, rows, second)
-            best = len(rows) + len(others), max(first.std_mm, second.std_mm, 1e-4), nearer, farther, line
-    if best is None:
-        return None
-    _, noise, nearer, farther, line = best
-    members, part = np.zeros(len(points), bool), np.zeros(len(points), int)
-    members[nearer] = members[farther] = part[farther] = True
-    return replace(line, members=members, part=part, std_mm=noise)
-
-
-def find_face(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | None:
-    """Find the best supported line in a profile (N, 2), mm; return it or a parallel one at smaller z."""
-    lines = _find_lines(points, rng)
-    if not lines:
-        return None
-    beside = [(0.0, *lines[0])]
-    beside += [(apart, *line) for line in lines[1:] if (apart := _line_distance(lines[0][1], line[1])) is not None]
-    _, rows, face = min(beside, key=lambda each: each[0])
-    members = np.zeros(len(points), dtype=bool)
-    members[rows] = True
-    return replace(face, members=members, part=np.zeros(len(points), dtype=int))
-
-
-def find_walls(points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return the wall number (N,) of each point of a profile (N, 2), from 1; 0 for points on no wall.
-
-    Walls are contiguous runs of points ``near`` (N,) the artefact's wall, without outliers from a smooth curve.
-    """
-    rows = np.flatnonzero(near)
-    walls, number = np.zeros(len(points), dtype=int), 0
-    if len(rows) < LEAST_WALL:
-        return walls
-    apart = np.linalg.norm(np.diff(points[rows], axis=0), axis=1)
-    ends = (np.diff(rows) > _LARGEST_GAP) | (apart > _LARGEST_GAP * np.median(apart))
-    for run in np.split(rows, np.flatnonzero(ends) + 1):
-        for _ in range(_LARGEST_ROUNDS):
-            if len(run) < LEAST_WALL:
-                break
-            centred = points[run] - points[run].mean(axis=0)
-            along, off = (centred @ np.linalg.svd(centred, full_matrices=False)[2].T).T
-            curve = np.vander(along / max(np.ptp(along), 1e-9), 3)
-            off = off - curve @ np.linalg.lstsq(curve, off, rcond=None)[0]
-            kept = np.abs(off) <= max(
-                _REJECTED_BEYOND * MAD_TO_STD * float(np.median(np.abs(off))), _LEAST_TOLERANCE_MM
-            )
-            if kept.all():
-                number += 1
-                walls[run] = number
-                break
-            run = run[kept]
-    return walls
-
-
-def _find_lines(points: np.ndarray, rng: np.random.Generator) -> list[tuple[np.ndarray, ProfileLine]]:
-    """Return the best supported lines of a profile, each with the rows (n,) of its points."""
-    lines: list[tuple[np.ndarray, ProfileLine]] = []
-    left = np.arange(len(points))
-    for _ in range(_LINES):
-        line = find_line(points[left], rng)
-        if line is None:
-            break
-        lines.append((left[line.members], line))
-        left = left[~line.members]
-    return lines
-
-
-def _line_distance(first: ProfileLine, second: ProfileLine) -> float | None:
-    """Return the distance of a line beyond another towards larger z, mm; None if not parallel, or identical."""
-    normal = np.array([-first.direction[1], first.direction[0]]) * np.sign(first.direction[0] or 1.0)
-    apart = float((second.middle_mm - first.middle_mm) @ normal)
-    noise = max(first.std_mm, second.std_mm, 1e-4)
-    lean = [line.std_mm / max(line.length_mm, 1e-9) * np.sqrt(12 / line.members.sum()) for line in (first, second)]
-    turned = abs(float(first.direction[0] * second.direction[1] - first.direction[1] * second.direction[0]))
-    if turned > _REJECTED_BEYOND * float(np.hypot(*lean)) + _PARALLEL or abs(apart) < 2 * _REJECTED_BEYOND * noise:
-        return None
-    return apart
+    return ProfileLine(members=members, std_mm=std, middle_mm=middle, direction=direction)

@@ -1,4 +1,4 @@
-"""Start values of a mount: closed form from circles of a sphere, or search from lines of flat artefacts."""
+"""Start values of a mount: closed form from circles of a sphere, or search from lines of a plane."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,12 +6,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefact_shapes import PlaneShape, RingShape, SphereShape, StepShape
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet, point_by_mount, to_sheet
-from uwlts.calibration.mount.profiles import Detection, ProfileArc, ProfileLine, circles_through
-from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet
+from uwlts.calibration.mount.profiles import Detection, ProfileArc, ProfileLine
 from uwlts.errors import CalibrationError
-from uwlts.fitting.shapes import perpendicular_to
 
 _SUBSET = 8  # poses of a random subset: 24 linear equations for 12 unknowns
 _SUBSETS = 40  # random subsets: with a fifth of the poses wrong, one of six subsets contains no wrong pose
@@ -23,12 +20,6 @@ _TURNS_TRIED = 10  # best rotations, which are refined
 _RADII = (1.02, 1.15, 1.5)
 """Trial radii of an unknown sphere, relative to its largest section."""
 _REWEIGHTED = 10  # rounds of Cauchy weights; a start needs no more digits
-_FAR = 4.0
-"""Standard uncertainties within which points of a ring's wall are sought; poses beyond as many misfits are rejected."""
-_CLEAR = 6.0
-"""Least ratio of a circle's radius to the search width of its points: smaller circles cannot be distinguished."""
-_CIRCLES = 3000  # circles tried: with a fifth of the points on the wall, 24 of them are right
-_JUDGED = 1500  # points for the score of a circle
 _ROUGH = Scatter(point_mm=0.1, smooth_mm=1e-4, length_mm=1.0, pose_mm=0.3, turn_rad=3e-3)
 """Scatter for the weights of the search; beyond it the loss is robust."""
 
@@ -38,33 +29,21 @@ class NoFit(CalibrationError):
 
 
 def start(
-    problem: Problem,
-    whole: Problem,
-    seen: Sequence[Detection],
-    sheet: np.ndarray,
-    towards: np.ndarray | None,
-    rng: np.random.Generator,
-) -> tuple[MountState, Problem]:
-    """Estimate a state near the solution, and return it with the problem of the points that it uses.
+    problem: Problem, seen: Sequence[Detection], sheet: np.ndarray, towards: np.ndarray | None, rng: np.random.Generator
+) -> MountState:
+    """Estimate a state near the solution.
 
-    ``whole`` contains all points of the profiles; ``sheet`` (4, 4) maps the sheet's frame to the sensor's. ``towards``
-    (3,) is the direction of the sensor's frame nearest to the axis of a rotary table.
-
-    Raises CalibrationError if too few profiles show a wall of the ring.
+    ``sheet`` (4, 4) maps the sheet's frame to the sensor's. ``towards`` (3,) is the direction of the sensor's frame
+    nearest to the axis of a rotary table.
     """
     arcs = [each for each in seen if isinstance(each, ProfileArc)]
-    lines = [each for each in seen if isinstance(each, ProfileLine)]
-    match problem.shape:
-        case SphereShape() if towards is not None:
-            return _start_on_table(problem, arcs, sheet, towards), problem
-        case SphereShape():
-            return _start_of_sphere(problem, arcs, sheet, rng), problem
-        case StepShape():
-            return _start_of_step(problem, lines, sheet, rng), problem
-        case RingShape():
-            return _start_of_ring(problem, whole, lines, sheet, rng)
-        case _:
-            return _start_of_plane(problem, lines, sheet, rng), problem
+    if problem.shape.flat:
+        return _start_of_plane(problem, [each for each in seen if isinstance(each, ProfileLine)], sheet, rng)
+    return (
+        _start_of_sphere(problem, arcs, sheet, rng)
+        if towards is None
+        else _start_on_table(problem, arcs, sheet, towards)
+    )
 
 
 def _start_of_sphere(
@@ -84,7 +63,7 @@ def _start_of_sphere(
         subsets += [rng.choice(everything, _SUBSET, replace=False) for _ in range(_SUBSETS)]
     found: list[tuple[float, MountState]] = []
     largest = float(np.quantile(radii, 0.9))
-    for radius in [problem.shape.size_mm] if problem.shape.size_mm else [share * largest for share in _RADII]:
+    for radius in [problem.shape.radius_mm] if problem.shape.radius_mm else [share * largest for share in _RADII]:
         depth = np.sqrt(np.maximum(radius**2 - radii**2, 0))
         for subset in subsets:
             for state in _linear_solutions(rotations, positions, centres, depth, subset, radius):
@@ -109,7 +88,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
     flat = _solve_robustly(design, centres)
     largest, states = float(np.quantile(radii, 0.9)), []
     root = np.sqrt(complex(flat[2] @ flat[2] - flat[1] @ flat[1], -2 * flat[1] @ flat[2]))
-    for radius in [problem.shape.size_mm] if problem.shape.size_mm else [share * largest for share in _RADII]:
+    for radius in [problem.shape.radius_mm] if problem.shape.radius_mm else [share * largest for share in _RADII]:
         depth = np.sqrt(np.maximum(radius**2 - radii**2, 0))
         for other in (root, -root):
             moving = np.cos(angles) * other.real + np.sin(angles) * other.imag
@@ -207,85 +186,6 @@ def _start_of_plane(
             solution = _solve_robustly(design, -(places @ normal)[:, None])[:, 0]
             states.append(MountState(turn, solution[:3], np.append(normal, solution[3])))
     return _refine_best(problem, states, sheet)
-
-
-def _start_of_step(
-    problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
-) -> MountState:
-    """Estimate a state from the lines of a step: the plane of the first face, then the height."""
-    first = [points[part == 0] for points, part in zip(problem.points, problem.part, strict=True)]
-    none = [np.zeros(len(points), dtype=int) for points in first]
-    state = _start_of_plane(replace(problem, points=first, part=none, shape=PlaneShape()), lines, sheet, rng)
-    state = replace(state, artefact=np.append(state.artefact, 0.0))
-    found = float(np.median(problem.distances(state)[np.concatenate(problem.part) > 0]))
-    height = found if problem.shape.size_mm is None else float(np.copysign(problem.shape.size_mm, found))
-    return replace(state, artefact=np.append(state.artefact[:4], height))
-
-
-def _start_of_ring(
-    problem: Problem, whole: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
-) -> tuple[MountState, Problem]:
-    """Estimate a state from the lines of the face, as for a plane, then find the wall as a circle of other points.
-
-    The face gives the mount, with an uncertainty along the face. This uncertainty is the search width of the circle.
-    """
-    shape, plane = problem.shape, replace(problem, shape=PlaneShape())
-    state = _start_of_plane(plane, lines, sheet, rng)
-    off = plane.rms_mm(state)
-    noise = float(np.median([line.std_mm for line in lines]))
-    scatter = Scatter(max(noise, 1e-6), noise, 1.0, max(float(np.median(off)), noise), 1e-3)
-    used = plane.select(off < _FAR * np.median(off) + 5 * noise)
-    state = used.solve_robustly(state, scatter)
-    covariance = RestrictedEstimate(used, state, np.array(scatter)).covariance[:6, :6]
-    middle = state.rotation @ np.vstack(used.points).mean(axis=0)
-    to_point = point_by_mount(middle)
-    known = float(np.sqrt(np.linalg.eigvalsh(to_point @ covariance @ to_point.T)[-1]))
-    reach = _FAR * float(np.hypot(known, scatter.pose_mm))
-    base = whole.to_base(state)
-    normal, distance = state.artefact[:3], state.artefact[3]
-    axes = perpendicular_to(normal)
-    height = base @ normal - distance
-    beside = np.flatnonzero(np.abs(height) > reach)
-    # Weight heights equally: a table has many points, all at one height.
-    heights = np.sort(height[beside])
-    alike = np.searchsorted(heights, height[beside] + reach) - np.searchsorted(heights, height[beside] - reach)
-    beside = rng.choice(beside, _JUDGED, p=1 / alike / np.sum(1 / alike)) if len(beside) else beside
-    assert shape.size_mm is not None
-    centre = _find_circle(base[beside] @ axes.T, shape.size_mm, reach, rng)
-    if centre is None:
-        require_surfaces(problem)
-    assert centre is not None
-    state = replace(state, artefact=np.concatenate([normal, centre @ axes + distance * normal, [shape.size_mm]]))
-    flat = to_sheet(whole.points, sheet)
-    for narrower in (1.0, 3.0, 9.0):
-        problem = whole.select_detected(whole.detect_again(state, flat, max(reach / narrower, 5 * noise), rng))
-        require_surfaces(problem)
-        state = problem.solve_robustly(state, scatter)
-    return state, problem
-
-
-def require_surfaces(problem: Problem) -> None:
-    """Raise NoFit if too few profiles show a surface."""
-    if (words := problem.shape.describe_missing(problem.part)) is not None:
-        raise NoFit(words)
-
-
-def _find_circle(points: np.ndarray, radius_mm: float, reach_mm: float, rng: np.random.Generator) -> np.ndarray | None:
-    """Find the centre (2,) of the circle with most points (N, 2) near it, less those inside and outside."""
-    if not len(points):
-        return None
-    tried = points[rng.integers(len(points), size=(_CIRCLES, 3))]
-    centres, radii = circles_through(tried)
-    proper = np.isfinite(radii) & (radii > _CLEAR * reach_mm) & (radii < np.linalg.norm(np.ptp(points, axis=0)))
-    proper &= np.abs(radii - radius_mm) < max(0.03 * radius_mm, reach_mm)
-    if not proper.any():
-        return None
-    off = np.abs(np.linalg.norm(points - centres[proper, None], axis=2) - radii[proper, None])
-    # Surfaces other than walls fill a disc, with as many points beside the circle.
-    near, beside = (np.count_nonzero(off < reach, axis=1) for reach in (reach_mm, 3 * reach_mm))
-    score = 1.5 * near - 0.5 * beside
-    best = int(np.argmax(score))
-    return centres[proper][best] if score[best] > 0 else None
 
 
 def _solve_robustly(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:

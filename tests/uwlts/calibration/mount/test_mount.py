@@ -12,24 +12,18 @@ import uwlts
 from tests.uwlts.mount_views import (
     MOUNT,
     RADIUS_MM,
-    RING_AXIS,
-    RING_MM,
     SPHERE_MM,
     STANDOFF_MM,
     Campaign,
     errors_of,
     profile_of,
-    ring_campaign,
     sphere_campaign,
-    step_campaign,
 )
 from uwlts.calibration.mount import restricted_likelihood
-from uwlts.calibration.mount.artefact_shapes import RingShape
-from uwlts.calibration.mount.profiles import ProfileLine, _line_distance
 from uwlts.cli import main
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.shapes import fit_circle
-from uwlts.model.mount import Mount, PlaneFound, RingFound, SphereFound, StepFound
+from uwlts.model.mount import Mount, PlaneFound, SphereFound
 from uwlts.storage.mount_files import read_mount, read_profiles
 from uwlts.storage.pose_files import read_poses
 
@@ -97,37 +91,6 @@ def test_a_short_arc_is_fitted_by_its_distances(rng):
     np.testing.assert_allclose(np.append(centre, found), fit.x, atol=1e-4)
 
 
-@pytest.mark.parametrize("turned_deg", [0.0, 30.0, 170.0])
-@pytest.mark.parametrize(("apart_mm", "found"), [(0.12, True), (-0.12, True), (0.04, False)])
-def test_faces_of_a_step_are_apart_by_more_than_their_noise(turned_deg, apart_mm, found):
-    """Eight standard deviations of 0.01 mm; the distance is along the normal that points to larger z."""
-    direction = np.array([np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))])
-    normal = np.array([-direction[1], direction[0]]) * np.sign(direction[0])
-
-    def face(at: np.ndarray, along: np.ndarray) -> ProfileLine:
-        members = np.ones(50, dtype=bool)
-        return ProfileLine(
-            members=members, part=0 * members, std_mm=0.01, middle_mm=at, direction=along, length_mm=20.0
-        )
-
-    first, second = face(30 * direction, direction), face(-12 * direction + apart_mm * normal, -direction)
-    distance = _line_distance(first, second)
-    assert distance == (pytest.approx(apart_mm, abs=1e-9) if found else None)
-
-
-def test_points_near_the_edge_of_a_ring_are_on_neither_surface(rng):
-    """A face at z = 0 with a chamfer of 1 mm to a bore; distances are from the planes of both."""
-    face = np.column_stack([np.linspace(26, 42, 60), np.zeros(60)])
-    chamfer = np.column_stack([np.linspace(25, 26, 10), np.linspace(1, 0, 10)])
-    wall = np.column_stack([np.full(60, 25.0), np.linspace(20, 1, 60)])
-    points = np.vstack([wall, chamfer, face]) + 1e-3 * rng.standard_normal((130, 2))
-    off = np.abs(np.column_stack([points[:, 1], points[:, 0] - 25]))
-    found = RingShape(25.0).find_again(points, off, 1.0, rng)
-    assert found is not None
-    np.testing.assert_array_equal(found.part > 0, (points[:, 1] > 2.0))
-    assert found.members[(points[:, 1] > 2) | (points[:, 0] > 26)].mean() > 0.95
-
-
 def least_scatter_mm(campaign: Campaign) -> float:
     """Return the rms distance from the sphere after SciPy's plain least squares, started at the true values."""
     seen = [np.isfinite(profile).all(axis=1) for profile in campaign.profiles]
@@ -193,72 +156,6 @@ def test_a_plane_and_a_robot_that_scatters_give_the_mount():
     """The first steps reverse because the scatter changes; later steps must not remain damped."""
     campaign = sphere_campaign(np.random.default_rng([1, 3]), poses=24, plane_only=True, robot_mm=0.03)
     within(mount_of(campaign, artefact_kind="plane"))
-
-
-@pytest.mark.parametrize("height", [12.0, None])
-def test_a_step_gives_the_mount(rng, height):
-    """Two faces with a step of 12 mm; errors as in `within`, and the height within its stated uncertainty."""
-    mount = mount_of(step_campaign(rng, height_mm=12.0), artefact_kind="step", height_mm=height)
-    within(mount)
-    assert (mount.std()[:3] < 0.3).all() and (np.degrees(mount.std()[3:]) < 0.05).all()
-    assert isinstance(mount.artefact, StepFound) and sum(pose.reason is None for pose in mount.poses) >= 18
-    if height is None:
-        assert abs(abs(mount.artefact.height_mm) - 12.0) < 5 * mount.artefact.height_std_mm < 0.1
-    else:
-        assert abs(mount.artefact.height_mm) == height and mount.artefact.height_std_mm is None
-    assert np.abs(mount.artefact.normal) == pytest.approx([0, 0, 1], abs=1e-3)
-
-
-def test_a_step_of_another_height_is_not_found(rng):
-    with pytest.raises(CalibrationError, match="0 of 20 profiles show the step"):
-        mount_of(step_campaign(rng, height_mm=12.0), artefact_kind="step", height_mm=40.0)
-    with pytest.raises(DescriptionError, match="positive height of a step"):
-        mount_of(step_campaign(rng, height_mm=12.0, poses=8), artefact_kind="plane", height_mm=12.0)
-
-
-@pytest.mark.parametrize(
-    ("options", "radius"),
-    [
-        pytest.param({}, RING_MM["inner"], marks=pytest.mark.slow),
-        pytest.param({"tilt_deg": 22.0}, RING_MM["inner"], marks=pytest.mark.slow),
-        ({"outside": True, "table": False}, RING_MM["outer"]),
-        ({"towards_sensor": True, "robot_mm": 0.05}, RING_MM["inner"]),
-    ],
-)
-def test_a_ring_gives_the_mount(rng, options, radius):
-    """Bore or outside, with or without a table, z away from the sensor or towards it; errors as in `within`."""
-    mount = mount_of(ring_campaign(rng, **options), artefact_kind="ring", radius_mm=radius)
-    within(mount)
-    ideal = "robot_mm" not in options
-    assert (mount.std()[:3] < (0.05 if ideal else 0.3)).all()
-    assert (np.degrees(mount.std()[3:]) < (0.015 if ideal else 0.1)).all()
-    assert isinstance(mount.artefact, RingFound) and sum(pose.reason is None for pose in mount.poses) >= 22
-    assert mount.artefact.radius_mm == radius and mount.artefact.radius_std_mm is None
-    # Its axis passes through the place of the ring, whose covariance is not stored: some times what it shows.
-    away = np.cross(np.array(mount.artefact.centre_mm) - SPHERE_MM, RING_AXIS)
-    assert np.linalg.norm(away) < 0.3
-    assert abs(np.array(mount.artefact.axis) @ RING_AXIS) == pytest.approx(1.0, abs=1e-6)
-
-
-def test_wrong_poses_of_a_ring_are_left_out(rng):
-    campaign = ring_campaign(rng)
-    campaign.poses[3, :3, 3] += (0.8, -0.5, 0.6)
-    campaign.profiles[11][:] = np.nan
-    mount = mount_of(campaign, artefact_kind="ring", radius_mm=RING_MM["inner"])
-    within(mount)
-    reasons = {number for number, pose in enumerate(mount.poses) if pose.reason is not None}
-    assert {3, 11} <= reasons and len(reasons) < 6
-
-
-def test_a_ring_of_another_radius_or_without_wall_is_refused(rng):
-    with pytest.raises(CalibrationError, match="profiles show a wall of radius 30 mm .* check the radius"):
-        mount_of(ring_campaign(rng), artefact_kind="ring", radius_mm=30.0)
-    with pytest.raises(CalibrationError, match="of 24 profiles show a wall of radius 25 mm"):
-        mount_of(sphere_campaign(rng, poses=24, plane_only=True), artefact_kind="ring", radius_mm=25.0)
-    with pytest.raises(DescriptionError, match="the radius of the ring is missing: give `radius_mm`"):
-        mount_of(ring_campaign(rng, poses=8), artefact_kind="ring")
-    with pytest.raises(DescriptionError, match="positive height of a step"):
-        mount_of(ring_campaign(rng, poses=8), artefact_kind="ring", height_mm=12.0)
 
 
 def test_the_scale_of_a_robot_is_found(rng):
@@ -334,18 +231,6 @@ def test_intervals_hold_as_often_as_stated(robot_mm, campaigns):
     for seed in range(campaigns):
         campaign = sphere_campaign(np.random.default_rng([7, seed]), robot_mm=robot_mm)
         mount = mount_of(campaign, radius_mm=RADIUS_MM)
-        errors = np.concatenate(errors_of(mount.transform()))
-        held += np.mean(np.abs(errors) < mount.coverage_factor * mount.std())
-    assert held >= binom.ppf(1e-4, campaigns, 0.95)
-
-
-@pytest.mark.slow
-def test_intervals_by_a_ring_hold_as_often_as_stated():
-    """As for the sphere, with a robot that scatters by 0.05 mm."""
-    held, campaigns = 0.0, 16
-    for seed in range(campaigns):
-        campaign = ring_campaign(np.random.default_rng([11, seed]), robot_mm=0.05)
-        mount = mount_of(campaign, artefact_kind="ring", radius_mm=RING_MM["inner"])
         errors = np.concatenate(errors_of(mount.transform()))
         held += np.mean(np.abs(errors) < mount.coverage_factor * mount.std())
     assert held >= binom.ppf(1e-4, campaigns, 0.95)

@@ -25,12 +25,11 @@ def profiles_of(kind: str) -> tuple[Problem, MountState]:
         off = base[:, 2] - height if kind == "plane" else np.linalg.norm(base - SPHERE_MM, axis=1) - RADIUS_MM
         points.append(seen[np.abs(off) < 1])
     artefact = np.array([0.0, 0.0, 1.0, height]) if kind == "plane" else np.append(SPHERE_MM, RADIUS_MM)
-    part = [np.zeros(len(each), dtype=int) for each in points]
 
     def motion(offset_s: float) -> tuple[np.ndarray, np.ndarray]:
         return campaign.poses[:, :3, :3], campaign.poses[:, :3, 3] + offset_s * np.array([3.0, 5.0, -2.0])
 
-    problem = Problem(points, motion, np.array([0.0, 1.0, 0.0]), SHAPES[kind](), part, scale=True, time=True)
+    problem = Problem(points, motion, np.array([0.0, 1.0, 0.0]), SHAPES[kind](), scale=True, time=True)
     return problem, MountState(MOUNT[:3, :3], MOUNT[:3, 3], artefact)
 
 
