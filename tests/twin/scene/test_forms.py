@@ -1,4 +1,4 @@
-"""Flange, cable, rope, marine growth and sea floor: sizes, topology, and deviation of facets from the functions."""
+"""Flange and sea floor: sizes, topology, and deviation of facets from the functions."""
 
 import math
 
@@ -7,10 +7,8 @@ import pytest
 import trimesh
 from pydantic import ValidationError
 
-from twin.scene.forms import Cable, Flange, OvergrownPipe, Rope, Seabed
-from twin.scene.forms.cables_and_ropes import rope_radius
+from twin.scene.forms import Flange, Seabed
 from twin.scene.forms.flange import flange_face
-from twin.scene.forms.overgrown_pipe import overgrown_radius
 from twin.scene.forms.seabed import seabed_height
 from twin.scene.forms.triangles import rounded_box
 from twin.scene.scene_object import FreeForm
@@ -59,62 +57,6 @@ def test_a_flanges_face_is_a_saddle_of_its_flatness():
     assert np.isfinite(flange_face(flange, np.array([0.0]), np.array([81.0]))).all()
 
 
-def test_a_bent_cable_is_a_piece_of_a_torus():
-    cable = Cable(kind="cable", diameter_mm=20.0, length_mm=180.0, bend_radius_mm=150.0)
-    x, y, z = middles(mesh_of(cable)).T
-    distance = np.hypot(np.hypot(x, y - 150.0) - 150.0, z)
-    # 0.005 mm around the jacket and as much along the arc, whose chords are inside only on the outer side of the bend.
-    assert distance.min() > 10.0 - 0.011 and distance.max() < 10.0055
-    assert np.abs(np.arctan2(x, 150.0 - y)).max() == pytest.approx(90.0 / 150.0, abs=1e-9)
-    straight = mesh_of(Cable(kind="cable", diameter_mm=20.0, length_mm=180.0))
-    assert np.hypot(*straight.vertices.T[1:]) == pytest.approx(10.0)
-    np.testing.assert_allclose(straight.bounds[:, 0], [-90.0, 90.0])
-
-
-@pytest.mark.parametrize("strands", [3, 7])
-def test_a_ropes_section_is_that_of_its_round_strands(strands):
-    rope = Rope(kind="rope", strands=strands, diameter_mm=30.0, lay_mm=90.0)
-    share = math.sin(math.pi / strands)
-    circle = 15.0 / (1 + share)
-    mesh = mesh_of(rope)
-    x, y, z = mesh.vertices.T
-    turn = 2 * math.pi * x / 90.0
-    nearest = np.full(len(x), np.inf)
-    for k in range(strands):
-        angle = turn + 2 * math.pi * k / strands
-        nearest = np.minimum(nearest, np.hypot(y - circle * np.sin(angle), z + circle * np.cos(angle)))
-    np.testing.assert_allclose(nearest, circle * share, atol=1e-9)
-    assert np.hypot(y, z).max() == pytest.approx(15.0, abs=0.005)
-    x, y, z = middles(mesh).T
-    angle, pitch = np.arctan2(y, -z), 2 * math.pi / strands
-    away = np.abs(np.hypot(y, z) - rope_radius(rope, x, angle))
-    turned = (angle - 2 * math.pi * x / 90.0) / pitch
-    crowns = np.abs(turned - np.round(turned)) < 0.25
-    # 0.005 mm round a strand and as much along it; facets that cross a valley fill its bottom.
-    assert away[crowns].max() < 0.011 and away.max() < 0.1 * 15.0
-
-
-def test_growth_covers_its_pipe():
-    pipe = OvergrownPipe(kind="overgrown_pipe", barnacles=0, length_mm=60.0)
-    x, angle = np.meshgrid(np.linspace(-30, 30, 120), np.linspace(-np.pi, np.pi, 360, endpoint=False))
-    growth = overgrown_radius(pipe, x, angle) - 40.0
-    assert growth.min() > 0 and growth.max() <= 6.0 * 1.5
-    assert growth.mean() == pytest.approx(6.0, abs=1.0) and growth.std() > 0.3
-    # The waves close round the pipe.
-    ends = overgrown_radius(pipe, np.array([5.0, 5.0]), np.array([-np.pi, np.pi]))
-    assert ends[0] == pytest.approx(ends[1], abs=1e-9)
-    more = pipe.model_copy(update={"barnacles": 20, "seed": 0})
-    grown = overgrown_radius(more, x, angle) - 40.0 - growth
-    # A barnacle is highest on the crater's rim: where its slope by s = t^2 vanishes, 1 - s = 3.75 (1 - s / 0.16).
-    s = 2.75 / (3.75 / 0.16 - 1)
-    rim = (1 - s) ** 2 - 0.6 * (1 - s / 0.16) ** 2
-    assert grown.min() >= 0 and grown.max() == pytest.approx(4.0 * rim, abs=0.05)
-    x, y, z = middles(mesh_of(more)).T
-    away = np.abs(np.hypot(y, z) - overgrown_radius(more, x, np.arctan2(y, -z)))
-    assert np.quantile(away, 0.9) < 0.04 and away.max() < 0.4
-    assert not np.array_equal(more.barnacle_places(), more.model_copy(update={"seed": 1}).barnacle_places())
-
-
 def test_a_sea_floor_has_ripples_and_stones():
     bed = Seabed(kind="seabed", roughness_mm=0.0, stones=0, ripple_pitch_mm=50.0, ripple_height_mm=5.0)
     x = np.linspace(-100, 100, 2001)
@@ -150,8 +92,6 @@ WRONG = {
     "falls through": (Flange, {"kind": "flange", "bolts": 1, "head_width_mm": 12.0}),
     "bolts is 5, for 4": (Flange, {"kind": "flange", "bolts": 5}),
     "is not smaller": (Flange, {"kind": "flange", "bore_diameter_mm": 200.0}),
-    "cannot lie on an arc": (Cable, {"kind": "cable", "bend_radius_mm": 5.0}),
-    "barnacle_diameter_mm": (OvergrownPipe, {"kind": "overgrown_pipe", "barnacle_diameter_mm": 60.0}),
     "smallest_stone_mm 20 is more": (Seabed, {"kind": "seabed", "smallest_stone_mm": 20.0}),
     "stone_diameter_mm": (Seabed, {"kind": "seabed", "stone_diameter_mm": 400.0}),
 }

@@ -3,14 +3,12 @@
 A new form is a module with its description, formula and triangles, and an entry in `AnyForm`.
 """
 
-from twin.scene.forms.cables_and_ropes import Cable, Rope
 from twin.scene.forms.flange import Flange
 from twin.scene.forms.head import Head
-from twin.scene.forms.overgrown_pipe import OvergrownPipe
 from twin.scene.forms.pitted_pipe import PittedPipe
 from twin.scene.forms.seabed import Seabed
 from twin.scene.forms.weld import Weld
 
-AnyForm = Cable | Flange | Head | OvergrownPipe | PittedPipe | Rope | Seabed | Weld
+AnyForm = Flange | Head | PittedPipe | Seabed | Weld
 
-__all__ = ["AnyForm", "Cable", "Flange", "Head", "OvergrownPipe", "PittedPipe", "Rope", "Seabed", "Weld"]
+__all__ = ["AnyForm", "Flange", "Head", "PittedPipe", "Seabed", "Weld"]
