@@ -109,7 +109,7 @@ def _floor(values: np.ndarray, key: str) -> Any:
 
 def read_values(path: Path) -> Values:
     """Return all numbers and texts of a file by name; nothing for a page or another file that displays results."""
-    match "".join(path.suffixes[-2:]) if path.name.endswith(".copc.laz") else path.suffix:
+    match path.suffix:
         case ".json":
             return dict(_of_table(json.loads(path.read_text(encoding="utf-8"))))
         case ".yaml":
@@ -120,7 +120,7 @@ def read_values(path: Path) -> Values:
             return dict(_of_hdf5(path))
         case ".ply":
             return dict(_of_ply(path))
-        case ".laz" | ".copc.laz":
+        case ".laz":
             return dict(_of_laz(path))
         case ".e57":
             return dict(_of_e57(path))

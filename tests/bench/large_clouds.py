@@ -48,7 +48,7 @@ def main(points: int = 10_000_000) -> int:
         for seed, cloud in enumerate(("before.ply", "after.ply")):
             _write_pipe(folder / cloud, points, seed=seed)
         commands = (
-            ("uwlts export after.ply --out after.copc.laz", 4.0),
+            ("uwlts export after.ply --out after.laz", 4.0),
             ("uwlts inspect after.ply --wall-mm 9.5 --out after.json", 4.0),
             ("uwlts compare after.ply before.ply --out change.html", 8.0),
             ("uwlts register before.ply after.ply --out both.h5", 8.0),

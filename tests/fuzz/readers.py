@@ -23,7 +23,7 @@ from tests.uwlts.storage.test_capture import a_header, interrupted, record, smal
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_ros_bags import messages, write_ros2
 from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
-from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, BLOCK, COLUMNS, INFO, POINTS, PROGRAMS, pcd
+from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, BLOCK, COLUMNS, INFO, PROGRAMS
 from tests.uwlts.stripe.test_learned import centroid_model
 from twin.datasets.data_set import load_description as load_data_set
 from twin.design.screening import encode_part, read_parts
@@ -174,10 +174,6 @@ def _foreign(path: Path) -> None:
     write_cloud(path, some_cloud())
 
 
-def _pcd(path: Path) -> None:
-    path.write_bytes(pcd(path.name.partition("-")[2].partition(".")[0], points=POINTS[:21]))
-
-
 def _gocator(path: Path) -> None:
     rows = "0,0,5,0,0,0,80,10.5,Z,1.5,,3.5\n0,0,5,0,0,0,80,10.5,I,7,8,9\n"
     path.write_text(f"{INFO}Profile\n{ATTRIBUTES.format(0)}{COLUMNS},-0.5,0,0.5\n{rows}End\n")
@@ -200,6 +196,12 @@ def _mount_description(path: Path) -> None:
 
 def _las(path: Path) -> None:
     table = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+    table.x, table.y, table.z = 1e-3 * some_cloud().points_mm.T
+    table.write(path)
+
+
+def _old_laz(path: Path) -> None:
+    table = laspy.LasData(laspy.LasHeader(version="1.2", point_format=3))
     table.x, table.y, table.z = 1e-3 * some_cloud().points_mm.T
     table.write(path)
 
@@ -293,12 +295,6 @@ distortion_coefficients:
   cols: 5
   data: [-0.1, 0.02, 0.001, -0.002, 0.0]
 """
-
-
-COLMAP_IMAGES = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n" + "".join(
-    f"{number} 0.5 -0.5 0.5 0.5 {number} 2 3 1 image{number}.png\n1.5 2.5 -1 3 4 7\n" for number in range(1, 4)
-)
-COLMAP = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 OPENCV 640 480 800 801 320.5 240.5 -0.1 0.02 0.001 -0.002\n"
 
 
 def _ros(path: Path) -> None:
@@ -465,11 +461,8 @@ READERS = {
             Reader(f"cloud-{kind}", f".{kind}", form, make, read_cloud)
             for kind, form, make in (("xyz", "lines", _foreign), ("las", "bytes", _las), ("e57", "bytes", _foreign))
         ),
-        *(
-            Reader(f"cloud-pcd-{kind}", f"-{kind}.pcd", "lines" if kind == "ascii" else "bytes", _pcd, read_cloud)
-            for kind in ("ascii", "binary", "binary_compressed")
-        ),
-        Reader("cloud-copc", ".copc.laz", "bytes", _foreign, read_cloud),
+        Reader("cloud-laz", ".laz", "bytes", _foreign, read_cloud),
+        Reader("cloud-laz-1.2", ".laz", "bytes", _old_laz, read_cloud),
         Reader("cloud-gocator", ".csv", "lines", _gocator, read_cloud),
         *(
             Reader(
@@ -480,13 +473,6 @@ READERS = {
                 lambda path, robot=robot: read_poses(path, pose_format=robot),
             )
             for robot in PROGRAMS
-        ),
-        Reader(
-            "poses-colmap",
-            ".txt",
-            "lines",
-            _text(COLMAP_IMAGES),
-            lambda path: read_poses(path, pose_format="colmap", unit="m"),
         ),
         Reader("cloud-block", ".csv", "lines", _text(BLOCK.format(";") + "X;Y;Z\n" + 12 * "1,5;2;3\n"), read_cloud),
         Reader("verification", ".verification.json", "json", _verification, _verified),
@@ -548,7 +534,6 @@ READERS = {
             read_shape,
         ),
         Reader("datums", ".toml", "toml", _text("[[datum]]\ncentre_mm = [1, 2, 3]\nradius_mm = 5\n"), read_datums),
-        Reader("colmap", ".txt", "lines", _text(COLMAP), _sensor_with),
         Reader("screened", ".parquet", "bytes", _part, _read_part),
         Reader("results", ".json", "json", _results, CampaignResults.read_file),
         Reader("guided-plan", ".toml", "toml", _guided_plan, load_guided_plan),

@@ -26,7 +26,6 @@ from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.copc_file import write_copc
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Route, WebSocketRoute
@@ -598,12 +597,12 @@ def test_keys_alone_are_enough(desk, page):
 
 @pytest.mark.slow
 def test_who_looks_closer_sees_all_points_there(desk, page):
-    """The COPC file has twice as many points as are shown."""
+    """The cloud has twice as many points as are shown."""
     rng = np.random.default_rng(3)
     points = np.column_stack([*rng.uniform(-100, 100, (2, 600_000)), rng.normal(400, 0.1, 600_000)])
     none = np.full(len(points), -1)
     cloud = uwlts.PointCloud(points, np.ones(len(points)), none, none)
-    write_copc(desk.folder / "plate.copc.laz", lambda: [cloud])
+    cloud.save(desk.folder / "plate.cloud.h5")
     tab(page, "Files")
     page.get_by_role("button", name="show", exact=True).click()
     page.locator(".cloud-view[data-points]").wait_for()

@@ -219,7 +219,7 @@ def compare_clouds(
     Parameters
     ----------
     cloud
-        Cloud of the surface, or its file (.ply, .h5, .copc.laz; from other programs .las, .e57, or text in mm).
+        Cloud of the surface, or its file (.ply, .h5; from other programs .las, .laz, .e57, or text in mm).
     reference
         Earlier cloud; mesh file (.stl, .obj, .off, or .ply with faces); or ideal shape. "plane", "sphere" or "cylinder"
         fits a shape. A TOML file states its kind and known sizes (docs: compare scans).

@@ -241,7 +241,7 @@ def list_fields(kind: str) -> list[AnalysisField]:
             )
     if kind == "export":
         about = "Ending of the file; the documentation of cloud formats says what each contains."
-        fields.append(AnalysisField(_FORMAT, "format", about, True, choices=(*CLOUD_FORMATS, ".copc.laz")))
+        fields.append(AnalysisField(_FORMAT, "format", about, True, choices=CLOUD_FORMATS))
     return fields
 
 

@@ -59,7 +59,7 @@ def guess_kind(name: str) -> str:
             return "interrupted capture"
         case [_, *_, "truth", "h5"]:
             return "truth"
-        case [_, *_, "ply"] | [_, *_, "copc", "laz"]:
+        case [_, *_, "ply"]:
             return "cloud"
         case [_, *_, "h5"]:
             return "capture"

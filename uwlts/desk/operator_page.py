@@ -32,8 +32,7 @@ from uwlts.model.library import validate_description
 from uwlts.report.inventory import describe
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_region, read_thinned_cloud
-from uwlts.storage.copc_file import is_copc
+from uwlts.storage.cloud_files import read_thinned_cloud
 
 _LIST_S = 2.0  # period in which the list of files is read again
 _MOST_SHOWN = 300_000  # points, fluent on a tablet
@@ -148,18 +147,15 @@ class _Desk:
         """Return the names of the calibrations."""
         return [file.name for file in list_files(self.folder) if file.kind == "calibration"]
 
-    def show_cloud(self, name: str, cloud: PointCloud, *, of: int | None = None, path: Path | None = None) -> None:
+    def show_cloud(self, name: str, cloud: PointCloud, *, of: int | None = None) -> None:
         """Show a cloud, a sample ``of`` that many points, thinned if it is large, and make it the one to measure.
 
-        A closer view shows more points: those of a COPC file's ``path``, else those of the cloud.
+        A closer view shows more of its points.
         """
 
         def closer(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-            if path is not None:
-                found = read_region(path, low, high, _MOST_SHOWN)
-            else:
-                inside = np.flatnonzero(np.all((cloud.points_mm >= low) & (cloud.points_mm <= high), axis=1))
-                found = cloud.select(inside[:: -(-len(inside) // _MOST_SHOWN) or 1])
+            inside = np.flatnonzero(np.all((cloud.points_mm >= low) & (cloud.points_mm <= high), axis=1))
+            found = cloud.select(inside[:: -(-len(inside) // _MOST_SHOWN) or 1])
             return point_table(found.points_mm, **_fields(found))
 
         self.measuring.open(cloud)
@@ -176,7 +172,7 @@ class _Desk:
         cloud, total = read_thinned_cloud(path, _MOST_OPENED)
         if total > len(cloud):
             self.board.say(f"{name} has {total:,} points: an even sample of {len(cloud):,} is measured", "warning")
-        self.show_cloud(name, cloud, of=total, path=path if is_copc(path) else None)
+        self.show_cloud(name, cloud, of=total)
 
     def _show_result(self, path: Path) -> None:
         """Show the cloud of an analysis, unless a scan is shown."""

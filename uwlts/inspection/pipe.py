@@ -59,7 +59,7 @@ def inspect_pipe(
     Parameters
     ----------
     cloud
-        Cloud of the object, or its file (.ply, .h5, .copc.laz; from other programs .las, .e57, and text in mm).
+        Cloud of the object, or its file (.ply, .h5; from other programs .las, .laz, .e57, and text in mm).
     section_mm
         Length of a section along the pipe (or a weld); by default up to twelve sections.
     wall_mm

@@ -14,7 +14,7 @@ from uwlts.errors import SetupError
 
 PROJECT = "uwlts"
 EXTRAS = {
-    "clouds": "clouds as LAZ, LAS, E57 and COPC",
+    "clouds": "clouds as LAZ, LAS and E57",
     "cluster": "sweeps on several machines",
     "frames": "results as tables of pandas",
     "genicam": "cameras with a GenTL producer, XIMEA's among them",

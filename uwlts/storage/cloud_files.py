@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwlts.errors import CaptureError, OutputError
+from uwlts.errors import CaptureError
 from uwlts.files.reading import log_warnings, open_regular, parse_json, require_regular_file
 from uwlts.files.writing import refuse_unsuitable, require_ending, write_atomically
 from uwlts.model.sensor import Description, Table
@@ -32,7 +32,6 @@ from uwlts.storage.cloud import (
     note_step,
     omit_points,
 )
-from uwlts.storage.copc_file import is_copc, read_copc
 from uwlts.storage.foreign_clouds import FORMATS, find_format, read_foreign, require_libraries, write_foreign
 from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
 from uwlts.storage.normal_std import compute_normal_std
@@ -45,10 +44,10 @@ VERSION = 1  # of the file format
 POINTS_OF_PART = 1_000_000
 """Number of points in a part of a large cloud."""
 
-CLOUD_ENDINGS = (".ply", ".h5", ".copc.laz", *(ending for ending, each in FORMATS.items() if each.read))
+CLOUD_ENDINGS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.read))
 """Endings of the clouds that can be read."""
 CLOUD_FORMATS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.write))
-"""Endings of the clouds that can be written, including ``.copc.laz`` and ``.foxglove.mcap``."""
+"""Endings of the clouds that can be written, including ``.foxglove.mcap``."""
 COLOURED_FORMATS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.coloured))
 """Endings of the clouds that can be written with a colour of each point."""
 PLY_COLOURS = ("red", "green", "blue")
@@ -88,7 +87,6 @@ def write_cloud(
       is rounded to integers (0 if unknown) and ``amplitude`` holds its value; the standard ``gps_time`` is the time in
       s if known. Extra fields are ``frame``, ``line``, ``deviation_mm``, and the covariance ``cov_xx_mm2`` to
       ``cov_zz_mm2``.
-    - ``.copc.laz``: the same without times and covariances as COPC, in an octree with levels of detail.
     - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the image as
       column and the line as row if both are known and below 65536; ``timeStamp`` in 64 bits since ``acquisitionStart``
       if times are known; the covariance as an extension, ``uwlts:cov_xx_mm2`` to ``uwlts:cov_zz_mm2``.
@@ -153,16 +151,14 @@ def refuse_unsuitable_cloud(path: str | os.PathLike[str], *, overwrite: bool, co
 
 def _require_format(path: Path, *, coloured: bool) -> None:
     require_ending(path, COLOURED_FORMATS if coloured else CLOUD_FORMATS)
-    if coloured and is_copc(path):
-        raise OutputError(f"{path}: COPC is written without colours; give a name that ends with .laz alone")
 
 
 def read_cloud(path: str | os.PathLike[str], *, unit: Unit | None = None) -> PointCloud:
-    """Read a cloud from HDF5 (``.h5``), COPC (``.copc.laz``), PLY, or a format of other programs.
+    """Read a cloud from HDF5 (``.h5``), PLY, or a format of other programs.
 
-    PLY of other programs needs only x, y, z. Further formats are text (``.xyz``, ``.csv`` and others, mm), LAS and E57
-    (m). Field names as changed by CloudCompare (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
-    missing frame and line are -1, and a deviation that is missing or all NaN is None.
+    PLY of other programs needs only x, y, z. Further formats are text (``.xyz``, ``.csv`` and others, mm), LAS, LAZ and
+    E57 (m). Field names as changed by CloudCompare (`scalar_intensity` and so on) are recognised. Missing intensity is
+    NaN, missing frame and line are -1, and a deviation that is missing or all NaN is None.
 
     ``unit`` is that of PLY and text of other programs whose names of columns state none; by default mm.
 
@@ -191,12 +187,10 @@ def read_thinned_cloud(
 ) -> tuple[PointCloud, int]:
     """Read every n-th point of a cloud's file, at most ``at_most``, and the number of points; see `read_cloud`.
 
-    For HDF5 and binary PLY only these are held in memory. For COPC the upper levels are read, an even sample.
+    For HDF5 and binary PLY only these are held in memory.
     """
     with _naming(path):
-        if is_copc(path):
-            cloud, total = read_copc(path, at_most=at_most)
-        elif _is_foreign(path):
+        if _is_foreign(path):
             whole = read_foreign(Path(path), unit=unit)
             cloud, total = whole.select(_every(len(whole), at_most)), len(whole)
         else:
@@ -216,15 +210,11 @@ def read_region(
 ) -> PointCloud:
     """Read the points in the box from ``low_mm`` (3,) to ``high_mm`` (3,), or an even sample of ``at_most``.
 
-    For COPC only the nodes in the box are read, for other files one part at a time.
+    HDF5 and binary PLY are read one part at a time.
     """
     low, high = np.asarray(low_mm, float), np.asarray(high_mm, float)
     if low.shape != (3,) or high.shape != (3,) or not (np.isfinite([low, high]).all() and (low < high).all()):
         raise CaptureError(f"a region goes from x, y, z to larger x, y, z; found {low.tolist()} to {high.tolist()} mm")
-    if is_copc(path):
-        with _naming(path):
-            cloud = read_copc(path, box_mm=(low, high), at_most=at_most)[0]
-            return _in_mm(cloud, path, unit)
     found = [
         part.select(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
         for part in read_parts(path, unit=unit)
@@ -240,7 +230,7 @@ def read_parts(
 
     For HDF5 and binary PLY only one part is held in memory.
     """
-    if is_copc(path) or _is_foreign(path):
+    if _is_foreign(path):
         whole = read_cloud(path, unit=unit)
         yield from (whole.select(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
         return
@@ -309,8 +299,8 @@ def _every(count: int, at_most: int | None) -> slice:
 
 
 def name_cloud(path: str | os.PathLike[str]) -> str:
-    """Return the name of a cloud's file without its ending, such as ``.ply``, ``.cloud.h5`` or ``.copc.laz``."""
-    return re.sub(r"\.(cloud|full|copc)$", "", Path(path).stem)
+    """Return the name of a cloud's file without its ending, such as ``.ply`` or ``.cloud.h5``."""
+    return re.sub(r"\.(cloud|full)$", "", Path(path).stem)
 
 
 def is_lean(path: str | os.PathLike[str]) -> bool:
@@ -323,7 +313,7 @@ def is_cloud(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is a cloud, by its ending, or by its label if captures have the same ending."""
     if _in_hdf5(path):
         return read_format(Path(path)) == FORMAT
-    if is_copc(path) or Path(path).suffix.lower() == ".ply":
+    if Path(path).suffix.lower() == ".ply":
         return True
     form = find_format(path)
     return form is not None and form.read is not None and not form.ambiguous

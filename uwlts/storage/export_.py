@@ -22,13 +22,11 @@ from uwlts.storage.cloud_files import (
     CLOUD_FORMATS,
     is_readable_cloud,
     read_cloud,
-    read_parts,
     read_region,
     read_thinned_cloud,
     refuse_unsuitable_cloud,
     write_cloud,
 )
-from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.import_.folder_description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
 from uwlts.storage.number_tables import Unit
@@ -57,10 +55,10 @@ def export(
     Parameters
     ----------
     file : str or Path
-        Capture (.h5) or cloud (.ply, .h5, .copc.laz, or .xyz, .txt, .csv, .asc, .pcd, .las, .e57 of other programs).
+        Capture (.h5) or cloud (.ply, .h5, or .xyz, .txt, .csv, .asc, .las, .laz, .e57 of other programs).
     out : str or Path
         New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
-        .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).
+        .las, .e57, .mcap (ROS 2) or .foxglove.mcap.
     images : {"png", "tiff"}
         Format of a capture's images; both keep all bits.
     region_mm : pair of (3,), optional
@@ -99,8 +97,6 @@ def export(
             cloud = read_region(file, *region_mm, at_most, unit=unit)
         _write(cloud, out, overwrite=overwrite)
         return len(cloud)
-    if of_points and is_copc(out):
-        return write_copc(out, lambda: read_parts(file, unit=unit), overwrite=overwrite, progress=progress)
     if of_points:
         cloud = read_cloud(file, unit=unit)
         _write(cloud, out, overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""Clouds in formats of other programs and scanners: text, PCD, LAS, E57; LAZ, COPC and MCAP are only written here."""
+"""Clouds in formats of other programs and scanners: text, LAS, LAZ and E57; MCAP is only written."""
 
 import os
 from collections.abc import Callable
@@ -11,12 +11,10 @@ import numpy as np
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.files.writing import write_atomically
 from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
-from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
 from uwlts.storage.mcap_clouds import mcap_content
-from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit, read_number_table
-from uwlts.storage.pcd_file import read_pcd
+from uwlts.storage.number_tables import Unit, read_number_table
 from uwlts.storage.point_cloud2 import covariance_columns
 
 Colours = np.ndarray | None
@@ -31,7 +29,7 @@ class CloudFormat:
     write: Callable[[Path, PointCloud, Colours, Path], object] | None = None
     """Writes a cloud with colours (N, 3) or None to a path that is renamed to the second one afterwards. None if
     files are only read."""
-    libraries: tuple[Literal["laspy", "lazrs", "copclib", "pye57"], ...] = ()  # optional libraries that writing needs
+    libraries: tuple[Literal["laspy", "lazrs", "pye57"], ...] = ()  # optional libraries that writing needs
     coloured: bool = False  # whether points can have colours
     unit: Unit | None = None  # unit that the format prescribes, or None if files can be in any unit
     ambiguous: bool = False  # whether files with this ending usually contain something else
@@ -46,24 +44,14 @@ def find_format(path: str | os.PathLike[str]) -> CloudFormat | None:
 def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
     """Read all points of a file in one of `FORMATS`.
 
-    Text is in the unit that the names of its columns state, else in ``unit``, by default mm; PCD is in ``unit``; LAS
-    and E57 are in m, as they prescribe. The scans of an E57 file are combined, each at its pose.
+    Text is in the unit that the names of its columns state, else in ``unit``, by default mm; LAS,
+    LAZ and E57 are in m, as they prescribe. The scans of an E57 file are combined, each at its pose.
 
     Raises CaptureError if the file is damaged or foreign, SetupError if the library for its format is not installed.
     """
     form = find_format(path)
     assert form is not None and form.read is not None
     return form.read(path, unit)
-
-
-def _read_pcd(path: Path, unit: Unit | None) -> PointCloud:
-    columns, warnings = read_pcd(path)
-    if missing := [axis for axis in "xyz" if axis not in columns]:
-        raise CaptureError(f"{path} has no {', '.join(missing)}, only {', '.join(columns) or 'nothing'}")
-    points, scale = np.column_stack([columns[axis] for axis in "xyz"]), MM_PER_UNIT[check_unit(unit or "mm")]
-    step = scale * find_float_step(points)
-    cloud = make_foreign_cloud(scale * points.astype(np.float64), intensity=columns.get("intensity"), step_mm=step)
-    return replace(cloud, warnings=[*warnings, *cloud.warnings])
 
 
 def _read_text(path: Path, unit: Unit | None) -> PointCloud:
@@ -91,9 +79,6 @@ def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: Co
     """
     if len(cloud) == 0:
         raise OutputError(f"the cloud has no points, and {path.suffix} cannot hold none: write PLY or HDF5")
-    if is_copc(path):
-        write_copc(path, lambda: [cloud], overwrite=overwrite)
-        return
     form = find_format(path)
     assert form is not None and form.write is not None
     with write_atomically(path, overwrite=overwrite) as aside:
@@ -149,17 +134,14 @@ def _write_e57(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> 
 
 FORMATS = {
     ".xyz": CloudFormat(_read_text, _write_text),
-    ".laz": CloudFormat(None, _write_las, libraries=("laspy", "lazrs"), coloured=True, unit="m"),
-    ".copc.laz": CloudFormat(libraries=("copclib",), unit="m"),
+    ".laz": CloudFormat(
+        lambda path, unit: read_las(path), _write_las, libraries=("laspy", "lazrs"), coloured=True, unit="m"
+    ),
     ".e57": CloudFormat(lambda path, unit: read_e57(path), _write_e57, libraries=("pye57",), coloured=True, unit="m"),
     ".las": CloudFormat(lambda path, unit: read_las(path), _write_las, libraries=("laspy",), coloured=True, unit="m"),
     ".mcap": CloudFormat(None, _write_mcap, unit="m", ambiguous=True),
     ".txt": CloudFormat(_read_text, ambiguous=True),
     ".csv": CloudFormat(_read_text, ambiguous=True),
     ".asc": CloudFormat(_read_text, ambiguous=True),
-    ".pcd": CloudFormat(_read_pcd),
 }
-"""Formats by the file's ending; COPC is read and written in parts (`uwlts.storage.copc_file`).
-
-Text has columns x, y, z by name, or the first three, and optionally intensity.
-"""
+"""Formats by the file's ending. Text has columns x, y, z by name, or the first three, and optionally intensity."""

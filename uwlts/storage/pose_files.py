@@ -9,16 +9,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
-from uwlts.files.reading import log_warnings, natural_key, read_bytes
+from uwlts.files.reading import log_warnings, read_bytes
 from uwlts.files.writing import hash_file, write_atomically
 from uwlts.model.calibration import is_rigid
 from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
-from uwlts.storage.number_tables import MM_PER_UNIT, ROTATION_NAMES, NumberTable, Unit, check_unit, read_number_table
+from uwlts.storage.number_tables import MM_PER_UNIT, ROTATION_NAMES, NumberTable, Unit, read_number_table
 from uwlts.storage.ros_bags import read_bag_poses
 
 PoseFormat = str
 """matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg, angle-rad,
-abb, kuka, ur, colmap."""
+abb, kuka, ur."""
 FARTHEST_MM = 1e7
 """Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
 
@@ -64,10 +64,8 @@ _MOST_PROGRAM_BYTES = 64 * 2**20  # hours of a robot's path
 _EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
 _FORMATS = (
     "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg, "
-    "abb, kuka, ur (text of robot programs), colmap (images.txt)"
+    "abb, kuka, ur (text of robot programs)"
 )
-_COLMAP = "colmap"
-_IMAGE_ROW = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _MOST_POSES = 1_000_000  # more than an hour at 200 poses a second
@@ -92,8 +90,7 @@ def read_poses(
     the poses are those of the sensor's side relative to the object.
 
     With the formats ``abb``, ``kuka`` and ``ur`` the file is text of a robot's program, whose poses are read in order
-    (`_ROBOTS`). With ``colmap`` it is a file ``images.txt`` of COLMAP, whose transforms of the world to the camera are
-    inverted. The poses are sorted by the names of their images, and ``unit`` is required: COLMAP's lengths have none.
+    (`_ROBOTS`).
 
     Names decide the order of columns where they say it: x, y, z; qw, qx, qy, qz; roll, pitch, yaw or rx, ry, rz. Units
     in names (``x_m``, ``yaw [deg]``) are obeyed; without them positions are in ``unit``, by default mm.
@@ -106,8 +103,6 @@ def read_poses(
     """
     if pose_format in _ROBOTS:
         return _read_program(Path(path), pose_format, unit, digests), None
-    if pose_format == _COLMAP:
-        return _read_colmap(Path(path), unit, digests), None
     table = read_number_table(Path(path), digests, named=False)
     return _poses(table, pose_format, unit)
 
@@ -125,37 +120,6 @@ def _read_program(path: Path, robot: str, unit: Unit | None, digests: dict[str, 
         raise DescriptionError(f"{path} has no pose in the form of {robot} ({program.form})")
     poses = poses_from_rows(rows, program.pose_format, path)
     poses[:, :3, 3] *= MM_PER_UNIT[program.unit]
-    return poses
-
-
-def _read_colmap(path: Path, unit: Unit | None, digests: dict[str, str] | None) -> np.ndarray:
-    """Read poses (P, 4, 4) of cameras in the world, mm, in the order of the images' names (colmap.github.io/format).
-
-    Raises DescriptionError without ``unit``, or if rows of images and of their points do not alternate.
-    """
-    if unit is None:
-        raise DescriptionError(
-            f"{path}: lengths of COLMAP have no unit. Scale its model to mm or m (colmap model_aligner), and give the "
-            "unit of the poses"
-        )
-    rows = [line.split() for line in _read_lines(path, digests) if not line.startswith("#")]
-    while rows and not rows[-1]:  # points of the last image, if it has none
-        rows.pop()
-    images, points = rows[::2], rows[1::2]
-    wrong = any(each and (len(each) % 3 or not each[-1].removeprefix("-").isdigit()) for each in points)
-    if wrong or not images or any(len(image) < 10 for image in images):
-        raise DescriptionError(f"{path} is no images.txt of COLMAP; expected rows {_IMAGE_ROW} and of points")
-    try:
-        images.sort(key=lambda image: natural_key(" ".join(image[9:])))
-        numbers = np.array([image[1:8] for image in images], float)
-    except ValueError as error:
-        raise DescriptionError(f"{path} is no images.txt of COLMAP: {error}; expected rows {_IMAGE_ROW}") from error
-    if not np.isfinite(numbers).all():
-        raise DescriptionError(f"{path} has a pose that is not finite")
-    of_world = poses_from_rows(numbers[:, [4, 5, 6, 0, 1, 2, 3]], "quaternion-wxyz", path)
-    poses = np.tile(np.eye(4), (len(of_world), 1, 1))
-    poses[:, :3, :3] = np.swapaxes(of_world[:, :3, :3], 1, 2)
-    poses[:, :3, 3] = -MM_PER_UNIT[check_unit(unit)] * np.einsum("pji,pj->pi", of_world[:, :3, :3], of_world[:, :3, 3])
     return poses
 
 
@@ -187,7 +151,7 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
             covariance = covariance * units[:, None] * units
         rows[:, :3] *= 1e3
         return _trajectory(path, times, poses_from_rows(rows, "quaternion-xyzw", path), covariance)
-    if pose_format in (*_ROBOTS, _COLMAP):
+    if pose_format in _ROBOTS:
         raise DescriptionError(f"{path}: poses of the format {pose_format} have no times, which a trajectory needs")
     table = read_number_table(path, named=False)
     if pose_format == "tum":

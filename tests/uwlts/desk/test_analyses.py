@@ -136,7 +136,7 @@ def test_clouds_are_compared_registered_and_exported(analyses, folder):
 
 def test_results_are_named_after_the_first_file():
     assert name_results("inspect pipe", {"cloud": "wall.ply"}) == "wall-pipe"
-    assert name_results("export", {"file": "wall.copc.laz"}) == name_results("export", {"file": "wall.cloud.h5"})
+    assert name_results("export", {"file": "wall.laz"}) == name_results("export", {"file": "wall.cloud.h5"})
     assert name_results("export", {"file": "wall.full.ply"}) == "wall-export"
     assert name_results("register", {"clouds": ["a.ply", "b.ply"]}) == "a-registered"
     assert name_results("register", {"clouds": []}) == name_results("compare", {"cloud": None}) == ""

@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
         ("scan.h5.part", "interrupted capture"),
         ("scan.truth.h5", "truth"),
         ("wall.ply", "cloud"),
-        ("pipe.copc.laz", "cloud"),
+        ("pipe.laz", "exported cloud"),
         ("calibration.json", "calibration"),
         ("plan.toml", "description"),
         ("wall.html", "report"),

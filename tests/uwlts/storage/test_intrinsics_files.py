@@ -225,7 +225,7 @@ def _focal(known: KnownCamera) -> dict[str, float]:
         WIDE.replace("distortion_model: plumb_bob", "model: OPENCV_FISHEYE"),
         KALIBR.replace("radtan", "equidistant").replace("[-0.125, 0.0625, 0.001, -0.002]", str(FISHEYE.tolist())),
     ],
-    ids=["ros", "ros-fisheye", "colmap", "kalibr"],
+    ids=["ros", "ros-fisheye", "opencv", "kalibr"],
 )
 def test_equidistant_lenses_are_converted(tmp_path: Path, text: str):
     """Also one whose corners are 69 deg from the axis."""
@@ -309,67 +309,3 @@ def test_intrinsics_of_another_camera_are_refused():
     oblong = KnownCamera(2000.0, 2500.0, 640.0, 512.0, Distortion(), None)
     with pytest.raises(DescriptionError, match=r"pixel_aspect.*1\.25"):
         set_intrinsics(sensor, oblong, source="camera.yaml")
-
-
-COLMAP = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n7 {}\n"
-
-
-@pytest.mark.parametrize(
-    ("row", "distortion"),
-    [
-        ("PINHOLE 1280 1024 2451.25 2450.75 641 511.75", Distortion()),
-        (
-            "OPENCV 1280 1024 2451.25 2450.75 641 511.75 -0.125 0.0625 1e-3 -2e-3",
-            KNOWN.distortion.model_copy(update={"k3": 0.0}),
-        ),
-        (
-            "FULL_OPENCV 1280 1024 2451.25 2450.75 641 511.75 -0.125 0.0625 1e-3 -2e-3 0.03125 0.25 -0.125 0.5",
-            KNOWN.distortion.model_copy(update={"k4": 0.25, "k5": -0.125, "k6": 0.5}),
-        ),
-    ],
-)
-def test_cameras_of_colmap(tmp_path: Path, row: str, distortion: Distortion):
-    """COLMAP's first pixel has its centre at 0.5, this program's at 0."""
-    (tmp_path / "cameras.txt").write_text(COLMAP.format(row))
-    known = read_intrinsics(tmp_path / "cameras.txt")
-    assert known == KnownCamera(2451.25, 2450.75, 640.5, 511.25, distortion, (1280, 1024))
-
-
-@pytest.mark.parametrize(("row", "k"), [("SIMPLE_RADIAL", [-0.1, 0.0]), ("RADIAL", [-0.1, 0.02])])
-def test_cameras_of_colmap_with_one_focal_length(tmp_path: Path, row: str, k: list[float]):
-    parameters = " ".join(map(str, k[: 1 if "SIMPLE" in row else 2]))
-    (tmp_path / "cameras.txt").write_text(COLMAP.format(f"{row} 640 480 800 320.5 240.5 {parameters}"))
-    expected = Distortion(k1=k[0], k2=k[1])
-    assert read_intrinsics(tmp_path / "cameras.txt") == KnownCamera(800.0, 800.0, 320.0, 240.0, expected, (640, 480))
-
-
-def test_fisheye_cameras_of_colmap_are_equidistant(tmp_path: Path):
-    """Their rays are those of OpenCV's own fisheye model."""
-    k = np.array([-0.01, 0.004, 0.0, 0.0])
-    (tmp_path / "cameras.txt").write_text(COLMAP.format(f"RADIAL_FISHEYE 640 480 436 320.5 240.5 {k[0]} {k[1]}"))
-    known = read_intrinsics(tmp_path / "cameras.txt")
-    rays = np.array([[[0.1, 0.2]], [[-0.6, 0.3]], [[0.5, -0.5]]])
-    wanted = cv2.fisheye.distortPoints(rays, np.diag([436.0, 436.0, 1.0]), k)
-    bent = np.array(list(known.distortion.model_dump().values()))[[0, 1, 2, 3, 4, 5, 6, 7]]
-    found = cv2.projectPoints(
-        np.concatenate([rays, np.ones((3, 1, 1))], axis=2), np.zeros(3), np.zeros(3), np.diag([436.0, 436.0, 1.0]), bent
-    )[0]
-    np.testing.assert_allclose(found, wanted, atol=0.02)
-
-
-@pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "DIVISION"])
-def test_other_cameras_of_colmap_are_refused_by_name(tmp_path: Path, model: str):
-    (tmp_path / "cameras.txt").write_text(COLMAP.format(f"{model} 640 480 800 801 320.5 240.5 0.9"))
-    with pytest.raises(DescriptionError, match=f"has the lens model {model} of COLMAP; .* FULL_OPENCV"):
-        read_intrinsics(tmp_path / "cameras.txt")
-
-
-def test_incomplete_cameras_of_colmap_are_refused(tmp_path: Path):
-    row = COLMAP.format("OPENCV 640 480 800 801 320.5")
-    for text, words in (
-        (row, "OPENCV has 3 parameters; expected fx, fy, cx"),
-        (2 * row, "has 2 cameras; expected one"),
-    ):
-        (tmp_path / "cameras.txt").write_text(text)
-        with pytest.raises(DescriptionError, match=words):
-            read_intrinsics(tmp_path / "cameras.txt")

@@ -1,6 +1,5 @@
-"""Files of other makers: PCD clouds, CSV of Gocator and scanCONTROL sensors, and poses in robot programs."""
+"""Files of other makers: CSV of Gocator and scanCONTROL sensors, and poses in robot programs."""
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,91 +9,7 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.number_tables import read_number_table
-from uwlts.storage.pose_files import read_poses, read_trajectory
-
-# Equal values follow each other, so that the compressed file has references of all kinds.
-POINTS = np.repeat(np.random.default_rng(8).uniform(-80, 80, (60, 3)).astype(np.float32), 7, axis=0)
-INTENSITY = np.repeat(np.arange(60, dtype=np.float32), 7)
-
-
-def compress(plain: bytes) -> bytes:
-    """LZF by brute force: at each place the longest earlier match of up to 264 bytes, or literal bytes."""
-    packed, literals, at = bytearray(), bytearray(), 0
-
-    def flush() -> None:
-        for start in range(0, len(literals), 32):
-            part = literals[start : start + 32]
-            packed.append(len(part) - 1)
-            packed.extend(part)
-        literals.clear()
-
-    while at < len(plain):
-        place = plain.rfind(plain[at : at + 3], max(0, at - 8191), at + 2) if at + 3 <= len(plain) else -1
-        if place < 0 or place >= at:
-            literals.append(plain[at])
-            at += 1
-            continue
-        length = 3
-        while length < 264 and at + length < len(plain) and plain[place + length] == plain[at + length]:
-            length += 1
-        flush()
-        far, rest = at - place - 1, length - 2
-        packed.append(min(rest, 7) << 5 | far >> 8)
-        if rest >= 7:
-            packed.append(rest - 7)
-        packed.append(far & 255)
-        at += length
-    flush()
-    return bytes(packed)
-
-
-def pcd(
-    form: str, *, points: np.ndarray = POINTS, declared: int | None = None, viewpoint: str = "0 0 0 1 0 0 0"
-) -> bytes:
-    fields = [*points.T, np.zeros((len(points), 2), np.float32), INTENSITY[: len(points)]]
-    header = (
-        "# .PCD v0.7 - Point Cloud Data\nVERSION 0.7\nFIELDS x y z _ intensity\nSIZE 4 4 4 4 4\nTYPE F F F F F\n"
-        f"COUNT 1 1 1 2 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\n"
-        f"POINTS {len(points) if declared is None else declared}\nDATA {form}\n"
-    ).encode()
-    table = np.column_stack(fields).astype("<f4")
-    if form == "ascii":
-        return header + "\n".join(" ".join(map(repr, map(float, row))) for row in table).encode() + b"\n"
-    if form == "binary":
-        return header + table.tobytes()
-    plain = b"".join(np.ascontiguousarray(each.astype("<f4")).tobytes() for each in fields)
-    packed = compress(plain)
-    assert len(packed) < len(plain) / 2
-    return header + struct.pack("<II", len(packed), len(plain)) + packed
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
-def test_pcd_is_read(tmp_path: Path, form: str):
-    (tmp_path / "a.pcd").write_bytes(pcd(form))
-    cloud = read_cloud(tmp_path / "a.pcd")
-    assert np.array_equal(cloud.points_mm, POINTS) and np.array_equal(cloud.intensity, INTENSITY)
-    assert cloud.warnings == []
-    assert np.allclose(uwlts.read(tmp_path / "a.pcd", unit="m").points_mm, 1000.0 * POINTS, rtol=1e-6)
-    moved = POINTS.copy()
-    moved[10] = np.nan
-    (tmp_path / "b.pcd").write_bytes(pcd(form, points=moved, viewpoint="1 0 0 1 0 0 0"))
-    found = read_cloud(tmp_path / "b.pcd")
-    assert len(found) == len(POINTS) - 1
-    assert "VIEWPOINT" in found.warnings[0] and "without finite coordinates" in found.warnings[1]
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
-def test_a_damaged_pcd_is_refused(tmp_path: Path, form: str):
-    content = pcd(form)
-    damaged = [content[: len(content) - 40], pcd(form, declared=2**31 - 1), pcd(form, declared=len(POINTS) + 1)]
-    damaged += [content.replace(b"FIELDS x", b"FIELDS q"), content.replace(b"COUNT 1", b"COUNT -1"), b"# .PCD\n"]
-    if form == "binary_compressed":
-        damaged.append(content[:-20] + b"\xff" * 20)
-    for each in damaged:
-        (tmp_path / "a.pcd").write_bytes(each)
-        with pytest.raises(uwlts.Error, match=r"a\.pcd"):
-            read_cloud(tmp_path / "a.pcd")
-
+from uwlts.storage.pose_files import read_poses
 
 INFO = "Info\nCSV Version,Sensor Count,Trigger Mode\n2,1,0\nEnd\nDeviceInfo\nID,Model\n13434,2M\nEnd\n"
 COLUMNS = "Frame,Source,Time,Encoder,Z Encoder,Inputs,Exposure,Y,Axis"
@@ -242,40 +157,3 @@ def test_poses_of_robot_programs_are_read(tmp_path: Path, robot: str):
     (tmp_path / "b.mod").write_text("no pose")
     with pytest.raises(uwlts.Error, match=f"no pose in the form of {robot}"):
         read_poses(tmp_path / "b.mod", pose_format=robot)
-
-
-def test_poses_of_colmap_are_inverted_and_sorted_by_name(tmp_path: Path):
-    """The transform from the world to the camera is drawn with SciPy; the pose is its inverse."""
-    rng = np.random.default_rng(4)
-    names = ["img 10.png", "img 9.png", "img 1.png"]
-    turns, shifts = Rotation.random(3, rng=rng), rng.uniform(-2, 2, (3, 3))
-    points = ["100.5 20.5 -1 3.5 4.5 12", "", ""]
-    rows = []
-    for number, (name, turn, shift, seen) in enumerate(zip(names, turns, shifts, points, strict=True), start=1):
-        quaternion = turn.as_quat(scalar_first=True)
-        rows += [f"{number} {' '.join(map(repr, map(float, [*quaternion, *shift])))} 1 {name}", seen]
-    header = (
-        "# Image list with two lines of data per image:\n#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
-    )
-    text = header + "\n".join(rows)
-    (tmp_path / "images.txt").write_text(text + "\n")
-    for unit, scale in (("mm", 1.0), ("m", 1000.0)):
-        poses, times = read_poses(tmp_path / "images.txt", pose_format="colmap", unit=unit)
-        assert times is None
-        for pose, number in zip(poses, (2, 1, 0), strict=True):
-            from_world = np.vstack([np.column_stack([turns[number].as_matrix(), scale * shifts[number]]), [0, 0, 0, 1]])
-            assert np.allclose(pose @ from_world, np.eye(4), atol=1e-10)
-    with pytest.raises(uwlts.Error, match="lengths of COLMAP have no unit"):
-        read_poses(tmp_path / "images.txt", pose_format="colmap")
-    with pytest.raises(uwlts.Error, match="colmap have no times"):
-        read_trajectory(tmp_path / "images.txt", pose_format="colmap", unit="m")
-    without_points = header + "\n".join(rows[::2]) + "\n"
-    for wrong in (
-        without_points,
-        header,
-        text.replace(" 1 img 9.png", ""),
-        text.replace("img 10.png", "").replace("1 ", "nan "),
-    ):
-        (tmp_path / "images.txt").write_text(wrong)
-        with pytest.raises(uwlts.Error, match=r"images\.txt"):
-            read_poses(tmp_path / "images.txt", pose_format="colmap", unit="m")

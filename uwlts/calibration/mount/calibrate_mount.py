@@ -93,7 +93,7 @@ def calibrate_mount(
     pose_format
         matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved axes),
         euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table; abb, kuka
-        or ur for text of robot programs; colmap for images.txt.
+        or ur for text of robot programs.
     profile_unit
         Unit of the profiles; by default that in the names of columns, else mm.
     pose_unit

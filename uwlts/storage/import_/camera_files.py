@@ -1,4 +1,4 @@
-"""Camera calibrations of other programs: files of OpenCV, Kalibr and COLMAP, and ROS CameraInfo."""
+"""Camera calibrations of other programs: files of OpenCV and Kalibr, and ROS CameraInfo."""
 
 import io
 import re
@@ -24,7 +24,7 @@ _BROWN_CONRADY = ("", "plumbbob", "rationalpolynomial", "radtan", "radialtangent
 _BROWN_CONRADY += ("opencv", "fullopencv")
 _PINHOLES = ("pinhole", "perspective", "none")
 _EQUIDISTANT = ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4", "kb4")
-"""Names of the model of `cv2.fisheye` in ROS, Kalibr, COLMAP and others."""
+"""Names of the model of `cv2.fisheye` in ROS, Kalibr and others."""
 _MODELS = ("distortionmodel", "distortiontype", "projectionmodel", "lensmodel")
 """Names that state nothing but the lens model, so that an unknown value is a foreign model."""
 _MAYBE_MODELS = ("cameramodel", "cameratype", "model", "modeltype", "type", "projection", "lens", "lenstype")
@@ -35,21 +35,6 @@ _FOREIGN = re.compile(
     "telecentric"
 )
 _NO = ("", "0", "0.0", "false", "no", "off", "none")
-
-_COLMAP = re.compile(r"^\d+[ \t]+([A-Z][A-Z0-9_]*)[ \t]+(\d+)[ \t]+(\d+)((?:[ \t]+\S+)*)[ \t]*$", re.MULTILINE)
-"""Row of a file cameras.txt of COLMAP: number, model, width, height, parameters."""
-_OF_COLMAP = {
-    "SIMPLE_PINHOLE": "f cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
-    "RADIAL_FISHEYE": "f cx cy k1 k2",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
-}
-"""Parameters of COLMAP's camera models that this program's camera can have (colmap.github.io/cameras.html)."""
 
 _MOST_BYTES = 2**20  # hundreds of times a usual file
 _LARGEST = 1e9
@@ -85,9 +70,6 @@ class KnownCamera:
 def read_intrinsics(path: Path) -> KnownCamera:
     """Read a camera from an OpenCV file (YAML, XML or JSON), a ROS CameraInfo or a Kalibr file of one camera (YAML).
 
-    A text file of one COLMAP camera (``cameras.txt``) is read as well; its pixel coordinates begin at the corner of the
-    first pixel, half a pixel before those of this program.
-
     The camera matrix of a CameraInfo is that of the whole image sensor: for images of a region (``roi``), the principal
     point is moved by its offset.
 
@@ -99,10 +81,7 @@ def read_intrinsics(path: Path) -> KnownCamera:
         path, most_bytes=_MOST_BYTES, error=DescriptionError, called="intrinsics", foreign="is not a file of intrinsics"
     )
     # OpenCV's own parser hangs or terminates the process on some damaged files.
-    if rows := _COLMAP.findall(text):
-        entries = _colmap(rows, path)
-    else:
-        entries = _xml(text, path) if text.lstrip().startswith("<?xml") else _yaml(text, path)
+    entries = _xml(text, path) if text.lstrip().startswith("<?xml") else _yaml(text, path)
     equidistant = _is_equidistant(entries, path)
     known = _unpack_kalibr({_plain_name(key): value for key, value in entries.items()}, path)
     matrix, coefficients = _numbers(known, _MATRIX, path), _numbers(known, _COEFFICIENTS, path)
@@ -155,32 +134,6 @@ def set_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor
         "distortion": known.distortion.model_dump(),
     }
     return validate_description(Sensor, merge_tables(sensor.model_dump(), {"camera": changes}), source)
-
-
-def _colmap(rows: list[tuple[str, str, str, str]], path: Path) -> dict[str, object]:
-    """Return the only camera of a file of COLMAP as entries of a CameraInfo; raises DescriptionError for others."""
-    if len(rows) > 1:
-        raise DescriptionError(f"{path} has {len(rows)} cameras; expected one: give a file with that of the sensor")
-    model, width, height, text = rows[0]
-    if model not in _OF_COLMAP:
-        raise DescriptionError(
-            f"{path} has the lens model {shorten(model)} of COLMAP; this program's camera can be "
-            f"{', '.join(_OF_COLMAP)}: calibrate with one of these"
-        )
-    names, values = _OF_COLMAP[model].split(), text.split()
-    if len(names) != len(values):
-        raise DescriptionError(f"{path}: {model} has {len(values)} parameters; expected {', '.join(names)}")
-    numbers = dict(zip(names, _numbers({"parameters": values}, ("parameters",), path).tolist(), strict=True))
-    fx, fy = (numbers.get(name, numbers.get("f", 0.0)) for name in ("fx", "fy"))
-    fisheye = "FISHEYE" in model
-    wanted = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    return {
-        "camera_matrix": [fx, 0.0, numbers["cx"] - 0.5, 0.0, fy, numbers["cy"] - 0.5, 0.0, 0.0, 1.0],
-        "distortion_coefficients": [numbers.get(name, 0.0) for name in wanted],
-        "distortion_model": "equidistant" if fisheye else "rational_polynomial",
-        "image_width": width,
-        "image_height": height,
-    }
 
 
 def _xml(text: str, path: Path) -> dict[str, object]:
