@@ -405,23 +405,23 @@ def _bag(path: Path) -> None:
 
 def _shard(path: Path) -> None:
     image, centre = np.zeros((4, 6), np.uint8), np.zeros(6, np.float32)
-    with open_shard(path, "hdf5" if path.suffix == ".h5" else "webdataset", frames=2) as shard:
+    with open_shard(path) as shard:
         for key in ("a", "b"):
             shard.add(Sample(key, image, {"centre_px": centre}, {"frame": 1}))
 
 
 def _read_shard(path: Path) -> None:
-    reader = ShardReader(path, "hdf5" if path.suffix == ".h5" else "webdataset", frames=2)
+    reader = ShardReader(path, frames=2)
     for number in range(2):
         reader.sample(number, None)
 
 
 def _card(path: Path) -> None:
-    shard = {"name": "train-0.h5", "split": "train", "frames": 2, "sha256": "a" * 64}
-    content = dict.fromkeys(("title", "notes", "licence"), "a") | {"seed": 1, "file_format": "hdf5", "redrawn": 0}
+    shard = {"name": "train-0.tar", "split": "train", "frames": 2, "sha256": "a" * 64}
+    content = dict.fromkeys(("title", "notes", "licence"), "a") | {"seed": 1, "redrawn": 0}
     content |= {"versions": {"uwlts": "1"}, "image": {"width_px": 6}, "scenes": {"train": 1}, "frames": {"train": 2}}
     content |= {"labels": {"centre_px": "a"}, "drawn": {"a": {"mean": 1.0}}, "status": {"ok": 3}, "description": {}}
-    path.write_text(json.dumps({"format": "uwlts-dataset", "version": 1} | content | {"shards": [shard]}))
+    path.write_text(json.dumps({"format": "uwlts-dataset", "version": 2} | content | {"shards": [shard]}))
 
 
 def _read_card(path: Path) -> None:
@@ -520,7 +520,6 @@ READERS = {
         Reader("tum", ".txt", "lines", _tum, lambda path: read_trajectory(path, pose_format="tum")),
         Reader("covariances", ".csv", "lines", _covariances, read_trajectory),
         Reader("learned", ".onnx", "bytes", centroid_model, read_model_of_lines),
-        Reader("shard-hdf5", ".h5", "bytes", _shard, _read_shard),
         Reader("shard-tar", ".tar", "bytes", _shard, _read_shard),
         Reader("card", ".json", "json", _card, _read_card),
         Reader("data-set", ".toml", "toml", _shipped("datasets/stripe-turbid.toml"), load_data_set),

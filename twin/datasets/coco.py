@@ -1,8 +1,8 @@
 """Masks of a data set as COCO annotations, one JSON file per split, for segmentation tools.
 
-Each kind of mask is a category. Each kind that is present in an image is an annotation: a compressed run-length
-encoding of the mask with its box and area (https://cocodataset.org/#format-data). ``file_name`` is the image's name in
-the data set: ``train-000000.tar/000012-00.png`` in an archive, ``train-000000.h5/000012-00`` in HDF5.
+Each kind of mask is a category. Each kind that is present in an image is an annotation: the runs of the mask with
+its box and area (https://cocodataset.org/#format-data). ``file_name`` is the image's name in the data set, such as
+``train-000000.tar/000012-00.png``.
 """
 
 import json
@@ -48,9 +48,8 @@ def write_coco(folder: Path, card: DataCard) -> list[Path]:
 def _images(folder: Path, card: DataCard, split: Any) -> Iterator[dict[str, Any]]:
     names = _names(card, split)
     for number, sample in enumerate(DataSet(folder, card, split, ("key",))):
-        ending = ".png" if card.file_format == "webdataset" else ""
         size = {"width": card.image["width_px"], "height": card.image["height_px"]}
-        yield {"id": number, "file_name": f"{names[number]}/{sample['key']}{ending}", "license": 1} | size
+        yield {"id": number, "file_name": f"{names[number]}/{sample['key']}.png", "license": 1} | size
 
 
 def _names(card: DataCard, split: Any) -> list[str]:
@@ -67,27 +66,14 @@ def _annotations(folder: Path, card: DataCard, split: Any) -> Iterator[dict[str,
             rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
             first = int(columns[0]), int(rows[0])
             box = [*first, int(columns[-1]) + 1 - first[0], int(rows[-1]) + 1 - first[1]]
-            code = {"size": list(mask.shape), "counts": encode_mask(mask)}
+            code = {"size": list(mask.shape), "counts": _count_runs(mask)}
             where = {"image_id": image, "category_id": int(kind), "iscrowd": 1}
             yield {"id": count} | where | {"segmentation": code, "bbox": box, "area": int(mask.sum())}
             count += 1
 
 
-def encode_mask(mask: np.ndarray) -> str:
-    """Return the compressed run-length encoding of a mask (H, W), bool, as in the COCO API's ``maskApi.c``.
-
-    Runs are counted along columns and start with unset pixels. From the third run on, the difference from the run two
-    before is encoded, in groups of five bits, the lowest first. Each group has a continuation bit and is written as a
-    character, starting at "0".
-    """
+def _count_runs(mask: np.ndarray) -> list[int]:
+    """Return the lengths of runs of equal pixels of a mask (H, W) along its columns; the first is of unset pixels."""
     flat = np.concatenate([[False], mask.ravel(order="F")])
     starts = np.flatnonzero(flat[1:] != flat[:-1])
-    runs = np.diff(np.concatenate([[0], starts, [mask.size]]))
-    written = runs.copy()
-    written[3:] -= runs[1:-2]
-    # Groups of each number, without those that only repeat the sign.
-    groups = written[:, None] >> 5 * np.arange(mask.size.bit_length() // 5 + 1)
-    bits = groups & 31
-    last = (groups >> 5) == np.where(bits & 16, -1, 0)
-    kept = np.cumsum(last, axis=1) - last == 0
-    return (48 + bits + 32 * ~last)[kept].astype(np.uint8).tobytes().decode("ascii")
+    return np.diff(np.concatenate([[0], starts, [mask.size]])).tolist()

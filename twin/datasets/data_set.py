@@ -216,7 +216,7 @@ class DataSetDescription(Description):
     Indices in lists start at 0. Values of integers are rounded.
 
     ``spp``, ``effects`` and ``without`` are those of `twin.simulate`. ``labels`` are the arrays stored with each image.
-    ``format`` is "webdataset" (tar archives) or "hdf5"; each file has ``scenes_per_shard`` scenes.
+    Each file has ``scenes_per_shard`` scenes.
     """
 
     title: str
@@ -234,7 +234,6 @@ class DataSetDescription(Description):
     effects: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     labels: tuple[Label, ...] = ("centre", "quality", "masks", "sensor")
-    format: Literal["webdataset", "hdf5"] = "webdataset"
     vary: dict[str, AnyDistribution] = {}
     _whole: frozenset[str] = PrivateAttr(default=frozenset())
 

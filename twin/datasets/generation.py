@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import JsonValue
 
-from twin.datasets.card import PAGE, README, write_card
+from twin.datasets.card import write_card
 from twin.datasets.data_set import DataSetDescription, load_description
 from twin.datasets.draws import DrawnScene, choose_split, draw_scene
 from twin.datasets.labels import make_labels
@@ -31,7 +31,7 @@ from uwlts.model.placement import camera_from_object
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import run_jobs
 from uwlts.storage.data_set import CARD, SPLITS, Split
-from uwlts.storage.data_set_shards import SUFFIXES, Sample, open_shard
+from uwlts.storage.data_set_shards import SUFFIX, Sample, open_shard
 
 if TYPE_CHECKING:
     from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
@@ -42,9 +42,9 @@ MOST_ATTEMPTS = 20
 _PATIENCE_S = 30.0
 """Waiting time for the plan, which other runs lock briefly at their start."""
 _OUTPUT = re.compile(
-    rf"({'|'.join(SPLITS)})-\d{{6}}\.(tar|h5)|coco-({'|'.join(SPLITS)})\.json|{re.escape(CARD)}|{re.escape(README)}|{re.escape(PAGE)}|{re.escape(PLAN)}"
+    rf"({'|'.join(SPLITS)})-\d{{6}}\.tar|coco-({'|'.join(SPLITS)})\.json|{re.escape(CARD)}|{re.escape(PLAN)}"
 )
-_UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.(tar|h5|json|md|html)")
+_UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.(tar|json)")
 
 
 @protect_inputs()
@@ -70,7 +70,7 @@ def dataset(
     description
         Name (see: twin scenes) or path of the data set's description.
     out
-        Folder for the data set: shards, dataset.json, README.md and dataset.html.
+        Folder for the data set: shards and dataset.json.
     scenes
         Number of scenes; default: the description's.
     seed
@@ -153,11 +153,11 @@ def _jobs(description: DataSetDescription, folder: Path, variant: str) -> list[_
     members: dict[Split, list[int]] = {split: [] for split in SPLITS}
     for scene in range(description.scenes):
         members[choose_split(description, scene)].append(scene)
-    suffix, size = SUFFIXES[description.format], description.scenes_per_shard
+    size = description.scenes_per_shard
     jobs = [
         _Job(
             description,
-            folder / f"{split}-{first // size:06d}{suffix}",
+            folder / f"{split}-{first // size:06d}{SUFFIX}",
             split,
             (*scenes[first : first + size],),
             variant,
@@ -185,7 +185,7 @@ def _prepare(folder: Path, jobs: list[_Job], plan: dict[str, JsonValue], *, over
     else:
         _clear(folder, all_of_it=overwrite and (folder / PLAN).is_file())
     files = {job.path for job in jobs}
-    pattern = f"*{SUFFIXES[jobs[0].description.format]}"
+    pattern = f"*{SUFFIX}"
     keep_to_plan(folder, plan, files, recorded=pattern, called="a data set", overwrite=overwrite)
 
 
@@ -221,7 +221,7 @@ def _render(job: _Job, report: Callable[[None], None]) -> None:
     dr.set_thread_count(1)
     # Mitsuba warns of shear in every scene, because of rounding errors of rotated cylinders.
     mi.set_log_level(mi.LogLevel.Error)
-    with open_shard(job.path, job.description.format, frames=job.frames) as writer:
+    with open_shard(job.path) as writer:
         for scene in job.scenes:
             drawn, studio = _measurable(job.description, scene)
             for index, shot in enumerate(drawn.scene.motion.shots()):

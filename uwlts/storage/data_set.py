@@ -11,13 +11,13 @@ from typing import Any, Literal, get_args
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.files.json_files import read_model
 from uwlts.model.sensor import Description, Table
-from uwlts.storage.data_set_shards import SUFFIXES, Format, ShardReader
+from uwlts.storage.data_set_shards import SUFFIX, ShardReader
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 CARD = "dataset.json"
 CARD_FORMAT = "uwlts-dataset"
-CARD_VERSION = 1  # of the file format
+CARD_VERSION = 2  # of the file format
 
 
 class Shard(Description):
@@ -42,7 +42,6 @@ class DataCard(Description):
     notes: str
     licence: str
     seed: int
-    file_format: Format
     versions: dict[str, str]
     image: dict[str, int]
     scenes: dict[Split, int]
@@ -71,7 +70,7 @@ class DataSet(Sequence[dict[str, Any]]):
     def __init__(self, folder: Path, card: DataCard, split: Split | None, names: tuple[str, ...] | None):
         self.card, self._names = card, names
         shards = [shard for shard in card.shards if split in (None, shard.split)]
-        self._readers = [ShardReader(folder / one.name, card.file_format, frames=one.frames) for one in shards]
+        self._readers = [ShardReader(folder / one.name, frames=one.frames) for one in shards]
         self._ends = list(accumulate(one.frames for one in shards))
 
     def __len__(self) -> int:
@@ -90,7 +89,7 @@ class DataSet(Sequence[dict[str, Any]]):
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for reader in self._readers:
             # A temporary reader, so that its table of contents does not stay in memory.
-            own = ShardReader(reader.path, reader.format, frames=reader.frames)
+            own = ShardReader(reader.path, frames=reader.frames)
             yield from (own.sample(number, self._names) for number in range(own.frames))
 
 
@@ -138,7 +137,7 @@ def load_dataset(folder: str | Path, *, split: Split | None = None, names: Seque
         raise CaptureError(f"{error}{advice}") from error
     for shard in card.shards:
         # Only plain file names are allowed, because a path could lead outside the folder.
-        if Path(shard.name).name != shard.name or Path(shard.name).suffix != SUFFIXES[card.file_format]:
+        if Path(shard.name).name != shard.name or Path(shard.name).suffix != SUFFIX:
             raise CaptureError(f"{folder / CARD} names a shard '{shard.name}', which is not a file of a data set")
     known = {"image", "info", *card.labels}
     if names is not None and (unknown := set(names) - known):

@@ -1,11 +1,8 @@
-"""Files of a data set: tar archives for the webdataset library, or HDF5 files; each frame is a sample.
+"""Files of a data set: tar archives for the webdataset library, each frame a sample.
 
-In a tar archive, the files of a sample are consecutive and share the name up to the first dot. Frame 0 of scene 123 is
+The files of a sample are consecutive and share the name up to the first dot. Frame 0 of scene 123 is
 ``000123-00``. ``.png`` is the image, and ``.mask.png`` and ``.object_map.png`` are 8-bit images. ``.json``
 contains the metadata. Each further array is a ``.npy`` file with its name.
-
-In an HDF5 file, each array is a dataset with the frames along its first axis; further datasets are ``image``, ``json``
-and ``key``. Texts have a fixed length: in those of variable length, HDF5 may search a damaged file forever.
 """
 
 from __future__ import annotations
@@ -17,19 +14,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, assert_never
+from typing import Any
 
 import cv2
-import h5py
 import numpy as np
 
 from uwlts.errors import CaptureError
 from uwlts.files.reading import NPY_DAMAGE, require_regular_file
 from uwlts.files.writing import write_atomically
-from uwlts.storage.hdf5_file import DAMAGE, find_dataset, require_small_chunks
 
-Format = Literal["webdataset", "hdf5"]
-SUFFIXES: dict[Format, str] = {"webdataset": ".tar", "hdf5": ".h5"}
+SUFFIX = ".tar"
 _PICTURES = ("mask", "object_map")
 _PNG_UNFILTERED = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
 _NOISY = [*_PNG_UNFILTERED, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
@@ -48,32 +42,19 @@ class Sample:
     info: dict[str, Any]
 
 
-class ShardWriter(Protocol):
+@contextmanager
+def open_shard(path: Path) -> Iterator[ShardWriter]:
+    """Open a shard for writing; it appears at ``path`` if the body ends without an exception."""
+    with (
+        write_atomically(path, overwrite=True) as aside,
+        tarfile.open(aside, "w", format=tarfile.USTAR_FORMAT) as archive,
+    ):
+        yield ShardWriter(archive)
+
+
+class ShardWriter:
     """Writer of the samples of a shard, in order."""
 
-    def add(self, sample: Sample) -> None:
-        """Write a sample."""
-        ...
-
-
-@contextmanager
-def open_shard(path: Path, file_format: Format, *, frames: int) -> Iterator[ShardWriter]:
-    """Open a shard with a number of frames; it appears at ``path`` if the body ends without an exception."""
-    with write_atomically(path, overwrite=True) as aside:
-        match file_format:
-            case "webdataset":
-                with tarfile.open(aside, "w", format=tarfile.USTAR_FORMAT) as archive:
-                    yield _TarWriter(archive)
-            case "hdf5":
-                with h5py.File(aside, "w", libver="latest") as file:
-                    writer = _Hdf5Writer(file, frames)
-                    yield writer
-                    writer.write_texts()
-            case _:
-                assert_never(file_format)
-
-
-class _TarWriter:
     def __init__(self, archive: tarfile.TarFile):
         self._archive = archive
 
@@ -94,30 +75,6 @@ class _TarWriter:
         self._archive.addfile(member, io.BytesIO(content))
 
 
-class _Hdf5Writer:
-    def __init__(self, file: h5py.File, frames: int):
-        self._file, self._frames = file, frames
-        self._texts: dict[str, list[bytes]] = {"key": [], "json": []}
-
-    def add(self, sample: Sample) -> None:
-        """Write a sample."""
-        for name, values in {"image": sample.image, **sample.arrays}.items():
-            if name not in self._file:
-                chunk = (1, *values.shape)
-                packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-                self._file.create_dataset(name, (self._frames, *values.shape), values.dtype, chunks=chunk, **packed)
-            dataset = self._file[name]
-            assert isinstance(dataset, h5py.Dataset)
-            dataset[len(self._texts["key"])] = values
-        self._texts["key"].append(sample.key.encode())
-        self._texts["json"].append(json.dumps(sample.info, allow_nan=False).encode())
-
-    def write_texts(self) -> None:
-        """Write the keys and the metadata of all samples, whose longest text is known now."""
-        for name, texts in self._texts.items():
-            self._file.create_dataset(name, data=np.array(texts, dtype=np.bytes_), chunks=(1,), compression="gzip")
-
-
 def _png(values: np.ndarray, settings: list[int]) -> bytes:
     return cv2.imencode(".png", values, settings)[1].tobytes()
 
@@ -134,26 +91,19 @@ class ShardReader:
     Raises CaptureError if the file is missing, damaged, or has another number of frames than ``frames``.
     """
 
-    def __init__(self, path: Path, file_format: Format, *, frames: int):
+    def __init__(self, path: Path, *, frames: int):
         self.path, self.frames = path, frames
-        self.format: Format = file_format
         self._places: list[tuple[str, dict[str, tuple[int, int]]]] | None = None
 
     def sample(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
         """Read a sample: arrays by name, with "key", "image" and "info", its metadata; only ``names`` if given."""
         require_regular_file(self.path, called="shard of a data set")
         try:
-            match self.format:
-                case "webdataset":
-                    return self._from_tar(number, names)
-                case "hdf5":
-                    return self._from_hdf5(number, names)
-                case _:
-                    assert_never(self.format)
-        except (*DAMAGE, *NPY_DAMAGE, AttributeError, tarfile.TarError, cv2.error) as error:
+            return self._read_sample(number, names)
+        except (*NPY_DAMAGE, LookupError, TypeError, AttributeError, tarfile.TarError, cv2.error) as error:
             raise CaptureError(f"{self.path} is not a shard of this data set, or is damaged: {error}") from error
 
-    def _from_tar(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
+    def _read_sample(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
         if self._places is None:
             self._places = self._found_places()
         key, places = self._places[number]
@@ -176,33 +126,6 @@ class ShardReader:
         if len(found) != self.frames:
             raise ValueError(f"it contains {len(found)} frames, expected {self.frames}")
         return list(found.items())
-
-    def _from_hdf5(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
-        with h5py.File(self.path, "r") as file:
-            keys, infos = (_texts(file, name) for name in ("key", "json"))
-            if len(keys) != self.frames:
-                raise ValueError(f"it contains {len(keys)} frames, expected {self.frames}")
-            sample: dict[str, Any] = {"key": keys[number].decode()}
-            for name in sorted(set(file) - {"key", "json"}):
-                if names is None or name in names:
-                    dataset = find_dataset(file, name, path=self.path)
-                    if dataset is None:
-                        raise ValueError(f"'{name}' is not an array")
-                    require_small_chunks(dataset, name, path=self.path)
-                    sample[name] = dataset[number]
-            if names is None or "info" in names:
-                sample["info"] = json.loads(infos[number])
-            return sample
-
-
-def _texts(file: h5py.File, name: str) -> h5py.Dataset:
-    texts = file[name]
-    if not isinstance(texts, h5py.Dataset) or texts.dtype.kind != "S":
-        raise ValueError(
-            f"'{name}' is not text of a fixed length, which earlier versions did not write: make the data set again"
-        )
-    require_small_chunks(texts, name, path=file.filename)
-    return texts
 
 
 def _decode(ending: str, content: bytes) -> Any:
