@@ -147,14 +147,15 @@ def _acceptance(path: Path) -> None:
         "artefacts": {"b": {"standard": spheres}},
     }
     plan |= {"positions": [{"name": "c", "artefact": "b", "file": "d.ply"}]}
-    place = {"place_mm": [0.0, 0.0, 0.0], "direction": [0.0, 1.0, 0.0], "length_mm": 60.0, "calibration_std_mm": 0.003}
+    place = {"place_mm": [0.0, 0.0, 0.0], "direction": [0.0, 1.0, 0.0], "length_mm": 60.0}
     value = {"symbol": "SD", "position": "c", "label": "spacing", "value_mm": 0.01, "expanded_mm": 0.006} | place
     judged = {**plan["positions"][0], "state": "judged", "values": [value]}
-    scale = {"components": [], "anisotropy": None, "lengths": 1, "degrees": 0, "scatter_mm": None, "remarks": []}
-    worst = {"symbol": "SD", "worst": value, "count": 1, "wanted": 7, "mpe_mm": 0.1, "decision": "conformity proven"}
-    content = {"plan": plan, "positions": [judged], "characteristics": [worst], "scale": scale, "remarks": ["e"]}
+    worst = {"symbol": "SD", "worst": value, "count": 1, "mpe_mm": 0.1, "decision": "conformity proven"}
+    few = {"clause": "f", "required": "at least 7", "done": "1", "met": False}
+    content = {"plan": plan, "positions": [judged], "characteristics": [worst], "requirements": [few], "remarks": ["e"]}
+    content |= {"verdict": "conformity proven", "conclusion": "conformity proven: g"}
     content |= {"calibration": None, "software": "uwlts 1", "date": "2026-01-02T03:04:05+00:00"}
-    path.write_text(json.dumps({"format": "uwlts-acceptance", "version": 1} | content))
+    path.write_text(json.dumps({"format": "uwlts-acceptance", "version": 2} | content))
 
 
 def _cloud(path: Path) -> None:

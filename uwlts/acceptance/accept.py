@@ -9,27 +9,26 @@ from typing import Any, Literal
 from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from uwlts._version import __version__
-from uwlts.acceptance.acceptance_plan import SYMBOLS, AcceptancePlan, PlannedPosition, Symbol, load_plan
+from uwlts.acceptance.acceptance_plan import SYMBOLS, AcceptancePlan, Interval, PlannedPosition, load_plan
 from uwlts.acceptance.characteristics import (
     NAMES,
+    RULES,
     Characteristic,
     CharacteristicValue,
-    Decision,
     StoredPart,
     describe_missing,
     judge_characteristic,
     measure_position,
 )
-from uwlts.acceptance.directional_scale import DirectionalScale, ScaleComponent, fit_directional_scale
+from uwlts.acceptance.requirements import Requirement, check_requirements
 from uwlts.argument_types import check_arguments
 from uwlts.errors import DescriptionError, Error
 from uwlts.files.json_files import EDITED, read_model, to_canonical_json, trusting, write_model
 from uwlts.files.reading import is_regular_file
 from uwlts.files.writing import hash_file
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest
-from uwlts.model.artefacts import PlaneStandard, SphereStandard
+from uwlts.model.artefacts import PlaneStandard
 from uwlts.model.brief import Brief
-from uwlts.model.sensor import Vector
 from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration
@@ -37,20 +36,18 @@ from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_cloud, read_cloud
 
-FORMAT, VERSION = "uwlts-acceptance", 1
+FORMAT, VERSION = "uwlts-acceptance", 2
 
 State = Literal["missing", "failed", "judged"]
-Verdict = Literal["incomplete", "nonconformity proven", "conformity not proven", "conformity proven"]
-
-_LEAST_SPACING = 0.3
-"""Least sphere spacing relative to the diagonal of the measuring volume (VDI/VDE 2634 part 2)."""
+Verdict = Literal["nonconformity proven", "rejected", "undecided", "accepted", "conformity proven"]
 
 
 class JudgedPosition(StoredPart):
     """Position of the plan: whether its file is missing, could not be evaluated (with the reason), or is judged.
 
     ``inputs`` is the digest of file, calibration and artefact; a later run takes the values of an unchanged position
-    from the earlier result.
+    from the earlier result. Of all ``points``, those ``on_artefact`` are in its region, and the ``rejected`` ones are
+    the farthest of these, which the guideline permits leaving out.
     """
 
     name: str
@@ -58,11 +55,13 @@ class JudgedPosition(StoredPart):
     file: str
     state: State
     reason: str = ""
+    region_mm: tuple[Interval, Interval, Interval] | None = None
     sha256: str | None = None
     inputs: str | None = None
     points: int = 0
+    on_artefact: int = 0
+    rejected: int = 0
     warnings: tuple[str, ...] = ()
-    stage_direction: Vector | None = None
     values: tuple[CharacteristicValue, ...] = ()
 
 
@@ -77,10 +76,14 @@ class Acceptance(Brief, StoredPart):
         State and measured values of each position.
     characteristics : tuple of Characteristic
         Worst value, limit and decision of each characteristic that is measured or limited.
-    scale : DirectionalScale or None
-        Shares of stage and sensor in the length errors.
+    requirements : tuple of Requirement
+        What VDI/VDE 2634 part 2 demands, and what was done.
+    verdict : str
+        Verdict on all characteristics: a proven nonconformity counts at once, conformity if everything is measured.
+    conclusion : str
+        The verdict with its reason as a sentence.
     remarks : tuple of str
-        Deviations from the guideline, and what is missing.
+        What is not stated or not tested, and warnings.
     calibration : str or None
         Digest of the calibration.
     software, date : str
@@ -92,7 +95,9 @@ class Acceptance(Brief, StoredPart):
     plan: AcceptancePlan
     positions: tuple[JudgedPosition, ...]
     characteristics: tuple[Characteristic, ...]
-    scale: DirectionalScale | None
+    requirements: tuple[Requirement, ...]
+    verdict: Verdict
+    conclusion: str
     remarks: tuple[str, ...]
     calibration: str | None
     software: str
@@ -116,16 +121,6 @@ class Acceptance(Brief, StoredPart):
         return {key: value for key, value in plain(self).items() if key != EDITED or value}
 
     @property
-    def verdict(self) -> Verdict:
-        """Verdict on all characteristics: a proven nonconformity counts at once, conformity when all is measured."""
-        found: set[Decision] = {each.decision for each in self.characteristics if each.mpe_mm is not None}
-        if "nonconformity proven" in found:
-            return "nonconformity proven"
-        if self.outstanding or not found:
-            return "incomplete"
-        return "conformity proven" if found == {"conformity proven"} else "conformity not proven"
-
-    @property
     def outstanding(self) -> tuple[JudgedPosition, ...]:
         """Positions that are still to be measured, or measured again."""
         return tuple(each for each in self.positions if each.state != "judged")
@@ -145,12 +140,14 @@ class Acceptance(Brief, StoredPart):
             first = self.outstanding[0]
             again = "measure again" if first.state == "failed" else "measure"
             lines.append(f"next: {again} {first.artefact}, {first.name}, into {first.file}")
+        lines.append(f"decision rule: {RULES[self.plan.decision_rule]}")
         lines += [format_characteristic(each) for each in self.characteristics]
-        if self.scale is not None:
-            known = (each for each in self.scale.components if each.value is not None)
-            lines += [f"{format_scale(each)} ({each.share})" for each in known]
+        lines += [
+            f"{'done' if each.met else 'not met'}: {each.clause}: {each.required}; {each.done}"
+            for each in self.requirements
+        ]
         lines += [f"note: {each}" for each in self.remarks]
-        return [*lines, self.verdict]
+        return [*lines, self.conclusion]
 
     @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
@@ -167,17 +164,11 @@ def format_characteristic(each: Characteristic) -> str:
     u = "U not known" if each.worst.expanded_mm is None else f"U {each.worst.expanded_mm:.4f} mm"
     where = f"{each.worst.position}, {each.worst.label}"
     sign = "" if each.symbol in ("PF", "PF95", "F", "F95") else "+"
+    chance = f", probability of conformity {each.probability_text()}" if each.probability is not None else ""
     return (
-        f"{each.symbol:5} {words}: {each.worst.value_mm:{sign}.4f} mm ({where}; {each.count} measured), {u}, {limit}: "
-        f"{each.decision}"
+        f"{each.symbol:5} {words}: {each.worst.value_mm:{sign}.4f} mm ({where}; {each.count} measured), {u}, {limit}"
+        f"{chance}: {each.decision_text()}"
     )
-
-
-def format_scale(each: ScaleComponent) -> str:
-    """Return a determined component with its 95 % interval as text."""
-    assert each.value is not None
-    half = "" if each.half_interval is None else f" ± {1e6 * each.half_interval:.0f}"
-    return f"{each.words}: {1e6 * each.value:+.0f}{half} µm/m"
 
 
 @trusting
@@ -193,8 +184,9 @@ def accept(
     The plan names the artefacts with their certificates, the captures or clouds of each position, and the limits. Files
     that are not there yet are reported as missing, so that the test can be repeated while an operator works through the
     plan. Characteristics are those of VDI/VDE 2634 part 2 and ISO 10360-13. The test value uncertainty contains
-    calibration, form, alignment and temperature of the artefacts (ISO 14253-5, ISO/TS 23165). The decision is that of
-    ISO 14253-1.
+    calibration, form, alignment and temperature of the artefacts (ISO 14253-5, ISO/TS 23165). The plan states the
+    decision rule. All points in an artefact's region are measurements of it: none is left out by its distance, except
+    the 0.3 % that VDI/VDE 2634 permits.
 
     Parameters
     ----------
@@ -210,7 +202,7 @@ def accept(
     Returns
     -------
     Acceptance
-        States of the positions, characteristics with decisions, and the shares of stage and sensor.
+        States of the positions, characteristics with decisions, requirements of the guideline, and the verdict.
 
     Raises
     ------
@@ -229,25 +221,28 @@ def accept(
     for position in stated.positions:
         judged.append(_judge_position(path.parent, stated, position, calibration, before))
         progress(len(judged), len(stated.positions))
-    values = [(value, each) for each in judged for value in each.values]
-    scale = fit_directional_scale(
-        [value for value, _ in values],
-        [each.artefact for _, each in values],
-        [each.stage_direction or stated.stage_direction for _, each in values],
-    )
+    values = [value for each in judged for value in each.values]
     characteristics = tuple(
         judge_characteristic(
-            symbol, [value for value, _ in values], stated.mpe.of(symbol), mpe_mm_per_m=stated.mpe.per_metre(symbol)
+            symbol, values, stated.mpe.of(symbol), mpe_mm_per_m=stated.mpe.per_metre(symbol), rule=stated.decision_rule
         )
         for symbol in SYMBOLS
-        if stated.mpe.of(symbol) is not None or any(value.symbol == symbol for value, _ in values)
+        if stated.mpe.of(symbol) is not None or any(value.symbol == symbol for value in values)
     )
+    shares = [each.rejected / each.on_artefact for each in judged if each.on_artefact]
+    requirements = check_requirements(stated, values, shares)
+    verdict, reason = _conclude(characteristics, judged)
+    unmet = sum(not each.met for each in requirements)
+    if verdict in ("conformity proven", "accepted") and unmet:
+        reason += f"; {unmet} requirements of VDI/VDE 2634 part 2 are not met"
     edited = () if known is None or not known.edited else ("the earlier result was edited after it was written",)
     return Acceptance(
         plan=stated,
         positions=tuple(judged),
         characteristics=characteristics,
-        scale=scale,
+        requirements=requirements,
+        verdict=verdict,
+        conclusion=f"{verdict}: {reason}",
         remarks=(*_remarks(stated, characteristics), *_warnings(judged), *edited),
         calibration=None if calibration is None else calibration_digest(calibration),
         software=f"uwlts {__version__}",
@@ -259,6 +254,27 @@ def accept(
 def read_acceptance(path: str | Path) -> Acceptance:
     """Read the result of an acceptance test; CaptureError if it is missing, newer, damaged, or of another format."""
     return read_model(path, Acceptance, file_format=FORMAT, version=VERSION, called="acceptance test")
+
+
+def _conclude(characteristics: Sequence[Characteristic], positions: Sequence[JudgedPosition]) -> tuple[Verdict, str]:
+    """Return the verdict on all characteristics, and its reason."""
+    limited = [each for each in characteristics if each.mpe_mm is not None]
+    for against in ("nonconformity proven", "rejected"):
+        if failed := [each.symbol for each in limited if each.decision == against]:
+            guarded = " by more than the guard band" if against == "nonconformity proven" else ""
+            return against, f"{', '.join(failed)} beyond the maximum permissible error{guarded}"
+    open_ones = [f"{each.symbol}: {each.reason}" for each in limited if each.decision == "undecided"]
+    left = sum(each.state == "missing" for each in positions)
+    reasons = [f"{left} of {len(positions)} positions are still to be measured"] if left else []
+    reasons += [f"{each.name} failed: {each.reason}" for each in positions if each.state == "failed"]
+    reasons += open_ones if not reasons else []
+    if not limited:
+        reasons.append("no maximum permissible error is stated")
+    if reasons:
+        return "undecided", "; ".join(reasons)
+    if all(each.decision == "accepted" for each in limited):
+        return "accepted", "every value is within its maximum permissible error, without a guard band"
+    return "conformity proven", "every value with its guard band is within its maximum permissible error"
 
 
 def _judge_position(
@@ -278,6 +294,7 @@ def _judge_position(
         "artefact": artefact.model_dump(mode="json"),
         "temperature": None if plan.temperature is None else plan.temperature.model_dump(mode="json"),
         "position": plain,
+        "margin_mm": plan.margin_mm(artefact),
         "software": __version__,
     }
     inputs = hashlib.sha256(to_canonical_json(content)).hexdigest()
@@ -285,8 +302,8 @@ def _judge_position(
         return before[inputs]
     state = {"sha256": content["file"], "inputs": inputs}
     try:
-        cloud, direction = _measure_cloud(file, calibration)
-        values = measure_position(cloud, artefact, position.name, plan.temperature)
+        cloud = _measure_cloud(file, calibration)
+        found = measure_position(cloud, plan, position)
     except DescriptionError:
         raise
     except Error as error:
@@ -296,21 +313,21 @@ def _judge_position(
         **state,
         state="judged",
         points=len(cloud),
+        on_artefact=found.on_artefact,
+        rejected=found.rejected,
         warnings=(*cloud.warnings, *_edited_parts(cloud)),
-        stage_direction=direction,
-        values=tuple(values),
+        values=tuple(found.values),
     )
 
 
-def _measure_cloud(file: Path, calibration: AnyCalibration | None) -> tuple[PointCloud, Vector | None]:
-    """Return the cloud in a file, or that of a capture, and the stage's direction if the file states it."""
+def _measure_cloud(file: Path, calibration: AnyCalibration | None) -> PointCloud:
+    """Return the cloud in a file, or that of a capture."""
     if is_cloud(file):
-        return read_cloud(file), None
+        return read_cloud(file)
     if calibration is None:
         raise DescriptionError(f"{file} is a capture: the plan must name the `calibration` that reconstructs it")
     with Capture(file) as capture:
-        cloud = reconstruct(capture, calibration, with_uncertainty=False)
-        return cloud, capture.header.stage_direction
+        return reconstruct(capture, calibration, with_uncertainty=False)
 
 
 def _edited_parts(cloud: PointCloud) -> list[str]:
@@ -322,9 +339,6 @@ def _remarks(plan: AcceptancePlan, characteristics: Sequence[Characteristic]) ->
     for each in characteristics:
         if each.mpe_mm is None:
             yield f"{each.symbol}: no maximum permissible error is stated"
-        planned = sum(_count_of(plan, one, each.symbol) for one in plan.positions)
-        if planned < each.wanted:
-            yield f"{each.symbol}: the plan has {planned} measurements, the guideline demands at least {each.wanted}"
     for symbol, what in (("PF", "probing"), ("SD", "sphere spacing"), ("F", "flatness")):
         if symbol not in {each.symbol for each in characteristics}:
             yield f"{symbol}: neither measured nor limited: {what} is not tested"
@@ -335,10 +349,6 @@ def _remarks(plan: AcceptancePlan, characteristics: Sequence[Characteristic]) ->
         heated = artefact.expansion_per_k is not None and plan.temperature is not None
         if not heated and not isinstance(standard, PlaneStandard):
             yield f"{name}: temperature or expansion is not stated; the test value uncertainty does not contain it"
-        least = _LEAST_SPACING * plan.diagonal_mm()
-        for spacing in standard.spacings_mm if isinstance(standard, SphereStandard) else ():
-            if spacing < least:
-                yield f"{name}: a spacing of {spacing:g} mm; the guideline demands {least:.0f} mm in this volume"
 
 
 def _warnings(judged: Sequence[JudgedPosition]) -> list[str]:
@@ -348,20 +358,3 @@ def _warnings(judged: Sequence[JudgedPosition]) -> list[str]:
         for text in position.warnings:
             where.setdefault(text, []).append(position.name)
     return [f"{', '.join(names)}: {text}" for text, names in where.items()]
-
-
-def _symbols_of(plan: AcceptancePlan, position: PlannedPosition) -> tuple[Symbol, ...]:
-    standard = plan.artefacts[position.artefact].standard
-    if isinstance(standard, SphereStandard):
-        return ("PF", "PF95", "PS", "SD") if standard.spacings_mm else ("PF", "PF95", "PS")
-    return ("F", "F95") if isinstance(standard, PlaneStandard) else ("E",)
-
-
-def _count_of(plan: AcceptancePlan, position: PlannedPosition, symbol: Symbol) -> int:
-    """Return how many values of a characteristic a position gives."""
-    standard = plan.artefacts[position.artefact].standard
-    if symbol not in _symbols_of(plan, position):
-        return 0
-    if not isinstance(standard, SphereStandard):
-        return 1
-    return len(standard.spacings_mm) if symbol == "SD" else len(standard.diameters_mm)

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.library import read_table, validate_description
-from uwlts.model.sensor import Description, NotNegative, UnitVector
+from uwlts.model.sensor import Description, NotNegative
 
 Symbol = Literal["PF", "PF95", "PS", "SD", "F", "F95", "E"]
 """Symbols of the characteristics, as in the names of the permissible errors."""
@@ -22,6 +22,12 @@ Spread = Annotated[float, Field(ge=0, le=1e6)]
 
 REFERENCE_C = 20.0
 """Reference temperature of lengths (ISO 1)."""
+
+DecisionRule = Literal["U", "1.65 u", "simple"]
+"""Rule that decides on conformity: guard bands of U or 1.65 u, or none."""
+
+Interval = tuple[Length, Length]
+"""Lower and upper end of a coordinate, mm."""
 
 
 class PermissibleErrors(Description):
@@ -74,6 +80,9 @@ class CertifiedArtefact(Description):
         Expanded uncertainty (k = 2) of the sizes by alignment and mounting in the test.
     expansion_per_k, expansion_uncertainty_per_k : float, optional
         Thermal expansion coefficient and its expanded uncertainty (k = 2).
+    margin_mm : float, optional
+        Largest distance of a point from the surface. By default a tenth of a sphere's diameter, and a twentieth of the
+        volume's diagonal for a plane.
     """
 
     standard: Artefact
@@ -83,6 +92,7 @@ class CertifiedArtefact(Description):
     alignment_uncertainty_mm: NotNegative = 0.0
     expansion_per_k: NotNegative | None = None
     expansion_uncertainty_per_k: NotNegative = 0.0
+    margin_mm: Size | None = None
 
     @model_validator(mode="after")
     def _is_of_a_test(self) -> "CertifiedArtefact":
@@ -123,11 +133,22 @@ class Temperature(Description):
 
 
 class PlannedPosition(Description):
-    """Position of an artefact: its name in the plan, and the file of its capture or cloud, beside the plan."""
+    """Position of an artefact: its name in the plan, and the file of its capture or cloud, beside the plan.
+
+    ``region_mm`` are the intervals of X, Y and Z that contain nothing but the artefact; by default everything.
+    """
 
     name: str
     artefact: str
     file: str
+    region_mm: tuple[Interval, Interval, Interval] | None = None
+
+    @model_validator(mode="after")
+    def _region_is_open(self) -> "PlannedPosition":
+        for axis, (low, high) in zip("XYZ", self.region_mm or (), strict=False):
+            if low >= high:
+                raise ValueError(f"region_mm: the interval of {axis} is {low:g} to {high:g}; expected an increase")
+        return self
 
 
 class AcceptancePlan(Description):
@@ -141,8 +162,8 @@ class AcceptancePlan(Description):
         File of the sensor's calibration, beside the plan; captures need it.
     volume_mm : (float, float, float)
         Size of the measuring volume along X, Y and Z.
-    stage_direction : (float, float, float)
-        Direction of the stage in the object coordinate system, for clouds; captures state theirs.
+    decision_rule : {"U", "1.65 u", "simple"}
+        Guard band of the decisions: the expanded uncertainty U (k = 2), 1.65 u of ISO 14253-1:2017, or none.
     mpe : PermissibleErrors
     temperature : Temperature, optional
     artefacts : dict
@@ -157,7 +178,7 @@ class AcceptancePlan(Description):
     operator: str | None = None
     calibration: str | None = None
     volume_mm: tuple[Size, Size, Size]
-    stage_direction: UnitVector = (1.0, 0.0, 0.0)
+    decision_rule: DecisionRule = "U"
     mpe: PermissibleErrors = Field(default_factory=PermissibleErrors)
     temperature: Temperature | None = None
     artefacts: dict[str, CertifiedArtefact]
@@ -174,6 +195,13 @@ class AcceptancePlan(Description):
                 f"a position names the artefact {unknown[0]!r}; the plan has {', '.join(sorted(self.artefacts))}"
             )
         return self
+
+    def margin_mm(self, artefact: CertifiedArtefact) -> float:
+        """Return the largest distance of a point from an artefact's surface, mm."""
+        if artefact.margin_mm is not None:
+            return artefact.margin_mm
+        standard = artefact.standard
+        return min(standard.diameters_mm) / 10 if isinstance(standard, SphereStandard) else self.diagonal_mm() / 20
 
     def diagonal_mm(self) -> float:
         """Return the diagonal of the measuring volume (L0 of VDI/VDE 2634)."""

@@ -6,23 +6,36 @@ the sensor is what is tested, and does not contribute.
 """
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.special import ndtr
 
-from uwlts.acceptance.acceptance_plan import REFERENCE_C, CertifiedArtefact, Length, Size, Spread, Symbol, Temperature
+from uwlts.acceptance.acceptance_plan import (
+    REFERENCE_C,
+    AcceptancePlan,
+    CertifiedArtefact,
+    DecisionRule,
+    Length,
+    PlannedPosition,
+    Size,
+    Spread,
+    Symbol,
+    Temperature,
+)
+from uwlts.acceptance.artefact_points import MeasuredSurface, measure_plane, measure_spheres, measure_step_height
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.artefact_figures import PlaneEvaluation, StepEvaluation, evaluate_cloud
 from uwlts.evaluation.decision import Verdict, judge_interval
-from uwlts.evaluation.spheres import SphereEvaluation
-from uwlts.model.artefacts import PlaneStandard, SphereStandard, StepStandard
+from uwlts.fitting.least_squares import principal_axes
+from uwlts.fitting.shapes import FlatFit, SphereFit
+from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.sensor import UnitVector, Vector
 from uwlts.storage.cloud import PointCloud
 
-Decision = Literal[
-    "nonconformity proven", "not proven", "no test value uncertainty", "no MPE", "not measured", "conformity proven"
-]
+Decision = Literal["nonconformity proven", "rejected", "undecided", "no MPE", "accepted", "conformity proven"]
+"""Decisions in order of severity; those of simple acceptance prove nothing."""
 
 NAMES: dict[Symbol, tuple[str, str]] = {
     "PF": ("probing error of form, all points", "PF (VDI/VDE 2634-2)"),
@@ -35,16 +48,24 @@ NAMES: dict[Symbol, tuple[str, str]] = {
 }
 """Name of each characteristic, and its symbols in the guidelines."""
 
-WANTED: dict[Symbol, int] = {"PF": 10, "PF95": 10, "PS": 10, "SD": 7, "F": 6, "F95": 6, "E": 1}
-"""Least number of measured spheres, spacings and planes (VDI/VDE 2634 part 2); a step has no guideline."""
-
 COVERAGE_FACTOR = 2.0  # k = 2, about 95 % (ISO 14253-1)
+
+_GUARDS: dict[DecisionRule, float] = {"U": COVERAGE_FACTOR, "1.65 u": 1.65, "simple": 0.0}
+"""Guard band of each rule (unit: standard uncertainty)."""
+
+RULES: dict[DecisionRule, str] = {
+    "U": "guard band of the expanded uncertainty U, k = 2 (ISO 14253-1:2013)",
+    "1.65 u": "guard band of 1.65 u, at least 95 % probability of conformity (ISO 14253-1:2017)",
+    "simple": "simple acceptance: the value alone is compared with the limit, which proves nothing (ILAC-G8:09/2019)",
+}
+"""Text of each decision rule, with its edition."""
 
 _DECISIONS: dict[Verdict, Decision] = {
     "within the limit": "conformity proven",
     "exceeds the limit": "nonconformity proven",
-    "undecided": "not proven",
+    "undecided": "undecided",
 }
+_SIMPLE: dict[Verdict, Decision] = {"within the limit": "accepted", "exceeds the limit": "rejected"}
 
 
 class StoredPart(BaseModel):
@@ -71,9 +92,9 @@ class CharacteristicValue(StoredPart):
     length_mm : float or None
         Calibrated length at the temperature of the test, for spacings and steps.
     direction : (float, float, float) or None
-        Direction of that length.
-    calibration_std_mm : float or None
-        Standard uncertainty of that length by the artefact, common to all positions of the artefact.
+        Direction of that length, or the normal of a plane.
+    extent_mm : (float, float) or None
+        Length and width of the measured part of a plane.
     """
 
     symbol: Symbol
@@ -84,35 +105,39 @@ class CharacteristicValue(StoredPart):
     place_mm: tuple[Length, Length, Length]
     length_mm: Size | None = None
     direction: UnitVector | None = None
-    calibration_std_mm: Spread | None = None
+    extent_mm: tuple[Spread, Spread] | None = None
 
 
 class Characteristic(StoredPart):
-    """Characteristic with its worst value, the maximum permissible error, and the decision (ISO 14253-1).
+    """Characteristic with its worst value, the maximum permissible error, and the decision.
 
     Attributes
     ----------
     symbol : str
     worst : CharacteristicValue or None
-        Value that is nearest to, or farthest beyond, the limit, including its uncertainty; None if nothing was
-        measured.
-    count, wanted : int
-        Number of measured values, and the least number of the guideline.
+        Value that is nearest to, or farthest beyond, the limit, including its guard band; None if nothing was measured.
+    count : int
+        Number of measured values.
     mpe_mm : float or None
         Maximum permissible error, for lengths without ``mpe_mm_per_m``.
     mpe_mm_per_m : float
         Growth of the maximum permissible error with the length.
     decision : str
-        "conformity proven" if the interval of every value is within the limits, "nonconformity proven" if the
-        interval of a value is outside, else "not proven"; or the reason why there is no decision.
+        "conformity proven" if every value with its guard band is within the limits, "nonconformity proven" if a value
+        without its guard band is outside, else "undecided". Simple acceptance gives "accepted" or "rejected".
+    reason : str
+        Why the decision is "undecided"; else empty.
+    probability : float or None
+        Smallest probability of conformity of a value, for a normal distribution about it.
     """
 
     symbol: Symbol
     worst: CharacteristicValue | None
     count: Annotated[int, Field(ge=0)]
-    wanted: Annotated[int, Field(ge=0)]
     mpe_mm: Size | None
     decision: Decision
+    reason: str = ""
+    probability: Annotated[float, Field(ge=0, le=1)] | None = None
     mpe_mm_per_m: Spread = 0.0
 
     def limit_mm(self, value: CharacteristicValue) -> float | None:
@@ -124,77 +149,100 @@ class Characteristic(StoredPart):
         growth = f" + {self.mpe_mm_per_m:g} L / m" if self.mpe_mm_per_m else ""
         return "" if self.mpe_mm is None else f"{self.mpe_mm:g}{growth}"
 
+    def decision_text(self) -> str:
+        """Return the decision with its reason."""
+        return f"{self.decision}: {self.reason}" if self.reason else self.decision
 
-def measure_position(
-    cloud: PointCloud, artefact: CertifiedArtefact, position: str, temperature: Temperature | None
-) -> list[CharacteristicValue]:
+    def probability_text(self) -> str:
+        """Return the probability of conformity in per cent, without claiming certainty; empty if it is not known."""
+        if self.probability is None:
+            return ""
+        if not 0.001 <= self.probability <= 0.999:
+            return "> 99.9 %" if self.probability > 0.5 else "< 0.1 %"
+        return f"{100 * self.probability:.1f} %"
+
+
+@dataclass(frozen=True)
+class MeasuredPosition:
+    """Values at a position, and the numbers of points: on the artefact, and left out of these by the 0.3 % rule."""
+
+    values: list[CharacteristicValue]
+    on_artefact: int
+    rejected: int
+
+
+def measure_position(cloud: PointCloud, plan: AcceptancePlan, position: PlannedPosition) -> MeasuredPosition:
     """Return all values of the characteristics at one position.
 
-    EvaluationError if the cloud does not show the artefact.
+    EvaluationError if the region does not show the artefact, or too many of its points are off.
     """
+    artefact, temperature = plan.artefacts[position.artefact], plan.temperature
     standard = artefact.at_temperature(None if temperature is None else temperature.value_c)
-    found = evaluate_cloud(cloud, standard)
-    match found:
-        case SphereEvaluation():
-            return list(_sphere_values(found, artefact, position, temperature))
-        case PlaneEvaluation():
-            by_form = _form_expanded_mm(artefact)
-            place = _mean_place(cloud, found.deviation_mm)
-            values: tuple[tuple[Symbol, float], ...] = ("F", found.form.range_mm), ("F95", found.form.range_95_mm)
-            return [
-                CharacteristicValue(
-                    symbol=symbol, position=position, label="plane", value_mm=value, expanded_mm=by_form, place_mm=place
-                )
-                for symbol, value in values
-            ]
-        case StepEvaluation():
-            assert isinstance(artefact.standard, StepStandard)
-            calibrated = found.height_mm - found.height_error_mm
-            std = _size_std_mm(artefact, artefact.standard.height_uncertainty_mm, calibrated, temperature)
-            return [
-                CharacteristicValue(
-                    symbol="E",
-                    position=position,
-                    label="height",
-                    value_mm=found.height_error_mm,
-                    expanded_mm=_expanded(std),
-                    place_mm=found.point_mm,
-                    length_mm=calibrated,
-                    direction=found.normal,
-                    calibration_std_mm=std,
-                )
-            ]
-        case _:
-            raise EvaluationError(f"a {found.kind} has no characteristic of an acceptance test")
+    points, frame = cloud.points_mm, cloud.frame
+    if position.region_mm is not None:
+        low, high = np.array(position.region_mm).T
+        inside = ((points >= low) & (points <= high)).all(axis=1)
+        points, frame = points[inside], frame[inside]
+    margin = plan.margin_mm(artefact)
+    match standard:
+        case SphereStandard():
+            surfaces = measure_spheres(points, standard, margin_mm=margin)
+            values = list(_sphere_values(surfaces, standard, artefact, position.name, temperature))
+            return MeasuredPosition(values, sum(s.points for s in surfaces), sum(s.rejected for s in surfaces))
+        case PlaneStandard():
+            plane = measure_plane(points, standard, margin_mm=margin)
+            return MeasuredPosition(
+                list(_plane_values(plane, points, artefact, position.name)), plane.points, plane.rejected
+            )
+        case StepStandard():
+            step = measure_step_height(points, frame, standard)
+            std = _size_std_mm(artefact, standard.height_uncertainty_mm, standard.height_mm, temperature)
+            value = CharacteristicValue(
+                symbol="E",
+                position=position.name,
+                label="height",
+                value_mm=step.height_error_mm,
+                expanded_mm=_expanded(std),
+                place_mm=step.point_mm,
+                length_mm=standard.height_mm,
+                direction=step.normal,
+            )
+            return MeasuredPosition([value], step.points_used, 0)
+        case PipeStandard():
+            raise EvaluationError(f"a {standard.kind} has no characteristic of an acceptance test")
 
 
 def judge_characteristic(
-    symbol: Symbol, values: list[CharacteristicValue], mpe_mm: float | None, *, mpe_mm_per_m: float = 0.0
+    symbol: Symbol,
+    values: list[CharacteristicValue],
+    mpe_mm: float | None,
+    *,
+    mpe_mm_per_m: float = 0.0,
+    rule: DecisionRule = "U",
 ) -> Characteristic:
     """Return a characteristic with its worst value and the decision; for the limits see `Characteristic`."""
     own = [each for each in values if each.symbol == symbol]
     limits = {id(each): _limit_mm(each, mpe_mm, mpe_mm_per_m) for each in own}
+    guard = _GUARDS[rule] / COVERAGE_FACTOR
 
     def beyond(each: CharacteristicValue) -> float:
-        return abs(each.value_mm) + (each.expanded_mm or 0.0) - (limits[id(each)] or 0.0)
+        return abs(each.value_mm) + guard * (each.expanded_mm or 0.0) - (limits[id(each)] or 0.0)
 
-    worst = max(own, key=beyond, default=None)
-    decisions = {_decide(each, limits[id(each)]) for each in own} or {"no MPE" if mpe_mm is None else "not measured"}
-    order: tuple[Decision, ...] = (
-        "nonconformity proven",
-        "not proven",
-        "no test value uncertainty",
-        "no MPE",
-        "not measured",
-        "conformity proven",
-    )
+    judged = [_decide(each, limits[id(each)], rule) for each in own]
+    if not own:
+        judged: list[tuple[Decision, str]] = [("no MPE", "") if mpe_mm is None else ("undecided", "not measured")]
+    order = get_args(Decision)
+    decision, reason = min(judged, key=lambda each: order.index(each[0]))
+    chances = [_probability(each, limits[id(each)]) for each in own]
+    known = [chance for chance in chances if chance is not None]
     return Characteristic(
         symbol=symbol,
-        worst=worst,
+        worst=max(own, key=beyond, default=None),
         count=len(own),
-        wanted=WANTED[symbol],
         mpe_mm=mpe_mm,
-        decision=next(each for each in order if each in decisions),
+        decision=decision,
+        reason=reason,
+        probability=min(known) if known and len(known) == len(chances) else None,
         mpe_mm_per_m=mpe_mm_per_m,
     )
 
@@ -203,29 +251,43 @@ def _limit_mm(value: CharacteristicValue, mpe_mm: float | None, mpe_mm_per_m: fl
     return None if mpe_mm is None else mpe_mm + 1e-3 * mpe_mm_per_m * (value.length_mm or 0.0)
 
 
-def _decide(value: CharacteristicValue, mpe_mm: float | None) -> Decision:
-    """Return the decision on one value by its coverage interval."""
-    if mpe_mm is None:
-        return "no MPE"
-    if value.expanded_mm is None:
-        return "no test value uncertainty"
+def _decide(value: CharacteristicValue, limit_mm: float | None, rule: DecisionRule) -> tuple[Decision, str]:
+    """Return the decision on one value, and the reason of an open one."""
+    if limit_mm is None:
+        return "no MPE", ""
     size = abs(value.value_mm)
-    return _DECISIONS[judge_interval(size - value.expanded_mm, size + value.expanded_mm, upper=mpe_mm)]
+    if rule == "simple":
+        return _SIMPLE[judge_interval(size, size, upper=limit_mm)], ""
+    where = f"{value.position}, {value.label}"
+    if value.expanded_mm is None:
+        return "undecided", f"the certificate states too little for a test value uncertainty ({where})"
+    guard = _GUARDS[rule] / COVERAGE_FACTOR * value.expanded_mm
+    decision = _DECISIONS[judge_interval(size - guard, size + guard, upper=limit_mm)]
+    return decision, f"the limit is within the guard band ({where})" if decision == "undecided" else ""
+
+
+def _probability(value: CharacteristicValue, limit_mm: float | None) -> float | None:
+    """Return the probability that the true value is within the limits; None without limit or uncertainty."""
+    if limit_mm is None or not value.expanded_mm:
+        return None
+    std = value.expanded_mm / COVERAGE_FACTOR
+    return float(ndtr((limit_mm - value.value_mm) / std) - ndtr((-limit_mm - value.value_mm) / std))
 
 
 def _sphere_values(
-    found: SphereEvaluation, artefact: CertifiedArtefact, position: str, temperature: Temperature | None
+    surfaces: list[MeasuredSurface[SphereFit]],
+    standard: SphereStandard,
+    artefact: CertifiedArtefact,
+    position: str,
+    temperature: Temperature | None,
 ) -> Iterator[CharacteristicValue]:
-    standard = artefact.standard
-    assert isinstance(standard, SphereStandard)
-    for number, sphere in enumerate(found.spheres, start=1):
-        calibrated = sphere.diameter_mm - sphere.diameter_error_mm
-        by_size = _expanded(_size_std_mm(artefact, standard.diameter_uncertainty_mm, calibrated, temperature))
+    for number, (sphere, diameter) in enumerate(zip(surfaces, standard.diameters_mm, strict=True), start=1):
+        by_size = _expanded(_size_std_mm(artefact, standard.diameter_uncertainty_mm, diameter, temperature))
         by_form = _form_expanded_mm(artefact)
         measured: tuple[tuple[Symbol, float, float | None], ...] = (
-            ("PF", sphere.form.range_mm, by_form),
-            ("PF95", sphere.form.range_95_mm, by_form),
-            ("PS", sphere.diameter_error_mm, by_size),
+            ("PF", sphere.range_mm, by_form),
+            ("PF95", sphere.range_95_mm, by_form),
+            ("PS", 2 * sphere.fit.radius_mm - diameter, by_size),
         )
         for symbol, value, expanded in measured:
             yield CharacteristicValue(
@@ -234,24 +296,48 @@ def _sphere_values(
                 label=f"sphere {number}",
                 value_mm=value,
                 expanded_mm=expanded,
-                place_mm=sphere.centre_mm,
+                place_mm=_vector(sphere.fit.centre_mm),
             )
-    centres = np.array([sphere.centre_mm for sphere in found.spheres])
-    for number, spacing in enumerate(found.spacings, start=1):
+    centres = np.array([sphere.fit.centre_mm for sphere in surfaces])
+    for number, calibrated in enumerate(standard.spacings_mm, start=1):
         between = centres[number] - centres[number - 1]
-        calibrated = spacing.spacing_mm - spacing.sse_mm
+        spacing = float(np.linalg.norm(between))
         std = _size_std_mm(artefact, standard.spacing_uncertainty_mm, calibrated, temperature)
         yield CharacteristicValue(
             symbol="SD",
             position=position,
-            label="spacing" if len(found.spacings) == 1 else f"spacing {number}-{number + 1}",
-            value_mm=spacing.sse_mm,
+            label="spacing" if len(standard.spacings_mm) == 1 else f"spacing {number}-{number + 1}",
+            value_mm=spacing - calibrated,
             expanded_mm=_expanded(std),
-            place_mm=tuple((centres[number] + centres[number - 1]) / 2),
+            place_mm=_vector((centres[number] + centres[number - 1]) / 2),
             length_mm=calibrated,
-            direction=tuple(between / np.linalg.norm(between)),
-            calibration_std_mm=std,
+            direction=_vector(between / spacing),
         )
+
+
+def _plane_values(
+    plane: MeasuredSurface[FlatFit], points: np.ndarray, artefact: CertifiedArtefact, position: str
+) -> Iterator[CharacteristicValue]:
+    middle = points.mean(axis=0)
+    along = (points - middle) @ principal_axes(points - middle)[1][:2].T
+    length, width = np.ptp(along, axis=0).tolist()
+    measured: tuple[tuple[Symbol, float], ...] = ("F", plane.range_mm), ("F95", plane.range_95_mm)
+    for symbol, value in measured:
+        yield CharacteristicValue(
+            symbol=symbol,
+            position=position,
+            label="plane",
+            value_mm=value,
+            expanded_mm=_form_expanded_mm(artefact),
+            place_mm=_vector(middle),
+            direction=_vector(plane.fit.normal),
+            extent_mm=(length, width),
+        )
+
+
+def _vector(values: np.ndarray) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 def _form_expanded_mm(artefact: CertifiedArtefact) -> float | None:
@@ -282,11 +368,6 @@ def _size_std_mm(
 
 def _expanded(std_mm: float | None) -> float | None:
     return None if std_mm is None else COVERAGE_FACTOR * std_mm
-
-
-def _mean_place(cloud: PointCloud, deviation_mm: np.ndarray) -> Vector:
-    x, y, z = cloud.points_mm[np.isfinite(deviation_mm)].mean(axis=0).tolist()
-    return x, y, z
 
 
 def describe_missing(artefact: CertifiedArtefact) -> list[str]:

@@ -207,7 +207,7 @@ def accept(
     pdf=False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Exit code 0 only if conformity is proven for everything in the plan.
+    """Exit code 0 only if conformity is proven for everything in the plan, or accepted by simple acceptance.
 
     Example: uwlts accept acceptance.toml --pdf
     """
@@ -236,5 +236,5 @@ def accept(
     show(found.lines())
     uwlts.report.write_acceptance(page, found, pdf=pdf, overwrite=overwrite)
     say(f"wrote {page}, {result.name}" + (f", {page.with_suffix('.pdf').name}" if pdf else ""))
-    if found.verdict != "conformity proven":
+    if found.verdict not in ("conformity proven", "accepted"):
         sys.exit(1)

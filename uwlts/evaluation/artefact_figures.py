@@ -8,15 +8,7 @@ from typing import Any, ClassVar, assert_never
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.figures import (
-    TOWARDS_SENSOR,
-    ArtefactEvaluation,
-    FigureId,
-    FormErrors,
-    Quantity,
-    measure_form,
-    spread_mm,
-)
+from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
 from uwlts.evaluation.spheres import evaluate_spheres
 from uwlts.evaluation.step_faces import StepFace, label_step_faces, step_height
 from uwlts.fitting.least_squares import RobustFit, fit_robustly
@@ -60,14 +52,13 @@ def evaluate_cloud(cloud: PointCloud, artefact: Artefact) -> ArtefactEvaluation:
 class PlaneEvaluation(ArtefactEvaluation):
     """Evaluation of a plane; `re_mm` is the range of the residuals (range error), `std_mm` their standard deviation.
 
-    `form` has the form errors by all points. `normal` points to the sensor; deviations are positive on that side.
+    `normal` points to the sensor; deviations are positive on that side.
     """
 
     kind: ClassVar[str] = "plane"
 
     re_mm: float
     std_mm: float
-    form: FormErrors
     point_mm: tuple[float, float, float]
     normal: tuple[float, float, float]
 
@@ -114,7 +105,6 @@ def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluati
         **counts,
         re_mm=spread_mm(robust.fit.residuals_mm),
         std_mm=robust.fit.std_mm,
-        form=measure_form(_fit_facing_plane, points, robust.distances_mm),
         point_mm=tuple(robust.fit.point_mm.tolist()),
         normal=tuple(robust.fit.normal.tolist()),
     )

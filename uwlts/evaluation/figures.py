@@ -2,14 +2,13 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, ClassVar, assert_never
 
 import numpy as np
 
-from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE, Fit
+from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 
 TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
@@ -207,29 +206,6 @@ class ArtefactEvaluation(ABC):
 def spread_mm(residuals_mm: np.ndarray) -> float:
     """Return the range of residuals, largest minus smallest (PE and RE of VDI/VDE 2634)."""
     return float(np.ptp(residuals_mm))
-
-
-@dataclass(frozen=True)
-class FormErrors:
-    """Form errors of a surface, mm, from all its points.
-
-    ``range_mm`` is the range of the distances after rejecting the farthest 0.3 % of the points, which VDI/VDE 2634
-    permits. ``range_95_mm`` is the width of the narrowest band about that fit that contains 95 % of the points.
-    """
-
-    range_mm: float
-    range_95_mm: float
-
-
-def measure_form(fit: Callable[[np.ndarray], Fit], points: np.ndarray, distances_mm: np.ndarray) -> FormErrors:
-    """Return the form errors of points (N, 3), mm, whose ``distances_mm`` (N,) from a first fit are known."""
-    rejected = int(VDI_OUTLIER_SHARE * len(points))
-    kept = np.argsort(np.abs(distances_mm), kind="stable")[: len(points) - rejected]
-    shape = fit(points[kept])
-    distances = np.sort(shape.distances_mm(points))
-    inside = int(np.ceil(0.95 * len(points)))
-    narrowest = float(np.min(distances[inside - 1 :] - distances[: len(points) - inside + 1]))
-    return FormErrors(spread_mm(shape.residuals_mm), narrowest)
 
 
 def _plain(value: Any) -> Any:

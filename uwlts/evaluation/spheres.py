@@ -9,15 +9,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.figures import (
-    TOWARDS_SENSOR,
-    ArtefactEvaluation,
-    FigureId,
-    FormErrors,
-    Quantity,
-    measure_form,
-    spread_mm,
-)
+from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
 from uwlts.fitting.least_squares import DEFAULT_K, RobustFit, fit_robustly, robust_std
 from uwlts.fitting.point_groups import number_cubes
 from uwlts.fitting.shapes import SphereFit, fit_sphere
@@ -201,9 +193,8 @@ class SphereResult:
     """Sphere measured by its fit of free radius, mm, OCS.
 
     The probing error ``pe_mm`` is the range of the radial residuals, ``std_mm`` their standard deviation.
-    ``form`` has the form errors by all points, also the rejected ones. ``diameter_std_mm`` is the standard uncertainty
-    by the scatter of the points alone. ``points_mixed`` counts points that were excluded because another surface
-    crosses the sphere there.
+    ``diameter_std_mm`` is the standard uncertainty by the scatter of the points alone. ``points_mixed`` counts points
+    that were excluded because another surface crosses the sphere there.
     """
 
     centre_mm: tuple[float, float, float]
@@ -212,7 +203,6 @@ class SphereResult:
     diameter_std_mm: float
     pe_mm: float
     std_mm: float
-    form: FormErrors
     points_used: int
     points_rejected: int
     points_mixed: int
@@ -292,7 +282,6 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
                 diameter_std_mm=2 * float(np.sqrt(fit.covariance[3, 3])),
                 pe_mm=spread_mm(fit.residuals_mm),
                 std_mm=fit.std_mm,
-                form=measure_form(fit_sphere, points[members], robust.distances_mm),
                 points_used=len(used),
                 points_rejected=robust.rejected,
                 points_mixed=sphere.points_mixed,

@@ -1,4 +1,4 @@
-"""Page of an acceptance test: verdict, characteristics with decisions, pictures, shares, and traceability."""
+"""Page of an acceptance test: verdict, characteristics with decisions, requirements, pictures, and traceability."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,8 +8,7 @@ from markupsafe import Markup
 
 from uwlts.acceptance.accept import FORMAT, VERSION, Acceptance, JudgedPosition
 from uwlts.acceptance.acceptance_plan import SYMBOLS, CertifiedArtefact, Symbol
-from uwlts.acceptance.characteristics import NAMES, Characteristic, CharacteristicValue
-from uwlts.acceptance.directional_scale import DirectionalScale, ScaleComponent
+from uwlts.acceptance.characteristics import NAMES, RULES, Characteristic, CharacteristicValue
 from uwlts.files.json_files import json_text
 from uwlts.model.artefacts import SphereStandard, StepStandard
 from uwlts.pages.numbers import format_fixed
@@ -31,7 +30,8 @@ from uwlts.pages.toolkit import (
 
 KIND = "acceptance"
 """Kind of the page, in the name of its JSON file."""
-_DECISIONS = {"conformity proven": "#2e8b57", "nonconformity proven": RED}
+_GREEN = "#2e8b57"
+_DECISIONS = {"conformity proven": _GREEN, "accepted": _GREEN, "nonconformity proven": RED, "rejected": RED}
 """Colours of decisions; all others are open."""
 _OPEN = "#d9822b"
 _SIGNED = ("PS", "SD", "E")
@@ -67,7 +67,7 @@ def write_acceptance(path: str | Path, acceptance: Acceptance, *, pdf: bool = Fa
 
 def acceptance_page(acceptance: Acceptance) -> str:
     """Return the page as text."""
-    plan, scale = acceptance.plan, acceptance.scale
+    plan = acceptance.plan
     x, y, z = plan.volume_mm
     measured: list[Symbol] = [
         symbol for symbol in SYMBOLS if any(value.symbol == symbol for value in acceptance.values)
@@ -77,6 +77,7 @@ def acceptance_page(acceptance: Acceptance) -> str:
         ("client", plan.client or "not stated"),
         ("operator", plan.operator or "not stated"),
         ("measuring volume", f"{x:g} x {y:g} x {z:g} mm (X, Y, Z), diagonal {plan.diagonal_mm():.0f} mm"),
+        ("decision rule", RULES[plan.decision_rule]),
         ("calibration", f"{plan.calibration or 'clouds only'}, identifier {acceptance.calibration or MISSING}"),
         ("judged", f"{acceptance.date.replace('T', ' ')}, by {acceptance.software}"),
     ]
@@ -84,17 +85,17 @@ def acceptance_page(acceptance: Acceptance) -> str:
         "uwlts.report",
         "acceptance.html.j2",
         title=plan.title,
-        verdict=acceptance.verdict,
-        conclusion=_conclusion(acceptance),
-        colour={"conformity proven": "good", "nonconformity proven": "bad"}.get(acceptance.verdict, "open"),
+        conclusion=f"{acceptance.conclusion[0].upper()}{acceptance.conclusion[1:]}.",
+        colour={_GREEN: "good", RED: "bad", _OPEN: "open"}[_colour_of(acceptance.verdict)],
         facts=facts,
         characteristics=[_characteristic_row(each) for each in acceptance.characteristics],
         limits=_draw_limits(acceptance) if acceptance.values else None,
         places=_draw_places(acceptance) if acceptance.values else None,
-        lengths=_draw_lengths(acceptance) if scale is not None else None,
-        scale=[_scale_row(each) for each in _shown_components(scale)],
-        scatter=_describe_scatter(scale),
-        scale_remarks=() if scale is None else scale.remarks,
+        lengths=_draw_lengths(acceptance) if any(value.length_mm for value in acceptance.values) else None,
+        requirements=[
+            (each.clause, "done" if each.met else "not met", each.required, each.done)
+            for each in acceptance.requirements
+        ],
         remarks=acceptance.remarks,
         positions=[_position_row(number, each, measured) for number, each in enumerate(acceptance.positions, start=1)],
         measured=measured,
@@ -104,28 +105,6 @@ def acceptance_page(acceptance: Acceptance) -> str:
     )
 
 
-def _conclusion(acceptance: Acceptance) -> str:
-    left = len(acceptance.outstanding)
-    match acceptance.verdict:
-        case "conformity proven":
-            return (
-                "Conformity proven: every characteristic with its uncertainty is within its maximum permissible error."
-            )
-        case "nonconformity proven":
-            failed = [each.symbol for each in acceptance.characteristics if each.decision == "nonconformity proven"]
-            return f"Nonconformity proven: {', '.join(failed)} beyond the maximum permissible error, with uncertainty."
-        case "conformity not proven":
-            failed = [
-                each.symbol
-                for each in acceptance.characteristics
-                if each.mpe_mm is not None and each.decision != "conformity proven"
-            ]
-            return f"Conformity not proven: no decision, or the limit is within the interval, for {', '.join(failed)}."
-        case "incomplete":
-            return f"Incomplete: {left} of {len(acceptance.positions)} positions are still to be measured."
-    return acceptance.verdict
-
-
 def _characteristic_row(each: Characteristic) -> tuple[str, ...]:
     words, guideline = NAMES[each.symbol]
     worst = each.worst
@@ -133,8 +112,10 @@ def _characteristic_row(each: Characteristic) -> tuple[str, ...]:
     expanded = MISSING if worst is None or worst.expanded_mm is None else format_fixed(worst.expanded_mm, 4)
     place = MISSING if worst is None else f"{worst.position}, {worst.label}"
     limit = each.limit_text() or MISSING
-    measured = f"{each.count} ({each.wanted})"
-    return each.symbol, each.decision, value, expanded, limit, place, measured, f"{words}; {guideline}"
+    chance = each.probability_text() or MISSING
+    measured = f"{each.count}"
+    name = f"{words}; {guideline}"
+    return each.symbol, each.decision_text(), value, expanded, limit, chance, place, measured, name
 
 
 def _position_row(number: int, each: JudgedPosition, measured: Sequence[Symbol]) -> tuple[str, ...]:
@@ -145,7 +126,8 @@ def _position_row(number: int, each: JudgedPosition, measured: Sequence[Symbol])
         own = [value.value_mm for value in each.values if value.symbol == symbol]
         shown = [format_fixed(value, 4, signed=symbol in _SIGNED).replace("-", "\N{MINUS SIGN}") for value in own]
         values.append(" / ".join(shown) or MISSING)
-    return f"{number}", each.name, each.artefact, state, *values
+    points = f"{each.on_artefact:,} of {each.points:,}; {each.rejected}" if each.points else MISSING
+    return f"{number}", each.name, each.artefact, state, points, *values
 
 
 def _artefact_row(name: str, each: CertifiedArtefact) -> tuple[str, ...]:
@@ -168,31 +150,6 @@ def _artefact_row(name: str, each: CertifiedArtefact) -> tuple[str, ...]:
 
 def _stated(value: float | None) -> str:
     return "not stated" if value is None else f"{value:g}"
-
-
-def _shown_components(scale: DirectionalScale | None) -> list[ScaleComponent]:
-    if scale is None:
-        return []
-    return [*scale.components, *([] if scale.anisotropy is None else [scale.anisotropy])]
-
-
-def _scale_row(each: ScaleComponent) -> tuple[str, ...]:
-    if each.value is None:
-        return each.words, each.share, "not determined", MISSING, MISSING
-    std = MISSING if each.std is None else format_fixed(1e6 * each.std, 0)
-    half = MISSING if each.half_interval is None else format_fixed(1e6 * each.half_interval, 0)
-    words = "significant" if each.significant else "not significant"
-    said = each.share if each.half_interval is None else f"{each.share}, {words}"
-    return each.words, said, format_fixed(1e6 * each.value, 0, signed=True), std, half
-
-
-def _describe_scatter(scale: DirectionalScale | None) -> str | None:
-    if scale is None or scale.scatter_mm is None:
-        return None
-    return (
-        f"{scale.lengths} lengths leave a scatter of {1e3 * scale.scatter_mm:.1f} µm (standard deviation, "
-        f"{scale.degrees} degrees of freedom)."
-    )
 
 
 def _colour_of(decision: str) -> str:
@@ -261,4 +218,5 @@ def _draw_lengths(acceptance: Acceptance) -> Markup:
 
 
 def _length_label(value: CharacteristicValue) -> str:
-    return plain_text(f"{value.position} ({value.symbol}, {value.length_mm or 0.0:.0f} mm)")
+    along = "XYZ"[int(np.argmax(np.abs(value.direction)))] if value.direction else ""
+    return plain_text(f"{value.position} ({value.symbol}, {value.length_mm or 0.0:.0f} mm, mostly along {along})")

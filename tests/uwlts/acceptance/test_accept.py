@@ -133,7 +133,7 @@ def test_warm_artefacts_are_longer(folder, found):
 
 
 @pytest.mark.parametrize(
-    ("share", "decision"), [(1.1, "conformity proven"), (1.0, "not proven"), (0.9, "nonconformity proven")]
+    ("share", "decision"), [(1.1, "conformity proven"), (1.0, "undecided"), (0.9, "nonconformity proven")]
 )
 def test_a_decision_needs_the_whole_interval(found, folder, share, decision):
     """The limit is beyond, within or before the interval of the worst spacing."""
@@ -144,15 +144,17 @@ def test_a_decision_needs_the_whole_interval(found, folder, share, decision):
     limits = content_of()["mpe"] | {"SD_mm": limit}
     judged = uwlts.accept(write_plan(folder, "limited.toml", mpe=limits), earlier=found)
     assert of(judged, "SD").decision == decision
-    verdicts = {"not proven": "conformity not proven"}
-    assert judged.verdict == verdicts.get(decision, decision)
+    assert judged.verdict == decision
+    assert judged.conclusion.startswith(f"{decision}: ")
+    if decision == "undecided":
+        assert "SD: the limit is within the guard band" in judged.conclusion
 
 
 def test_limits_may_grow_with_the_length(found, folder):
     worst = of(found, "SD").worst
     reach = abs(worst.value_mm) + worst.expanded_mm
     constant = 0.5 * reach
-    for per_m, decision in ((1.1, "conformity proven"), (0.9, "not proven")):
+    for per_m, decision in ((1.1, "conformity proven"), (0.9, "undecided")):
         growth = (per_m * reach - constant) / (1e-3 * worst.length_mm)
         limits = content_of()["mpe"] | {"SD_mm": constant, "SD_mm_per_m": growth}
         judged = of(uwlts.accept(write_plan(folder, "growing.toml", mpe=limits), earlier=found), "SD")
@@ -169,14 +171,18 @@ def test_what_is_missing_is_named(folder, tmp_path):
     positions = content_of()["positions"][:1] + [{"name": "later", "artefact": "plate", "file": "later.ply"}]
     changes = {"artefacts": bare, "positions": positions, "mpe": {"PF_mm": 0.3, "F_mm": 0.3, "E_mm": 0.1}}
     found = uwlts.accept(write_plan(folder, "bare.toml", **changes))
-    assert found.verdict == "incomplete"
+    assert found.verdict == "undecided"
+    assert found.conclusion == "undecided: 1 of 2 positions are still to be measured"
     assert [each.name for each in found.outstanding] == ["later"]
     decisions = {each.symbol: each.decision for each in found.characteristics}
-    expected = {"PF": "no test value uncertainty", "PF95": "no MPE", "PS": "no MPE", "SD": "no MPE"}
-    assert decisions == expected | {"F": "not measured", "E": "not measured"}
+    expected = {"PF": "undecided", "PF95": "no MPE", "PS": "no MPE", "SD": "no MPE"}
+    assert decisions == expected | {"F": "undecided", "E": "undecided"}
+    assert "states too little for a test value uncertainty" in of(found, "PF").reason
+    assert of(found, "F").reason == of(found, "E").reason == "not measured"
     said = "\n".join(found.lines())
     assert "next: measure plate, later, into later.ply" in said
-    assert "SD: the plan has 1 measurements, the guideline demands at least 7" in said
+    assert "not met: sphere spacing: positions: at least 7; 1 of 1 planned" in said
+    assert "not met: flatness: positions: at least 6; 0 of 1 planned" in said
     assert "bar: without form_mm of the certificate" in said
     assert "SD: no maximum permissible error is stated" in said
 
@@ -186,7 +192,8 @@ def test_a_cloud_without_the_artefact_fails_with_the_reason(folder):
     found = uwlts.accept(write_plan(folder, "wrong.toml", positions=positions))
     assert found.positions[0].state == "failed"
     assert "spheres found" in found.positions[0].reason
-    assert found.verdict == "incomplete"
+    assert found.verdict == "undecided"
+    assert "wrong failed: " in found.conclusion
     assert "next: measure again bar, wrong" in "\n".join(found.lines())
 
 
@@ -200,6 +207,8 @@ def test_a_cloud_without_the_artefact_fails_with_the_reason(folder):
         ({"mpe": {"PF": 0.1}}, "mpe.PF: unknown key"),
         ({"mpe": {"PF_mm": -0.1}}, "mpe.PF_mm"),
         ({"mpe": {"SD_mm_per_m": 0.1}}, "SD_mm_per_m needs SD_mm"),
+        ({"decision_rule": "U95"}, "decision_rule"),
+        ({"positions": [content_of()["positions"][0] | {"region_mm": [[0, 1], [2, 1], [0, 1]]}]}, "interval of Y"),
     ],
 )
 def test_wrong_plans_are_refused(tmp_path, changes, said):
@@ -234,11 +243,12 @@ def test_the_command_leads_through_the_plan(folder, tmp_path):
     begun = run_program(app, "uwlts", "accept", str(plan))
     assert begun.returncode == 1
     assert "next: measure step, step, into step.ply" in begun.stdout
-    assert "incomplete" in begun.stdout.splitlines()[-2]
+    assert begun.stdout.splitlines()[-2] == "undecided: 1 of 2 positions are still to be measured"
     (tmp_path / "later.ply").rename(tmp_path / "step.ply")
     done = run_program(app, "uwlts", "accept", str(plan))
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-2] == "conformity proven"
+    assert done.stdout.splitlines()[-2].startswith("conformity proven: every value with its guard band is within")
+    assert "requirements of VDI/VDE 2634 part 2 are not met" in done.stdout.splitlines()[-2]
     page = (tmp_path / "plan.acceptance.html").read_text(encoding="utf-8")
     assert "Conformity proven" in page and "not tested" in page
     assert uwlts.read(tmp_path / "plan.acceptance.json").verdict == "conformity proven"
