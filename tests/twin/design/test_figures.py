@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from tests.virtual_sensors import altered
-from twin.design.figures_of_merit import CLASS_NAMES, Figures, compute_figures
+from twin.design.figures_of_merit import CLASS_NAMES, Figures, compute_figures, laser_class
 from twin.design.sensor_arrays import adjust_to_standoff, extract_parameters
 from uwlts.model.media import water_absorption_per_m, water_scattering_per_m
 from uwlts.model.placement import view_of_sheet
@@ -206,6 +206,30 @@ def test_laser_classes(thesis, power_mw, fan_deg, expected):
     p = extract_parameters([sensor], [sensor.media["water"]])
     found, _ = compute_figures(p, reflectance=0.5, water_depth_m=100.0)
     assert CLASS_NAMES[int(found.laser_class.item())] == expected
+
+
+@pytest.mark.parametrize("profile", ["flat", "gaussian"])
+@pytest.mark.parametrize("fan_deg", [8.0, 30.0, 45.0, 80.0])
+def test_the_class_changes_with_the_power_through_7_mm_at_100_mm(thesis, profile, fan_deg):
+    """Classes 2, 3R, 3B and 4 begin at 0.39, 1, 5 and 500 mW through the aperture (IEC 60825-1, condition 3).
+
+    The power through it is the integral of the profile over its angle. The estimate takes the largest power per angle
+    for all of it, which is more for a Gaussian profile, by less than 14 % in the narrowest fan.
+    """
+    half = math.radians(fan_deg) / 2
+    angle = np.linspace(-half, half, 200_001)
+    density = np.exp(-2 * (angle / half) ** 2) if profile == "gaussian" else np.ones_like(angle)
+    share = density[np.abs(angle) <= math.atan(3.5 / 100.0)].sum() / density.sum()
+    most = math.exp(2 * (math.atan(0.035) / half) ** 2) if profile == "gaussian" else 1.0
+
+    def class_of(power_mw: float) -> str:
+        laser = {"power_mw": power_mw, "fan_angle_deg": fan_deg, "fan_profile": profile}
+        sensor = altered(thesis, {"laser": laser})
+        return CLASS_NAMES[int(laser_class(extract_parameters([sensor], [sensor.media["water"]])).item())]
+
+    for limit_mw, below, above in ((0.39, "1", "2"), (1.0, "2", "3R"), (5.0, "3R", "3B"), (500.0, "3B", "4")):
+        assert class_of(limit_mw / share * 1.001) == above
+        assert class_of(limit_mw / share / most * 0.999) == below
 
 
 def test_the_optical_depth_of_scattering_is_the_coefficient_times_the_longest_path(thesis):

@@ -17,10 +17,18 @@ from uwlts.files.json_files import compute_seal, to_canonical_json
 from uwlts.model.calibration import KnownMedium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
-from uwlts.report.certificate import NOT_JOINT, JointCertificate, check_certificate, make_certificate, read_certificate
+from uwlts.report.certificate import (
+    NOT_JOINT,
+    JointCertificate,
+    certificate_lines,
+    check_certificate,
+    make_certificate,
+    read_certificate,
+)
 from uwlts.report.certificate_page import certificate_page, write_certificate
 from uwlts.report.certificate_volume import (
     compare_calibrations,
+    compute_volume_lengths,
     find_ends,
     length_uncertainties,
     prepare_use,
@@ -156,6 +164,30 @@ def test_uncertainties_of_lengths_agree_with_draws(calibration, use):
         assert stated.point_mm > stated.calibration_mm
         compared += 1
     assert compared == 4
+
+
+def test_the_largest_uncertainty_of_the_volume_is_stated(use):
+    """No position alone has a larger uncertainty, and one has the stated one; positions differ by more than 2 %."""
+    checked = 0
+    for stated in length_uncertainties(use):
+        if stated.axis != "X" and stated.length_mm in (20.0, 50.0):
+            places = find_ends(use.region, stated.axis, stated.length_mm)
+            for noise, value in ((0.0, stated.calibration_mm), (use.noise_px, stated.point_mm)):
+                alone = [
+                    2 * compute_volume_lengths(use, place[None]).std_mm(use.covariance, noise_px=noise).item()
+                    for place in places
+                ]
+                assert value == pytest.approx(max(alone), rel=1e-9)
+                assert min(alone) < 0.98 * value
+                checked += 1
+    assert checked == 8
+
+
+def test_the_terminal_names_the_longest_length_of_each_axis(content):
+    lines = certificate_lines(content)
+    for axis in "XYZ":
+        longest = max((row for row in content.lengths if row.axis == axis), key=lambda row: row.length_mm)
+        assert f"{1e3 * longest.calibration_mm:.1f} µm of {longest.length_mm:g} mm along {axis}" in lines[0]
 
 
 def test_along_x_the_stage_counts(use, thesis):
