@@ -11,10 +11,11 @@ from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
 from tests.uwlts.mount_views import MOUNT, SPHERE_MM
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, read_stored_estimate
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
 from uwlts.calibration.mount.captured_profiles import CapturedProfiles
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.calibration.sequential.sheet_fit import object_frame
+from uwlts.fitting.next_observation import CovarianceRoot
 from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import stack_pixels
 
@@ -32,7 +33,7 @@ def joint_estimate(thesis: Sensor) -> StoredEstimate:
 
 def largest_parts(known, by, count=3):
     """Return the independent parts (count, P) of parameter errors with the largest effect on a mount."""
-    root = covariance_root(known.covariance)
+    root = CovarianceRoot.from_covariance(known.covariance).root
     return root[:, np.argsort(-np.linalg.norm(by @ root[: by.shape[1]] * 1e3, axis=0))[:count]].T
 
 

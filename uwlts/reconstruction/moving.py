@@ -12,8 +12,8 @@ from hashlib import sha256
 
 import numpy as np
 
-from uwlts.calibration.joint.stored_estimate import covariance_root
 from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.fitting.next_observation import CovarianceRoot
 from uwlts.model.mount import Mount
 from uwlts.model.trajectory import Trajectory, convert_to_platform_clock
 from uwlts.reconstruction.path_uncertainty import (
@@ -157,7 +157,7 @@ def _mount_errors(poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarra
     A translation d and a rotation w of the mount move a point p by d + w x (p - t), all in the platform's frame. The
     sensor's position t is ``place_mm`` (3,).
     """
-    root = covariance_root(covariance)
+    root = CovarianceRoot.from_covariance(covariance).root
     turns, shifts = poses[:, :3, :3] @ root[3:], poses[:, :3, :3] @ root[:3]
     return np.concatenate([shifts - np.cross(turns, (poses[:, :3, :3] @ place_mm)[:, :, None], axis=1), turns], axis=1)
 

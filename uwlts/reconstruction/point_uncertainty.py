@@ -13,10 +13,11 @@ from itertools import pairwise
 import numpy as np
 
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, perpendicular_directions
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, read_stored_estimate, require_joint
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate, require_joint
 from uwlts.errors import CalibrationError
 from uwlts.files.writing import hash_file
 from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.next_observation import CovarianceRoot
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import StageParameter
@@ -174,7 +175,7 @@ def point_uncertainty(
     root = np.zeros((len(known.covariance), 1 + len(found)))
     # Variance added by the medium's index: its drift, or its full variance in a medium without calibration.
     root[:, 0] = np.sqrt(np.maximum(np.diag(known.covariance) - np.pad(np.diag(found), (0, len(root) - len(found))), 0))
-    root[: len(found), 1:] = covariance_root(found)
+    root[: len(found), 1:] = CovarianceRoot.from_covariance(found).root
     by_stage_alone = ~posed[:, 0, 0]
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import JsonValue, PlainSerializer
 
 from uwlts._version import __version__
-from uwlts.calibration.joint.next_shot import ShotForecast, rank_next_shots
+from uwlts.calibration.joint.next_shot import WHOLE_VOLUME, Shot, rank_next_shots
 from uwlts.calibration.joint.observability import (
     Weakness,
     compute_mesh_lengths,
@@ -20,6 +20,7 @@ from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.errors import CaptureError
 from uwlts.files.json_files import SEAL, compute_seal, read_json
 from uwlts.files.writing import hash_file
+from uwlts.fitting.next_observation import Forecast
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit
@@ -271,12 +272,14 @@ def _complete_joint(base: Certificate, calibration: Calibration) -> JointCertifi
     )
 
 
-def _shots(outlooks: Sequence[ShotForecast]) -> tuple[NextShot, ...]:
+def _shots(forecasts: Sequence[Forecast[Shot]]) -> tuple[NextShot, ...]:
     """Return the best shots, and the best of each kind, in order."""
-    kinds = [outlook.words.split(",")[0] for outlook in outlooks]
+    kinds = [each.candidate.words.split(",")[0] for each in forecasts]
     return tuple(
-        NextShot(words=o.words.rstrip(","), before_mm=o.before_mm, after_mm=o.after_mm, advice=o.advice())
-        for place, (kind, o) in enumerate(zip(kinds, outlooks, strict=True))
+        NextShot(
+            words=f.candidate.words.rstrip(","), before_mm=f.before, after_mm=f.after, advice=f.advice(WHOLE_VOLUME)
+        )
+        for place, (kind, f) in enumerate(zip(kinds, forecasts, strict=True))
         if place < _BEST_SHOTS or kind not in kinds[:place]
     )
 

@@ -14,8 +14,9 @@ from uwlts.calibration.joint.observability import (
 )
 from uwlts.calibration.joint.residuals import STEP, STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SCANNED
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, require_joint
 from uwlts.errors import CalibrationError
+from uwlts.fitting.next_observation import CovarianceRoot
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Uncertainty
@@ -133,7 +134,8 @@ def uncertainty_maps(use: CalibrationInUse) -> tuple[np.ndarray, dict[str, np.nd
     mesh = use.region.mesh(_ROWS, _COLUMNS)
     at = mesh.reshape(-1, 2)
     points = sample_sheet(use.known, at)
-    moved = remove_rigid_motion(at, (points.by_parameters @ covariance_root(use.covariance)).transpose(2, 0, 1))
+    root = CovarianceRoot.from_covariance(use.covariance).root
+    moved = remove_rigid_motion(at, (points.by_parameters @ root).transpose(2, 0, 1))
     calibration = np.sqrt(np.sum(moved**2, axis=0))
     shown = {"calibration": calibration, "single point": np.hypot(calibration, points.by_px * use.noise_px)}
     maps = {

@@ -121,4 +121,4 @@ def test_advice_is_given_for_an_exactly_known_stage(thesis):
     calibration = calibrated(thesis.model_copy(update={"uncertainty": exact}))
     assert StageParameter.SCALE not in calibration.joint.parameters
     best = rank_next_shots(calibration)[0]
-    assert best.after_mm < best.before_mm
+    assert best.after < best.before

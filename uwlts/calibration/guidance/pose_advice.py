@@ -12,6 +12,7 @@ from uwlts.calibration.camera.target_images import Placement, TargetImage, obser
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, points_on_target
 from uwlts.errors import CalibrationError, RangeError
+from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, eliminate_others, rank_candidates
 from uwlts.model.calibration import CameraModel, rigid_transform
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.placement import laser_pose
@@ -167,67 +168,6 @@ _MARGIN_PX = 10.0  # margin of the image, in which circles would be cut
 _SAMPLE = 100  # points used for a candidate's information; more are redundant
 
 
-@dataclass(frozen=True, eq=False)
-class CandidatePose:
-    """Candidate pose ``T_camera_target`` (4, 4), with pixels (N, 2) and information (P, P) of its image.
-
-    The information is for a point noise of 1 px.
-    """
-
-    pose: np.ndarray
-    pixels: np.ndarray
-    information: np.ndarray
-
-
-def information_of(
-    points_mm: np.ndarray, pixels: np.ndarray, pose: np.ndarray, camera: CameraModel, setting: Setting
-) -> np.ndarray:
-    """Return the information (P, P) of one image with unknown pose on the camera's parameters, for 1 px noise.
-
-    The pose is eliminated from the normal equations (Schur complement). Zeros for a pose behind the camera.
-    """
-    intrinsics, count = setting.intrinsics(), len(points_mm)
-    placement = Placement(points_mm, np.zeros(count), pixels, np.zeros(count, dtype=int), 1.0)
-    seen = observe(placement, intrinsics, intrinsics.from_model(camera), pose_values(pose))
-    if seen is None:
-        return np.zeros((len(intrinsics.names),) * 2)
-    by_global, basis = seen.by_global, np.linalg.qr(seen.by_local / np.linalg.norm(seen.by_local, axis=0))[0]
-    left = by_global - basis @ (basis.T @ by_global)
-    return left.T @ left
-
-
-def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) -> list[CandidatePose]:
-    """Return poses with a detectable target: three distances, nine places in the image, nine tilts.
-
-    One tilt is zero; the others move one of eight sides away from the camera. ``spin_rad`` is the target's rotation in
-    the image, from its x axis to the image's.
-    """
-    target, volume, window = setting.target, setting.sensor.volume, setting.sensor.camera.window
-    outer = window.distance_mm + window.thickness_mm
-    nearest, farthest = outer + volume.near_mm, outer + volume.far_mm
-    points, middle = target.points_mm, target.points_mm.mean(axis=0)
-    largest = [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX]
-    step = max(1, len(points) // _SAMPLE)
-    spin = cv2.Rodrigues(np.array([0.0, 0.0, spin_rad]))[0]
-    sides = np.arange(8) * np.pi / 4
-    tilts = [np.zeros(3), *(TILT_RAD * np.array([np.sin(side), -np.cos(side), 0.0]) for side in sides)]
-    found = []
-    for depth, x, y, tilt in product(_DEPTHS, _PLACES, _PLACES, tilts):
-        distance = nearest + depth * (farthest - nearest)
-        ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
-        turn = cv2.Rodrigues(tilt)[0] @ spin
-        pose = rigid_transform(turn, ray / ray[2] * distance - turn @ middle)
-        rotation = cv2.Rodrigues(turn)[0]
-        pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
-        ahead = points @ pose[2, :3] + pose[2, 3] > 0
-        inside = ahead & np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
-        if target.is_findable(inside):
-            sample = np.flatnonzero(inside)[::step]
-            added = information_of(points[sample], pixels[sample], pose, camera, setting)
-            found.append(CandidatePose(pose, pixels[inside], added * inside.sum() / len(sample)))
-    return found
-
-
 _USUAL_SIGMA_PX = 0.1  # usual point noise, until residuals are known
 _LEAST_SIGMA_PX = 0.02  # smallest point noise: sharp circles, also in reality
 # Prior standard deviations of a described lens: relative to the focal length and the image's side, and of plain
@@ -280,47 +220,50 @@ class State:
     undetermined: str  # reason why the poses do not determine it
     poses: np.ndarray  # (F, 4, 4); ``T_camera_target`` of the recorded poses
     coverage: Coverage
-    information: np.ndarray  # (P, P); on the camera's parameters, initially from the description
+    known: CovarianceRoot  # of the camera's parameters, initially from the description
+
+    @property
+    def keys(self) -> tuple[LensParameter, ...]:
+        """Parameters of the camera."""
+        return self.setting.intrinsics().keys
+
+    @property
+    def sigma_px(self) -> float:
+        """Point noise of the images so far."""
+        return _USUAL_SIGMA_PX if self.solution is None else max(self.solution.sigma_px, _LEAST_SIGMA_PX)
 
     def std(self) -> dict[LensParameter, float]:
         """Return the standard deviation of every camera parameter: the solution's, else the expected one."""
         if self.solution is None:
             return self.expected_std()
-        return dict(zip(self.setting.intrinsics().keys, self.solution.std().values(), strict=True))
+        return dict(zip(self.keys, self.solution.std().values(), strict=True))
 
     def expected_std(self) -> dict[LensParameter, float]:
         """Return the standard deviations that follow from the information."""
-        std = np.sqrt(np.diag(np.linalg.inv(self.information))).tolist()
-        return dict(zip(self.setting.intrinsics().keys, std, strict=True))
+        return dict(zip(self.keys, self.known.std(np.eye(len(self.keys))).tolist(), strict=True))
 
-    def with_image(self, pose: np.ndarray, pixels: np.ndarray, information: np.ndarray) -> "State":
-        """Add an expected image: pose (4, 4), pixels (N, 2) and information (P, P) for 1 px noise."""
-        sigma = _USUAL_SIGMA_PX if self.solution is None else max(self.solution.sigma_px, _LEAST_SIGMA_PX)
-        return replace(
-            self,
-            poses=np.concatenate([self.poses, pose[None]]),
-            coverage=self.coverage.with_points(pixels),
-            information=self.information + information / sigma**2,
-        )
+    def information_of(self, points_mm: np.ndarray, pixels: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Return the information (P, P) of one image with unknown pose, near ``pose``, on the camera's parameters.
+
+        Zeros for a pose behind the camera.
+        """
+        intrinsics, count = self.setting.intrinsics(), len(points_mm)
+        placement = Placement(points_mm, np.zeros(count), pixels, np.zeros(count, dtype=int), 1.0)
+        seen = observe(placement, intrinsics, intrinsics.from_model(self.camera), pose_values(pose))
+        if seen is None:
+            return np.zeros((len(self.keys),) * 2)
+        rows = np.hstack([seen.by_global, seen.by_local]) / self.sigma_px
+        return eliminate_others(rows.T @ rows, len(self.keys))
+
+    def showing(self, pose: np.ndarray, pixels: np.ndarray) -> "State":
+        """Add the tilt and the coverage of an image with a pose (4, 4) and pixels (N, 2)."""
+        poses, coverage = np.concatenate([self.poses, pose[None]]), self.coverage.with_points(pixels)
+        return replace(self, poses=poses, coverage=coverage)
 
     def with_view(self, view: TargetView, pose: np.ndarray) -> "State":
         """Add an expected image that shows the target at a pose ``T_camera_target`` (4, 4)."""
-        information = information_of(view.points_mm, view.pixels, pose, self.camera, self.setting)
-        return self.with_image(pose, view.pixels, information)
-
-
-@dataclass(frozen=True, eq=False)
-class PoseAdvice:
-    """Most helpful pose, its benefit, and the place of the target's middle.
-
-    ``gain`` is in the units of `compute_shortfall`, ``place`` in fractions of the image's width and height,
-    ``distance_mm`` along the camera's axis.
-    """
-
-    candidate: CandidatePose
-    gain: float
-    place: tuple[float, float]
-    distance_mm: float
+        information = self.information_of(view.points_mm, view.pixels, pose)
+        return replace(self.showing(pose, view.pixels), known=self.known.with_information(information))
 
 
 def solve_state(
@@ -357,7 +300,7 @@ def solve_state(
         undetermined=undetermined,
         poses=np.empty((0, 4, 4)),
         coverage=coverage_of([], width_px=image.width_px, height_px=image.height_px),
-        information=np.diag(np.array(stds) ** -2.0),
+        known=CovarianceRoot(np.diag(stds)),
     )
     poses = [estimate_pose(one.view, camera) for one in recorded] if solution is None else solution.target_poses
     for one, pose in zip(recorded, poses, strict=True):
@@ -365,9 +308,12 @@ def solve_state(
     return state
 
 
-def compute_shortfall(state: State) -> float:
-    """Return a measure of missing evidence: 0 when all limits are reached, else log ratios and weighted fractions."""
-    std, share = state.expected_std(), state.coverage.share
+def compute_shortfall(state: State, std: dict[LensParameter, float] | None = None) -> float:
+    """Return a measure of missing evidence: 0 when all limits are reached, else log ratios and weighted fractions.
+
+    The standard deviations ``std`` of the parameters are the expected ones by default.
+    """
+    std, share = std or state.expected_std(), state.coverage.share
     ratios = np.log([std[key] / limit for key, limit in state.wanted.std_px().items() if key in std])
     beyond = _BEYOND * (ratios.sum() + _COVERAGE_WEIGHT * (1 - share))
     short = _COVERAGE_WEIGHT * max(state.wanted.coverage - share, 0.0)
@@ -383,15 +329,64 @@ def _find_missing_tilt(state: State) -> np.ndarray:
     return np.maximum(1 - reached / state.wanted.tilt_rad, 0.0)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CandidatePose(Candidate):
+    """Candidate pose ``T_camera_target`` (4, 4), with the pixels (N, 2) of its image."""
+
+    pose: np.ndarray
+    pixels: np.ndarray
+
+
+PoseAdvice = Forecast[CandidatePose]
+"""Expected effect of a pose on `compute_shortfall`."""
+
+
+def candidates(state: State, *, spin_rad: float = 0.0) -> list[CandidatePose]:
+    """Return poses with a detectable target: three distances, nine places in the image, nine tilts.
+
+    One tilt is zero; the others move one of eight sides away from the camera. ``spin_rad`` is the target's rotation in
+    the image, from its x axis to the image's.
+    """
+    camera, target, sensor = state.camera, state.setting.target, state.setting.sensor
+    volume, window = sensor.volume, sensor.camera.window
+    outer = window.distance_mm + window.thickness_mm
+    nearest, farthest = outer + volume.near_mm, outer + volume.far_mm
+    points, middle = target.points_mm, target.points_mm.mean(axis=0)
+    largest = [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX]
+    step = max(1, len(points) // _SAMPLE)
+    spin = cv2.Rodrigues(np.array([0.0, 0.0, spin_rad]))[0]
+    sides = np.arange(8) * np.pi / 4
+    tilts = [np.zeros(3), *(TILT_RAD * np.array([np.sin(side), -np.cos(side), 0.0]) for side in sides)]
+    found = []
+    for depth, x, y, tilt in product(_DEPTHS, _PLACES, _PLACES, tilts):
+        distance = nearest + depth * (farthest - nearest)
+        ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
+        turn = cv2.Rodrigues(tilt)[0] @ spin
+        pose = rigid_transform(turn, ray / ray[2] * distance - turn @ middle)
+        rotation = cv2.Rodrigues(turn)[0]
+        pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
+        ahead = points @ pose[2, :3] + pose[2, 3] > 0
+        inside = ahead & np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
+        if target.is_findable(inside):
+            sample = np.flatnonzero(inside)[::step]
+            added = state.information_of(points[sample], pixels[sample], pose) * inside.sum() / len(sample)
+            found.append(CandidatePose(information=added, pose=pose, pixels=pixels[inside]))
+    return found
+
+
 def best_pose(state: State, *, spin_rad: float = 0.0, skipped: int = 0) -> PoseAdvice | None:
-    """Return the most helpful candidate pose after ``skipped`` skipped ones; None if no candidate shows the target."""
-    options = candidates(state.setting, state.camera, spin_rad=spin_rad)
-    if not options:
-        return None
-    after = [compute_shortfall(state.with_image(each.pose, each.pixels, each.information)) for each in options]
-    best = int(np.argsort(after, kind="stable")[skipped % len(after)])
-    place, distance = middle_of(options[best].pose, state)
-    return PoseAdvice(options[best], compute_shortfall(state) - after[best], place, distance)
+    """Return the most helpful candidate pose after ``skipped`` skipped ones; None if no candidate shows the target.
+
+    The candidates are compared by `compute_shortfall`.
+    """
+
+    def figure(std: np.ndarray, candidate: CandidatePose | None) -> float:
+        seen = state if candidate is None else state.showing(candidate.pose, candidate.pixels)
+        return compute_shortfall(seen, dict(zip(state.keys, std.tolist(), strict=True)))
+
+    every = np.eye(len(state.keys))
+    ranked = rank_candidates(state.known, every, candidates(state, spin_rad=spin_rad), figure=figure)
+    return ranked[skipped % len(ranked)] if ranked else None
 
 
 def compute_gain(state: State, view: TargetView, pose: np.ndarray) -> float:
@@ -406,21 +401,21 @@ def middle_of(pose: np.ndarray, state: State) -> tuple[tuple[float, float], floa
     return (float(u / state.camera.width_px), float(v / state.camera.height_px)), float(middle[2])
 
 
-def format_pose_advice(advice: PoseAdvice, state: State, pose: np.ndarray | None) -> str:
-    """Describe how to move the target from its present pose (4, 4), None if unknown, to the advised one."""
-    parts, aim = [], advice.candidate.pose
+def format_pose_advice(aim: np.ndarray, state: State, pose: np.ndarray | None) -> str:
+    """Describe how to move the target from its present pose (4, 4), None if unknown, to the advised one (4, 4)."""
+    parts, (wanted, wanted_mm) = [], middle_of(aim, state)
     place, distance = (None, None) if pose is None else middle_of(pose, state)
     if pose is None or np.arccos(np.clip(pose[:3, 2] @ aim[:3, 2], -1, 1)) > _SAME_TILT_RAD:
         parts.append(_tilt_words(aim, pose))
-    if place is None or not np.linalg.norm(np.subtract(place, advice.place)) <= _SAME_PLACE:
-        there = place_words(*advice.place)
+    if place is None or not np.linalg.norm(np.subtract(place, wanted)) <= _SAME_PLACE:
+        there = place_words(*wanted)
         nothing = ": nothing seen there yet" if there == state.coverage.emptiest() else ""
         parts.append(f"bring its middle to the {there} of the image{nothing}")
     if distance is None:
-        parts.append(f"to about {advice.distance_mm:.0f} mm from the camera")
-    elif abs(distance / advice.distance_mm - 1) > _SAME_DISTANCE:
-        how = "nearer" if advice.distance_mm < distance else "farther"
-        parts.append(f"{how}, to about {advice.distance_mm:.0f} mm from the camera (now {distance:.0f} mm)")
+        parts.append(f"to about {wanted_mm:.0f} mm from the camera")
+    elif abs(distance / wanted_mm - 1) > _SAME_DISTANCE:
+        how = "nearer" if wanted_mm < distance else "farther"
+        parts.append(f"{how}, to about {wanted_mm:.0f} mm from the camera (now {distance:.0f} mm)")
     return "; ".join(parts) or "hold it still, just like this"
 
 

@@ -1,4 +1,4 @@
-"""Selection of the image that would improve measured lengths most, from the information that it would add."""
+"""Images that may be added to a joint calibration, with the reduction of the uncertainty of lengths by each."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -19,13 +19,15 @@ from uwlts.calibration.joint.observability import (
 from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Spheres, SurfaceScanEvidence
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, append_independent, covariance_root, require_joint
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, require_joint
+from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, eliminate_others, rank_candidates
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.sheet import sheet_surface
 from uwlts.targets import Target, parse_target
 
+WHOLE_VOLUME = "lengths over the volume"
 _FEWEST_POINTS = 20  # target points in view: fewer determine the pose of an image poorly
 _FEWEST_LINES = 20  # profile lines on a surface in view
 _SAMPLES = 400  # points of a curve, enough to interpolate a point on each profile line of its image
@@ -54,41 +56,24 @@ _TILTS = {
     "lower edge nearer": (-1.0, 0.0),
 }
 """Rotations about the camera's x and y axes."""
-_HELPFUL = 0.95  # ratio to the previous uncertainty; less than a twentieth is not an improvement
 
 
-@dataclass(frozen=True, eq=False)
-class ShotForecast:
-    """Possible image with its description and effect.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shot(Candidate):
+    """Possible image or scan, with its view, and for a target ``T_camera_target`` (4, 4)."""
 
-    ``before_mm`` and ``after_mm`` are the standard uncertainty of lengths over the volume (root mean square) without
-    and with it. ``covariance`` (P, P) is that of the parameters with it, ``pose`` (4, 4) the ``T_camera_target`` of a
-    target.
-    """
-
-    words: str
-    before_mm: float
-    after_mm: float
-    covariance: np.ndarray
     view: ViewMedium
     pose: np.ndarray | None = None
 
-    def advice(self) -> str:
-        """Describe the image as advice, without a full stop."""
-        if self.after_mm > _HELPFUL * self.before_mm:
-            return "no single further image would reduce the uncertainty of lengths by a twentieth"
-        return (
-            f"{self.words} would reduce the standard uncertainty of lengths over the volume from {self.before_mm:.4f} "
-            f"to {self.after_mm:.4f} mm"
-        )
 
-
-_Shot = tuple[StoredEstimate, Evidence, np.ndarray]
+_Simulated = tuple[StoredEstimate, Evidence, np.ndarray]
 """The estimate (with parameters that the image adds), the image's evidence, and its local parameters."""
 
 
-def rank_next_shots(calibration: Calibration) -> list[ShotForecast]:
+def rank_next_shots(calibration: Calibration) -> list[Forecast[Shot]]:
     """Return possible further images, the most helpful one first; empty if the evidence covers no area.
+
+    They are compared by the standard uncertainty of lengths over the volume (root mean square), mm.
 
     Raises CalibrationError if the calibration contains no joint estimate, or a damaged one.
     """
@@ -96,20 +81,13 @@ def rank_next_shots(calibration: Calibration) -> list[ShotForecast]:
     if region is None or not region.has_area():
         return []
     known, uncertainty = read_region_estimate(calibration, region), calibration.origin().known_before
-    lengths = compute_mesh_lengths(known, region)
-    count, before_mm, found = len(known.values), _rms(lengths.std_mm(known.covariance)), []
     low, high = region.outline_mm[:, 1].min(), region.outline_mm[:, 1].max()
     depths = {words: float(low + share * (high - low)) for words, share in _PLACES.items()}
-    for words, shot, pose in _generate_candidates(known, region.name, depths, uncertainty):
-        added = None if shot is None else _compute_information(shot, uncertainty)
-        if shot is not None and added is not None:
-            # Use a root of the covariance: its inverse may be numerically inaccurate.
-            root = covariance_root(shot[0].covariance)
-            covariance = root @ np.linalg.solve(np.eye(root.shape[1]) + root.T @ added @ root, root.T)
-            covariance = covariance[:count, :count]
-            after_mm = _rms(lengths.std_mm(covariance))
-            found.append(ShotForecast(words, before_mm, after_mm, covariance, shot[0].view, pose))
-    return sorted(found, key=lambda outlook: outlook.after_mm)
+    return rank_candidates(
+        CovarianceRoot.from_covariance(known.covariance),
+        compute_mesh_lengths(known, region).by_parameters,
+        _generate_shots(known, region.name, depths, uncertainty),
+    )
 
 
 def advice_lines(calibration: Calibration) -> list[str]:
@@ -124,38 +102,45 @@ def advice_lines(calibration: Calibration) -> list[str]:
     lines = format_weaknesses(
         find_weaknesses(compute_mesh_lengths(known, region), known.parameters.keys, known.covariance)
     )
-    return [*lines, *(f"next: {outlook.advice()}" for outlook in rank_next_shots(calibration)[:1])]
+    best = rank_next_shots(calibration)[:1]
+    return [*lines, *(f"next: {forecast.advice(WHOLE_VOLUME)}" for forecast in best)]
 
 
-def _generate_candidates(
+def _generate_shots(
     known: StoredEstimate, medium: str, depths: Mapping[str, float], uncertainty: Uncertainty
-) -> Iterator[tuple[str, _Shot | None, np.ndarray | None]]:
-    """Generate descriptions and simulated evidence of images, None if impossible, with the pose of a target."""
-    described = known.calibration.origin().target
-    if described is not None:
-        views = {medium: known.view}
-        # An image in air helps only beside others in air, whose series determines the camera.
-        in_air = [other.view for other in list_regions(known.calibration) if other.view.medium is None]
-        if known.view.medium is not None and in_air:
-            views["air"] = in_air[0]
-        for name, view in views.items():
-            yield from _generate_target_shots(replace(known, view=view), name, parse_target(described), depths)
+) -> Iterator[Shot]:
+    """Generate the possible images with the information that they add."""
+    simulated: list[tuple[str, _Simulated | None, np.ndarray | None]] = [*_simulate_targets(known, medium, depths)]
     for words, depth in depths.items():
         place = f"in {medium}, {words} (Z {depth:+.0f} mm),"
-        yield f"an image of a step {place}", _simulate_step(known, depth, uncertainty), None
-        yield f"a scan of two spheres of {SPHERE_MM:g} mm {place}", _simulate_spheres(known, depth, uncertainty), None
+        simulated.append((f"an image of a step {place}", _simulate_step(known, depth, uncertainty), None))
+        spheres = f"a scan of two spheres of {SPHERE_MM:g} mm {place}"
+        simulated.append((spheres, _simulate_spheres(known, depth, uncertainty), None))
+    for words, shot, pose in simulated:
+        if shot is not None and (added := _compute_information(shot, len(known.values), uncertainty)) is not None:
+            yield Shot(words=words, information=added, view=shot[0].view, pose=pose)
 
 
-def _generate_target_shots(
-    known: StoredEstimate, medium: str, target: Target, depths: Mapping[str, float]
-) -> Iterator[tuple[str, _Shot | None, np.ndarray | None]]:
-    through = " without the window" if known.calibration.window is not None and not known.view.window else ""
-    for where, depth in depths.items():
-        for tilt, turns in _TILTS.items():
-            pose = _pose(known.calibration, target, depth, turns)
-            words = f"an image of the target in {medium}{through}, {where} (Z {depth:+.0f} mm), {tilt}"
-            words += "," if tilt == "square" else f" by {_TILT_DEG:g}°,"
-            yield words, _simulate_target(known, target, pose), pose
+def _simulate_targets(
+    known: StoredEstimate, medium: str, depths: Mapping[str, float]
+) -> Iterator[tuple[str, _Simulated | None, np.ndarray]]:
+    """Generate descriptions, simulated images (None if impossible) and poses of the target."""
+    described = known.calibration.origin().target
+    if described is None:
+        return
+    target, views = parse_target(described), {medium: known.view}
+    # An image in air helps only beside others in air, whose series determines the camera.
+    in_air = [other.view for other in list_regions(known.calibration) if other.view.medium is None]
+    if known.view.medium is not None and in_air:
+        views["air"] = in_air[0]
+    for name, view in views.items():
+        through = " without the window" if known.calibration.window is not None and not view.window else ""
+        for where, depth in depths.items():
+            for tilt, turns in _TILTS.items():
+                pose = _pose(known.calibration, target, depth, turns)
+                words = f"an image of the target in {name}{through}, {where} (Z {depth:+.0f} mm), {tilt}"
+                words += "," if tilt == "square" else f" by {_TILT_DEG:g}°,"
+                yield words, _simulate_target(replace(known, view=view), target, pose), pose
 
 
 def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tuple[float, float]) -> np.ndarray:
@@ -165,7 +150,7 @@ def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tupl
     return rigid_transform(turn, frame[:3, 3] + depth_mm * frame[:3, 2] - turn @ middle)
 
 
-def _simulate_target(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Shot | None:
+def _simulate_target(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Simulated | None:
     """Simulate an image of the target with the stripe at ``T_camera_target`` (4, 4); None if too little is in view."""
     points = target.points_mm
     pixels = _mask_outside(known, known.project(points @ pose[:3, :3].T + pose[:3, 3]))
@@ -186,7 +171,7 @@ def _simulate_target(known: StoredEstimate, target: Target, pose: np.ndarray) ->
     return known, evidence, pose_values(pose)
 
 
-def _simulate_step(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
+def _simulate_step(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Simulated | None:
     """Simulate an image of a step standard with the lower face at a depth Z; None if too little is in view.
 
     The standard of the evidence is used if it contains one.
@@ -216,7 +201,7 @@ def _simulate_step(known: StoredEstimate, depth_mm: float, uncertainty: Uncertai
     return known, evidence, np.array([0.0, -frame[:3, 2] @ (frame[:3, 3] + frame[:3, 2] * depth_mm)])
 
 
-def _simulate_spheres(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
+def _simulate_spheres(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Simulated | None:
     """Simulate a scan along X of two spheres of unknown size at a depth Z; None if they are not in view."""
     stage: dict[ParameterKey, Prior] = {key: Prior(0.0, uncertainty.stage_lean()) for key in SLOPES}
     known = _append_parameters(known, stage | {StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale)})
@@ -252,12 +237,8 @@ def _simulate_spheres(known: StoredEstimate, depth_mm: float, uncertainty: Uncer
 def _append_parameters(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> StoredEstimate:
     """Append those of these parameters to an estimate that it does not contain and that are not known exactly."""
     added = {key: prior for key, prior in priors.items() if key not in known.parameters.keys and prior.std > 0}
-    return replace(
-        known,
-        parameters=replace(known.parameters, priors=known.parameters.priors | added),
-        values=np.append(known.values, [prior.mean for prior in added.values()]),
-        covariance=append_independent(known.covariance, [prior.std for prior in added.values()]),
-    )
+    parameters = replace(known.parameters, priors=known.parameters.priors | added)
+    return replace(known, parameters=parameters, values=np.append(known.values, [p.mean for p in added.values()]))
 
 
 def _simulate_stripe(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
@@ -301,35 +282,29 @@ def _mask_outside(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
     return np.where(inside[:, None], pixels, np.nan)
 
 
-def _compute_information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
-    """Return the information (P, P) that an image adds to the inverse covariance; None if a ray meets nothing.
+def _compute_information(shot: _Simulated, known: int, uncertainty: Uncertainty) -> np.ndarray | None:
+    """Return the information on the first ``known`` parameters that an image adds; None if a ray meets nothing.
 
     The noise is that of the same kind of residual, or of the noisiest stripe for a new kind.
     """
-    known, evidence, local_values = shot
-    parts = evidence.residuals(known.parameters, known.values, local_values)
+    estimate, evidence, local_values = shot
+    parts = evidence.residuals(estimate.parameters, estimate.values, local_values)
     if parts is None:
         return None
-    joint = require_joint(known.calibration)
+    joint = require_joint(estimate.calibration)
     noise = {name: Noise(sigma, joint.shared_variance[name]) for name, sigma in joint.scatter_px.items()}
     stripe = max((each for name, each in noise.items() if name != TARGET), key=Noise.effective_px)
     noise = {part.kind: noise.get(part.kind, stripe) for part in parts}
     if isinstance(evidence, SurfaceScanEvidence):
         kind, surface = evidence.surface.kind, evidence.surface
         noise[kind] = add_common_error(noise[kind], evidence.common_px, bodies=surface.count)
-    count, local = len(known.values), len(local_values)
-    total = np.zeros((count + local,) * 2)
+    count = len(estimate.values)
     before = evidence.known_before(local_values, uncertainty).by_local
+    total = np.zeros((count + len(local_values),) * 2)
+    total[known:count, known:count] = np.diag(estimate.parameters.prior_std()[known:] ** -2.0)
     total[count:, count:] = (before.T @ before).toarray()
     for part in parts:
         rows = np.hstack([part.by_global, part.by_local])
         at = np.r_[0:count, count + part.local_columns]
         total[np.ix_(at, at)] += noise[part.kind].effective_px() ** -2 * np.einsum("ni,nj->ij", rows, rows)
-    border, block = total[:count, count:], total[count:, count:]
-    scale = 1.0 / np.sqrt(np.diag(block))
-    border, block = border * scale, block * np.outer(scale, scale)
-    return total[:count, :count] - border @ np.linalg.solve(block, border.T)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    return eliminate_others(total, known)

@@ -6,13 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwlts.calibration.joint.parameters import ViewMedium
-from uwlts.calibration.joint.stored_estimate import (
-    StoredEstimate,
-    covariance_root,
-    read_original_estimate,
-    require_joint,
-)
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_original_estimate, require_joint
 from uwlts.errors import CalibrationError
+from uwlts.fitting.next_observation import CovarianceRoot
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
 from uwlts.model.sensor import Medium
@@ -193,12 +189,10 @@ def find_weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: 
 
     ``lengths`` are those over the volume; ``covariance`` is (P, P).
     """
-    std, root = np.sqrt(np.diag(covariance)), covariance_root(covariance)
-    _, sizes, parts = np.linalg.svd(lengths.by_parameters @ root, full_matrices=False)
-    total = float(np.sum(sizes**2))
-    found = []
-    for size, part in zip(sizes[:_MOST], parts, strict=False):
-        direction = root @ part
+    std, found = np.sqrt(np.diag(covariance)), []
+    directions = [*CovarianceRoot.from_covariance(covariance).weak_directions(lengths.by_parameters)]
+    total = sum(size**2 for size, _ in directions)
+    for size, direction in directions[:_MOST]:
         changes = lengths.by_parameters @ direction
         worst = int(np.argmax(np.abs(changes)))
         if size**2 < _LEAST_SHARE * total or abs(changes[worst]) < _NEGLIGIBLE_MM:

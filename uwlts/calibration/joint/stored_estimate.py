@@ -190,17 +190,6 @@ def append_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarr
     return np.pad(covariance, (0, len(std))) + np.diag([*[0.0] * len(covariance), *np.square(std)])
 
 
-def covariance_root(covariance: np.ndarray) -> np.ndarray:
-    """Return the symmetric root (P, P) of a covariance, computed from its correlations.
-
-    It does not depend on the platform, so its columns (independent parts of the parameters) can be compared.
-    """
-    scale = np.sqrt(np.diag(covariance))
-    scale = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return scale[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
-
-
 def require_joint(calibration: Calibration) -> JointEstimate:
     """Return the joint estimate of a calibration; raises CalibrationError if it contains none."""
     if calibration.joint is None:

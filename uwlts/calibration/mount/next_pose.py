@@ -1,7 +1,7 @@
 """Weakly determined directions of a mount, missing motions, and the best pose to add."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -11,6 +11,7 @@ from uwlts.calibration.mount.artefact_shapes import SphereShape
 from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, point_by_mount, to_sheet
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate
 from uwlts.errors import CalibrationError
+from uwlts.fitting.next_observation import Candidate, CovarianceRoot, rank_candidates
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.mount import NextPose
 
@@ -31,6 +32,13 @@ _UNKNOWN_MM = 100.0
 _UNKNOWN_RAD = 0.5  # the same for its rotation
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _CandidatePose(Candidate):
+    """Candidate with ``T_base_platform`` (4, 4)."""
+
+    pose: np.ndarray
+
+
 def next_pose(
     problem: Problem, state: MountState, scatter: Scatter, sheet: np.ndarray, names: list[str]
 ) -> NextPose | None:
@@ -42,21 +50,31 @@ def next_pose(
     """
     if problem.table:
         return None
+    prior = np.zeros(problem.size)
+    prior[:3], prior[3:6] = _UNKNOWN_MM**-2.0, _UNKNOWN_RAD**-2.0
+    information = RestrictedEstimate(problem, state, np.array(scatter)).information.sum(axis=0)
+    to_point = np.zeros((3, problem.size))
+    to_point[:, :6] = point_by_mount(state.rotation @ np.vstack(problem.points).mean(axis=0))
+    known = CovarianceRoot.from_information(information + np.diag(prior))
+    ranked = rank_candidates(known, to_point, _generate_candidates(problem, state, scatter, sheet, names))
+    if not ranked:
+        return None
+    best, pose = ranked[0], ranked[0].candidate.pose.tolist()
+    return NextPose(
+        words=best.candidate.words,
+        T_base_platform=tuple(tuple(row) for row in pose),
+        before_mm=best.before,
+        after_mm=best.after,
+    )
+
+
+def _generate_candidates(
+    problem: Problem, state: MountState, scatter: Scatter, sheet: np.ndarray, names: list[str]
+) -> Iterator[_CandidatePose]:
+    """Generate rotations of the pose nearest to the middle of all, in both directions, for every candidate view."""
     rotations, positions = problem.motion(state.offset_s)
     every = Rotation.from_matrix(rotations)
     nearest = int(np.argmin((every.mean().inv() * every).magnitude()))
-    middle = np.vstack(problem.points).mean(axis=0)
-    prior = np.zeros(problem.size)
-    prior[:3], prior[3:6] = _UNKNOWN_MM**-2.0, _UNKNOWN_RAD**-2.0
-    known = RestrictedEstimate(problem, state, np.array(scatter)).information.sum(axis=0) + np.diag(prior)
-    to_point = point_by_mount(state.rotation @ middle)
-
-    def point_std(information: np.ndarray) -> float:
-        size = 1 / np.sqrt(np.diag(information))
-        covariance = size[:, None] * np.linalg.pinv(size[:, None] * information * size, hermitian=True) * size
-        return float(np.sqrt(np.trace(to_point @ covariance[:6, :6] @ to_point.T) / 3))
-
-    best: tuple[float, str, np.ndarray] | None = None
     for axis, side in product(range(3), (1, -1)):
         turned = rotations[nearest] @ Rotation.from_rotvec(side * _TURN_RAD * np.eye(3)[axis]).as_matrix()
         for points, seen, where in _views(problem, state, sheet):
@@ -71,25 +89,12 @@ def next_pose(
                 points = _on_plane(points, seen, turned @ state.rotation, normal, sheet)
             if points is None:
                 continue
-            added = RestrictedEstimate(
-                _one_pose(problem, points, turned, position), state, np.array(scatter)
-            ).information[0]
-            after = point_std(known + added)
-            if best is None or after < best[0]:
-                words = (
-                    f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from "
-                    f"pose {names[nearest]}, with the {problem.shape.kind} {where}"
-                )
-                best = after, words, rigid_transform(turned, position)
-    if best is None:
-        return None
-    after, words, pose = best
-    return NextPose(
-        words=words,
-        T_base_platform=tuple(tuple(row) for row in pose.tolist()),
-        before_mm=point_std(known),
-        after_mm=after,
-    )
+            added = RestrictedEstimate(_one_pose(problem, points, turned, position), state, np.array(scatter))
+            words = (
+                f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from pose "
+                f"{names[nearest]}, with the {problem.shape.kind} {where}"
+            )
+            yield _CandidatePose(words=words, information=added.information[0], pose=rigid_transform(turned, position))
 
 
 def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> Problem:

@@ -341,11 +341,12 @@ class TargetPhase:
         """Show the image and the next request to the operator."""
         pose = None if found.usable is None else estimate_pose(found.usable, state.camera)
         sheet = describe_missing_sheet(state)
-        request = "move the target" if advice is None else format_pose_advice(advice, state, pose)
+        request = "move the target" if advice is None else format_pose_advice(advice.candidate.pose, state, pose)
         if sheet and not describe_missing(state):
             request = f"move the target so that the laser line lies on it, nearer and farther: {sheet[0]}"
         self._screen.request(request if reasons else "hold it still")
-        self._operator.hint(f"next: {request if advice is None or sheet else format_pose_advice(advice, state, None)}")
+        hint = request if advice is None or sheet else format_pose_advice(advice.candidate.pose, state, None)
+        self._operator.hint(f"next: {hint}")
         points = None if found.view is None else found.view.pixels
         self._session.show(found.image, "; ".join(reasons) or "good", points=points)
 

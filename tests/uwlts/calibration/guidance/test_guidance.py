@@ -218,7 +218,7 @@ def led(setting: Setting, wanted: CompletionLimits, rng: np.random.Generator, *,
     while describe_missing(state) and len(poses) < most:
         wish = best_pose(state)
         # The advised pose itself needs no further instruction.
-        assert format_pose_advice(wish, state, wish.candidate.pose) == "hold it still, just like this"
+        assert format_pose_advice(wish.candidate.pose, state, wish.candidate.pose) == "hold it still, just like this"
         pose = wish.candidate.pose.copy()
         pose[:3, :3] = cv2.Rodrigues(rng.normal(0, 0.05, 3))[0] @ pose[:3, :3]
         pose[:3, 3] += rng.normal(0, 5.0, 3)
@@ -262,7 +262,7 @@ def test_advised_poses_beat_as_many_random_ones(setting):
     wanted = CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6)
     count = 6
     wished = led(setting, wanted, np.random.default_rng(3), most=count)
-    options = candidates(setting, nominal_camera(setting))
+    options = candidates(solve_state([], setting))
     assert len(options) > 20
     stds = []
     for draw in range(12):
@@ -295,7 +295,7 @@ def test_an_image_seen_again_gains_little(setting):
 
 def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
     state = led(setting, CompletionLimits(), np.random.default_rng(3), most=1)
-    count = len(candidates(setting, state.camera))
+    count = len(candidates(state))
     first, second, last, again = (best_pose(state, skipped=skipped) for skipped in (0, 1, count - 1, count))
     assert first.gain >= second.gain >= last.gain and first.gain > last.gain
     assert len({wish.candidate.pose.tobytes() for wish in (first, second, last)}) == 3
@@ -304,19 +304,16 @@ def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
 
 
 def test_pose_advice_is_in_plain_words(setting):
-    state = solve_state(
-        recorded(setting, [target_pose(middle_mm=(-60, -40, 330.0))], np.random.default_rng(0)), setting
-    )
-    wish = best_pose(state)
-    far = replace(wish, distance_mm=450.0, place=(0.8, 0.8))
-    far.candidate.pose[:3, :3] = target_pose(tilt_deg=(25, 0))[:3, :3]
-    words = format_pose_advice(far, state, target_pose(middle_mm=(-60, -40, 330.0)))
+    near = target_pose(middle_mm=(-60, -40, 330.0))
+    state = solve_state(recorded(setting, [near], np.random.default_rng(0)), setting)
+    far = target_pose(tilt_deg=(25, 0), middle_mm=(60.0, 50.0, 450.0))
+    words = format_pose_advice(far, state, near)
     assert "right side is farther, 25 deg (now it is tilted by 0 deg)" in words
     assert "bring its middle to the lower right of the image" in words
     assert "farther, to about 450 mm from the camera (now 330 mm)" in words
     for tilt, side in (((-25, 0), "left side"), ((0, 25), "lower side"), ((18, -18), "upper right corner")):
-        far.candidate.pose[:3, :3] = target_pose(tilt_deg=tilt)[:3, :3]
-        assert f"tilt the target so that its {side} is farther" in format_pose_advice(far, state, None)
+        tilted = target_pose(tilt_deg=tilt, middle_mm=(60.0, 50.0, 450.0))
+        assert f"tilt the target so that its {side} is farther" in format_pose_advice(tilted, state, None)
 
 
 def test_what_is_missing_is_said(setting):

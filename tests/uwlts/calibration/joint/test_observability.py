@@ -158,7 +158,9 @@ def test_steps_alone_leave_the_window_open(thesis, height_mm, pair):
     before = np.mean(over.std_mm(known.covariance) ** 2)
     for key in pair:
         assert np.mean(over.std_mm(without(known, key)) ** 2) < 0.65 * before
-    assert any("target in air without the window" in outlook.words for outlook in rank_next_shots(calibration))
+    assert any(
+        "target in air without the window" in forecast.candidate.words for forecast in rank_next_shots(calibration)
+    )
 
 
 def test_the_cost_is_part_of_the_lengths_uncertainty(from_water):
@@ -175,7 +177,7 @@ def test_shots_are_where_their_words_say(from_water):
     """Depths along the laser's axis, in the order of their words; the edge said to be nearer is so, by 20 deg."""
     frame, corner = from_water.object_transform(), np.abs(TARGET.extent_mm).max()
     square, tilted, depths = {}, [], {}
-    for shot in rank_next_shots(from_water):
+    for shot in (forecast.candidate for forecast in rank_next_shots(from_water)):
         if shot.pose is not None:
             words = shot.words.split(", ")
             where, depth = words[1].split(" (Z ")
@@ -238,18 +240,18 @@ def shot(sensor, pose, view, spoilt):
 @pytest.mark.slow
 def test_the_advised_shot_does_what_was_predicted(from_water, in_water, thesis):
     """The prediction is within 20 %, because the noise and the weights are estimated again from all residuals."""
-    outlooks = rank_next_shots(from_water)
-    best = outlooks[0]
-    assert best.pose is not None
-    assert best.after_mm < 0.9 * best.before_mm
-    added = shot(BUILT, best.pose, best.view, noise(9))
+    forecasts = rank_next_shots(from_water)
+    best = forecasts[0]
+    assert best.candidate.pose is not None
+    assert best.after < 0.9 * best.before
+    added = shot(BUILT, best.candidate.pose, best.candidate.view, noise(9))
     result = solve_jointly(gathered(thesis, [in_water, added]), options=OPTIONS)
     known, over, _ = of_calibration(from_water)
     reached = np.sqrt(np.mean(over.std_mm(result.estimate.covariance) ** 2))
     assert known.parameters.keys == result.estimate.parameters.keys
-    assert reached == pytest.approx(best.after_mm, rel=0.2)
-    assert [o.after_mm for o in outlooks] == sorted(o.after_mm for o in outlooks)
-    every = " ".join(o.words for o in outlooks)
+    assert reached == pytest.approx(best.after, rel=0.2)
+    assert [each.after for each in forecasts] == sorted(each.after for each in forecasts)
+    every = " ".join(each.candidate.words for each in forecasts)
     assert all(kind in every for kind in ("target in water", "step in water", "spheres of 30 mm in water"))
     assert "in air" not in every
 

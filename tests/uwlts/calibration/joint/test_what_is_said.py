@@ -1,7 +1,6 @@
 """Texts for synthetic estimates: conditions of warnings and contradictions, their figures and advice."""
 
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +18,6 @@ from uwlts.calibration.joint.consistency import (
 )
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Noise
 from uwlts.calibration.joint.initial import estimate_series_start
-from uwlts.calibration.joint.next_shot import ShotForecast
 from uwlts.calibration.joint.parameters import DescribedSheet, EarlierEstimate, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.refresh import LengthChange, WaterChange
 from uwlts.calibration.joint.residuals import STRIPE, TARGET, Residuals
@@ -254,11 +252,3 @@ def test_a_refresh_tells_expanded_uncertainties_before_and_after(longer_mm, word
         f"value is 0.0123 mm {word}"
     )
     assert len(WaterChange("water 2", 1.33, 1e-4, 1.33, 1e-4, None).lines()) == 1
-
-
-def test_a_shot_is_advised_where_it_lowers_the_uncertainty_by_a_twentieth():
-    shot = ShotForecast("a shot", 0.1, 0.0949, np.eye(1), VIEW)
-    assert shot.advice() == (
-        "a shot would reduce the standard uncertainty of lengths over the volume from 0.1000 to 0.0949 mm"
-    )
-    assert replace(shot, after_mm=0.0951).advice().startswith("no single further image would reduce")

@@ -15,12 +15,12 @@ from tests.uwlts.drawn_stripes import SENSOR, step_image, write
 from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.mount_views import errors_of
 from tests.uwlts.sensor_profiles import RADIUS_MM, captured_by, half_way, joint_estimate, largest_parts
-from uwlts.calibration.joint.stored_estimate import covariance_root
 from uwlts.calibration.mount.captured_profiles import reconstruct_profiles
 from uwlts.calibration.mount.hand_eye import BoardEvidence
 from uwlts.calibration.mount.restricted_likelihood import RestrictedEstimate, solve_step
 from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import DescriptionError
+from uwlts.fitting.next_observation import CovarianceRoot
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
@@ -119,7 +119,7 @@ def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
         return on_platform @ pose[:3, :3].T + pose[:3, 3]
 
     moved = []
-    for part in covariance_root(known.covariance).T:
+    for part in CovarianceRoot.from_covariance(known.covariance).root.T:
         ends = (points(known.values + sign * part, sign * by @ part[: by.shape[1]]) for sign in (1, -1))
         moved.append(np.subtract(*ends) / 2)
     expected = np.sqrt(np.sum(np.square(moved), axis=0))
@@ -143,7 +143,7 @@ def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
         return on_platform @ pose[:3, :3].T
 
     here, moved = known.calibration.object_transform(), []
-    for part in covariance_root(known.covariance).T:
+    for part in CovarianceRoot.from_covariance(known.covariance).root.T:
         moved.append(np.subtract(*(points_from_true_frame(known.values + sign * part) for sign in (1, -1))) / 2)
     described = point_uncertainty(table, known.calibration, frame, line, noisy).patterns_mm.astype(float)
     expected = np.sqrt(np.sum(np.square(moved), axis=0))
