@@ -21,7 +21,7 @@ from cyclopts import App
 import twin
 from docs.studies.result_tables import publish, table
 from twin.design.sensor_arrays import adjust_to_standoff, extract_parameters
-from twin.recording.predict import PredictedUncertainty
+from twin.experiments.result import ExperimentResult
 from twin.scene.description import load_scene
 from uwlts.errors import Error
 from uwlts.model.library import load_sensor, merge_tables, validate_description
@@ -176,13 +176,13 @@ def figure_of(name: str, scan: str) -> str:
     return next(words for start, words in kinds.items() if name.startswith(start))
 
 
-def compare_errors(sensors: list[list[PredictedUncertainty]]) -> dict[str, np.ndarray]:
+def compare_errors(sensors: list[list[ExperimentResult]]) -> dict[str, np.ndarray]:
     """Return errors and the other campaign's uncertainties (K, 2) in mm by kind of figure; k = 2."""
     pairs: dict[str, list[tuple[float, float]]] = {}
     for predictions in sensors:
         for own, other in (predictions, predictions[::-1]):
-            stated = {(each.scan, each.name): each.predicted_mm for each in own.figures}
-            for each in other.figures:
+            stated = {(each.scan, each.name): each.stated_mm for each in own.table.errors()}
+            for each in other.table.errors():
                 if (u := stated.get((each.scan, each.name))) is not None and "known" not in each.name:
                     pairs.setdefault(figure_of(each.name, each.scan), []).extend((e, u) for e in each.errors_mm)
     return {kind: np.array(some) for kind, some in pairs.items()}
@@ -200,7 +200,7 @@ def error_rows(pairs: dict[str, np.ndarray]) -> list[list[str]]:
     return rows
 
 
-def detection_rows(sensors: list[list[PredictedUncertainty]]) -> list[list[str]]:
+def detection_rows(sensors: list[list[ExperimentResult]]) -> list[list[str]]:
     """Return the rows of the table of pits: predicted and found a90 of each sensor."""
     rows, ratios, scaled = [], [], []
     for number, predictions in enumerate(sensors, start=1):
@@ -233,7 +233,7 @@ def main(folder: Path, *, sensors: int = 30, first_seed: int = 8000, pit_scans: 
         found.append(json.loads(path.read_text(encoding="utf-8")))
         print(seed, found[-1].get("failure", "done"), flush=True)
     done = [
-        [PredictedUncertainty.model_validate(each) for each in sensor["predictions"]]
+        [ExperimentResult.model_validate(each) for each in sensor["predictions"]]
         for sensor in found
         if "failure" not in sensor
     ]

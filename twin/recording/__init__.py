@@ -1,1 +1,1 @@
-"""Recording of captures with ground truth, campaigns, and the demonstration."""
+"""Recording of captures with ground truth, and of campaigns."""

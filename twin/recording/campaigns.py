@@ -3,19 +3,19 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 
 from pydantic import JsonValue
 
 from twin.rendering_options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign
-from uwlts.errors import CaptureError, DescriptionError, Error, OutputError
+from uwlts.errors import CaptureError, DescriptionError, Error, OutputError, SetupError
 from uwlts.files.inputs import record_made, refuse_input
 from uwlts.files.json_files import describe_other_plan, read_json
 from uwlts.files.writing import lock_output, write_atomically
 from uwlts.runtime.progress import ProgressListener, ignore_progress
-from uwlts.runtime.workers import run_jobs
+from uwlts.runtime.workers import open_workers, run_jobs
 from uwlts.storage.capture import part_path
 from uwlts.storage.truth import truth_path
 
@@ -107,11 +107,12 @@ def record_campaigns(
     campaign: Campaign,
     folder: Path,
     *,
-    seeds: range,
+    seeds: Sequence[int],
     every: int = 1,
     spp: int = 16,
     variant: str = CPU,
     workers: int | None = None,
+    scheduler: str | None = None,
     overwrite: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> list[Path]:
@@ -119,7 +120,8 @@ def record_campaigns(
 
     Each seed draws its own sensor and noise. ``every`` takes only every n-th profile of the scans; calibrations keep
     all images. Complete recordings are kept and interrupted ones resumed, unless ``overwrite`` removes those of these
-    seeds. ``progress(done, total)`` counts images.
+    seeds. ``progress(done, total)`` counts images. With ``scheduler``, the address of a Dask scheduler, its workers
+    render, and progress is that of whole recordings.
 
     Raises DescriptionError if the folder contains a campaign with other settings or a description is wrong; DesignError
     if the sensor cannot measure a scene; OutputError if a file cannot be written; SetupError if a rendering process was
@@ -132,9 +134,8 @@ def record_campaigns(
         for job in _jobs(campaign, place, seed=seed, every=every, spp=spp, variant=variant, flaws=Flaws())
     ]
     plan = _plan(campaign, every=every, spp=spp, variant=variant)
-    _record_all(
-        jobs, folder, plan, recorded="campaign-*/*.h5*", workers=workers, overwrite=overwrite, progress=progress
-    )
+    run = {"workers": workers, "scheduler": scheduler, "overwrite": overwrite, "progress": progress}
+    _record_all(jobs, folder, plan, recorded="campaign-*/*.h5*", **run)
     return folders
 
 
@@ -160,6 +161,7 @@ def _record_all(
     workers: int | None,
     overwrite: bool,
     progress: ProgressListener,
+    scheduler: str | None = None,
 ) -> None:
     """Render incomplete recordings into a folder that follows a plan; ``recorded`` is the pattern of its captures."""
     make_folder(folder)
@@ -179,7 +181,15 @@ def _record_all(
         total = sum(job.images for job in jobs)
         counted = count(total - sum(job.images for job in waiting))
         progress(next(counted), total)
-        run_jobs(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
+        if scheduler is None:
+            run_jobs(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
+            return
+        with open_workers(scheduler=scheduler) as cluster:
+            for job, lost in cluster.map_unordered(_record, waiting):
+                if lost is not None:
+                    raise SetupError(f"{job.path}: {lost.reason}")
+                for done in islice(counted, job.images):
+                    progress(done, total)
 
 
 def make_folder(folder: Path) -> Path:
@@ -231,7 +241,7 @@ def keep_to_plan(
         aside.write_text(text, encoding="utf-8")
 
 
-def _record(job: _Job, report: Callable[[None], None]) -> None:
+def _record(job: _Job, report: Callable[[None], None] = lambda _: None) -> None:
     """Render a recording; call ``report`` after every image."""
     use_variant(job.variant)
     import drjit as dr

@@ -2,7 +2,7 @@
 
 import pytest
 
-from twin.recording.demonstration import demo
+from twin.experiments.demonstration import demo
 from uwlts.errors import CommandFailed
 
 

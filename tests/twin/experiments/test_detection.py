@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import scene_of
-from twin.recording.detection import (
+from twin.experiments.detection import (
     FlawFindings,
     ProbabilityOfDetection,
     collect_findings,

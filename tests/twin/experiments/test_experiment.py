@@ -1,7 +1,9 @@
-"""Predicted uncertainties: figures and errors, refused campaigns, and a prediction by rendering."""
+"""Experiments: table of figures, refused campaigns, and a prediction by rendering."""
 
 import json
 import math
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +11,28 @@ import pytest
 from markupsafe import escape
 
 import twin
-from twin.recording.detection import ProbabilityOfDetection
-from twin.recording.predict import PredictedFigure, PredictedUncertainty
-from uwlts.errors import CommandFailed, DescriptionError, DescriptionWarning
+from twin.experiments.detection import ProbabilityOfDetection
+from twin.experiments.result import ExperimentResult
+from twin.experiments.runner import CommandLine, run_stages
+from uwlts.errors import CommandFailed, DescriptionError, DescriptionWarning, SetupError
+from uwlts.model.library import load_sensor
+from uwlts.storage.figure_table import FigureTable, MeasuredFigure
 
-FIGURE = PredictedFigure(
-    scan="spheres", name="SSE", checked="two spheres", expanded_mm=(0.03, 0.04), errors_mm=(-0.035, 0.005)
+
+def row(campaign: str, figure: str, measured_mm: float, true_mm: float | None, expanded_mm: float | None):
+    values = {"measured_mm": measured_mm, "true_mm": true_mm, "expanded_mm": expanded_mm}
+    return MeasuredFigure(campaign=campaign, scan="spheres", method="joint", figure=figure, **values)
+
+
+TABLE = FigureTable(
+    rows=(
+        row("0", "SSE", 100.0 - 0.035, 100.0, 0.03),
+        row("0", "STD", 0.02, None, None),
+        row("1", "SSE", 100.0 + 0.005, 100.0, 0.04),
+    )
+)
+RESULT = ExperimentResult(
+    campaign="c", sensor="s", as_built="b", seeds=(0, 1), table=TABLE, conditions={"spheres": "two spheres"}
 )
 CAMPAIGN = """
 title = "small"
@@ -39,14 +57,35 @@ placements = ["standoff"]
 """
 
 
-def test_figures_compare_uncertainty_and_errors():
-    assert FIGURE.predicted_mm == pytest.approx(math.sqrt((0.03**2 + 0.04**2) / 2))
-    assert FIGURE.found_mm == pytest.approx(2 * math.sqrt((0.035**2 + 0.005**2) / 2))
-    assert FIGURE.covered == 1
-    result = PredictedUncertainty(campaign="c", sensor="s", as_built="b", seeds=(0, 1), figures=(FIGURE, FIGURE))
-    assert result.covered_share() == 0.5
-    assert any(line.split() == ["spheres", "SSE", "0.0354", "0.0500", "1", "of", "2"] for line in result.lines())
-    assert result.lines()[-1] == "  spheres: two spheres"
+def test_errors_are_compared_with_their_uncertainties():
+    (found,) = TABLE.errors()
+    assert (found.scan, found.method, found.name) == ("spheres", "joint", "SSE")
+    assert found.errors_mm == pytest.approx((-0.035, 0.005), abs=1e-12)
+    assert found.stated_mm == pytest.approx(math.sqrt((0.03**2 + 0.04**2) / 2))
+    assert found.found_mm == pytest.approx(2 * math.sqrt((0.035**2 + 0.005**2) / 2))
+    assert found.covered == 1
+    assert TABLE.covered_share() == 0.5
+    assert RESULT.lines()[2].split() == ["spheres", "SSE", "0.0354", "0.0500", "1", "of", "2"]
+    assert RESULT.lines()[-1] == "  spheres: two spheres"
+
+
+def test_without_errors_there_is_no_verdict():
+    nothing = TABLE.select(figure="STD")
+    assert len(nothing.rows) == 1
+    assert RESULT.model_copy(update={"table": nothing}).verdict() == "no errors to judge"
+
+
+def test_the_table_becomes_a_data_frame():
+    frame = TABLE.to_frame()
+    assert list(frame.columns[:4]) == ["campaign", "scan", "method", "figure"]
+    assert frame["error_mm"].isna().tolist() == [False, True, False]
+    assert frame["measured_mm"].tolist()[1] == 0.02
+
+
+def test_a_missing_pandas_is_named_with_its_installation(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(SetupError, match=r"needs the library pandas.* -m pip install"):
+        TABLE.to_frame()
 
 
 def test_detections_have_their_own_table():
@@ -60,13 +99,67 @@ def test_detections_have_their_own_table():
         false_calls=1,
         a90_mm=0.18,
     )
-    result = PredictedUncertainty(
-        campaign="c", sensor="s", as_built="b", seeds=(0,), figures=(FIGURE,), detections=(pits,)
-    )
-    (row,) = (line for line in result.lines() if line.startswith("pit "))
+    lines = RESULT.model_copy(update={"detections": (pits,)}).lines()
+    (row,) = (line for line in lines if line.startswith("pit "))
     assert row.split(maxsplit=8)[:8] == ["pit", "hit/miss", "5", "1", "of", "2", "1", "0.180"]
     assert row.endswith("-  2 flaws, fewer than 60; a90 is not bounded")
-    assert result.validity() == ["spheres: two spheres", "pits: a pipe"]
+
+
+def test_commands_that_are_done_are_skipped(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """A line runs if its output is missing or older than an input."""
+    source, made = tmp_path / "a.toml", tmp_path / "nominal.json"
+    source.touch()
+    line = CommandLine("calibrate", f"uwlts nominal thesis --medium water --out {made} --overwrite", (source,), made)
+    assert not line.is_done()
+    counted: list[tuple[int, int]] = []
+    run_stages([line], progress=lambda done, total, stage="": counted.append((done, total)))
+    assert counted == [(0, 1), (1, 1)]
+    assert line.is_done()
+    before = made.stat().st_mtime_ns
+    run_stages([line], quiet=False)
+    assert made.stat().st_mtime_ns == before
+    assert capfd.readouterr().out == ""
+    os.utime(source, ns=(before + 1, before + 1))
+    assert not line.is_done()
+
+
+@pytest.mark.parametrize(
+    ("scenes", "seeds", "says"),
+    [
+        ([], [0], "scenes is empty"),
+        (["spheres"], [], "seeds is empty"),
+        (["spheres"], [-1], "seed is -1"),
+        (["nowhere"], [0], "nowhere"),
+        ([{"scene": "spheres", "place": "near"}], [0], "place"),
+        (["target"], [0], "has no scan"),
+    ],
+)
+def test_experiments_without_a_result_are_refused_before_rendering(scenes, seeds, says, tmp_path: Path):
+    with pytest.raises(DescriptionError, match=says):
+        twin.experiment("thesis-small", scenes, seeds, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_sensor_and_its_scenes_give_a_table(tmp_path: Path):
+    """Errors of a described sensor in an artefact and a free form, and a resumed run with one more seed."""
+    sensor = load_sensor("thesis-small")
+    scenes = [
+        {"scene": "spheres", "name": "spheres", "motion": {"start_mm": -18.0, "step_mm": 6.0, "count": 7}},
+        {"scene": "head", "name": "head", "motion": {"count": 3}},
+    ]
+    options = {"out": tmp_path / "out", "spp": 4, "imperfections": {}}
+    found = twin.experiment(sensor, scenes, [3], **options).table
+    assert {row.scan for row in found.rows} == {"spheres", "head"}
+    assert {row.campaign for row in found.rows} == {"campaign-3"}
+    # Three expanded uncertainties are exceeded once in 10^9 figures.
+    assert all(abs(e) < 3 * u for each in found.errors() for e, u in zip(each.errors_mm, each.expanded_mm, strict=True))
+    assert {each.name for each in found.select(scan="head").errors()} == {f"mean error {axis}" for axis in "XYZ"}
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "campaign-3").iterdir()}
+    again = twin.experiment(sensor, scenes, [3, 4], **options).table
+    assert again.select(campaign="campaign-3") == found
+    assert len(again.rows) == 2 * len(found.rows)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
 @pytest.mark.parametrize(
@@ -93,7 +186,6 @@ def write_results(folder: Path, name: str, *, error_mm: float, random_mm: float,
     parts = {"random_mm": random_mm, "systematic_mm": systematic_mm, "expanded_mm": expanded}
     evaluation = {
         "format": "uwlts-evaluation",
-        "artefact": {"kind": "spheres", "spacing_uncertainty_mm": 0.05},
         "evaluation": {"figures_mm": {"SSE": error_mm, "PE": 0.1}},
         "uncertainty": {"SSE": parts},
     }
@@ -103,7 +195,7 @@ def write_results(folder: Path, name: str, *, error_mm: float, random_mm: float,
     (folder / f"{name}.inspection.json").write_text(json.dumps(inspection), encoding="utf-8")
 
 
-def predict_without_rendering(campaign: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> PredictedUncertainty:
+def predict_without_rendering(campaign: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> ExperimentResult:
     """Predict from results that are written instead of rendered and measured ones, of two campaigns."""
 
     def written(*_: object, seeds: range, **__: object) -> list[Path]:
@@ -114,8 +206,8 @@ def predict_without_rendering(campaign: Path, out: Path, monkeypatch: pytest.Mon
                 write_results(folder, name, error_mm=0.1, random_mm=0.03, systematic_mm=systematic_mm)
         return folders
 
-    monkeypatch.setattr("twin.recording.predict.record_campaigns", written)
-    monkeypatch.setattr("twin.recording.predict.run_lines", lambda *_, **__: None)
+    monkeypatch.setattr("twin.experiments.experiment.record_campaigns", written)
+    monkeypatch.setattr("twin.experiments.experiment.run_stages", lambda *_, **__: None)
     return twin.predict(campaign=campaign, out=out, campaigns=2)
 
 
@@ -132,10 +224,11 @@ def test_predicted_uncertainties_contain_systematic_parts_and_certificates(
     described = tmp_path / "small.toml"
     described.write_text(CAMPAIGN + TARGET + SPHERES + PLANE, encoding="utf-8")
     result = predict_without_rendering(described, tmp_path / "out", monkeypatch)
-    spacing, flatness = result.figures
+    spacing, flatness = result.table.errors()
+    certificate = 0.01  # of the scene `spheres`
     assert (spacing.scan, spacing.name, flatness.scan, flatness.name) == ("spheres", "SSE", "plane", "flatness error")
     assert flatness.expanded_mm == pytest.approx([2 * math.hypot(0.03, part) for part in (0.12, 0.05)])
-    assert spacing.expanded_mm == pytest.approx([math.hypot(2 * 0.03, 2 * part, 0.05) for part in (0.12, 0.05)])
+    assert spacing.expanded_mm == pytest.approx([math.hypot(2 * 0.03, 2 * part, certificate) for part in (0.12, 0.05)])
     assert not result.understated
 
 
@@ -154,9 +247,9 @@ def test_deviations_beyond_the_stated_uncertainty_are_told_on_all_outputs(
     assert [line for line in result.lines() if line.startswith("understated: ")] == [
         f"understated: {text}" for text in sentences
     ]
-    page = (tmp_path / "out" / "prediction.html").read_text(encoding="utf-8")
+    page = (tmp_path / "out" / "experiment.html").read_text(encoding="utf-8")
     assert all(str(escape(text)) in page for text in sentences)
-    written = json.loads((tmp_path / "out" / "prediction.json").read_text(encoding="utf-8"))
+    written = json.loads((tmp_path / "out" / "experiment.json").read_text(encoding="utf-8"))
     assert [each["key"] for each in written["understated"]] == ["temperature_k", "drift_k"]
 
 
@@ -168,7 +261,7 @@ def test_a_failed_calibration_is_reported_with_its_reason(tmp_path: Path, capfd:
     with pytest.raises(CommandFailed):
         twin.predict(campaign=described, out=tmp_path / "out", campaigns=1, every=9, spp=2)
     assert "error: " in capfd.readouterr().out
-    assert not (tmp_path / "out" / "prediction.json").exists()
+    assert not (tmp_path / "out" / "experiment.json").exists()
 
 
 SMALL = """
@@ -230,19 +323,25 @@ def test_errors_of_a_rendered_campaign_are_within_the_prediction(tmp_path: Path)
     campaign.write_text(SMALL, encoding="utf-8")
     options = {"campaign": campaign, "out": out, "water": "clear", "campaigns": 1, "every": 4, "spp": 8}
     result = twin.predict(**options)
-    assert {each.scan for each in result.figures} >= {"spheres", "step-scan", "plane", "pipe-around", "undercuts"}
+    assert {each.scan for each in result.table.errors()} >= {
+        "spheres",
+        "step-scan",
+        "plane",
+        "pipe-around",
+        "undercuts",
+    }
     # Three expanded uncertainties are exceeded once in 10^9 figures; a flatness is biased by its own noise.
-    for each in result.figures:
+    for each in result.table.errors():
         assert np.all(np.abs(each.errors_mm) < 3 * np.array(each.expanded_mm)), each
-        assert 0.001 < each.predicted_mm < 1.0, each
-        assert "a = 0.32/m and b = 0.03/m" in each.checked, each
+        assert 0.001 < each.stated_mm < 1.0, each
+        assert "a = 0.32/m and b = 0.03/m" in result.conditions[each.scan], each
     assert {each.flaw for each in result.detections} == {"pit", "undercut"}
     assert any("25 profiles 2 mm apart" in each.checked for each in result.detections), "thinned by `every`"
-    written = json.loads((out / "prediction.json").read_text(encoding="utf-8"))
-    assert written["format"] == "twin-prediction"
-    assert len(written["figures"]) == len(result.figures)
+    written = json.loads((out / "experiment.json").read_text(encoding="utf-8"))
+    assert written["format"] == "twin-experiment"
+    assert len(written["table"]["rows"]) == len(result.table.rows)
     assert len(written["detections"]) == 2
-    page = (out / "prediction.html").read_text(encoding="utf-8")
+    page = (out / "experiment.html").read_text(encoding="utf-8")
     assert "spheres, SSE" in page and "Probability of detection" in page and "Where the statements were checked" in page
     # A second call renders nothing again.
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.truth.h5")}

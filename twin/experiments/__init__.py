@@ -1,0 +1,1 @@
+"""Experiments: rendered campaigns are calibrated, measured and compared with the truth."""

@@ -1,0 +1,297 @@
+"""Experiments with rendered campaigns: a sensor measures scenes, and its errors are compared with its uncertainties."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from twin.experiments.figures import describe_conditions, read_figures, read_flaws
+from twin.experiments.result import ExperimentResult
+from twin.experiments.runner import Method, evidence_of, inspected_as, is_evaluated, plan_lines, run_stages
+from twin.recording.campaigns import make_folder, record_campaigns, require_at_least
+from twin.rendering_options import CPU, Variant
+from twin.scene.campaign import Campaign, CampaignRecording, Take, list_takes, load_campaign
+from twin.scene.stated_deviations import find_understated
+from uwlts.errors import DescriptionError, DescriptionWarning
+from uwlts.files.writing import write_atomically
+from uwlts.model.library import validate_description
+from uwlts.model.sensor import Sensor
+from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.storage.figure_table import FigureTable
+
+JOINT = "joint"
+"""Method of an experiment: all recordings of targets and of the step standard are calibrated together."""
+
+
+def experiment(
+    sensor: str | Path | Sensor,
+    scenes: Sequence[str | Path | dict[str, Any]],
+    seeds: Sequence[int],
+    *,
+    as_built: str | Path | Sensor | None = None,
+    campaign: str | Path = "quick",
+    imperfections: dict[str, float] | None = None,
+    water: str | float | None = None,
+    out: str | Path | None = None,
+    every: int = 1,
+    spp: int = 16,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    variant: Variant = CPU,
+    progress: ProgressListener = ignore_progress,
+) -> ExperimentResult:
+    """Calibrate a sensor and measure scenes with it in rendered campaigns, and compare the results with the truth.
+
+    Each seed draws a campaign with its own imperfections and noise. The sensor's software calibrates it jointly,
+    reconstructs and evaluates the scans, and states uncertainties. An interrupted experiment is resumed, and seeds can
+    be added. OUT/experiment.html and experiment.json are written.
+
+    Parameters
+    ----------
+    sensor
+        Sensor as described: a description, or its name or path.
+    scenes
+        Scenes to scan: names (see: twin scenes), paths, or recordings of a campaign as dict, such as
+        ``{"scene": "spheres", "placements": ["near"]}``.
+    seeds
+        Seeds of the campaigns, such as ``range(10)``.
+    as_built
+        Sensor to render; default: as described.
+    campaign
+        Campaign with the recordings for the calibration and the imperfections; its other recordings are left out.
+    imperfections
+        Imperfections by name, instead of those of the campaign; ``{}`` for none.
+    water
+        As for `predict`.
+    out
+        Folder for campaigns and results (default: runs/experiment-SENSOR). Complete recordings in it are kept.
+    scheduler
+        Address of a Dask scheduler whose workers share the folder. Default: processes on this machine.
+    overwrite
+        Render everything again.
+    every, workers
+        As for `record`.
+    spp, variant
+        As for `simulate`.
+    progress
+        Called with the number of images rendered or commands done, the total number, and the name of the stage.
+
+    Returns
+    -------
+    ExperimentResult
+        The table of figures, one row for each figure of every scan of every campaign.
+
+    Raises
+    ------
+    DescriptionError
+        An argument is out of its range, or the campaign has no calibration.
+    DesignError, OutputError, SetupError
+        As `record_campaigns`, or the scheduler does not answer.
+    CommandFailed
+        The sensor's software failed; its output gives the reason.
+    CaptureError
+        A result cannot be read.
+
+    Warns
+    -----
+    DescriptionWarning
+        The campaign deviates by more than the sensor's table ``[uncertainty]`` states. The warning comes before
+        anything is rendered, and is repeated in the result.
+    """
+    if not seeds or not scenes:
+        missing = "seeds" if scenes else "scenes"
+        raise DescriptionError(f"{missing} is empty; an experiment needs at least one of them")
+    described = load_campaign(campaign)
+    folder = Path(
+        out or Path("runs") / f"experiment-{sensor.name if isinstance(sensor, Sensor) else Path(sensor).stem}"
+    )
+    evidence = [each for each in described.recordings if _is_evidence(described, each)]
+    scans = [each if isinstance(each, dict) else {"scene": str(each)} for each in scenes]
+    changes: dict[str, Any] = {
+        "sensor": _name_of(sensor, folder / "sensor.toml"),
+        "as_built": _name_of(sensor if as_built is None else as_built, folder / "as-built.toml"),
+        "recordings": [*(each.model_dump() for each in evidence), *scans],
+    }
+    changes |= {} if imperfections is None else {"imperfections": imperfections}
+    changes |= {} if water is None else {"water": water}
+    described = validate_description(Campaign, described.model_dump() | changes, str(campaign))
+    options = {"every": every, "spp": spp, "workers": workers, "scheduler": scheduler, "variant": variant}
+    return run_experiment(
+        described, folder, seeds, name=str(campaign), with_truth=True, overwrite=overwrite, progress=progress, **options
+    )
+
+
+def predict(
+    sensor: str | Path | None = None,
+    *,
+    campaign: str | Path = "prediction",
+    water: str | float | None = None,
+    out: str | Path | None = None,
+    campaigns: int = 3,
+    first: int = 0,
+    every: int = 1,
+    spp: int = 16,
+    workers: int | None = None,
+    overwrite: bool = False,
+    variant: Variant = CPU,
+    progress: ProgressListener = ignore_progress,
+) -> ExperimentResult:
+    """Predict the uncertainty of a sensor's measurements, and compare it with the errors in rendered campaigns.
+
+    Every campaign has its own imperfections and noise. The sensor's software calibrates jointly, measures and
+    states an uncertainty, which is compared with the errors. Pits, dents and undercuts of drawn depths give their
+    probability of detection (MIL-HDBK-1823A). An interrupted run is resumed, and campaigns are added if the number is
+    increased. OUT/experiment.html and experiment.json are written.
+
+    Parameters
+    ----------
+    sensor
+        Name or path of a sensor description, such as that of `uwlts radiometry`; default: the sensors of the campaign,
+        as described and as built.
+    campaign
+        Name (see: twin scenes) or path of the campaign's description: a calibration, and scans of artefacts, pitted
+        pipes or welds.
+    water
+        Optical properties of the water in all scenes: a name, or a turbidity from 0 (pure) to 3 (harbour). By default
+        those of the scenes, else of the sensor.
+    out
+        Folder for campaigns and results (default: runs/predict-SENSOR). Complete recordings in it are kept.
+    campaigns
+        Number of campaigns.
+    first
+        Seed of the first campaign; the others follow.
+    overwrite
+        Render everything again.
+    every, workers
+        As for `record`.
+    spp, variant
+        As for `simulate`.
+    progress
+        Called with the number of images rendered or commands done, the total number, and the name of the stage.
+
+    Returns
+    -------
+    ExperimentResult
+        The table of figures, and the probabilities of detection.
+
+    Raises
+    ------
+    DescriptionError
+        An argument is out of its range, or the campaign has no calibration or no scan with a known truth.
+    DesignError, OutputError, SetupError
+        As `record_campaigns`.
+    CommandFailed
+        The sensor's software failed; its output gives the reason.
+    CaptureError
+        A result cannot be read.
+
+    Warns
+    -----
+    DescriptionWarning
+        The campaign deviates by more than the sensor's table ``[uncertainty]`` states. The warning comes before
+        anything is rendered, and is repeated in the result.
+    """
+    require_at_least(1, campaigns=campaigns, every=every, workers=workers)
+    require_at_least(0, first=first)
+    described = load_campaign(campaign)
+    changes: dict[str, Any] = {} if water is None else {"water": water}
+    if sensor is not None:
+        changes |= {"sensor": str(sensor), "as_built": str(sensor)}
+    described = validate_description(Campaign, described.model_dump() | changes, str(campaign))
+    folder = Path(out or Path("runs") / f"predict-{Path(described.sensor).stem}")
+    seeds = range(first, first + campaigns)
+    options = {"every": every, "spp": spp, "workers": workers, "variant": variant, "overwrite": overwrite}
+    return run_experiment(described, folder, seeds, name=str(campaign), with_truth=False, progress=progress, **options)
+
+
+def run_experiment(
+    campaign: Campaign,
+    folder: Path,
+    seeds: Sequence[int],
+    *,
+    name: str,
+    with_truth: bool,
+    every: int,
+    scheduler: str | None = None,
+    progress: ProgressListener = ignore_progress,
+    **options: Any,
+) -> ExperimentResult:
+    """Record a campaign for each seed, calibrate it jointly, measure its scans, and write table and page.
+
+    ``with_truth`` compares all scans with the ground truth, so that scans of any scene count; otherwise those of an
+    artefact, a pitted pipe or a weld. ``options`` are those of `record_campaigns`. Raises as `experiment`.
+    """
+    require_at_least(1, every=every, workers=options["workers"])
+    require_at_least(0, seed=min(seeds))
+    method, scans = sort_recordings(campaign, every, all_scans=with_truth)
+    takes = [{take.name: take for take in list_takes(campaign, seed=seed, every=every)} for seed in seeds]
+    understated = find_understated(campaign, [*takes[0].values()])
+    for each in understated:
+        warnings.warn(each.text(), DescriptionWarning, stacklevel=3)
+    folders = record_campaigns(
+        campaign, folder, seeds=seeds, every=every, scheduler=scheduler, progress=progress, **options
+    )
+    lines = [
+        line
+        for place, of_seed in zip(folders, takes, strict=True)
+        for line in plan_lines(place, of_seed, [method], with_truth=with_truth)
+    ]
+    run_stages(lines, scheduler=scheduler, progress=progress)
+    by_folder = dict(zip(folders, takes, strict=True))
+    rows = [row for place, of_seed in by_folder.items() for row in read_figures(place, of_seed, [method])]
+    detections, depths = read_flaws(by_folder, method)
+    table = FigureTable(rows=(*rows, *depths))
+    conditions = {scan: describe_conditions(take) for scan, take in scans.items()}
+    judged = {row.scan for row in rows}
+    result = ExperimentResult(
+        campaign=name,
+        sensor=campaign.sensor,
+        as_built=campaign.as_built,
+        water=campaign.water,
+        seeds=tuple(seeds),
+        table=table,
+        conditions={scan: text for scan, text in conditions.items() if scan in judged}
+        | {f"{each.flaw}s": each.checked for each in detections},
+        detections=detections,
+        understated=understated,
+    )
+    result.write(folder)
+    return result
+
+
+def sort_recordings(campaign: Campaign, every: int, *, all_scans: bool) -> tuple[Method, dict[str, Take]]:
+    """Return the joint calibration of a campaign, and its scans by name.
+
+    Raises DescriptionError if there is no recording of a target, or no scan.
+    """
+    evidence: dict[str, list[str]] = {"air": [], "water": [], "step": []}
+    scans: dict[str, Take] = {}
+    for take in list_takes(campaign, seed=0, every=every):
+        if (option := evidence_of(take)) is not None:
+            evidence[option].append(take.name)
+        elif all_scans or is_evaluated(take.scene) or inspected_as(take.scene) is not None:
+            scans[take.name] = take
+    if not evidence["air"] and not evidence["water"]:
+        raise DescriptionError(f"campaign {campaign.title!r} has no recording of a target for the calibration")
+    if not scans:
+        raise DescriptionError(f"campaign {campaign.title!r} has no scan of an artefact, a pitted pipe or a weld")
+    return Method(JOINT, evidence, tuple(scans)), scans
+
+
+def _is_evidence(campaign: Campaign, recording: CampaignRecording) -> bool:
+    """Return whether a recording of a campaign is one for its calibration."""
+    alone = campaign.model_copy(update={"recordings": (recording,)})
+    return any(evidence_of(take) is not None for take in list_takes(alone, seed=0))
+
+
+def _name_of(sensor: str | Path | Sensor, path: Path) -> str:
+    """Return name or path of a sensor; a description is written to ``path``."""
+    if not isinstance(sensor, Sensor):
+        return str(sensor)
+    make_folder(path.parent)
+    with write_atomically(path, overwrite=True) as aside:
+        aside.write_text(tomli_w.dumps(sensor.model_dump(mode="json", exclude_none=True)), encoding="utf-8")
+    return str(path)

@@ -1,0 +1,151 @@
+"""Result of an experiment: its table of figures, probabilities of detection, and page."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+from pydantic import BaseModel
+
+from twin.experiments.detection import ProbabilityOfDetection
+from twin.scene.stated_deviations import Understated
+from uwlts._version import __version__
+from uwlts.files.json_files import write_model
+from uwlts.model.brief import Brief, align_columns
+from uwlts.pages.toolkit import BLUE, figure_svg, new_figure, render_page, write_page
+from uwlts.storage.figure_table import FigureTable, format_errors
+
+RESULT = "experiment.json"
+PAGE = "experiment.html"
+_DETECTION_HEAD = "flaw", "method", "width / mm", "found", "false", "a90 / mm", "a90/95", "limits"
+
+
+class ExperimentResult(Brief, BaseModel, frozen=True):
+    """Errors and stated uncertainties of a sensor in rendered campaigns, and its probabilities of detection.
+
+    Attributes
+    ----------
+    campaign, sensor, as_built : str
+        Names or paths of the descriptions.
+    water : str or float or None
+        Water of all scenes, by its name or turbidity; None for that of the scenes or the sensor.
+    seeds : tuple of int
+        Seeds of the campaigns.
+    table : FigureTable
+        All figures, one row for each of every campaign.
+    conditions : dict
+        Where each statement was checked, by scan: scene, place, profiles and water.
+    detections : tuple of ProbabilityOfDetection
+        Probabilities of detection, by kind and width of the flaws.
+    understated : tuple of Understated
+        Deviations of the campaign that are larger than the sensor states: U does not contain them.
+    """
+
+    campaign: str
+    sensor: str
+    as_built: str
+    water: str | float | None = None
+    seeds: tuple[int, ...]
+    table: FigureTable
+    conditions: dict[str, str]
+    detections: tuple[ProbabilityOfDetection, ...] = ()
+    understated: tuple[Understated, ...] = ()
+
+    def verdict(self) -> str:
+        """Return the main result as a sentence."""
+        if np.isnan(covered := self.table.covered_share()):
+            return "no errors to judge"
+        share = f"{100 * covered:.0f} % of all errors are within U"
+        doubted = ", ".join(each.quantity for each in self.understated)
+        return f"{share}, which is too small: the sensor understates {doubted}" if doubted else share
+
+    def lines(self) -> list[str]:
+        """Return the result as lines of text."""
+        lines = [
+            f"sensor {self.sensor}, built as {self.as_built}; campaigns {self.campaign}: {len(self.seeds)}",
+            *format_errors(self.table.errors()),
+            self.verdict(),
+            "U: expanded uncertainty (k = 2) by propagation; found: twice the rms error of the campaigns",
+            *(f"understated: {each.text()}" for each in self.understated),
+        ]
+        if self.detections:
+            lines += align_columns([_DETECTION_HEAD, *map(_detection_row, self.detections)], right=range(2, 7))
+            lines += ["a90: depth found with 90 % probability; a90/95: its upper bound with 95 % confidence"]
+        return [*lines, "valid for this sensor, and for imperfections as in the campaign, where it was checked:"] + [
+            f"  {scan}: {text}" for scan, text in self.conditions.items()
+        ]
+
+    def errors_figure(self) -> Figure:
+        """Return a chart: bars for the stated uncertainties, and a dot for the error of every measurement."""
+        groups = self.table.errors()
+        figure, (axes,) = new_figure(8.0, 1.2 + 0.3 * len(groups))
+        for place, each in enumerate(groups):
+            axes.barh(place, 2 * each.stated_mm, left=-each.stated_mm, height=0.6, color=BLUE, alpha=0.2)
+            axes.plot(each.errors_mm, [place] * len(each.errors_mm), "o", color=BLUE, markersize=4)
+        axes.axvline(0.0, color="black", linewidth=0.5)
+        axes.set_yticks(range(len(groups)), [f"{each.scan}, {each.name}" for each in groups])
+        axes.invert_yaxis()
+        axes.set_xlabel("measured minus true value, mm")
+        return figure
+
+    def write(self, folder: Path) -> None:
+        """Write experiment.json and experiment.html into a folder; OutputError if that fails."""
+        write_model(folder / RESULT, self, file_format="twin-experiment", version=1, overwrite=True)
+        write_page(folder / PAGE, self._page(), overwrite=True)
+
+    def _page(self) -> str:
+        """Return a page with the uncertainties and errors, and the probabilities of detection."""
+        count = len(self.seeds)
+        water = [] if self.water is None else [("water", f"{self.water}")]
+        return render_page(
+            "twin.experiments",
+            "page.html.j2",
+            sensor=Path(self.sensor).stem,
+            verdict=f"{self.verdict()}, in {count} rendered campaign{'s' if count > 1 else ''}.",
+            introduction=[
+                ("sensor", self.sensor),
+                ("built as", self.as_built),
+                ("campaign", self.campaign),
+                *water,
+                ("seeds", f"{self.seeds[0]} to {self.seeds[-1]}"),
+            ],
+            understated=[each.text() for each in self.understated],
+            figure=figure_svg(self.errors_figure()),
+            rows=[each.texts() for each in self.table.errors()],
+            curves=_draw_curves(self.detections) if self.detections else None,
+            detection_head=_DETECTION_HEAD,
+            detections=[*map(_detection_row, self.detections)],
+            validity=[*self.conditions.items()],
+            version=__version__,
+        )
+
+
+def _detection_row(each: ProbabilityOfDetection) -> tuple[str, ...]:
+    """Return the cells of a probability of detection."""
+    depths = ("-" if depth is None else f"{depth:.3f}" for depth in (each.a90_mm, each.a90_95_mm))
+    found = f"{sum(each.found)} of {len(each.found)}"
+    return each.flaw, each.method, f"{each.width_mm:g}", found, str(each.false_calls), *depths, each.limits()
+
+
+def _draw_curves(detections: Sequence[ProbabilityOfDetection]) -> Markup:
+    """Draw the probability of detection against the depth, with all hits and misses, and a90/95 as dots."""
+    from matplotlib.ticker import LogLocator
+
+    figure, panels = new_figure(8.0, 2.6 * len(detections), rows=len(detections))
+    for axes, each in zip(panels, detections, strict=True):
+        depth = np.array(each.depths_mm)
+        shown = np.geomspace(depth.min(), depth.max(), 200)
+        axes.semilogx(shown, each.probability(shown), color=BLUE)
+        axes.plot(depth, np.where(each.found, 1.0, 0.0), "|", color=BLUE)
+        if each.a90_95_mm is not None:
+            axes.plot([each.a90_95_mm], [0.9], "o", color=BLUE)
+        axes.axhline(0.9, color="black", linewidth=0.5)
+        axes.set_ylim(-0.05, 1.05)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("")
+        axes.set_title(f"{each.flaw}s, {each.width_mm:g} mm wide")
+        axes.set_ylabel("probability of detection")
+    panels[-1].set_xlabel("depth, mm")
+    return figure_svg(figure)
