@@ -143,12 +143,9 @@ def _list_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[st
         if fields:
             models = [each for field in fields for each in _list_models(field.annotation)]
         else:
-            models = [each for each in models if part in _list_kinds(each)] or models
+            kinds = [(each, each.model_fields.get("kind")) for each in models]
+            models = [each for each, kind in kinds if part in (get_args(kind.annotation) if kind else ("",))] or models
     return list(dict.fromkeys(key for each in models for key in each.model_fields))
-
-
-def _list_kinds(model: type[BaseModel]) -> tuple[object, ...]:
-    return get_args(model.model_fields["kind"].annotation) if "kind" in model.model_fields else ("",)
 
 
 def _list_models(annotation: Any) -> list[type[BaseModel]]:

@@ -105,11 +105,6 @@ def is_black(image: np.ndarray, full_dn: float) -> bool:
     return bool(cv2.medianBlur(image, 3).max() < BLACK * full_dn)
 
 
-def measure_clipped_share(image: np.ndarray, full_dn: float) -> float:
-    """Return the fraction of clipped pixels of an image (H, W)."""
-    return float(np.mean(image >= full_dn))
-
-
 def find_stripe_direction(
     image: np.ndarray, *, stripe_along: str, saturation: float
 ) -> Literal["along", "across"] | None:
@@ -129,7 +124,7 @@ def explain_missing_stripe(images: Iterable[np.ndarray], *, stripe_along: str, f
         count += 1
         if is_black(image, full_dn):
             black += 1
-        elif measure_clipped_share(image, full_dn) > WHITE:
+        elif np.mean(image >= full_dn) > WHITE:
             white += 1
         else:
             across += find_stripe_direction(image, stripe_along=stripe_along, saturation=full_dn) == "across"
