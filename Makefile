@@ -27,7 +27,7 @@ help:
 	@echo "make test    check the style and run the tests, without the slow ones"
 	@echo "make test-full   make check, and all tests, slow studies of statistics and campaigns included"
 	@echo "make oldest  run documented commands with the oldest allowed libraries, in $(OLDEST) (make test-full does it too)"
-	@echo "make check   only check the code: format, lint, layers of imports, idioms, types, licences of the libraries"
+	@echo "make check   only check the code: format, lint, layers of imports, idioms, types, licences of the libraries, size"
 	@echo "make fuzz    read many damaged files; CASES=5000 of each kind, READERS=\"capture sensor\" only these"
 	@echo "make soak    record 100,000 images by the desk and watch its memory; IMAGES=1000 only so many"
 	@echo "make bench   measure speed"
@@ -67,7 +67,7 @@ oldest: setup $(OLDEST)/.installed
 		-k "test_documentation or README or api.md or calibrate-a-mount or large-clouds"
 
 check: style types
-	@$(PYTHON) -m pytest -q tests/test_licences.py
+	@$(PYTHON) -m pytest -q tests/test_licences.py tests/test_budget.py
 
 style: setup
 	@$(PYTHON) -m ruff format --check --quiet .
