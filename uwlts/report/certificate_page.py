@@ -39,7 +39,12 @@ from uwlts.report.certificate_volume import (
     require_same_sensor,
     uncertainty_maps,
 )
-from uwlts.report.digital_certificate import digital_certificate, load_administration
+from uwlts.report.digital_certificate import (
+    Administration,
+    digital_certificate,
+    load_administration,
+    state_traceability,
+)
 from uwlts.report.parameters import ParameterRow, parameter_rows
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import read_calibration
@@ -102,7 +107,7 @@ def write_certificate(
     known = read_calibration(source)
     content = make_certificate(known, source, issued=datetime.now(UTC).isoformat(timespec="seconds"))
     earlier = None if before is None else (Path(before).name, read_calibration(before))
-    text = certificate_page(content, known, before=earlier)
+    text = certificate_page(content, known, before=earlier, administration=stated)
     sealed = json.dumps(content.in_file(), indent=2, ensure_ascii=False) + "\n"
     if stated is not None:
         xml = digital_certificate(content, stated)
@@ -113,9 +118,15 @@ def write_certificate(
 
 
 def certificate_page(
-    content: AnyCertificate, calibration: Calibration, *, before: tuple[str, Calibration] | None = None
+    content: AnyCertificate,
+    calibration: Calibration,
+    *,
+    before: tuple[str, Calibration] | None = None,
+    administration: Administration | None = None,
 ) -> str:
     """Return the page as text; ``before`` is the name and content of another calibration of the sensor to compare with.
+
+    The ``administration`` states measuring equipment and traceability.
 
     CalibrationError if the joint estimate is damaged, or the other calibration is of another sensor.
     """
@@ -130,6 +141,11 @@ def certificate_page(
         known_before=content.made_from.get("known_before", {}),
         parameters=_parameters(content.parameters, before),
         before=None if before is None else before[0],
+        equipment=[
+            (each.role, each.name, each.serial_number or MISSING, each.certificate or MISSING)
+            for each in (administration.equipment if administration is not None else ())
+        ],
+        traceability=state_traceability(content, administration)[1],
         lengths=_length_rows(content.lengths) if isinstance(content, JointCertificate) else [],
         drawn=_pictures(content, calibration, before) if isinstance(content, JointCertificate) else {},
     )

@@ -5,6 +5,7 @@ statements on laboratory, customer, item and responsible persons, which an `Admi
 """
 
 import datetime
+import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -75,8 +76,25 @@ class CalibratedItem(Description):
     model: Text | None = None
 
 
+EquipmentRole = Literal["target", "step standard", "thermometer", "other"]
+
+
+class Equipment(Description):
+    """Measuring equipment of the calibration, and the number of its certificate."""
+
+    role: EquipmentRole
+    name: Text
+    serial_number: Text | None = None
+    certificate: Text | None = None
+    manufacturer: Text | None = None
+    model: Text | None = None
+
+
 class Administration(Description):
-    """Administrative data of a digital calibration certificate, read from TOML."""
+    """Administrative data of a digital calibration certificate, read from TOML.
+
+    ``traceability`` says how the values of the ``equipment`` are traceable to the SI.
+    """
 
     identifier: Text  # unique identifier of the certificate
     # First and last day of the calibration.
@@ -88,12 +106,35 @@ class Administration(Description):
     customer: Contact
     item: CalibratedItem
     persons: tuple[ResponsiblePerson, ...] = Field(min_length=1)
+    traceability: Text | None = None
+    equipment: tuple[Equipment, ...] = ()
 
     @model_validator(mode="after")
     def _ends_after_its_begin(self) -> "Administration":
         if self.end < self.begin:
             raise ValueError(f"the calibration ends on {self.end}, before it begins on {self.begin}")
         return self
+
+
+def state_traceability(content: AnyCertificate, administration: Administration | None) -> tuple[bool, str]:
+    """Return whether the calibration is traceable by its stated equipment, and a sentence.
+
+    Traceability needs a statement, and a certificate of each piece of equipment that the calibration used.
+    """
+    used = ["target"] if content.made_from.get("target") else []
+    used += ["step standard"] if content.made_from.get("step_captures") else []
+    media = content.validity if isinstance(content, JointCertificate) else content.media
+    # An index that follows from the temperature rests on a thermometer.
+    used += ["thermometer"] if any(each.medium.kind in ("fresh", "sea") for each in media) else []
+    equipment = () if administration is None else administration.equipment
+    certified = {each.role for each in equipment if each.certificate is not None}
+    missing = [f"no certificate of the {role}" for role in used if role not in certified]
+    if administration is None or administration.traceability is None:
+        missing.insert(0, "no statement of traceability")
+    if missing:
+        return False, f"Traceability to the SI is not shown: {', '.join(missing)}."
+    assert administration is not None and administration.traceability is not None
+    return True, administration.traceability
 
 
 def load_administration(path: str | Path) -> Administration:
@@ -111,7 +152,7 @@ def digital_certificate(content: AnyCertificate, administration: Administration)
     root = ET.Element(f"{{{DCC}}}digitalCalibrationCertificate", {"schemaVersion": SCHEMA_VERSION})
     root.set(f"{{{_XSI}}}schemaLocation", f"{DCC} {_SCHEMA}")
     _add_administration(_child(root, "administrativeData"), content, administration)
-    _add_results(_child(_child(root, "measurementResults"), "measurementResult"), content)
+    _add_results(_child(_child(root, "measurementResults"), "measurementResult"), content, administration)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode", xml_declaration=False).join(
         ('<?xml version="1.0" encoding="UTF-8"?>\n', "\n")
@@ -138,7 +179,7 @@ def _add_administration(parent: ET.Element, content: AnyCertificate, stated: Adm
     if stated.item.model is not None:
         _child(item, "model", stated.item.model)
     identifications = _child(item, "identifications")
-    _identify(identifications, "manufacturer", stated.item.serial_number, "serial number")
+    _identify(identifications, "manufacturer", stated.item.serial_number, "serial number", "basic_serialNumber")
     _identify(identifications, "other", content.calibration.sha256, "SHA-256 of the calibration file")
     _identify(identifications, "other", content.calibration.digest, "identifier of the calibration in clouds")
     if content.sha256:
@@ -153,6 +194,10 @@ def _add_administration(parent: ET.Element, content: AnyCertificate, stated: Adm
         _child(person, "mainSigner", str(each.main_signer).lower())
     _add_contact(_child(parent, "customer"), stated.customer)
     statements = _child(parent, "statements")
+    traceable, sentence = state_traceability(content, stated)
+    statement = _child(statements, "statement")
+    _child(statement, "traceable", str(traceable).lower())
+    _text(statement, "declaration", sentence)
     for text in _statements(content):
         _text(_child(statements, "statement"), "declaration", text)
 
@@ -169,12 +214,15 @@ def _statements(content: AnyCertificate) -> Iterator[str]:
         yield from content.cannot_tell
 
 
-def _add_results(parent: ET.Element, content: AnyCertificate) -> None:
+def _add_results(parent: ET.Element, content: AnyCertificate, stated: Administration) -> None:
     _text(parent, "name", f"Calibration of {content.sensor}")
     method = _child(_child(parent, "usedMethods"), "usedMethod")
+    method.set("refType", "basic_methodMeasurementUncertainty")
     joint = isinstance(content, JointCertificate)
     _text(method, "name", "joint calibration of camera, window and laser sheet" if joint else "sequential calibration")
     _child(method, "norm", "JCGM 100:2008")
+    if stated.equipment:
+        _add_equipment(_child(parent, "measuringEquipments"), stated)
     if joint and content.validity:
         _add_medium(_child(parent, "influenceConditions"), content)
     results = _child(parent, "results")
@@ -187,8 +235,8 @@ def _add_results(parent: ET.Element, content: AnyCertificate) -> None:
         points = _result(results, "Lengths between two single points")
         for each in content.lengths:
             words = f"length of {each.length_mm:g} mm along {each.axis}"
-            _quantity(lengths, words, each.length_mm, UNITS["mm"], each.calibration_mm)
-            _quantity(points, words, each.length_mm, UNITS["mm"], each.point_mm)
+            for group, expanded in ((lengths, each.calibration_mm), (points, each.point_mm)):
+                _quantity(group, words, each.length_mm, UNITS["mm"], expanded, "basic_nominalValue")
     if isinstance(content, JointCertificate) and content.validity:
         volume = _result(results, "Volume")
         for region in content.validity:
@@ -196,6 +244,26 @@ def _add_results(parent: ET.Element, content: AnyCertificate) -> None:
             for words, pair in ends.items():
                 for end, value in zip(("smallest", "largest"), pair, strict=True):
                     _quantity(volume, f"{end} {words} in {region.name}", value, UNITS["mm"], None)
+
+
+def _add_equipment(parent: ET.Element, stated: Administration) -> None:
+    for each in stated.equipment:
+        equipment = _child(parent, "measuringEquipment")
+        equipment.set("refType", "basic_measurementStandard")
+        _text(equipment, "name", f"{each.role}: {each.name}")
+        if each.manufacturer is not None:
+            _text(_child(equipment, "manufacturer"), "name", each.manufacturer)
+        if each.model is not None:
+            _child(equipment, "model", each.model)
+        numbers = [
+            ("manufacturer", each.serial_number, "serial number", "basic_serialNumber"),
+            ("calibrationLaboratory", each.certificate, "certificate", "basic_certificateIdentifier"),
+        ]
+        if any(value is not None for _, value, *_ in numbers):
+            identifications = _child(equipment, "identifications")
+            for issuer, value, words, kind in numbers:
+                if value is not None:
+                    _identify(identifications, issuer, value, words, kind)
 
 
 def _add_medium(parent: ET.Element, content: JointCertificate) -> None:
@@ -206,7 +274,7 @@ def _add_medium(parent: ET.Element, content: JointCertificate) -> None:
         expanded = None if region.index_std is None else 2 * region.index_std
         _quantity(data, "refractive index relative to air", region.index, UNITS[""], expanded)
         if region.medium.kind in ("fresh", "sea"):
-            _quantity(data, "temperature", region.medium.temperature_c, r"\degreecelsius", None)
+            _quantity(data, "temperature", region.medium.temperature_c, r"\degreecelsius", None, "basic_temperature")
 
 
 def _result(parent: ET.Element, words: str) -> ET.Element:
@@ -215,17 +283,21 @@ def _result(parent: ET.Element, words: str) -> ET.Element:
     return _child(result, "data")
 
 
-def _quantity(parent: ET.Element, words: str, value: float, unit: str, expanded: float | None) -> None:
-    """Add a real quantity with its expanded uncertainty, if known."""
+def _quantity(
+    parent: ET.Element, words: str, value: float, unit: str, expanded: float | None, kind: str = "basic_measuredValue"
+) -> None:
+    """Add a real quantity of a ``kind`` (refType) with its expanded uncertainty, if known."""
     quantity = _child(parent, "quantity")
+    quantity.set("refType", kind)
     _text(quantity, "name", words)
     real = ET.SubElement(quantity, f"{{{SI}}}real")
-    ET.SubElement(real, f"{{{SI}}}value").text = _decimal(value)
+    known = expanded is not None and expanded > 0
+    ET.SubElement(real, f"{{{SI}}}value").text = _decimal(value, expanded if known else None)
     ET.SubElement(real, f"{{{SI}}}unit").text = unit
     if expanded is not None:
         uncertainty = ET.SubElement(real, f"{{{SI}}}expandedUnc")
         factor, probability = _COVERAGE
-        ET.SubElement(uncertainty, f"{{{SI}}}uncertainty").text = _decimal(expanded)
+        ET.SubElement(uncertainty, f"{{{SI}}}uncertainty").text = _decimal(expanded, expanded if known else None)
         ET.SubElement(uncertainty, f"{{{SI}}}coverageFactor").text = factor
         ET.SubElement(uncertainty, f"{{{SI}}}coverageProbability").text = probability
         ET.SubElement(uncertainty, f"{{{SI}}}distribution").text = "normal"
@@ -237,9 +309,16 @@ def _unit_of(row: ParameterRow) -> str:
     return UNITS[row.unit]
 
 
-def _decimal(value: float) -> str:
-    """Return a number that is read back exactly, in the form of D-SI."""
-    return repr(float(value))
+def _decimal(value: float, expanded: float | None) -> str:
+    """Return a number in the form of D-SI, with the digits of two significant ones of its uncertainty (GUM 7.2.6).
+
+    Without an uncertainty it has nine significant digits.
+    """
+    if expanded is None:
+        return f"{value:.9g}"
+    # Of the rounded uncertainty: 0.0996 is 0.10 and has two decimals.
+    decimals = 1 - math.floor(math.log10(float(f"{expanded:.1e}")))
+    return f"{round(value, decimals) or 0.0:.{max(0, decimals)}f}"
 
 
 def _add_contact(parent: ET.Element, contact: Contact) -> None:
@@ -258,8 +337,10 @@ def _add_contact(parent: ET.Element, contact: Contact) -> None:
             _child(location, name, text)
 
 
-def _identify(parent: ET.Element, issuer: str, value: str, words: str) -> None:
+def _identify(parent: ET.Element, issuer: str, value: str, words: str, kind: str | None = None) -> None:
     identification = _child(parent, "identification")
+    if kind is not None:
+        identification.set("refType", kind)
     _child(identification, "issuer", issuer)
     _child(identification, "value", value)
     _text(identification, "name", words)

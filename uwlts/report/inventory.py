@@ -21,6 +21,7 @@ from uwlts.model.sensor import Medium, Sensor
 from uwlts.pages.numbers import numbers_in
 from uwlts.report.any_file import read
 from uwlts.report.parameters import parameter_rows
+from uwlts.report.schema_check import digital_certificate_lines
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_readable_cloud, read_cloud
@@ -31,8 +32,10 @@ from uwlts.storage.truth import FORMAT as TRUTH, Truth, TruthHeader, TruthStatus
 
 
 @trusting
-def describe(path: str | Path, *, unit: Unit | None = None, trust_edited: bool = False) -> str:
-    """Describe a file that `read` reads, or a sensor description (by name or path).
+def describe(
+    path: str | Path, *, unit: Unit | None = None, schema: str | Path | None = None, trust_edited: bool = False
+) -> str:
+    """Describe a file that `read` reads, a digital calibration certificate, or a sensor description (by name or path).
 
     Parameters
     ----------
@@ -40,6 +43,9 @@ def describe(path: str | Path, *, unit: Unit | None = None, trust_edited: bool =
         File, or name of a shipped sensor such as thesis.
     unit : {"mm", "m"}, optional
         As for `export`.
+    schema : str or Path, optional
+        XML schema (dcc.xsd) by which a digital calibration certificate is validated. Schemas that it imports are beside
+        it.
     trust_edited : bool
         As for `read`.
 
@@ -51,12 +57,16 @@ def describe(path: str | Path, *, unit: Unit | None = None, trust_edited: bool =
     Raises
     ------
     CaptureError, DescriptionError
-        The file is missing, damaged, or of another kind.
+        The file is missing, damaged, or of another kind, or not valid by the schema.
+    SetupError
+        The library for schemas is not installed.
     """
     name, path = str(path), Path(path)
     endings = [each for each in path.suffixes if each != ".part"]
     if not endings or endings[-1] == ".toml":
         lines = sensor_lines(load_sensor(name))
+    elif endings[-1] == ".xml":
+        lines = digital_certificate_lines(path, schema)
     elif endings[-2:] == [".truth", ".h5"] or (endings[-1] == ".h5" and read_format(path) == TRUTH):
         lines = truth_lines(*read_truth(path))
     elif is_readable_cloud(path):

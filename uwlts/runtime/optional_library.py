@@ -21,6 +21,7 @@ EXTRAS = {
     "learn": "learned stripes",
     "registration": "the search for initial poses by shape",
     "ros": "ROS bags, and clouds as MCAP",
+    "schema": "validation of digital certificates",
 }
 """Features that need optional libraries, by the extra of this project that lists them."""
 

@@ -5,18 +5,21 @@ themselves (LGPL-3) are not copied into the project.
 """
 
 import re
+import sys
 import xml.etree.ElementTree as ET
+from decimal import Decimal
 
+import numpy as np
 import pytest
 
 import uwlts
 from tests.system.in_process import run_program
 from uwlts.cli import app
-from uwlts.errors import DescriptionError, EvaluationError
+from uwlts.errors import CaptureError, DescriptionError, EvaluationError, SetupError
 from uwlts.model.sensor import Medium
 from uwlts.report.certificate import CertifiedFile, JointCertificate, ParameterRow, Validity
 from uwlts.report.certificate_volume import LengthUncertainty
-from uwlts.report.digital_certificate import DCC, SI, UNITS, digital_certificate, load_administration
+from uwlts.report.digital_certificate import DCC, SI, UNITS, _decimal, digital_certificate, load_administration
 
 ADMINISTRATION = """
 identifier = "UW-7"
@@ -44,6 +47,22 @@ name = "A. Silva"
 role = "head"
 main_signer = true
 """
+EQUIPMENT = """
+[[equipment]]
+role = "target"
+name = "etched circles <7>"
+serial_number = "T-7"
+certificate = "2026-1"
+manufacturer = "Maker of targets"
+
+[[equipment]]
+role = "thermometer"
+name = "PT100"
+model = "P1"
+certificate = "2026-2"
+"""
+TRACEABLE = 'traceability = "By DAkkS D-K-1 to the SI"\n'
+
 ORDER = {
     "digitalCalibrationCertificate": "administrativeData! measurementResults!",
     "administrativeData": "dccSoftware! coreData! items! calibrationLaboratory! respPersons! customer! statements",
@@ -64,12 +83,14 @@ ORDER = {
     "respPerson": "person! role mainSigner",
     "person": "name!",
     "statements": "statement!",
-    "statement": "declaration",
+    "statement": "traceable declaration",
     "declaration": "content!",
     "measurementResults": "measurementResult!",
-    "measurementResult": "name! usedMethods influenceConditions results!",
+    "measurementResult": "name! usedMethods measuringEquipments influenceConditions results!",
     "usedMethods": "usedMethod!",
     "usedMethod": "name! norm",
+    "measuringEquipments": "measuringEquipment!",
+    "measuringEquipment": "name! manufacturer model identifications",
     "influenceConditions": "influenceCondition!",
     "influenceCondition": "name! data!",
     "results": "result!",
@@ -179,14 +200,146 @@ def test_elements_have_the_order_of_the_schema(administration):
 def test_values_are_those_of_the_certificate(administration):
     root = ET.fromstring(digital_certificate(certificate(), load_administration(administration)).encode())
     found = quantities(root)
-    assert found["f (f) in pixels"] == [(2440.0132856416235, r"\one", 0.36)]
-    assert found["stage_scale (stage_scale)"] == [(-3.0, r"\micro\metre\metre\tothe{-1}", 100.0)]
+    assert found["f (f) in pixels"] == [(2440.01, r"\one", 0.36)]
+    assert found["stage_scale (stage_scale)"] == [(0.0, r"\micro\metre\metre\tothe{-1}", 100.0)]
     assert found["glass_index (glass_index)"] == [(1.52, r"\one", None)]
-    lengths = [(150.0, r"\milli\metre", each) for each in (0.0118, 0.0306)]
+    lengths = [(150.0, r"\milli\metre", each) for each in (0.012, 0.031)]
     assert found["length of 150 mm along Y"] == lengths
     assert found["refractive index relative to air"] == [(1.3312, r"\one", 2e-5)]
     assert found["temperature"] == [(25.0, r"\degreecelsius", None)]
     assert found["largest Z in water"] == [(131.0, r"\milli\metre", None)]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_digits_are_those_of_the_uncertainty(seed):
+    """Two significant digits of the uncertainty, and as many decimals of the value: both are within half a digit."""
+    rng = np.random.default_rng([98, seed])
+    expanded, value = 10 ** rng.uniform(-8, 3), rng.uniform(-1, 1) * 10 ** rng.uniform(-2, 4)
+    texts = _decimal(expanded, expanded), _decimal(value, expanded)
+    digit = Decimal(f"{expanded:.1e}").as_tuple().exponent
+    for text, exact in zip(texts, (expanded, value), strict=True):
+        assert re.fullmatch(DECIMAL, text)
+        assert abs(float(text) - exact) <= 0.5001 * 10.0**digit
+        assert Decimal(text).as_tuple().exponent == min(digit, 0)
+    assert _decimal(0.0996, 0.0996) == "0.10" and _decimal(1234.4, 120.0) == "1230"
+    assert _decimal(1.52, None) == "1.52"
+
+
+def statement(root):
+    """Return whether the certificate is traceable, and the sentence."""
+    first = root.find(f".//{{{DCC}}}statement")
+    return first.findtext(f"{{{DCC}}}traceable"), first.findtext(f"{{{DCC}}}declaration/{{{DCC}}}content")
+
+
+@pytest.mark.parametrize(
+    ("stated", "used", "expected"),
+    [
+        (TRACEABLE + ADMINISTRATION + EQUIPMENT, {"target": {"kind": "circles"}}, ("true", "By DAkkS D-K-1 to the SI")),
+        (ADMINISTRATION + EQUIPMENT, {"target": {"kind": "circles"}}, ("false", "no statement of traceability")),
+        (
+            TRACEABLE + ADMINISTRATION + EQUIPMENT,
+            {"step_captures": [{}]},
+            ("false", "no certificate of the step standard"),
+        ),
+        (TRACEABLE + ADMINISTRATION, {"target": {}}, ("false", "no certificate of the thermometer")),
+        (
+            TRACEABLE + ADMINISTRATION,
+            {"target": {"kind": "circles"}},
+            ("false", "the target, no certificate of the th"),
+        ),
+    ],
+)
+def test_traceability_needs_a_statement_and_a_certificate_of_all_equipment(administration, stated, used, expected):
+    administration.write_text(stated, encoding="utf-8")
+    content = certificate(made_from=used)
+    root = ET.fromstring(digital_certificate(content, load_administration(administration)).encode())
+    check_order(root)
+    traceable, sentence = statement(root)
+    assert traceable == expected[0] and expected[1] in sentence
+
+
+def test_equipment_and_kinds_of_quantities_are_marked(administration):
+    administration.write_text(ADMINISTRATION + EQUIPMENT, encoding="utf-8")
+    root = ET.fromstring(digital_certificate(certificate(), load_administration(administration)).encode())
+    equipment = list(root.iter(f"{{{DCC}}}measuringEquipment"))
+    assert [each.get("refType") for each in equipment] == ["basic_measurementStandard"] * 2
+    texts = [each.text for each in root.iter()]
+    for text in ("target: etched circles <7>", "T-7", "2026-1", "Maker of targets", "thermometer: PT100", "P1"):
+        assert text in texts, text
+    kinds = {
+        each.findtext(f"{{{DCC}}}name/{{{DCC}}}content"): each.get("refType")
+        for each in root.iter(f"{{{DCC}}}quantity")
+    }
+    assert kinds["length of 150 mm along Y"] == "basic_nominalValue"
+    assert kinds["f (f) in pixels"] == "basic_measuredValue"
+    assert kinds["temperature"] == "basic_temperature"
+    serial = [each for each in root.iter(f"{{{DCC}}}identification") if each.get("refType") == "basic_serialNumber"]
+    assert len(serial) == 2
+
+
+SCHEMA = """<?xml version="1.0"?>
+<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema" xmlns:o="urn:other" targetNamespace="https://ptb.de/dcc">
+  <xs:import namespace="urn:other" schemaLocation="https://other.invalid/other.xsd"/>
+  <xs:element name="digitalCalibrationCertificate"><xs:complexType><xs:sequence>
+    <xs:any processContents="skip" minOccurs="COUNT" maxOccurs="COUNT"/>
+  </xs:sequence><xs:attribute name="schemaVersion" type="o:version"/><xs:anyAttribute processContents="skip"/>
+  </xs:complexType></xs:element>
+</xs:schema>
+"""
+"""Small schema of the root, with a schema that it imports from elsewhere, as dcc.xsd does."""
+IMPORTED = """<?xml version="1.0"?>
+<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema" targetNamespace="urn:other">
+  <xs:simpleType name="version"><xs:restriction base="xs:string"/></xs:simpleType>
+</xs:schema>
+"""
+
+
+@pytest.fixture
+def written(administration, tmp_path):
+    text = digital_certificate(certificate(), load_administration(administration))
+    (tmp_path / "c.xml").write_text(text, encoding="utf-8")
+    return tmp_path / "c.xml"
+
+
+def test_info_describes_and_validates_it(written, tmp_path):
+    pytest.importorskip("xmlschema")
+    plain = uwlts.describe(written)
+    assert "digital calibration certificate UW-7, schema 3.2.0" in plain and "not validated" in plain
+    schema = tmp_path / "dcc.xsd"
+    schema.write_text(SCHEMA.replace("COUNT", "2"), encoding="utf-8")
+    with pytest.raises(CaptureError, match="Put the schemas that it imports into its folder"):
+        uwlts.describe(written, schema=schema)
+    (tmp_path / "other.xsd").write_text(IMPORTED, encoding="utf-8")
+    done = run_program(app, "uwlts", "info", str(written), "--schema", str(schema))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith(f"valid by {schema}\n")
+    schema.write_text(SCHEMA.replace("COUNT", "3"), encoding="utf-8")
+    refused = run_program(app, "uwlts", "info", str(written), "--schema", str(schema))
+    assert refused.returncode == 2
+    assert "is not valid by" in refused.stderr
+
+
+def test_a_missing_library_names_the_extra(written, tmp_path, monkeypatch):
+    (tmp_path / "dcc.xsd").write_text(SCHEMA.replace("COUNT", "2"), encoding="utf-8")
+    monkeypatch.setitem(sys.modules, "xmlschema", None)
+    with pytest.raises(SetupError, match="needs the library xmlschema, which is not installed"):
+        uwlts.describe(written, schema=tmp_path / "dcc.xsd")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<a>", "is not valid XML"),
+        ("<a/>", "no digital calibration certificate"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "has a document type"),
+    ],
+)
+def test_other_xml_is_refused(tmp_path, text, said):
+    (tmp_path / "a.xml").write_text(text, encoding="utf-8")
+    with pytest.raises(CaptureError, match=said):
+        uwlts.describe(tmp_path / "a.xml")
+    with pytest.raises(CaptureError):
+        uwlts.describe(tmp_path / "missing.xml")
 
 
 def test_all_units_of_parameters_are_known():
