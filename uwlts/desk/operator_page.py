@@ -278,7 +278,7 @@ class _OperatorPage:
         # could overwrite what the operator has typed by then.
         camera, stage = _addresses(plan) if plan else ("", "")
         self._plan = ui.select(plans, label="plan of the scan", value=chosen, on_change=self._choose).classes("w-full")
-        kinds = "gige:NAME, genicam:PRODUCER.cti, replay:FILE"
+        kinds = "gige:NAME, replay:FILE"
         self._camera = ui.input("camera", value=camera, placeholder=kinds).classes("w-full")
         self._stage = ui.input("stage", value=stage, placeholder="/dev/ttyACM0; empty: none").classes("w-full")
         with ui.row():

@@ -61,7 +61,7 @@ def scan(
     out : str or Path
         Capture to write.
     camera : str, optional
-        Address of the camera, instead of the plan's: gige:NAME, genicam:PRODUCER.cti or replay:PATH.
+        Address of the camera, instead of the plan's: gige:NAME or replay:PATH.
     stage : str, optional
         Serial port of the stage, instead of the plan's.
     home : bool

@@ -6,7 +6,6 @@ because a library is broken, that becomes a finding.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 
 from uwlts.doctor import devices, machine
 from uwlts.doctor.machine import Finding, print_findings
@@ -16,22 +15,16 @@ __all__ = ["Finding", "examine", "print_findings"]
 
 
 def examine(
-    folder: Path = Path(),
-    *,
-    camera: str | None = None,
-    stage: str | None = None,
-    progress: ProgressListener = ignore_progress,
+    *, camera: str | None = None, stage: str | None = None, progress: ProgressListener = ignore_progress
 ) -> list[Finding]:
-    """Examine libraries, libLLVM, cameras, serial ports, permissions and speed of this machine, with advice.
+    """Examine libraries, renderer, cameras and serial ports of this machine, with advice.
 
     It takes about ten seconds.
 
     Parameters
     ----------
-    folder
-        Folder for captures; 64 MB are written there and removed.
     camera
-        Address of a camera to take ten frames: gige:NAME, genicam:PRODUCER.cti or replay:PATH. Its trigger
+        Address of a camera to take ten frames: gige:NAME or replay:PATH. Its trigger
         is switched off, and its whole image is read out.
     stage
         Serial port of a stage, whose version, settings and state are read. It is not moved and the laser stays off, but
@@ -47,9 +40,7 @@ def examine(
     parts: list[Callable[[], Sequence[Finding]]] = [
         _examine_libraries,
         machine.examine_renderer,
-        partial(machine.examine, folder),
         devices.examine_cameras,
-        devices.examine_producers,
         devices.examine_ports,
     ]
     if camera is not None:

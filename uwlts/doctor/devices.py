@@ -1,4 +1,4 @@
-"""Findings about cameras, driver libraries and serial ports, including trials of a camera and a stage.
+"""Findings about cameras, their library and serial ports, including trials of a camera and a stage.
 
 The stage is not moved and the laser stays off. The trial only sends queries, and Ctrl-X at the end, which switches the
 laser's pin off.
@@ -6,23 +6,18 @@ laser's pin off.
 
 import os
 import shlex
-import sys
 import threading
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict
-from pathlib import Path
 
 from uwlts.doctor.machine import Finding
 from uwlts.errors import Error, HardwareError, SetupError
 
 try:
     import grp
-    import pwd
 except ImportError:
-    grp = pwd = None  # Windows, where ports have no owners
+    grp = None  # Windows, where ports have no owners
 
-PRODUCERS = "GENICAM_GENTL64_PATH"
 # Aravis waits for answers for a second; drivers of faulty USB devices may hang.
 _DISCOVERY_S = 2.5
 _USUAL_GROUP = "dialout"
@@ -56,44 +51,6 @@ def examine_cameras() -> list[Finding]:
     return [*findings, Finding("cameras", "warning", "none answers to Aravis", advice)]
 
 
-def examine_producers(folders: str | None = None) -> list[Finding]:
-    """Examine the GenTL producers in folders separated by colons, by default those of the environment variable."""
-    named = os.environ.get(PRODUCERS, "") if folders is None else folders
-    if not named:
-        advice = (
-            "only for cameras with a GenTL producer: install the camera maker's software, which sets it, "
-            "or name the producer in the camera's address"
-        )
-        return [Finding("GenTL producers", "optional", f"{PRODUCERS} is not set", advice)]
-    findings = []
-    for folder in map(Path, filter(None, named.split(":"))):
-        producers = sorted(folder.glob("*.cti"))
-        if not producers:
-            what = "holds no producer (*.cti)" if folder.is_dir() else "is not a folder"
-            findings.append(Finding("GenTL producers", "warning", f"{folder} {what}", f"correct {PRODUCERS}"))
-        for path in producers:
-            # The producer's header is read, without running the producer.
-            try:
-                fits = _kind_of_program(path) == _kind_of_program(Path(sys.executable))
-            except OSError as error:
-                fault, advice = f": {error.strerror}", f"make {path} readable"
-            else:
-                fault = "" if fits else " is not a library for this machine"
-                advice = f"install the camera maker's software for {os.uname().machine}"
-            if fault:
-                findings.append(Finding("GenTL producer", "warning", f"{path}{fault}", advice))
-            else:
-                findings.append(Finding("GenTL producer", "ok", f"genicam:{path}"))
-    return findings
-
-
-def _kind_of_program(path: Path) -> tuple[bytes, bytes]:
-    """Return magic number, word length, byte order and machine of an ELF file."""
-    with path.open("rb") as file:
-        start = file.read(20)
-    return start[:6], start[18:20]
-
-
 def examine_ports(ports: Sequence[str] | None = None) -> list[Finding]:
     """Examine serial ports, by default those of this machine, and whether this user may open them."""
     if ports is None:
@@ -115,20 +72,16 @@ def _examine_port(port: str, description: str) -> Finding:
     if os.access(port, os.R_OK | os.W_OK):
         return Finding("serial port", "ok", named)
     owned = os.stat(port)
-    assert grp is not None and pwd is not None
-    user, group, members = f"user {os.geteuid()}", str(owned.st_gid), []
-    with suppress(KeyError):
-        user = pwd.getpwuid(os.geteuid()).pw_name
-    with suppress(KeyError):
-        group, _, _, members = grp.getgrgid(owned.st_gid)
+    assert grp is not None
+    try:
+        group = grp.getgrgid(owned.st_gid).gr_name
+    except KeyError:
+        group = str(owned.st_gid)
     if group == "root" or owned.st_mode & 0o060 != 0o060:
-        fault = f"nor has group {group}"
         advice = f"sudo chgrp {_USUAL_GROUP} {shlex.quote(port)} && sudo chmod 660 {shlex.quote(port)}"
-    elif user in members:
-        fault, advice = f"group {group} is not in force yet", "log out and in again, or restart the computer"
     else:
-        fault, advice = f"{user} is not in group {group}", _JOIN_GROUP.format(group)
-    return Finding("serial port", "warning", f"{named}: no permission, {fault}", advice)
+        advice = _JOIN_GROUP.format(group)
+    return Finding("serial port", "warning", f"{named}: no permission", advice)
 
 
 FRAMES = 10

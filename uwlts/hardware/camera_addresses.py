@@ -3,14 +3,12 @@
 from uwlts.errors import HardwareError
 from uwlts.hardware.aravis import AravisCamera
 from uwlts.hardware.camera_interface import CameraDevice
-from uwlts.hardware.genicam import GenicamCamera
 from uwlts.hardware.replay import ReplayCamera
 
 ADDRESSES = """\
-  gige:NAME or aravis:NAME       GigE Vision or USB3 Vision by Aravis: identifier, serial number or IP address;
-                                 without NAME the only camera there is
-  genicam:PRODUCER.cti[:SERIAL]  any camera with a GenTL producer, such as XIMEA's
-  replay:PATH                    a folder of images, or a capture"""
+  gige:NAME or aravis:NAME  GigE Vision or USB3 Vision by Aravis: identifier, serial number or IP address;
+                            without NAME the only camera there is
+  replay:PATH               a folder of images, or a capture"""
 
 
 def open_camera(address: str) -> CameraDevice:
@@ -25,9 +23,6 @@ def open_camera(address: str) -> CameraDevice:
     camera: CameraDevice
     if kind in ("gige", "aravis") and colon:
         camera = AravisCamera(rest, address=address)
-    elif kind == "genicam" and rest:
-        producer, _, serial = rest.partition(".cti:")
-        camera = GenicamCamera(f"{producer}.cti" if serial else rest, serial=serial or None, address=address)
     elif kind == "replay" and rest:
         camera = ReplayCamera(rest, address=address)
     else:

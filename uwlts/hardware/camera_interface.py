@@ -36,8 +36,7 @@ CHUNKS = ("EncoderValue", "Timestamp")
 BUFFERS = 32
 """Capacity of a driver's frame queue: half a second at 60 frames/s. Further frames are lost."""
 MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
-"""Bit depths of the grey formats. Packed formats are omitted: harvesters cannot unpack them, and few cameras offer only
-them."""
+"""Bit depths of the grey formats. Packed formats are omitted: few cameras offer only them."""
 COORDINATE_BITS = 16
 """Bit depth of the values in `CENTRE_LINES`."""
 _WAIT_S = 0.1

@@ -17,7 +17,6 @@ EXTRAS = {
     "clouds": "clouds as LAZ, LAS and E57",
     "cluster": "sweeps on several machines",
     "frames": "results as tables of pandas",
-    "genicam": "cameras with a GenTL producer, XIMEA's among them",
     "learn": "learned stripes",
     "registration": "the search for initial poses by shape",
     "ros": "ROS bags, and clouds as MCAP",
