@@ -399,7 +399,8 @@ def _compare_with_shape(
         deep_mm=deep,
     )
     variance = here.variance_mm2 + np.sum(here.patterns_mm**2, axis=1)
-    return _Distances(places, apart, normals, here.mean_mm, variance, found, moved, placed.describe())
+    reference = placed.describe() + placed.note_misfit(places, here.mean_mm, variance)
+    return _Distances(places, apart, normals, here.mean_mm, variance, found, moved, reference)
 
 
 def _shared_covariance(

@@ -21,6 +21,14 @@ from uwlts.storage.cloud import PointUncertainty
 _MOST_FITTED = 50_000
 """Number of points above which a cloud is thinned for a fit; more take longer without a benefit."""
 
+_MISFIT_STD = 5.0
+"""Distance of a place from a fitted shape, in standard deviations, beyond which it departs from it."""
+_MISFIT_SIZE = 0.002
+"""Least such distance, divided by the radius, or by half the extent of a plane: out of roundness of usual parts."""
+_MISFIT_SHARE = 0.4
+"""Share of departing places from which a surface is no such shape: local changes cover less of it. Judged on the tubes
+and bells of tests/uwlts/comparison/test_ideal_misfit.py."""
+
 
 class _Shape(Description):
     """Base of ideal shapes; a shape without a position is fitted to the cloud."""
@@ -126,6 +134,22 @@ class PlacedShape:
             normals, distance = away / np.maximum(length, 1e-300)[:, None], length - self.radius_mm
         distance = np.where(np.abs(distance) <= reach_mm, distance, np.nan)
         return Nearest(distance, normals, np.zeros(len(distance), np.intp))
+
+    def note_misfit(self, places_mm: np.ndarray, distance_mm: np.ndarray, variance_mm2: np.ndarray) -> str:
+        """Return a note if most of a surface departs from this fitted shape; empty otherwise.
+
+        ``distance_mm`` (P,) are local means at places (P, 3), NaN if farther away than searched, with their variance.
+        A local change covers the smaller part of a surface, so that it does not count.
+        """
+        size = self.radius_mm or 0.5 * float(np.linalg.norm(np.ptp(places_mm, axis=0)))
+        limit = np.maximum(_MISFIT_STD * np.sqrt(variance_mm2), _MISFIT_SIZE * size)
+        share = float(np.mean(~(np.abs(distance_mm) <= limit)))
+        if self.registration is None or share < _MISFIT_SHARE:
+            return ""
+        return (
+            f"; {100 * share:.0f} % of the surface departs by more than {float(np.nanmedian(limit)):.2g} mm: it is no "
+            f"{self.kind}, and distances are no local changes"
+        )
 
     def describe(self) -> str:
         """Describe kind, size and position as text."""
