@@ -13,7 +13,8 @@ from uwlts.calibration.joint.gathering import Gathered, build_priors, gather_joi
 from uwlts.calibration.joint.initial import build_step_evidence, estimate_line_start
 from uwlts.calibration.joint.observability import compute_mesh_lengths, list_regions, read_region_estimate
 from uwlts.calibration.joint.parameters import SHEET, EarlierEstimate, ViewMedium
-from uwlts.calibration.joint.procedure import JointProblem
+from uwlts.calibration.joint.policy import solve_and_check
+from uwlts.calibration.joint.problem import JointProblem
 from uwlts.calibration.joint.stored_estimate import (
     StoredEstimate,
     append_independent,
@@ -294,7 +295,7 @@ def solve_refreshed(
     start = parameters.start(earlier.values[: len(parameters.intrinsics.names)])
     lines = [estimate_line_start(profile, parameters, start) for profile in profiles]
     problem = JointProblem(parameters, profiles, start, lines, gathered.sensor, None, warnings)
-    result, against = problem.solve_and_check()
+    result, against = solve_and_check(problem)
     if against.all_against():
         raise CalibrationError(_explain_contradiction(problem, earlier) or against.refusal())
     warnings += against.doubts
@@ -308,7 +309,7 @@ def _explain_contradiction(problem: JointProblem, earlier: EarlierEstimate) -> s
     new = [key for key in parameters.keys[len(earlier.values) :] if isinstance(key, MediumIndex)]
     free = {key: replace(parameters.priors[key], std=_ANY_INDEX) for key in new}
     freed = replace(problem, parameters=replace(parameters, priors=parameters.priors | free))
-    result, against = freed.solve_and_check()
+    result, against = solve_and_check(freed)
     if against.all_against():
         return ""
     found = dict(zip(parameters.keys, result.values, strict=True))

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwlts.calibration.joint.consistency import deviations
+from uwlts.calibration.joint.diagnose import deviations
 from uwlts.calibration.joint.estimate import Estimate, estimate_noise
 from uwlts.calibration.joint.residuals import STRIPE, TARGET, Residuals
 from uwlts.model.parameter_keys import StageParameter, TargetParameter

@@ -5,7 +5,7 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
-from uwlts.calibration.joint.procedure import joint_problem
+from uwlts.calibration.joint.problem import joint_problem
 from uwlts.calibration.joint.residuals import SeenSheet
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 

@@ -12,11 +12,12 @@ from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, target_
 from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, square_sensor, stage_direction
 from tests.virtual_sensors import with_fine_target
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
+from uwlts.calibration.joint import policy
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.gathering import scan_stripes
 from uwlts.calibration.joint.initial import build_all_scan_evidence, build_scan_evidence
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
-from uwlts.calibration.joint.procedure import JointProblem, solve_jointly
+from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.residuals import STEP, Residuals
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Spheres
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
@@ -389,14 +390,14 @@ def test_what_only_a_known_size_contradicts_it_is_the_cause_of(thesis, target_in
     fine = with_fine_target(thesis)
     warnings = solved(fine, target_in_water, scan).warnings
     assert warnings[0].startswith("pipe along.h5: diameter of the pipe found 220.0")
-    as_described = JointProblem._judged_as_described
+    as_described = policy._solve_with_observed_uncertainties
 
     def misfitting(problem):
         result, against = as_described(problem)
         known = problem.evidence[-1].surface.diameter_std_mm < np.inf
         return result, replace(against, misfits={"target": "a misfit"}) if known else against
 
-    monkeypatch.setattr(JointProblem, "_judged_as_described", misfitting)
+    monkeypatch.setattr(policy, "_solve_with_observed_uncertainties", misfitting)
     with pytest.raises(CalibrationError, match=r"itself: pipe along.h5: diameter .* off\): most .*; a misfit"):
         solved(fine, target_in_water, scan)
 

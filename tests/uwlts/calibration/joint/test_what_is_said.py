@@ -9,7 +9,7 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import target_series
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
-from uwlts.calibration.joint.consistency import (
+from uwlts.calibration.joint.diagnose import (
     Findings,
     check_consistency,
     deviations,

@@ -1,4 +1,4 @@
-"""Consistency of evidence, prior knowledge and noise of a joint estimate: which images and values disagree."""
+"""What the residuals of a joint estimate show: images, values and parts of the description that disagree."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence, outliers
-from uwlts.calibration.joint.residuals import SHIFT, TARGET, Residuals, TargetEvidence
+from uwlts.calibration.joint.residuals import SHIFT, STRETCH, TARGET, Residuals, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.fitting.least_squares import robust_std
 from uwlts.model.parameter_keys import (
@@ -103,6 +103,8 @@ _FOCAL_WRONG = 0.2  # the same for a contradiction
 _POSITIONS_WRONG = 3.0
 """Rms position error of the stage divided by its stated uncertainty: four positions exceed it once in a million."""
 _FEWEST_POSITIONS = 4  # for which the limit above holds
+NOTICED = 3.0  # standard uncertainties: a parameter wrongly considered less certain loses little
+_UNDETERMINED = 1e-3  # relative shift of the outermost point by a coefficient's uncertainty: a pixel in a thousand
 _MOST_NAMED = 4  # findings of a kind that a message lists
 _MOST_SAID = 6  # findings in a readable message
 
@@ -260,6 +262,41 @@ def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
             gain = float(np.sqrt(max(1.0 + (after - 2 * exact) / std**2, _LEAST_GAIN**2)))
             alone = known + (value - known) / gain**2
             yield Deviation(abs(value - known) / (gain * std), key, alone, known, std), gain
+
+
+@dataclass(frozen=True)
+class PriorDeviations:
+    """Deviations of ``every`` parameter from prior knowledge, the largest first, and Birge's ratio of them."""
+
+    every: list[Deviation]
+    birge_ratio: float
+
+    @classmethod
+    def from_estimate(cls, result: Estimate) -> "PriorDeviations":
+        """Compare an estimate with its prior knowledge."""
+        return cls(deviations(result, least=0.0), estimate_birge_ratio(result))
+
+    def of_target(self) -> list[Deviation]:
+        """Return the deviations of the target's form and size."""
+        return [each for each in self.every if isinstance(each.key, TargetParameter)]
+
+    def form(self) -> list[Deviation]:
+        """Return the noticeable deviations of the target's form and size."""
+        return [each for each in self.of_target() if each.sigmas > NOTICED]
+
+    def stretch(self) -> dict[ParameterKey, float]:
+        """Return the target's stretch from the evidence alone if it is the cause of all deviations, else nothing.
+
+        The largest deviation is taken as the cause: wrong spacings along both sides appear in the stage's scale.
+        """
+        if not any(each.key in STRETCH and each.sigmas > NOTICED for each in self.every[:1]):
+            return {}
+        return {each.key: each.alone for each in self.of_target() if each.key in STRETCH}
+
+    def show_understated(self) -> bool:
+        """Return whether stated uncertainties are too small, and no single other parameter is wrong."""
+        others = (each for each in self.every if not isinstance(each.key, TargetParameter))
+        return bool(self.form() or self.birge_ratio > 1.0) and not any(each.wrong() for each in others)
 
 
 @dataclass(frozen=True)
@@ -457,6 +494,22 @@ def _check_correlations(result: Estimate) -> Iterator[tuple[bool, str, str]]:
                 f"the {kind} has systematic deviations {where} beyond noise ({noise.sigma_px:.2f} px rms, equivalent "
                 f"to one independent value in {noise.together:.0f} {values}): check {check}",
             )
+
+
+def list_undetermined(result: Estimate, evidence: Sequence[Evidence]) -> list[str]:
+    """Describe distortion coefficients that the images do not determine.
+
+    Their uncertainty alone shifts the outermost point of the target noticeably, and zero is as likely.
+    """
+    camera, std, found = result.parameters.camera(result.values), result.std(), []
+    points = [e.placement.pixels for e in evidence if isinstance(e, TargetEvidence)]
+    off = (np.vstack(points) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+    reach = float(np.linalg.norm(off, axis=1).max())
+    for key, power in ((LensParameter.K1, 2), (LensParameter.K2, 4), (LensParameter.K3, 6)):
+        value = getattr(camera.distortion, key.text)
+        if key in std and std[key] * reach**power > _UNDETERMINED and abs(value) < 2 * std[key]:
+            found.append(f"{key.quantity.words} is not determined: {key.quantity.format_with_std(value, std[key])}")
+    return found
 
 
 def find_excess_outliers(result: Estimate) -> dict[str, float]:

@@ -4,7 +4,7 @@ An estimate contains the derivatives of all residuals. Near it, the estimate fro
 equations of these images, without another iteration.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -267,30 +267,27 @@ def _invert(matrix: np.ndarray) -> np.ndarray | None:
 
 
 def keep_images(
-    evidence: Sequence[Evidence], local: Sequence[np.ndarray], wanted: Callable[[ImageId], bool]
-) -> tuple[list[Evidence], list[np.ndarray], list[int]]:
-    """Keep the wanted images of targets and steps, and all scans.
-
-    Returns the remaining pieces of evidence, their local parameters, and their numbers before.
-    """
-    kept: list[tuple[Evidence, np.ndarray, int]] = []
+    evidence: Sequence[Evidence], local: Sequence[np.ndarray], wanted: Collection[ImageId]
+) -> tuple[list[Evidence], list[np.ndarray]]:
+    """Keep the wanted images of targets and steps, and all scans; return them with their local parameters."""
+    kept: list[tuple[Evidence, np.ndarray]] = []
     for number, (piece, start) in enumerate(zip(evidence, local, strict=True)):
         if isinstance(piece, TargetEvidence):
-            images = [image for image in np.unique(piece.placement.image).tolist() if wanted((number, image))]
+            images = [image for image in np.unique(piece.placement.image).tolist() if (number, image) in wanted]
             if not images:
                 continue
-            piece = select_images(piece, images)
+            piece = _select_images(piece, images)
             if piece.staged:
                 start = np.concatenate([start[:8], np.zeros(len(piece.images()))])
-        elif isinstance(piece, StepProfileEvidence) and not wanted((number, piece.image)):
+        elif isinstance(piece, StepProfileEvidence) and (number, piece.image) not in wanted:
             continue
-        kept.append((piece, start, number))
-    return [each for each, _, _ in kept], [start for _, start, _ in kept], [number for _, _, number in kept]
+        kept.append((piece, start))
+    return [each for each, _ in kept], [start for _, start in kept]
 
 
-def select_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
+def _select_images(evidence: TargetEvidence, wanted: Sequence[int]) -> TargetEvidence:
     """Return the evidence of some images; stage positions still refer to the first image of all."""
-    placement, wanted = evidence.placement, list(images)
+    placement = evidence.placement
     here = np.isin(placement.image, wanted)
     kept = {name: getattr(placement, name)[here] for name in ("points_mm", "shifts_mm", "pixels", "image")}
     some = replace(evidence, placement=replace(placement, **kept))

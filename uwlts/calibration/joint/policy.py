@@ -1,0 +1,386 @@
+"""What is changed in a joint calibration because of what its residuals show: uncertainties, lens, images, weights."""
+
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.camera.lens import DISTORTIONS, HALVES_APART, RATIONAL, compare_models, select_model
+from uwlts.calibration.joint.diagnose import (
+    NOTICED,
+    Deviation,
+    Findings,
+    PriorDeviations,
+    check_consistency,
+    compute_size_deviations,
+    describe_wrong_sizes,
+    deviations,
+    list_undetermined,
+)
+from uwlts.calibration.joint.estimate import Estimate, Evidence
+from uwlts.calibration.joint.gathering import Gathered
+from uwlts.calibration.joint.linearised_estimate import HalfDifference, compare_estimates, keep_images, split_in_halves
+from uwlts.calibration.joint.parameters import Parameters
+from uwlts.calibration.joint.problem import JointProblem, joint_problem
+from uwlts.calibration.joint.residuals import BENDS, STRETCH
+from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError
+from uwlts.model.parameter_keys import LensParameter, ParameterKey, TargetParameter
+
+_LEAST_GAIN = 0.0
+"""Relative gain of a coefficient in predicted mean squares: any that is significant, since the uncertainties of other
+coefficients do not contain what a missing one does to them."""
+_CLEARLY_LESS = 0.9  # scatter with free pixel shape, relative to that without
+_MOST_WIDENED = 10.0
+"""Largest factor of a target's stated uncertainty for its observed form or size; more is another target."""
+_NOT_BELIEVED = "it is not believed"
+_MOST_HALVES = 3  # parameters whose halves disagree that a message names
+
+
+def solve_consistently(
+    gathered: Gathered, options: CalibrationOptions
+) -> tuple[JointProblem, Estimate, Findings, tuple[str, ...]]:
+    """Solve for gathered evidence, and change the problem until it fits, unless ``options.strict``.
+
+    Returns the problem, its estimate, the findings against it, and the changes.
+    """
+    attempt = _solve_first(gathered, options)
+    if not options.strict:
+        attempt = attempt.improve()
+    return attempt.problem, attempt.result, attempt.against, attempt.said
+
+
+def solve_and_check(problem: JointProblem) -> tuple[Estimate, Findings]:
+    """Return the estimate and the findings against it; errors as `estimate`.
+
+    The sizes of scanned objects are first estimated and compared with their descriptions. Wrong sizes would change
+    lens, window and stage, and would be barely visible in residuals. They are reported if there is no other
+    contradiction.
+    """
+    free = [_free_sizes(piece) for piece in problem.evidence]
+    result, against = _solve_with_observed_uncertainties(replace(problem, evidence=free))
+    sizes, alone = compute_size_deviations(result, problem.evidence), not against.all_against() or bool(problem.misfits)
+    doubts = [each.words() for each in sizes if each.doubtful()]
+    if not any(each.known() for each in sizes):
+        return result, replace(against, doubts=doubts + against.doubts)
+    wrong = describe_wrong_sizes(sizes)
+    if not wrong:
+        start = replace(problem, global_values=result.values, local=result.local)
+        result, with_sizes = _solve_with_observed_uncertainties(start)
+        # Contradictions that appear only with known sizes are caused by these sizes.
+        wrong = describe_wrong_sizes(sizes, least=NOTICED) if alone and with_sizes.all_against() else []
+        against = replace(with_sizes, doubts=doubts + with_sizes.doubts)
+    if alone:
+        against = replace(against, contradictions=wrong + against.contradictions)
+    return result, against
+
+
+def _free_sizes(piece: Evidence) -> Evidence:
+    return replace(piece, surface=piece.surface.free_sizes()) if isinstance(piece, SurfaceScanEvidence) else piece
+
+
+@dataclass(frozen=True)
+class _FormVerdict:
+    """What is done about noticeable deviations ``form`` of the target's form and size.
+
+    | finding | prior uncertainty |
+    | --- | --- |
+    | both halves of the images agree | the observed deviation |
+    | the halves disagree (``apart``) | as stated, times the deviation in standard uncertainties; the value is tied |
+    | many times what is stated (``refused``, with the factor) | the same |
+
+    ``tied`` are these factors of the parameters that stay as described.
+    """
+
+    form: list[Deviation]
+    apart: list[HalfDifference]
+    refused: dict[Deviation, float]
+    tied: dict[ParameterKey, float]
+
+    def describe(self, against: Findings, *, misfits: Collection[str]) -> tuple[list[str], list[str]]:
+        """Return contradictions and doubts about the target."""
+        doubts = [
+            f"{each.words()}; its uncertainty was enlarged accordingly"
+            for each in self.form
+            if each.key not in self.tied
+        ]
+        doubts += [f"{each.words()}: {_NOT_BELIEVED}, the target is taken as described" for each in self.apart]
+        contradictions = []
+        # Systematic deviations enlarge all uncertainties; without them, nothing would.
+        covered = misfits or (not against.contradictions and against.all_against())
+        for each, times in self.refused.items() if not self.apart else ():
+            found = f"{each.words()}; {times:.0f} times what is stated"
+            if each.wrong() and not covered:
+                contradictions.append(f"{found}: state it if this is so")
+            else:
+                doubts.append(f"{found}: {_NOT_BELIEVED}; state it if so")
+        if self.tied:
+            doubts.append(
+                f"the target's form or size is taken to be {max(self.tied.values()):.1f} times less certain than stated"
+            )
+        return contradictions, doubts
+
+
+def _solve_with_observed_uncertainties(problem: JointProblem) -> tuple[Estimate, Findings]:
+    """Return the estimate and the findings against it, with the sizes of scanned objects as in the evidence.
+
+    If all prior knowledge deviates more than stated, all prior uncertainties are multiplied by Birge's ratio, because
+    parameters without evidence may be as wrong. For the form and size of the target, see `_FormVerdict`. Both are not
+    done if a single other parameter contradicts prior knowledge.
+    """
+    result = problem.solve()
+    seen, sensor = PriorDeviations.from_estimate(result), problem.sensor
+    contradictions, doubts = [], []
+    if not seen.show_understated():
+        against = check_consistency(result, problem.evidence, sensor=sensor)
+    else:
+        factor = seen.birge_ratio
+        parameters, verdict = _judge_form(problem, seen, result)
+        sensor = sensor.model_copy(update={"uncertainty": sensor.uncertainty.scaled(factor)})
+        result = replace(problem, parameters=parameters, sensor=sensor).solve()
+        against = check_consistency(result, problem.evidence, sensor=sensor)
+        contradictions, doubts = verdict.describe(against, misfits=problem.misfits)
+        if factor > 1.0:
+            doubts.append(
+                f"the description's values of window, media, laser, stage and target deviate by {factor:.1f} times the "
+                "stated uncertainties: all uncertainties were enlarged by this factor; check [uncertainty]"
+            )
+    found = {"contradictions": [*contradictions, *against.contradictions], "doubts": [*doubts, *against.doubts]}
+    return result, replace(against, **found, stretch=seen.stretch(), form=bool(seen.form()))
+
+
+def _judge_form(problem: JointProblem, seen: PriorDeviations, near: Estimate) -> tuple[Parameters, _FormVerdict]:
+    """Return the parameters with the prior uncertainties of the verdict, and the verdict."""
+    form, known = seen.form(), problem.parameters
+    scaled = {key: replace(prior, std=seen.birge_ratio * prior.std) for key, prior in known.priors.items()}
+    priors, off = dict(scaled), {each.key: abs(each.alone - each.known) for each in seen.of_target()}
+    for alike in (BENDS, STRETCH):
+        if any(each.key in alike for each in form):
+            together = sum(off.get(key, 0.0) for key in alike)
+            priors |= {key: replace(priors[key], std=max(priors[key].std, together)) for key in alike}
+    wider = replace(known, priors=priors)
+    halves = _compare_halves_of_form(replace(problem, parameters=wider), near) if form else []
+    times = {each: priors[each.key].std / scaled[each.key].std for each in form}
+    refused = {each: many for each, many in times.items() if many > _MOST_WIDENED or halves is None}
+    tied = {}
+    for alike in (BENDS, STRETCH):
+        if any(each.key in alike for each in (*(halves or ()), *refused)):
+            # The stated uncertainty is multiplied by the deviation's ratio to it (Birge's ratio of one value).
+            less_sure = max((each.sigmas for each in form if each.key in alike), default=1.0)
+            tied |= {key: less_sure for key in alike if key in known.keys}
+    if tied:
+        stated = {key: replace(scaled[key], std=less_sure * scaled[key].std) for key, less_sure in tied.items()}
+        wider = replace(known, priors=priors | stated, tied=frozenset(tied))
+    return wider, _FormVerdict(form, halves or [], refused, tied)
+
+
+def _compare_halves_of_form(problem: JointProblem, near: Estimate) -> list[HalfDifference] | None:
+    """Estimate from both halves of the images; return parameters of the target that they disagree on.
+
+    None if a half determines no estimate.
+
+    Each half has its own noise: that of all images contains the disagreement.
+    """
+    found = []
+    for half in split_in_halves(problem.evidence):
+        evidence, local = keep_images(problem.evidence, near.local, half)
+        with suppress(CalibrationError):
+            found.append(replace(problem, evidence=evidence, local=local, global_values=near.values).solve())
+    if len(found) < 2:
+        return None
+    std = problem.parameters.prior_std()
+    shared = np.diag(np.where(np.isfinite(std), std, np.inf) ** -2.0)
+    values, covariances = [each.values for each in found], [each.covariance for each in found]
+    halves = compare_estimates(problem.parameters.keys, values, covariances, shared)
+    return [h for h in halves if isinstance(h.key, TargetParameter) and h.sigmas() > HALVES_APART]
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """Problem with its estimate and the findings against it; ``said`` lists previous changes."""
+
+    gathered: Gathered
+    options: CalibrationOptions
+    problem: JointProblem
+    result: Estimate
+    against: Findings
+    said: tuple[str, ...]
+
+    @classmethod
+    def solve(cls, gathered: Gathered, options: CalibrationOptions, said: tuple[str, ...] = ()) -> Self:
+        """Solve the problem for this evidence and these options."""
+        problem = joint_problem(gathered, options=options)
+        return cls(gathered, options, problem, *solve_and_check(problem), said)
+
+    def improve(self) -> "_Attempt":
+        """Change the problem by all rules in turn; contradictions of the description remain."""
+        attempt = self
+        for rule in _RULES:
+            for _ in range(rule.times):
+                if (changed := rule.change(attempt)) is None:
+                    break
+                attempt = changed
+            if attempt.against.contradictions:
+                break
+        return attempt
+
+    def _without_unfit(self) -> "_Attempt | None":
+        """Remove the images that contradict all others; None if too few remain, or more contradictions appear."""
+        if not self.against.unfit or (kept := self.gathered.remove_images(self.against.unfit)) is None:
+            return None
+        said = [f"{words}; left out" for words in self.against.unfit.values()]
+        fewer = _Attempt.solve(kept, self.options, (*self.said, *said))
+        return None if fewer.against.contradictions else fewer
+
+    def _with_better_lens(self) -> "_Attempt":
+        """Try fewer and more distortion coefficients, free pixel shape, or both, if something is odd.
+
+        Only parameters that the options leave open are changed. The pixel shape of a sensor on a stage is not freed for
+        contradictions only: a wrong spacing along one side has the same effect.
+        """
+        choice, camera, best = self.options.lens, self.options.camera, self
+        if choice is None or choice.distortion != "auto":
+            return best
+        odd = any(isinstance(each.key, LensParameter) for each in deviations(self.result, least=NOTICED))
+        odd |= bool(
+            self.against.all_against() or self.against.form or list_undetermined(self.result, self.problem.evidence)
+        )
+        free_pixels = choice.pixels == "auto" and self.options.poses == "free"
+        # All are compared at once: pixels that are not square hide the gain of a coefficient.
+        shapes = dict.fromkeys((camera.pixel_aspect, None) if free_pixels else (camera.pixel_aspect,))
+        known = DISTORTIONS if odd else (camera.distortion,)
+        if len(lenses := [replace(camera, distortion=d, pixel_aspect=shape) for shape in shapes for d in known]) > 1:
+            chosen = self._select_lens(lenses)
+            if "k3" in chosen.distortion and odd:
+                chosen = self._select_lens([chosen, *(replace(chosen, distortion=names) for names in RATIONAL)])
+            best = self._with_lens(chosen) or self if chosen != camera else self
+        if choice.pixels == "auto" and not free_pixels:
+            if best.against.misfits:
+                free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
+                best = (
+                    free if free is not None and _scatter(free.result) < _CLEARLY_LESS * _scatter(best.result) else best
+                )
+            best = best._describe_lens(camera)
+            return best._with_spacings_and_pixels_free() or best
+        return best._describe_lens(camera)
+
+    def _select_lens(self, lenses: Sequence[CameraOptions]) -> CameraOptions:
+        """Select the lens with the fewest parameters of those that predict held-out images as well as the best."""
+        stated, tried = joint_problem(self.gathered, options=self.options), {}
+        for options in lenses:
+            with suppress(CalibrationError):
+                trial = stated.with_lens(options, self.result)
+                result = trial.solve()
+                tried[options] = trial.linearise(result).predict(), result
+        if not tried:
+            return self.options.camera
+        noise = min((result for _, result in tried.values()), key=_scatter).noise
+        squares = {options: held.squares(noise) for options, (held, _) in tried.items()}
+        return select_model(compare_models(squares, least_gain=_LEAST_GAIN), self.options.camera)
+
+    def _describe_lens(self, before: CameraOptions) -> "_Attempt":
+        """Add warnings on changes of the lens, and on coefficients that remain undetermined."""
+        camera, said = self.options.camera, []
+        given = [name for name in camera.distortion if name not in before.distortion]
+        given += ["free pixels"] if camera.pixel_aspect != before.pixel_aspect else []
+        if given:
+            said.append(f"{', '.join(given)} were added to the lens: held-out images are predicted better with them")
+        if fewer := [name for name in before.distortion if name not in camera.distortion]:
+            said.append(f"{', '.join(fewer)} were left out of the lens: images are predicted as well without them")
+        return replace(self, said=(*self.said, *said, *list_undetermined(self.result, self.problem.evidence)))
+
+    def _with_spacings_and_pixels_free(self) -> "_Attempt | None":
+        """Estimate the target's spacings and the pixel shape; None if the spacings are as described.
+
+        On a stage, wrong spacings along one side have the same effect as pixels of another shape. Only placements of
+        the target that are rotated against each other distinguish them.
+        """
+        found = list(self.against.stretch.values())
+        if not found or self.options.camera.pixel_aspect is None:
+            return None
+        stated = self.gathered.sensor.uncertainty.stretch_by_axis()
+        known = {"target_stretch": tuple(max(each, sum(map(abs, found))) for each in stated)}
+        uncertainty = self.gathered.sensor.uncertainty.model_copy(update=known)
+        sensor = self.gathered.sensor.model_copy(update={"uncertainty": uncertainty})
+        camera = replace(self.options.camera, pixel_aspect=None)
+        freed = replace(self, gathered=replace(self.gathered, sensor=sensor))._with_lens(camera)
+        said = (
+            f"the target's spacings are off by {' and '.join(f'{1e6 * value:+.0f}' for value in found)} µm/m along "
+            "rows and columns, or the pixels' shape is not as described: both are estimated. To distinguish them, use "
+            "placements of the target rotated by 90° against each other, or set `pixels` to square or free"
+        )
+        return None if freed is None else replace(freed, said=(*freed.said, said))
+
+    def _with_lens(self, camera: CameraOptions) -> "_Attempt | None":
+        """Solve with another lens; None if it is not determined, or the evidence contradicts the description."""
+        try:
+            richer = _Attempt.solve(self.gathered, replace(self.options, camera=camera), self.said)
+        except CalibrationError:
+            return None
+        return None if richer.against.contradictions else richer
+
+    def _with_error_of_model(self) -> "_Attempt | None":
+        """Count all residuals of an image as one if images show systematic deviations, or their halves disagree.
+
+        An incomplete model also biases lens and poses, so that kinds of residuals that fit well are affected too.
+        """
+        halves = self.problem.linearise(self.result).disagreements()
+        if not halves and not self.against.all_against():
+            return None
+        problem = replace(self.problem, misfits=frozenset(self.result.noise))
+        result, against = solve_and_check(problem)
+        before, after = self.result.std(), result.std()
+        factor = float(np.median([after[key] / before[key] for key in before if key in after]))
+        said = [each.words() for each in halves[:_MOST_HALVES]]
+        said += [f"{words}; kept, as too many images are like this" for words in self.against.unfit.values()]
+        said += self.against.misfits.values()
+        # Larger uncertainties hide what the halves disagree on.
+        said += [words for words in self.against.doubts if _NOT_BELIEVED in words and words not in against.doubts]
+        said.append(
+            "images show systematic deviations from the model: all points of an image count as one, which makes "
+            f"uncertainties {factor:.1f} times larger (median)"
+        )
+        against = replace(against, unfit={}, misfits={})
+        return replace(self, problem=problem, result=result, against=against, said=(*self.said, *said))
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """Change of the problem, up to ``times`` times; the change returns None if nothing calls for it."""
+
+    change: Callable[[_Attempt], _Attempt | None]
+    times: int = 1
+
+
+_RULES = (
+    # Other coefficients or another pixel shape, if something is odd and the options leave the lens open.
+    _Rule(_Attempt._with_better_lens),
+    # Images that contradict all others are left out; what remains after three rounds has another cause.
+    _Rule(_Attempt._without_unfit, times=3),
+    # Images still show systematic deviations, or their halves disagree: all residuals of an image count as one.
+    _Rule(_Attempt._with_error_of_model),
+)
+
+
+def _scatter(result: Estimate) -> float:
+    """Return the geometric mean of the scatter of target points and stripes, px."""
+    return float(np.exp(np.mean(np.log([noise.sigma_px for noise in result.noise.values()]))))
+
+
+def _solve_first(gathered: Gathered, options: CalibrationOptions) -> _Attempt:
+    """Solve with the usual lens, or with fewer coefficients if the images do not determine them."""
+    try:
+        return _Attempt.solve(gathered, options)
+    except CalibrationError as refusal:
+        if options.lens is None or options.lens.distortion != "auto":
+            raise
+        for fewer in (("k1",), ()):
+            said = f"the lens has {' '.join(fewer) or 'no distortion'}: with {' '.join(options.camera.distortion)}, "
+            with suppress(CalibrationError):
+                camera = replace(options.camera, distortion=fewer)
+                return _Attempt.solve(gathered, replace(options, camera=camera), (said + str(refusal),))
+        raise
