@@ -18,11 +18,10 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import map_in_threads
 from uwlts.storage.capture import Capture
 from uwlts.stripe import Stripe, StripeOptions, StripeSettings, explain_missing_stripe, find_stripe
-from uwlts.stripe.capture_stripes import find_stripe_direction
+from uwlts.stripe.capture_stripes import FEWEST_LINES, find_stripe_direction
 from uwlts.targets import Target, TargetView, parse_target
 
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
-_FEWEST_LINES = 20  # fewer lines are reflections or specks, not the stripe
 _MANY_OUTLIERS = 0.05  # fraction of a capture's stripe points above which rejected points give a warning
 _LOOKED_AT = 15  # images of a capture that are searched for the reason of a missing stripe
 
@@ -275,8 +274,8 @@ def _stripe_settings(capture: Capture, settings: StripeSettings) -> tuple[str, S
 
 
 def _explain_short_stripe(pixels: np.ndarray) -> str:
-    enough = len(pixels) >= _FEWEST_LINES
-    return "" if enough else f"found on {len(pixels)} lines only; at least {_FEWEST_LINES} are needed"
+    enough = len(pixels) >= FEWEST_LINES
+    return "" if enough else f"found on {len(pixels)} lines only; at least {FEWEST_LINES} are needed"
 
 
 def _report(progress: ProgressListener, name: str, done: int, total: int) -> int:

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD
 from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe, find_stripe
 from uwlts.targets import Target, TargetView
 
 _DEGREE = 4  # degree for the bends of lens, window, line optics and plate; a higher one would follow outliers
 _TRIALS = 300  # parabolas through three points; with half the points outliers, one in eight contains no outlier
 _BEYOND = 0.025  # fraction of the plate's size by which distortion may shift its border in the image
-_OUTLIER = 5.0  # robust standard deviations from the curve; of a million normal values, one is larger
 _LEAST_LIMIT_PX = 1.0  # smallest inlier limit, independent of the scatter
 _FEWEST = 20  # points of a curve
 _LOST = 0.05  # fraction of the lines on the plate that may have no point on the curve without a second search
@@ -122,7 +121,7 @@ class _Curve:
         for _ in range(10):
             polynomial = np.polynomial.Polynomial.fit(lines[near], across[near], _DEGREE)
             apart = np.abs(across[near] - polynomial(lines[near]))
-            limit = max(_OUTLIER * MAD_TO_STD * float(np.median(apart)), _LEAST_LIMIT_PX)
+            limit = max(DEFAULT_K * MAD_TO_STD * float(np.median(apart)), _LEAST_LIMIT_PX)
             curve = _Curve(polynomial, limit)
             before, near = near, curve.holds(lines, across)
             if (near == before).all():

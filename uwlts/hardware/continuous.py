@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import EvaluationError, HardwareError, RangeError
-from uwlts.fitting.least_squares import robust_std
+from uwlts.fitting.least_squares import DEFAULT_K, robust_std
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage, StageReport
 from uwlts.hardware.scan_plan import Continuous, ScanPlan
@@ -42,7 +42,6 @@ _GAP_S = 0.8
 _SLOW_REPORT = 2.0
 """Reports that took this many times as long as the fastest are ignored: their time is less certain."""
 _FEWEST_REPORTS = 4  # of the stage's position: two determine the motion, the others check it
-_OUTLIER = 5.0  # robust standard deviations
 _BUSY = 0.9
 """Largest fraction of the frame period that the exposure may take."""
 
@@ -371,7 +370,7 @@ def _fit_line(reports: list[StageReport]) -> _Line:
     speed, start, away = refit()
     for _ in range(2):
         scatter = max(robust_std(away), 1e-6)
-        kept = np.abs(away) <= _OUTLIER * scatter
+        kept = np.abs(away) <= DEFAULT_K * scatter
         speed, start, away = refit()
     # The line takes two degrees of freedom.
     scatter = float(np.sqrt((away[kept] ** 2).sum() / max(np.count_nonzero(kept) - 2, 1)))

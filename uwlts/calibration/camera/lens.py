@@ -18,7 +18,7 @@ from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.calibration import CameraModel
 from uwlts.model.sensor import Uncertainty
@@ -36,7 +36,6 @@ _FOLDS = 5  # parts of the images for cross-validation; 5 to 10 are usual
 _WORSE = 1.0  # standard errors of the mean difference of squares within which a model is as good as the best
 _LEAST_GAIN = 0.01  # relative to the mean square; a smaller gain is useless even if significant
 _SOFT = 2.0  # robust standard deviations from which a point has less weight
-_OUTLIER = 5.0  # robust standard deviations from which a point is rejected
 _LARGEST_REJECTED = 0.3  # fraction of an image's points; more indicate another board or pose
 _LEAST_SCATTER_PX = 1e-6  # scatter of points; simulated ones may have none
 _FINEST_PX = 0.05
@@ -327,7 +326,7 @@ def _scatter(solution: CameraSolution) -> float:
 
 def _inliers(solution: CameraSolution) -> list[np.ndarray]:
     """Return masks (N,) of points within five robust standard deviations, which are at least `_FINEST_PX`."""
-    limit = _OUTLIER * max(_scatter(solution), _FINEST_PX)
+    limit = DEFAULT_K * max(_scatter(solution), _FINEST_PX)
     return [np.linalg.norm(residuals, axis=1) <= limit for residuals in solution.residuals_px]
 
 

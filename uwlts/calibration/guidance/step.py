@@ -14,11 +14,11 @@ from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Sensor
 from uwlts.optics.triangulation import points_on_sheet
 from uwlts.stripe import StripeStatus, extract_stripe
+from uwlts.stripe.capture_stripes import FEWEST_LINES
 
 PLACES = 3
 """Number of depths of the standard that are needed: near, middle and far."""
 _APART = 1 / 7  # fraction of the volume's depth
-_FEWEST_LINES = 20  # fewer lines are reflections or specks, not the stripe
 _MOST_SATURATED = 0.05  # fraction of the lines; outlier tests tolerate this many wrong centres
 
 
@@ -83,8 +83,8 @@ def judge_step(
     except ImageError as error:
         return StepQuality(np.empty((0, 2)), None, (str(error),))
     pixels, reasons = stripe.pixels(), []
-    if len(pixels) < _FEWEST_LINES:
-        reason = f"the laser line is found on {len(pixels)} lines only; at least {_FEWEST_LINES} are needed"
+    if len(pixels) < FEWEST_LINES:
+        reason = f"the laser line is found on {len(pixels)} lines only; at least {FEWEST_LINES} are needed"
         return StepQuality(pixels, None, (f"{reason}; is the laser on, is the standard in the sheet?",))
     clipped = (image.max(axis=0 if along == "width" else 1) >= full_dn) & (stripe.status != StripeStatus.NO_STRIPE)
     saturated = float(clipped.sum()) / len(pixels)

@@ -9,7 +9,7 @@ from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
 from uwlts.errors import CalibrationError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD
 from uwlts.fitting.schur_least_squares import LocalPrior, Observation, SchurFit, schur_least_squares
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Uncertainty
@@ -49,7 +49,6 @@ _DAMPING = 1e-9  # for the first step near the solution
 _FIRST_DAMPING = 1e-4  # for the first step from the start
 _FIRST_LINES = slice(None, None, 4)  # stripe pixels on targets in the first round: enough for a start, and fast
 _FIRST_ROUNDS = 30  # then outliers are rejected and the rest is solved to convergence
-_OUTLIER = 5.0  # standard deviations; of a million normal values, one is larger
 _LAGS = 100  # lines; filters and speckle correlate a few, wrong models some tens
 _SHARED_LAG = 0.05  # correlation that some thousand pairs can distinguish from zero by three standard errors
 _FEWEST_POINTS = 25  # points of an image, for its ten smooth functions
@@ -227,7 +226,7 @@ def _estimate_all_noise(
 
 def outliers(residuals: Residuals, noise: Noise) -> np.ndarray:
     """Return which residuals (n,) are outliers; for target points, both coordinates together."""
-    large = np.asarray(np.abs(residuals.values) > _OUTLIER * noise.sigma_px)
+    large = np.asarray(np.abs(residuals.values) > DEFAULT_K * noise.sigma_px)
     if residuals.kind == TARGET:
         large = np.repeat(np.any(large.reshape(-1, 2), axis=1), 2)
     return large
@@ -235,7 +234,7 @@ def outliers(residuals: Residuals, noise: Noise) -> np.ndarray:
 
 def outlier_limit(values: np.ndarray) -> float:
     """Return the absolute value beyond which values are outliers: five robust standard deviations."""
-    return _OUTLIER * MAD_TO_STD * float(np.median(np.abs(values)))
+    return DEFAULT_K * MAD_TO_STD * float(np.median(np.abs(values)))
 
 
 def estimate_noise(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
@@ -243,7 +242,7 @@ def estimate_noise(kind: str, residuals: Sequence[Residuals], points: Sequence[n
     values = np.concatenate([r.values for r in residuals])
     limit = outlier_limit(values)
     kept = np.abs(values) <= limit
-    sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else limit / _OUTLIER
+    sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else limit / DEFAULT_K
     if sigma < _FINEST_PX:
         return Noise(_FINEST_PX)
     if kind == TARGET:
@@ -290,7 +289,7 @@ def _image_variance_factor(residuals: Sequence[Residuals], places: np.ndarray, s
     ends = np.cumsum([len(part.values) // 2 for part in residuals])
     for part, at in zip(residuals, np.split(places, ends[:-1]), strict=True):
         pairs = part.values.reshape(-1, 2)
-        kept = np.all(np.abs(pairs) <= _OUTLIER * sigma, axis=1)
+        kept = np.all(np.abs(pairs) <= DEFAULT_K * sigma, axis=1)
         at, pairs = at[kept], pairs[kept]
         if len(pairs) < _FEWEST_POINTS:
             continue
@@ -304,7 +303,7 @@ def _neighbour_variance_factor(residuals: Sequence[Residuals], sigma: float) -> 
     """Return the variance factor 1 + 2 sum of the autocorrelation along the stripe, over all images."""
     products, counts = np.zeros(_LAGS), np.zeros(_LAGS)
     for part in residuals:
-        kept = (np.abs(part.values) <= _OUTLIER * sigma).astype(np.float64)
+        kept = (np.abs(part.values) <= DEFAULT_K * sigma).astype(np.float64)
         values = kept * part.values
         for lag in range(1, min(_LAGS, len(values) // 4)):
             products[lag] += values[lag:] @ values[:-lag]

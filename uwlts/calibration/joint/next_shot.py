@@ -25,11 +25,11 @@ from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.sheet import sheet_surface
+from uwlts.stripe.capture_stripes import FEWEST_LINES
 from uwlts.targets import Target, parse_target
 
 WHOLE_VOLUME = "lengths over the volume"
 _FEWEST_POINTS = 20  # target points in view: fewer determine the pose of an image poorly
-_FEWEST_LINES = 20  # profile lines on a surface in view
 _SAMPLES = 400  # points of a curve, enough to interpolate a point on each profile line of its image
 STEP_MM = 20.0
 """Height of the step standard, as in the thesis."""
@@ -156,7 +156,7 @@ def _simulate_target(known: StoredEstimate, target: Target, pose: np.ndarray) ->
     pixels = _mask_outside(known, known.project(points @ pose[:3, :3].T + pose[:3, 3]))
     inside = np.isfinite(pixels).all(axis=1)
     count, lit = int(inside.sum()), _simulate_stripe(known, target, pose)
-    if count < _FEWEST_POINTS or len(lit) < _FEWEST_LINES:
+    if count < _FEWEST_POINTS or len(lit) < FEWEST_LINES:
         return None
     evidence = TargetEvidence(
         view=known.view,
@@ -185,7 +185,7 @@ def _simulate_step(known: StoredEstimate, depth_mm: float, uncertainty: Uncertai
     raised = depth_mm - known.parameters.value(known.values, height)
     faces = ((~upper & (y < 0), depth_mm), (upper, raised), (~upper & (y > 0), depth_mm))
     kept = [_sample_curve(known, np.column_stack([y[face], np.full(face.sum(), z)])) for face, z in faces]
-    if min(map(len, kept)) < _FEWEST_LINES:
+    if min(map(len, kept)) < FEWEST_LINES:
         return None
     frame = known.calibration.object_transform()
     evidence = StepProfileEvidence(
@@ -213,7 +213,7 @@ def _simulate_spheres(known: StoredEstimate, depth_mm: float, uncertainty: Uncer
     chords = np.sqrt(radius**2 - positions**2)
     pixels = [_sample_curve(known, centre[1:] + chord * arc) for chord in chords for centre in centres]
     counts = [len(found) for found in pixels]
-    if min(counts) < _FEWEST_LINES:
+    if min(counts) < FEWEST_LINES:
         return None
     unknown = np.full(SPHERES, np.inf)
     sphere = np.repeat(np.tile(np.arange(SPHERES), _SPHERE_IMAGES), counts)

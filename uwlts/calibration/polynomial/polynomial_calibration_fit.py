@@ -16,7 +16,7 @@ from uwlts.calibration.polynomial.polynomial_evidence import (
     stripes_on_plate,
 )
 from uwlts.errors import CalibrationError, RangeError
-from uwlts.fitting.least_squares import robust_std
+from uwlts.fitting.least_squares import DEFAULT_K, robust_std
 from uwlts.model.brief import Brief
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -27,7 +27,6 @@ MOST_SMOOTH = 8
 """Largest degree of the coefficients as functions of the line."""
 _LINES_PER_DEGREE = 10  # lines needed for each degree over the lines
 _DETERMINED = 1e-6  # smallest ratio of singular values: a full view has 0.1, a triangular one some thousandths
-_OUTLIER = 5.0  # standard deviations; of a million normal values, one is larger
 _ROUNDS = 20  # of outlier rejection; a few suffice
 _RETURNING_ROUNDS = 10  # rounds in which outliers may return; afterwards they stay rejected, so that the iteration ends
 
@@ -94,7 +93,7 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
         residuals = y - design @ solution
         spread = robust_std(residuals[used])
         # Rounding errors of exact data are not outliers.
-        within = np.abs(residuals) <= max(_OUTLIER * spread, 1e-9 * float(np.ptp(y)))
+        within = np.abs(residuals) <= max(DEFAULT_K * spread, 1e-9 * float(np.ptp(y)))
         if rounds >= _RETURNING_ROUNDS:
             within &= used
         rounds += 1

@@ -133,37 +133,9 @@ def fit_sheet(
         )
     offset = float(plane.normal @ plane.point_mm)
     turn = float(np.arccos(np.clip(plane.normal @ nominal_normal, -1, 1)))
-    advice = None
-    if how := turned_like(plane.normal, nominal_normal, either_way=True):
-        advice = (
-            f". This occurs if the images are {how}, or the laser is on the camera's other side: correct the images, "
-            "or the description"
-        )
-    elif turn > _LARGEST_TURN:
-        advice = ": check stripe_along, the laser's position, and whether the images are rotated or mirrored"
-    if advice:
-        found = f"the sheet found has the normal {np.round(plane.normal, 3).tolist()}"
-        axis = int(np.argmax(np.abs(plane.normal[:2])))
-        if abs(plane.normal[axis]) > _CROSSING:
-            found += f" and crosses the camera's {'xy'[axis]} axis at {offset / plane.normal[axis]:.0f} mm"
-        raise CalibrationError(
-            f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description{advice}; "
-            + found
-        )
+    _require_orientation(plane.normal, offset, nominal_normal, turn)
     if nominal_offset_mm is not None and abs(nominal_offset_mm) > _LEAST_OFFSET_MM:
-        times = offset / nominal_offset_mm
-        if times < 0:
-            raise CalibrationError(
-                f"the sheet passes the camera at {offset:.1f} mm; expected {nominal_offset_mm:.1f} mm from the "
-                "sensor's description, on the other side: the images are turned by 180 deg or mirrored, or the laser "
-                "is on the camera's other side; correct the images, or the description"
-            )
-        if not 1 / _OTHER_UNIT < times < _OTHER_UNIT:
-            raise CalibrationError(
-                f"the sheet passes the camera at {offset:.1f} mm; expected {nominal_offset_mm:.1f} mm from the "
-                "sensor's description: the target's measures must be in mm (not cm, m or inches), and the laser's "
-                "position must be that of this sensor"
-            )
+        _require_offset(offset, nominal_offset_mm)
     return SheetSolution(
         model=SheetModel(normal=tuple(plane.normal.tolist()), offset_mm=offset),
         residuals_mm=robust.distances_mm,
@@ -174,6 +146,44 @@ def fit_sheet(
         normal_std_rad=float(np.sqrt(np.max(np.diag(plane.covariance)[1:]))),
         turn_rad=turn,
     )
+
+
+def _require_orientation(normal: np.ndarray, offset: float, nominal_normal: np.ndarray, turn: float) -> None:
+    """Raise CalibrationError if the sheet's normal (3,) is far from the nominal one, by ``turn`` rad."""
+    advice = None
+    if how := turned_like(normal, nominal_normal, either_way=True):
+        advice = (
+            f". This occurs if the images are {how}, or the laser is on the camera's other side: correct the images, "
+            "or the description"
+        )
+    elif turn > _LARGEST_TURN:
+        advice = ": check stripe_along, the laser's position, and whether the images are rotated or mirrored"
+    if advice:
+        found = f"the sheet found has the normal {np.round(normal, 3).tolist()}"
+        axis = int(np.argmax(np.abs(normal[:2])))
+        if abs(normal[axis]) > _CROSSING:
+            found += f" and crosses the camera's {'xy'[axis]} axis at {offset / normal[axis]:.0f} mm"
+        raise CalibrationError(
+            f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description{advice}; "
+            + found
+        )
+
+
+def _require_offset(offset: float, nominal_offset_mm: float) -> None:
+    """Raise CalibrationError if the sheet's distance from the camera indicates another side or unit."""
+    times = offset / nominal_offset_mm
+    if times < 0:
+        raise CalibrationError(
+            f"the sheet passes the camera at {offset:.1f} mm; expected {nominal_offset_mm:.1f} mm from the "
+            "sensor's description, on the other side: the images are turned by 180 deg or mirrored, or the laser "
+            "is on the camera's other side; correct the images, or the description"
+        )
+    if not 1 / _OTHER_UNIT < times < _OTHER_UNIT:
+        raise CalibrationError(
+            f"the sheet passes the camera at {offset:.1f} mm; expected {nominal_offset_mm:.1f} mm from the "
+            "sensor's description: the target's measures must be in mm (not cm, m or inches), and the laser's "
+            "position must be that of this sensor"
+        )
 
 
 def object_frame(sheet: SheetModel, *, laser_axis: np.ndarray) -> np.ndarray:
