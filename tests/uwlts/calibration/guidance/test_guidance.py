@@ -306,7 +306,8 @@ def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
 def test_pose_advice_is_in_plain_words(setting):
     near = target_pose(middle_mm=(-60, -40, 330.0))
     state = solve_state(recorded(setting, [near], np.random.default_rng(0)), setting)
-    far = target_pose(tilt_deg=(25, 0), middle_mm=(60.0, 50.0, 450.0))
+    far = target_pose(tilt_deg=(25, 0))
+    far[:3, 3] = np.array([60.0, 50.0, 450.0]) - far[:3, :3] @ BOARD.points_mm.mean(axis=0)
     words = format_pose_advice(far, state, near)
     assert "right side is farther, 25 deg (now it is tilted by 0 deg)" in words
     assert "bring its middle to the lower right of the image" in words
