@@ -1,4 +1,4 @@
-"""What the residuals of a joint estimate show: images, values and parts of the description that disagree."""
+"""Contradictions in a joint estimate, from its residuals: images, values and parts of the description."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What is changed in a joint calibration because of what its residuals show: uncertainties, lens, images, weights."""
+"""Changes of a joint calibration because of what its residuals show: uncertainties, lens, images, weights."""
 
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
@@ -85,13 +85,11 @@ def _free_sizes(piece: Evidence) -> Evidence:
 
 @dataclass(frozen=True)
 class _FormVerdict:
-    """What is done about noticeable deviations ``form`` of the target's form and size.
+    """Decision on noticeable deviations ``form`` of the target's form and size.
 
-    | finding | prior uncertainty |
-    | --- | --- |
-    | both halves of the images agree | the observed deviation |
-    | the halves disagree (``apart``) | as stated, times the deviation in standard uncertainties; the value is tied |
-    | many times what is stated (``refused``, with the factor) | the same |
+    If both halves of the images agree, the prior uncertainty becomes the observed deviation. If the halves disagree
+    (``apart``), or the deviation is many times what is stated (``refused``, with this factor), the value stays as
+    described. Its stated uncertainty is then multiplied by the deviation in standard uncertainties.
 
     ``tied`` are these factors of the parameters that stay as described.
     """
