@@ -257,7 +257,11 @@ def collect_findings(into: FlawFindings, take: Take, inspection: dict[str, Any])
 
 
 def _collect_pits(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) -> None:
-    """Add the pits within the scanned part of a pipe."""
+    """Add the pits within the scanned part of a pipe, cut by its ends or not.
+
+    A pit cut by an end is found if a finding is there. Its values are bounds and are not compared, as for all findings
+    that are not sized.
+    """
     number = next(n for n, thing in enumerate(scene.objects) if isinstance(thing, PittedPipe))
     pipe, place = scene.objects[number], scene.object_poses()[number]
     assert isinstance(pipe, PittedPipe)
@@ -284,10 +288,10 @@ def _collect_pits(into: FlawFindings, scene: Scene, inspection: dict[str, Any]) 
     )
     first, last = _scanned_mm(scene)
     along = pits[:, 0] + place[0, 3]
-    for pit in np.flatnonzero((along - reach > first) & (along + reach < last)).tolist():
+    for pit in np.flatnonzero((along > first) & (along < last)).tolist():
         into.depths_mm.append(depths[pit])
         into.found.append(pit in known)
-        if (feature := known.get(pit)) is not None:
+        if (feature := known.get(pit)) is not None and feature["reason"] is None:
             into.values.append((*_value(feature["values"]["depth"]), depths[pit]))
 
 

@@ -56,11 +56,12 @@ class BlemishSearchRule:
     most_deviation: float = 2.0
     """Limit of a point's deviation from this median, in the same unit: 1 % of the efficiency for normal noise is
     lost. Deviations in a pit of the smallest size stay below it, because its slopes increase the standard deviation."""
-    enlargements: int = 3  # most enlargements of the window around a peak, while its region reaches the window's edge
     enlargement: float = 1.7  # ratio of the window's sides before and after an enlargement
     core: float = 0.8  # radius, in radii of the bell, within which all points belong to the indication
     edge_share: float = 0.1
     """Height of the region's edge as a fraction of the blemish's height, as metal loss is boxed in pipe inspection."""
+    saddle: float = 0.75
+    """Height of a region beside another one, as a fraction of its largest height, from which it is the rest of that."""
     edge_std: float = 3.0  # least height of the region's edge, in standard deviations of a local mean
 
 
@@ -128,8 +129,13 @@ def _cells_of(
     return rows, columns
 
 
-def limit_deviations(surface: UnrolledSurface, tree: KDTree) -> tuple[UnrolledSurface, np.ndarray, float]:
+def limit_deviations(
+    surface: UnrolledSurface, tree: KDTree, *, together_mm: float, false_alarm: float
+) -> tuple[UnrolledSurface, np.ndarray, float]:
     """Limit the deviations of the points from the medians of their neighbours.
+
+    Outliers of one direction within ``together_mm`` of each other, more than chance explains with the given probability
+    of a false alarm, show a small blemish: they are no outliers, and keep their heights.
 
     Returns
     -------
@@ -158,9 +164,29 @@ def limit_deviations(surface: UnrolledSurface, tree: KDTree) -> tuple[UnrolledSu
     spread = np.maximum(spread, usually)
     off, most = surface.heights - middle, SEARCH_RULE.most_deviation * spread
     outliers, limited = np.abs(off) > SEARCH_RULE.outlier * spread, np.clip(off, -most, most)
+    for sign in (-1, 1):
+        together = _find_together(surface.places, outliers & (sign * off > 0), together_mm, false_alarm)
+        outliers[together], limited[together] = False, off[together]
     usual = ~outliers & (spread <= 2 * usually)
     ratio = float(np.std(off[usual]) / max(np.std(limited[usual]), 1e-300)) if usual.any() else 1.0
     return replace(surface, heights=middle + limited), outliers, max(ratio, 1.0)
+
+
+def _find_together(places: np.ndarray, chosen: np.ndarray, radius: float, false_alarm: float) -> np.ndarray:
+    """Return the ``chosen`` (N,) bool points (K,) int near more of them than random places would give anywhere.
+
+    The share of chosen points gives a binomial distribution of pairs: neighbours along a stripe share their noise.
+    """
+    points = np.flatnonzero(chosen)
+    if len(points) < 2:
+        return points[:0]
+    tree = KDTree(places[points])
+    beside = tree.query_ball_point(places[points], radius, return_length=True) - 1
+    share, neighbours = len(points) / len(places), SEARCH_RULE.points_in_smallest - 1
+    rare = stats.binom.sf(np.arange(neighbours + 1) // 2 - 1, neighbours, share) * len(points) < false_alarm
+    fewest = int(np.argmax(rare)) if rare.any() else neighbours + 1
+    full = tree.query_ball_point(places[points[beside >= fewest]], radius)
+    return points[np.unique(np.concatenate([np.zeros(0, int), *(np.array(each, int) for each in full)]))]
 
 
 def _median_of_rows(values: np.ndarray) -> np.ndarray:

@@ -6,6 +6,9 @@ Divided by its local scatter, the depth on an undamaged surface is a random fiel
 it exceeds a level anywhere is the expected Euler characteristic of the excursion set (Adler and Taylor, Random Fields
 and Geometry, 2007; Worsley et al., Human Brain Mapping 4, 1996, Table I). The threshold follows from this probability.
 Only indications that are significant for the tail of the noise remain.
+
+An indication grows from its peak to all adjacent cells above a tenth of its height, however far: a gouge or an area of
+corrosion is one indication. The shallow rest around it belongs to it.
 """
 
 from __future__ import annotations
@@ -39,10 +42,11 @@ class Indication:
 
 @dataclass(frozen=True, eq=False)
 class UnresolvedDeparture:
-    """Significant departure without a region: the nearest point, its signed height in mm, and the reason."""
+    """Significant departure without a region: the nearest point, its signed height, least height, and the reason."""
 
     point: int
     height_mm: float
+    bound_mm: float
     reason: str
 
 
@@ -76,10 +80,10 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
             f"{len(places)} points are too few to search for blemishes; "
             f"{20 * SEARCH_RULE.points_in_smallest} are needed"
         )
-    surface, outliers, wider = limit_deviations(surface, tree)
     smallest = float(
         np.median(tree.query(places[:: max(1, len(places) // 2000)], k=SEARCH_RULE.points_in_smallest)[0][:, -1])
     )
+    surface, outliers, wider = limit_deviations(surface, tree, together_mm=smallest, false_alarm=false_alarm)
     extent = surface.corners[1] - surface.corners[0]
     largest = min(SEARCH_RULE.largest_size * float(np.min(extent)), largest_mm)
     largest = max(largest, smallest)
@@ -103,14 +107,18 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
         if not peaks:
             break
         for peak in peaks:
+            core = np.array(tree.query_ball_point(peak.place, SEARCH_RULE.core * peak.radius), int)
+            if np.count_nonzero(undamaged[core]) < 0.5 * np.count_nonzero(~outliers[core]):
+                continue
             try:
                 if number == SEARCH_RULE.rounds:
                     raise EvaluationError(f"{SEARCH_RULE.rounds} rounds of the search found it again each time")
-                outcome = _delimit(surface, undamaged, tree, maps, peak, smallest)
-                points = outcome.points
+                outcome, points = _delimit(surface, undamaged, outliers, tree, maps, peak, smallest)
             except EvaluationError as error:
-                outcome = UnresolvedDeparture(int(tree.query(peak.place)[1]), peak.height, str(error))
-                points = np.array(tree.query_ball_point(peak.place, peak.radius), int)
+                points = core[undamaged[core]]
+                level = np.sign(peak.height) * float(np.median(surface.heights[points]))
+                bound = max(0.0, level - SEARCH_RULE.edge_std * float(maps[0].noise_at(peak.place[None])[0]))
+                outcome = UnresolvedDeparture(int(tree.query(peak.place)[1]), peak.height, bound, str(error))
             found.append(_Candidate(peak, outcome, points[undamaged[points]]))
             undamaged[points] = False
     level, noise = np.full(len(places), np.nan), np.full(len(places), np.nan)
@@ -129,10 +137,10 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
 
 
 class _Candidate(NamedTuple):
-    """Significant peak, the indication or departure at its place, and the points (K,) removed with it."""
+    """Significant peak, what is at its place, and the points (K,) removed with it."""
 
     peak: _Peak
-    outcome: Indication | UnresolvedDeparture
+    outcome: Indication | UnresolvedDeparture | None  # None for the rest of another indication
     points: np.ndarray
 
 
@@ -212,32 +220,53 @@ def _choose_peaks(maps: Sequence[BellMap], threshold: float) -> list[_Peak]:
 
 
 def _delimit(
-    surface: UnrolledSurface, undamaged: np.ndarray, tree: KDTree, maps: Sequence[BellMap], peak: _Peak, smallest: float
-) -> Indication:
-    """Return a peak with its region: adjacent cells that depart in the same direction.
+    surface: UnrolledSurface,
+    undamaged: np.ndarray,
+    outliers: np.ndarray,
+    tree: KDTree,
+    maps: Sequence[BellMap],
+    peak: _Peak,
+    smallest: float,
+) -> tuple[Indication | None, np.ndarray]:
+    """Return a peak with its region, and the points of this: adjacent cells that depart in the same direction.
 
-    EvaluationError if the region or its surroundings have too few points.
+    Without an indication, the region is the rest of another one. EvaluationError if the region or its surroundings
+    have too few points.
     """
-    noise, reach, points = float(maps[0].noise_at(peak.place[None])[0]), 3.0 * peak.radius, np.zeros(0, int)
-    for _ in range(SEARCH_RULE.enlargements):
+    noise, reach, step = float(maps[0].noise_at(peak.place[None])[0]), 3.0 * peak.radius, max(smallest, peak.radius / 4)
+    while True:
         near = np.array(tree.query_ball_point(peak.place, reach), int)
-        near = near[undamaged[near]]
+        taken, near = near[~undamaged[near] & ~outliers[near]], near[undamaged[near]]
         places, heights = surface.places[near] - peak.place, surface.heights[near]
-        inside, cut = _grow_region(places, heights, peak, noise=noise, reach=reach, step=max(smallest, peak.radius / 4))
-        points = near[inside]
-        if not cut:
+        grown = _grow_region(places, heights, surface.places[taken] - peak.place, peak, noise, reach, step)
+        if not grown.cut or len(near) == np.count_nonzero(undamaged):
             break
         reach *= SEARCH_RULE.enlargement
+    points = near[grown.inside]
+    if grown.is_rest:
+        return None, points
     if len(points) < SEARCH_RULE.fewest_points:
         raise EvaluationError(f"it has {len(points)} points; {SEARCH_RULE.fewest_points} are needed")
     chance = min(1.0, sum(each.false_alarms(peak.z) for each in maps))
-    return Indication(peak.place, peak.radius, peak.height, peak.z, chance, noise, points)
+    return Indication(peak.place, peak.radius, peak.height, peak.z, chance, noise, points), points
+
+
+class _Region(NamedTuple):
+    """Mask (n,) of the points in a region, whether it is cut by the window's edge, and whether it is a rest."""
+
+    inside: np.ndarray
+    cut: bool
+    is_rest: bool
 
 
 def _grow_region(
-    places: np.ndarray, heights: np.ndarray, peak: _Peak, *, noise: float, reach: float, step: float
-) -> tuple[np.ndarray, bool]:
-    """Return a mask (n,) of the points of a peak at the origin, and whether the region reaches the window's edge."""
+    places: np.ndarray, heights: np.ndarray, taken: np.ndarray, peak: _Peak, noise: float, reach: float, step: float
+) -> _Region:
+    """Return the region of a peak at the origin.
+
+    It is the rest of an indication with points ``taken`` (m, 2) if it touches them, and is not clearly higher
+    elsewhere.
+    """
     away = np.hypot(*places.T)
     ring = away > 0.5 * reach
     if np.count_nonzero(ring) < 2 * SEARCH_RULE.fewest_points:
@@ -247,20 +276,28 @@ def _grow_region(
     base = np.column_stack([np.ones(len(places)), places])
     left = heights - base @ (fit_biweight(base, heights, ring)[0] @ heights)
     side = int(np.ceil(2 * reach / step)) + 1
-    cells = np.floor((places + reach) / step).astype(int)
+    cells, other = (np.floor((each + reach) / step).astype(int) for each in (places, taken))
     flat = cells[:, 0] * side + cells[:, 1]
     # Sums over three by three cells.
     count = 9 * ndimage.uniform_filter(np.bincount(flat, minlength=side**2).reshape(side, side) * 1.0, 3)
     total = 9 * ndimage.uniform_filter(np.bincount(flat, left, side**2).reshape(side, side), 3)
     filled = count > 0.5
-    mean = np.where(filled, np.sign(peak.height) * total / np.maximum(count, 0.5), -np.inf)
+    mean: Any = np.where(filled, np.sign(peak.height) * total / np.maximum(count, 0.5), -np.inf)
+    middle = int(reach / step)
+    core = mean[middle - 1 : middle + 2, middle - 1 : middle + 2]
     level = np.maximum(
-        SEARCH_RULE.edge_share * float(mean.max()), SEARCH_RULE.edge_std * noise / np.sqrt(np.maximum(count, 1))
+        SEARCH_RULE.edge_share * float(core.max()), SEARCH_RULE.edge_std * noise / np.sqrt(np.maximum(count, 1))
     )
     labelled: Any = ndimage.label(mean > level)
-    middle = int(reach / step)
     own = labelled[0][middle - 1 : middle + 2, middle - 1 : middle + 2]
     region = np.isin(labelled[0], own[own > 0])
-    wide = ndimage.binary_dilation(region)
+    wide: Any = ndimage.binary_dilation(region)
     cut = bool(region[[0, 1, -2, -1], :].any() or region[:, [0, 1, -2, -1]].any())
-    return wide[cells[:, 0], cells[:, 1]] | (away < SEARCH_RULE.core * peak.radius), cut
+    beside: Any = np.zeros((side, side), bool)
+    beside[other[:, 0], other[:, 1]] = True
+    beside = ndimage.binary_dilation(beside, np.ones((3, 3)))
+    touches = bool(beside[wide].any() or beside[middle, middle])
+    top = float(np.max(mean, where=region, initial=0.0))
+    saddle = float(np.max(mean, where=region & beside, initial=0.0))
+    is_rest = touches and saddle >= SEARCH_RULE.saddle * top
+    return _Region(wide[cells[:, 0], cells[:, 1]] | (away < SEARCH_RULE.core * peak.radius), cut, is_rest)

@@ -52,9 +52,17 @@ class BlemishRule:
     most_variance: float = 12.0
     """Largest variance of a quadratic's value, times its number of points; it is 3 to 5 inside the point set."""
     cells: int = 26  # cells of the grid across the blemish
+    most_cells: int = 10_000  # most cells of the grid, limited by time
+    half_depth: float = 0.6
+    """Distance from the deepest place to half the depth, in radii: 0.5 for a cosine, 0.54 for a bell, 0.71 for a
+    paraboloid. It gives the radius of the deepest hollow of a blemish of any outline."""
+    compact: float = 0.45
+    """Least radius of the deepest hollow, in half the largest extent, of a blemish that is simulated as a bell."""
+    single: float = 0.75
+    """Radius of the deepest hollow, in radii of the blemish, from which the blemish is this hollow."""
+    beyond: float = 1.5
+    """Distance beyond the contour, in the largest spacing, within which places without points leave it open."""
     subdivision: int = 2  # subdivision of cells for contours, on a cubic spline
-    dent: float = 0.1
-    """Least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits."""
     end_std: float = 1 / np.sqrt(12.0)
     """Standard uncertainty of each end of a length, in spacings of profiles or points: rectangular distribution
     between two of them (GUM, 4.3.7), as the form of the surface there is unknown."""
@@ -67,6 +75,8 @@ class BlemishRule:
 
 
 _RULE = BlemishRule()
+DENT_SHARE = 0.1
+"""Least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits."""
 
 _NODES = [
     (np.sqrt(3.0) * np.array([a, b]), (2 / 3 if a == 0 else 1 / 6) * (2 / 3 if b == 0 else 1 / 6))
@@ -74,6 +84,10 @@ _NODES = [
     for b in (-1, 0, 1)
 ]
 """Places and weights of a normal distribution in two dimensions (Gauss-Hermite, exact to the fifth power)."""
+
+
+class NotSignificantError(EvaluationError):
+    """The depth, length or width of an indication is not significant relative to its surroundings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +103,7 @@ class Blemish:
     hollows: np.ndarray
     """(H, 2); deepest places of neighbours that the search joined, the deepest first; empty for a single blemish."""
     spacing_mm: np.ndarray  # (2,); spacing of the points along both axes
+    reason: str | None  # why its values are bounds only
     beneath_mm: float
     """Largest sum of its depth and the surface beneath it, minus its depth; zero without such a surface."""
 
@@ -115,11 +130,13 @@ def measure_blemish(
     wall. ``beneath_mm`` (N,) is the height of a smooth surface, of a dent for example, above which those of ``surface``
     count.
 
-    Raises EvaluationError if too few points around the indication determine the undamaged surface, or if its depth,
-    length or width is not significant.
+    Raises EvaluationError if too few points around the indication determine the undamaged surface, and
+    NotSignificantError if its depth, length or width is not significant.
     """
-    field = _Field.about(surface, search, indication)
-    sign = float(np.sign(indication.height_mm))
+    field, sign = _Field.about(surface, search, indication), float(np.sign(indication.height_mm))
+    # The deepest hollow of a gouge or an area of corrosion is far smaller than these.
+    local = field.hollow_radius(sign * surface.heights[field.near], indication.noise_mm)
+    field = _Field.about(surface, search, indication, local_mm=local)
     heights = sign * surface.heights[field.near]
     depths = field.depths(heights)
     deepest, between = field.find_deepest(heights)
@@ -135,9 +152,14 @@ def measure_blemish(
     edge = max(SEARCH_RULE.edge_share * depth, SEARCH_RULE.edge_std * float(np.median(by_noise[field.region])))
     seen = field.figures(depths, edge, deepest)
     seen[0] += between
-    # Errors of simulated blemishes of this size, measured at these points: noise, sampling and smoothing.
-    wrong = []
+    # Errors of simulated blemishes of this size, measured at these points: noise, sampling and smoothing. One of
+    # another outline than a bell is its own model.
+    wrong, is_bell = [], local >= 0.5 * _RULE.compact * float(np.max(seen[1:3]))
+    own_heights = field.seen @ np.where(field.region, depths, 0.0)
     for move in moves:
+        if not is_bell:
+            wrong.append(field.measure(own_heights + move, edge) - seen)
+            continue
         bell = _Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, rng)
         shift = rng.uniform(-0.5, 0.5, 2) * search.smallest_mm
         wrong.append(field.measure(field.observe(bell, shift) + move, edge) - bell.figures(edge))
@@ -160,7 +182,9 @@ def measure_blemish(
     length, width = plain[1], plain[2]
     kind = FeatureKind.PROTRUSION
     if sign < 0:
-        kind = FeatureKind.DENT if min(length, width) >= _RULE.dent * diameter_mm else FeatureKind.PIT
+        # Joined pits are pits: the deepest hollow counts, whose contour is three half-depth radii long.
+        least = min(length, width, 3 * _RULE.half_depth * local)
+        kind = FeatureKind.DENT if least >= DENT_SHARE * diameter_mm else FeatureKind.PIT
     names = ("height" if sign > 0 else "depth", "length", "width", "area", *(("lost area",) if sign < 0 else ()))
     values = [
         plain_value(kind, name, plain[k], random[k], None if common is None else common[k], least=0.0)
@@ -171,7 +195,7 @@ def measure_blemish(
         shared = None if common is None else common[k]
         widest = plain_value(kind, name, plain[k], np.hypot(without_bias[k], bias[k]), shared, least=0.0)
         if widest.low <= 0:
-            raise EvaluationError(f"it is not significant relative to its surroundings: {widest.text()}")
+            raise NotSignificantError(f"it is not significant relative to its surroundings: {widest.text()}")
     values.insert(1, plain_value(kind, "edge depth", edge, 0.0, None if common is None else 0.0))
     if wall_mm is not None and sign < 0:
         shared = None if common is None else common[0]
@@ -183,6 +207,9 @@ def measure_blemish(
         beneath = field.find_total(heights, sign * beneath_mm[field.near]) - float(seen[0])
     level = float(np.sqrt(2) * np.median(by_noise[field.region]))
     spacing = measure_spacing(surface.places[field.near], np.flatnonzero(inside))
+    reason = field.find_reason(surface, depths, edge, deepest)
+    if reason:
+        values = [value if value.name == "edge depth" else value.as_bound() for value in values]
     return Blemish(
         kind,
         tuple(values),
@@ -192,6 +219,7 @@ def measure_blemish(
         field.trace_outline(depths, edge, deepest),
         field.grid[field.find_hollows(depths, edge, std=level)],
         spacing,
+        reason,
         beneath,
     )
 
@@ -253,10 +281,13 @@ class _Field:
     footprint_std: float  # relative standard uncertainty of the squared footprints
     stride: int  # half a bandwidth in cells
     region: np.ndarray  # (G,) bool; cells of the blemish
+    gap_mm: float  # distance from all points, from which a place is not seen
 
     @classmethod
-    def about(cls, surface: UnrolledSurface, search: BlemishSearch, indication: Indication) -> _Field:
-        """Set up the grid and its operators around an indication."""
+    def about(
+        cls, surface: UnrolledSurface, search: BlemishSearch, indication: Indication, *, local_mm: float = np.inf
+    ) -> _Field:
+        """Set up the grid and its operators around an indication; ``local_mm`` is the radius of its deepest hollow."""
         own = surface.places[indication.points]
         low, high = own.min(axis=0), own.max(axis=0)
         radius = 0.25 * float(np.sum(high - low))
@@ -271,14 +302,21 @@ class _Field:
         places, heights = surface.places[near] - middle, surface.heights[near]
         ring = np.arange(len(near)) >= len(indication.points)
         dense = len(indication.points) / max(float(np.prod(high - low)), 1e-9)
-        bandwidth = max(min(_RULE.bandwidth * radius, float(np.sqrt(_RULE.points / np.pi / dense))), search.smallest_mm)
-        cell = float(np.max(high - low)) / _RULE.cells
+        # A noisy radius of the only hollow would add noise.
+        radius = local_mm if local_mm < _RULE.single * radius else radius
+        bandwidth = min(_RULE.bandwidth * radius, float(np.sqrt(_RULE.points / np.pi / dense)))
+        bandwidth = max(bandwidth, search.smallest_mm)
+        cell = min(float(np.max(high - low)) / _RULE.cells, 0.5 * bandwidth)
+        cell = max(cell, float(np.sqrt(np.prod(high - low + bandwidth) / _RULE.most_cells)))
         sides = [np.arange(a - cell, b + 2 * cell, cell) for a, b in zip(low - middle, high - middle, strict=True)]
         shape = len(sides[0]), len(sides[1])
         grid = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
         tree = KDTree(places)
         smooth = _quadratic_rows(grid, places, tree, bandwidth)
-        region = KDTree(places[~ring]).query(grid)[0] < bandwidth
+        # Beyond a border of the points quadratics would extrapolate.
+        spacing = measure_spacing(surface.places[near], np.flatnonzero(~ring))
+        gap = max(search.smallest_mm, float(np.max(spacing)))
+        region = KDTree(places[~ring]).query(grid)[0] < min(bandwidth, gap)
         stride = max(1, round(0.5 * bandwidth / cell))
         size = surface.footprint_mm[near]
         sharp = seen = _interpolation_rows((places - grid[0]) / cell, shape)
@@ -290,7 +328,7 @@ class _Field:
         design = np.column_stack([np.ones(len(places)), places])
         plane = fit_biweight(design, heights, ring)[0]
         known = surface.places[near], size, grid + middle, shape, cell
-        return cls(near, *known, smooth, design, plane, seen, sharp, surface.footprint_std, stride, region)
+        return cls(near, *known, smooth, design, plane, seen, sharp, surface.footprint_std, stride, region, gap)
 
     def depths(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
         """Return heights (G,) above the undamaged surface for point heights (n,).
@@ -321,6 +359,41 @@ class _Field:
         smooth = self.depths(heights, steps=0) + base
         top = int(np.argmax(np.where(self.region, smooth, -np.inf)))
         return top, self.interpolate_depth(smooth, top) - float(smooth[top])
+
+    def hollow_radius(self, heights: np.ndarray, noise_mm: float) -> float:
+        """Return the radius of the deepest hollow, from the distance of its deepest place to half its depth.
+
+        Depths count as less than half where they are so by some standard deviations of the noise.
+        """
+        smooth = self.depths(heights, steps=0)
+        top = int(np.argmax(np.where(self.region, smooth, -np.inf)))
+        away = np.hypot(*(self.grid - self.grid[top]).T)
+        std = noise_mm * np.sqrt(np.asarray(self.smooth.power(2).sum(axis=1)).ravel())
+        below = smooth < 0.5 * smooth[top] - SEARCH_RULE.edge_std * std
+        half = float(np.min(away, where=below, initial=float(away.max())))
+        return half / _RULE.half_depth
+
+    def find_reason(self, surface: UnrolledSurface, depths: np.ndarray, edge: float, deepest: int) -> str | None:
+        """Return why a blemish is not seen whole or not sized; None if it is.
+
+        It is not seen whole if there are places without points within its contour or directly beyond.
+        """
+        labelled: Any = ndimage.label((self.region & (depths > edge)).reshape(self.shape), np.ones((3, 3)))
+        labels = labelled[0].ravel()
+        within = np.flatnonzero((labels == labels[deepest]) & (labels > 0))
+        if not len(within):
+            within = np.array([deepest])
+        turns = np.arange(8) * np.pi / 4
+        around = _RULE.beyond * self.gap_mm * np.vstack([[0.0, 0.0], np.column_stack([np.cos(turns), np.sin(turns)])])
+        probes = (self.grid[within, None] + around).reshape(-1, 2)
+        reach = 2 * self.gap_mm
+        near = surface.points_between(probes.min(axis=0) - reach, probes.max(axis=0) + reach)
+        if np.any(KDTree(surface.places[near]).query(probes)[0] > self.gap_mm):
+            return f"not seen whole: no points {self.gap_mm:.2g} mm or less beyond its edge, or within it"
+        own = KDTree(self.grid[within]).query(surface.places[near])[0] < self.cell
+        if np.count_nonzero(own) < SEARCH_RULE.points_in_smallest:
+            return f"not sized: {np.count_nonzero(own)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
+        return None
 
     def measure(self, heights: np.ndarray, edge: float) -> np.ndarray:
         """Return the figures for point heights (n,), at their own deepest place."""

@@ -90,6 +90,13 @@ class LargeBlemish:
         taken = np.concatenate([np.zeros(0, int), *kept])
         return [each for each in self.search.indications if not np.isin(self.chosen[each.points], taken).any()]
 
+    def is_rough(self, share: float) -> bool:
+        """Return whether the ground of a hollow is rough: hollows cover a share of it, or parts of it are raised."""
+        parts = [each for each in self.search.indications if not self.is_form(each)]
+        inside = [each for each in parts if np.isin(self.chosen[each.points], self.own.points).mean() > 0.5]
+        covered = sum(len(each.points) for each in inside) / len(self.own.points)
+        return covered > share or any(each.height_mm * self.own.height_mm < 0 for each in inside)
+
     def is_form(self, indication: Indication) -> bool:
         """Return whether an indication of the window belongs to the form of the large one.
 
@@ -124,6 +131,8 @@ class LargeBlemish:
         points, depth = self.chosen[indication.points], found.values[0]
         random = float(np.hypot(depth.random, float(self.std_mm[indication.points].max())))
         values = [plain_value(found.kind, depth.name, depth.value, random, depth.systematic, least=0.0)]
+        if found.reason is not None:
+            raise EvaluationError(found.reason)
         if values[0].low <= 0:
             raise EvaluationError(f"it is not significant relative to the surface below: {values[0].text()}")
         in_hollow = self.own.height_mm < 0 and found.beneath_mm > SEARCH_RULE.edge_share * np.abs(self.height_mm).max()

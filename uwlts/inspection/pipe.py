@@ -16,8 +16,8 @@ from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication, search_blemishes
-from uwlts.inspection.blemishes import Blemish, measure_blemish
-from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, Inspection
+from uwlts.inspection.blemishes import DENT_SHARE, Blemish, NotSignificantError, measure_blemish
+from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, Inspection, plain_value
 from uwlts.inspection.nested_blemishes import LargeBlemish, search_within
 from uwlts.inspection.pipe_form import FORM_RULE, LARGEST_OVALITY, PipeForm, fit_pipe, pipe_features, refit_pipe
 from uwlts.inspection.pipe_welds import PipeWeld, find_welds, measure_weld
@@ -34,6 +34,13 @@ _SMALLEST_MM, _USUAL_MM = 5.0, (20.0, 5000.0)
 _OTHER_UNITS = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
 _THICKEST = 5
 """Ratio of diameter to wall below which a pipe is unusual; in ASME B36.10M it is larger from 1 1/2 inches on."""
+_OFF_SURFACE = 0.35
+"""Largest distance from the form of a point of the pipe's surface, as a fraction of the radius: dents of 15 % of the
+diameter, the deepest that codes assess, are 0.3 deep."""
+_MOVED = 0.2
+"""Change of the form, in standard deviations of a point, after which the surface is searched again."""
+_ROUGH = 0.25
+"""Part of a hollow covered by hollows in it, from which its ground is rough and it is one finding."""
 _FEWEST_POINTS = 500
 """Fewest points for a search on a pipe's surface."""
 
@@ -100,7 +107,7 @@ def inspect_pipe(
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST_POINTS} are needed for a pipe")
     form = fit_pipe(cloud, largest_ovality=largest_ovality)
     of_size = _check_size(2 * form.radius_mm, wall_mm)
-    chosen = np.flatnonzero(np.abs(form.distance_mm) < FORM_RULE.off_pipe * form.radius_mm)
+    chosen = np.flatnonzero(np.abs(form.distance_mm) < _OFF_SURFACE * form.radius_mm)
     off = _note_points_off(form, chosen)
     welds = find_welds(form, chosen)
     on_weld = np.any([weld.covers for weld in welds], axis=0) if welds else np.zeros(len(cloud), bool)
@@ -110,7 +117,10 @@ def inspect_pipe(
         # Fit again without the damaged points and the welds, which bias the form.
         damaged = np.ones(len(cloud), bool)
         damaged[chosen[search.undamaged]] = False
-        form = refit_pipe(cloud, form, left_out=damaged)
+        before, form = form.distance_mm[~damaged], refit_pipe(cloud, form, left_out=damaged)
+        after = form.distance_mm[~damaged]
+        if np.std(after - before) > _MOVED * robust_std(after):
+            search = _search_form(cloud, form, chosen, false_alarm)
     features, of_sections = pipe_features(cloud, form, section_mm=section_mm)
     of_welds, on_welds = _weld_features(cloud, form, welds)
     blemishes, of_blemishes = _blemish_features(cloud, form, chosen, search, wall_mm)
@@ -234,7 +244,16 @@ def _blemish_features(
     errors = PointErrors.along_normals(cloud, chosen, form.frame.normals_at(form.angle[chosen]))
     flat = _unroll(cloud, form, chosen, form.angle[chosen], errors)
     measured: list[tuple[Blemish, float, float]] = []
-    notes = [_note_omission(cloud, chosen[[each.point]], each.height_mm, each.reason) for each in search.unresolved]
+    notes: list[str] = []
+    unsized: list[tuple[FeatureKind, np.ndarray, float, float, str]] = []
+
+    def add_unsized(points: np.ndarray, height: float, bound: float, reason: str) -> None:
+        """Add a finding that is not sized, of some points and a signed height."""
+        kind = FeatureKind.PROTRUSION if height > 0 else FeatureKind.PIT
+        unsized.append((kind, chosen[points], abs(height), bound, f"not sized: {reason}"))
+
+    for each in search.unresolved:
+        add_unsized(np.array([each.point]), each.height_mm, each.bound_mm, each.reason)
     sizes = {"diameter_mm": 2 * form.radius_mm, "wall_mm": wall_mm}
 
     def unroll_about(indication: Indication) -> tuple[UnrolledSurface, float]:
@@ -249,8 +268,14 @@ def _blemish_features(
         """Add the blemish, or a note and return False; ``points`` are those of the indication."""
         try:
             blemish = measured_by()
-        except EvaluationError as error:
+        except NotSignificantError as error:
             notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
+            return False
+        except EvaluationError as error:
+            if any(np.isin(points, whole.own.points).all() and indication is not whole.own for whole, _ in large):
+                notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
+                return False
+            add_unsized(points, indication.height_mm, 0.0, str(error))
             return False
         measured.append((blemish, middle, indication.false_alarm))
         return True
@@ -262,10 +287,11 @@ def _blemish_features(
         return any(whole.explains(indication) for whole, _ in large)
 
     for indication in sorted(search.indications, key=lambda each: abs(each.height_mm), reverse=True):
-        if not is_explained(indication):
-            surface, middle = unroll_about(indication)
-            if (whole := search_within(surface, search, indication)) is not None:
-                large.append((whole, middle))
+        sides = np.ptp((around := unroll_about(indication))[0].places[indication.points], axis=0)
+        if not is_explained(indication) and np.min(sides) >= DENT_SHARE * 2 * form.radius_mm:
+            whole = search_within(around[0], search, indication)
+            if whole is not None and not whole.is_rough(_ROUGH):
+                large.append((whole, around[1]))
     taken = np.zeros(len(chosen), bool)
     for whole, middle in large:
         parts = whole.parts_beside(search.indications)
@@ -306,9 +332,19 @@ def _blemish_features(
             chance,
             in_cloud(blemish.outline),
             in_cloud(blemish.hollows),
+            blemish.reason,
         )
         features.append(feature)
         notes += _note_merged(feature)
+    for kind, points, height, bound, reason in unsized:
+        numbers[kind] += 1
+        place = cloud.points_mm[points].mean(axis=0)
+        out = form.frame.normals_at(form.frame.cylindrical(place[None])[1])[0]
+        name = "height" if kind == FeatureKind.PROTRUSION else "depth"
+        value = replace(plain_value(kind, name, max(height, bound), 0.0, None), low=bound).as_bound()
+        axes = np.array([form.frame.axes[2], np.cross(out, form.frame.axes[2]), out])
+        extent = np.array([0.0, 0.0, height])
+        features.append(Feature(kind, f"{kind} {numbers[kind]}", (value,), place, axes, extent, points, reason=reason))
     return features, [*_note_spacing([each[0] for each in measured]), *notes]
 
 
@@ -368,11 +404,11 @@ def _note_limits(cloud: PointCloud, form: PipeForm, search: BlemishSearch) -> li
 
 def _note_points_off(form: PipeForm, chosen: np.ndarray) -> list[str]:
     """Return a note on the points that are not chosen (M,), if there are any."""
-    count, limit = len(form.distance_mm), FORM_RULE.off_pipe * form.radius_mm
+    count, limit = len(form.distance_mm), _OFF_SURFACE * form.radius_mm
     if len(chosen) == count:
         return []
     inside = int(np.count_nonzero(form.distance_mm <= -limit))
     return [
         f"{count - len(chosen)} of {count} points are {limit:.2g} mm or more off the pipe ({inside} inside) and "
-        "are omitted: deeper or higher blemishes are cut off there or not found"
+        "are omitted: a finding beside them is not seen whole"
     ]

@@ -97,7 +97,13 @@ def pit_feature(place, depth: float, hollows=()) -> dict:
         return [x, 50 * math.sin(angle), 50 - 50 * math.cos(angle)]
 
     joined = [at(*each) for each in hollows]
-    return {"kind": "pit", "place_mm": at(*place), "hollows_mm": joined, "values": {"depth": value(depth)}}
+    return {
+        "kind": "pit",
+        "place_mm": at(*place),
+        "hollows_mm": joined,
+        "reason": None,
+        "values": {"depth": value(depth)},
+    }
 
 
 def test_pits_are_matched_with_findings(thesis):

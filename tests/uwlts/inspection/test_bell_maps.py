@@ -61,7 +61,7 @@ def test_single_wild_points_are_limited_and_pits_are_not() -> None:
     wild = rng.choice(np.flatnonzero(pit == 0), 60, replace=False)
     heights[wild] += 0.1
     surface = UnrolledSurface(places, heights, np.full(6000, 0.02), np.zeros((6000, 2)))
-    limited = limit_deviations(surface, KDTree(places))[0].heights
+    limited = limit_deviations(surface, KDTree(places), together_mm=1.0, false_alarm=0.05)[0].heights
     # Two standard deviations, of local scatters up to 1.7 times as large, above a median of nine points.
     assert np.median(limited[wild]) < 0.06
     deep = pit < -0.3

@@ -1,0 +1,38 @@
+"""Verdicts on drawn damaged pipes: no finding is cut short, sized from a stump, split or left out unsaid.
+
+Parts are those of `tests.oracles.damaged_pipes`, with seeds on which no threshold was chosen.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from docs.studies.inspection_verdicts import count_drawn, inspect
+from tests.oracles.damaged_pipes import KINDS
+
+SEEDS = [200, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (201, 202, 203))]
+DAMAGED = [kind for kind in KINDS if kind != "clean pipe"]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_no_verdict_on_a_damaged_pipe_is_false(kind: str, seed: int) -> None:
+    """Each truth is mentioned; a limit 10 % beside its depth is never judged on the wrong side."""
+    counts = count_drawn(kind, seed)
+    assert counts["truths"] > 0
+    assert not counts["not mentioned"] + counts["false within"] + counts["false exceeds"], counts
+
+
+def test_a_finding_cut_by_a_border_says_so() -> None:
+    """Its values are bounds, as text and as JSON, and the reason is stated."""
+    found = inspect(KINDS["pits cut by a border"](np.random.default_rng([200, 1])))
+    cut = [each for each in found.features if each.reason]
+    assert len(cut) == 4
+    for each in cut:
+        depth = each["depth"]
+        assert math.isinf(depth.high) and depth.text().startswith("depth at least")
+        record: Any = each.record()
+        assert record["values"]["depth"]["high"] is None and record["reason"] == each.reason
+    assert sum("not seen whole" in line for line in found.lines()) == 4
