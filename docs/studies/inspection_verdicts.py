@@ -1,4 +1,4 @@
-"""Verdicts of inspections of damaged pipes and parts like them, for 20 seeds a kind (tests/oracles/damaged_pipes.py).
+"""Verdicts of inspections of damaged pipes and parts like them, for 20 seeds a kind (tests/oracles).
 
     python -m docs.studies.inspection_verdicts --write
     python -m docs.studies.inspection_verdicts --kinds gouges --seeds chosen
@@ -18,12 +18,14 @@ from cyclopts import App
 
 import uwlts
 from docs.studies.result_tables import publish, table
-from tests.oracles.damaged_pipes import KINDS, Part, Truth
+from tests.oracles import damaged_pipes, joined_pipes
+from tests.oracles.damaged_pipes import Part, Truth
 from uwlts.errors import EvaluationError
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.report.findings_order import FindingLimits, judge_feature
 from uwlts.storage.cloud import PointCloud
 
+KINDS = damaged_pipes.KINDS | joined_pipes.KINDS
 SEEDS = {"chosen": range(20), "judged": range(100, 120)}
 LIMITS = 0.9, 1.1
 """Limits divided by the true depth."""

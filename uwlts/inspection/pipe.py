@@ -19,8 +19,9 @@ from uwlts.inspection.blemish_search import BlemishSearch, Indication, search_bl
 from uwlts.inspection.blemishes import DENT_SHARE, Blemish, NotSignificantError, measure_blemish
 from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, Inspection, plain_value
 from uwlts.inspection.nested_blemishes import LargeBlemish, search_within
-from uwlts.inspection.pipe_form import FORM_RULE, LARGEST_OVALITY, PipeForm, fit_pipe, pipe_features, refit_pipe
+from uwlts.inspection.pipe_form import FORM_RULE, LARGEST_OVALITY, PipeForm, pipe_features, refit_pipe
 from uwlts.inspection.pipe_welds import PipeWeld, find_welds, measure_weld
+from uwlts.inspection.scanned_part import find_straight_pipe
 from uwlts.storage.cloud import FOOTPRINT, PointCloud
 from uwlts.storage.cloud_files import load_cloud
 
@@ -105,10 +106,12 @@ def inspect_pipe(
         )
     if len(cloud) < _FEWEST_POINTS:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST_POINTS} are needed for a pipe")
-    form = fit_pipe(cloud, largest_ovality=largest_ovality)
+    part = find_straight_pipe(cloud, largest_ovality=largest_ovality)
+    form = part.form
     of_size = _check_size(2 * form.radius_mm, wall_mm)
-    chosen = np.flatnonzero(np.abs(form.distance_mm) < _OFF_SURFACE * form.radius_mm)
-    off = _note_points_off(form, chosen)
+    on_pipe = np.abs(form.distance_mm) < _OFF_SURFACE * form.radius_mm
+    off = _note_points_off(form, on_pipe, part.left_out)
+    chosen = np.flatnonzero(on_pipe & ~part.left_out)
     welds = find_welds(form, chosen)
     on_weld = np.any([weld.covers for weld in welds], axis=0) if welds else np.zeros(len(cloud), bool)
     chosen = chosen[~on_weld[chosen]]
@@ -127,7 +130,7 @@ def inspect_pipe(
     deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
-    notes = *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *of_blemishes
+    notes = *part.notes, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *of_blemishes
     found = Inspection("pipe", (*features, *of_welds, *blemishes), deviation, level, notes)
     return found.count_steps(cloud)
 
@@ -402,13 +405,13 @@ def _note_limits(cloud: PointCloud, form: PipeForm, search: BlemishSearch) -> li
     return notes
 
 
-def _note_points_off(form: PipeForm, chosen: np.ndarray) -> list[str]:
-    """Return a note on the points that are not chosen (M,), if there are any."""
-    count, limit = len(form.distance_mm), _OFF_SURFACE * form.radius_mm
-    if len(chosen) == count:
+def _note_points_off(form: PipeForm, on_pipe: np.ndarray, left_out: np.ndarray) -> list[str]:
+    """Return a note on the points that are neither ``on_pipe`` (N,) nor ``left_out`` (N,) with a region, if any."""
+    off, limit = ~(on_pipe | left_out), _OFF_SURFACE * form.radius_mm
+    if not off.any():
         return []
-    inside = int(np.count_nonzero(form.distance_mm <= -limit))
+    inside = int(np.count_nonzero(off & (form.distance_mm < 0)))
     return [
-        f"{count - len(chosen)} of {count} points are {limit:.2g} mm or more off the pipe ({inside} inside) and "
+        f"{np.count_nonzero(off)} of {len(off)} points are {limit:.2g} mm or more off the pipe ({inside} inside) and "
         "are omitted: a finding beside them is not seen whole"
     ]

@@ -33,6 +33,7 @@ class PipeFormRule:
     most_points: int = 150_000  # most points of the fit; with more points the errors common to all of them dominate
     rounds: int = 12  # most rounds of the fit; each divides the error of the axis by about ten
     still_mm: float = 1e-6  # change of the axis, mm, that ends the rounds
+    largest_step: float = 1.0  # change of the axis's slope in a round that shows that the fit diverges
     sectors: int = 72
     """Sectors around the pipe: 5 deg each, as for a pipe standard (`uwlts.evaluation.artefact_figures`)."""
     lengths: int = 12  # parts of the length within which errors of neighbouring points are correlated
@@ -127,16 +128,18 @@ class PipeForm:
         return self.arc >= FORM_RULE.oval_arc
 
 
-def fit_pipe(cloud: PointCloud, *, largest_ovality: float = LARGEST_OVALITY) -> PipeForm:
+def fit_pipe(
+    cloud: PointCloud, *, largest_ovality: float = LARGEST_OVALITY, start: CylinderFit | None = None
+) -> PipeForm:
     """Fit the form of the pipe that contains most points of a cloud.
 
-    A cylinder is fitted by orthogonal distances. Then harmonics of the radial distance around the pipe (out of
-    roundness) and along it (bow, taper) are fitted together with Tukey's biweight. EvaluationError if the points
-    determine no pipe.
+    A cylinder is fitted by orthogonal distances, unless a ``start`` is given. Then harmonics of the radial distance
+    around the pipe (out of roundness) and along it (bow, taper) are fitted together with Tukey's biweight.
+    EvaluationError if the points determine no pipe.
     """
     fitted = thin_evenly(np.arange(len(cloud)), FORM_RULE.most_points)
     points = cloud.points_mm[fitted]
-    start = fit_robustly(fit_cylinder, thin_evenly(points, FORM_RULE.start_points)).fit
+    start = start or fit_robustly(fit_cylinder, thin_evenly(points, FORM_RULE.start_points)).fit
     return _fit_from(cloud, fitted, PipeFrame.about(start, points), start.radius_mm, largest_ovality)
 
 
@@ -176,6 +179,11 @@ def _fit_from(
         slopes = np.array([known["along cos"], known["along sin"]]) / scale
         frame, radius = frame.shift_and_tilt(shift, slopes), radius + known["1"]
         moved = float(np.linalg.norm(shift) + abs(known["1"]) + scale * np.linalg.norm(slopes))
+        if not (radius > 0 and np.linalg.norm(slopes) < FORM_RULE.largest_step):
+            raise EvaluationError(
+                "the points do not agree with one straight pipe: the fit of its axis diverges. Inspect a straight, "
+                "bare part of a pipe, with points closer together than a tenth of its radius"
+            )
         if number and moved < FORM_RULE.still_mm:
             break
     counted = weight > 0
@@ -187,7 +195,8 @@ def _fit_from(
     if moved > scatter / np.sqrt(np.count_nonzero(counted)):
         raise EvaluationError(
             f"the fit of the pipe's axis does not converge: after {FORM_RULE.rounds} rounds it still changes by "
-            f"{moved:.2g} mm, more than its standard deviation. Remove points that do not belong to the pipe"
+            f"{moved:.2g} mm, more than its standard deviation. Remove points that belong to no straight pipe, "
+            "such as a bend or a branch"
         )
     # These terms are now part of the frame and the radius.
     inside = np.array([term in ("1", "cos", "sin", "along cos", "along sin") for term in terms])

@@ -1,0 +1,59 @@
+"""Parts that are no plain straight pipe are named or refused; damaged pipes are not.
+
+Parts are those of `tests.oracles.joined_pipes` and `tests.oracles.damaged_pipes`, with seeds on which no threshold was
+chosen. The study docs/studies/inspection_verdicts.py has 20 seeds a kind.
+"""
+
+import numpy as np
+import pytest
+
+from tests.oracles import damaged_pipes, joined_pipes
+from tests.oracles.damaged_pipes import Part
+from uwlts.errors import EvaluationError
+from uwlts.inspection.pipe_form import LARGEST_OVALITY
+from uwlts.inspection.scanned_part import ScannedPart, find_straight_pipe
+from uwlts.storage.cloud import PointCloud
+
+SEEDS = 210, 211
+JOINED = "bend", "T-piece", "flanged end", "reducer", "marine growth"
+DAMAGED = "clean pipe", "dent of 2 to 15 % of the diameter", "gouges", "patch of corrosion"
+
+
+def scanned(part: Part) -> ScannedPart:
+    cloud = PointCloud(part.points_mm, np.ones(len(part.points_mm)), part.frame, part.line)
+    return find_straight_pipe(cloud, largest_ovality=LARGEST_OVALITY)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", JOINED)
+def test_other_parts_are_named_or_refused(kind: str, seed: int) -> None:
+    part = joined_pipes.KINDS[kind](np.random.default_rng([seed, 1]))
+    try:
+        found = scanned(part)
+    except EvaluationError as error:
+        assert kind not in ("T-piece", "flanged end") and any(name in str(error) for name in part.names)
+        return
+    assert kind != "bend" and any(name in note for name in part.names for note in found.notes)
+    # Only bare pipe remains: noise of up to 0.05 mm, and 0.5 % of the radius beside growth.
+    left = np.abs(found.form.distance_mm[~found.left_out])
+    assert np.quantile(left, 0.9) < 3 * 0.05 + 0.005 * found.form.radius_mm
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_damaged_pipes_remain_pipes(kind: str, seed: int) -> None:
+    found = scanned(damaged_pipes.KINDS[kind](np.random.default_rng([seed, 2])))
+    assert not found.notes and not found.left_out.any()
+
+
+def test_a_coarse_cloud_is_refused_in_words() -> None:
+    """Points on a lattice of 31 mm, on a post of 60 mm radius that stands on a plate."""
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        angle, along = rng.uniform(-1, 1, 600), rng.uniform(0, 2000, 600)
+        post = np.column_stack([60 * np.cos(angle), 60 * np.sin(angle), along])
+        plate = np.column_stack([rng.uniform(-300, 300, (300, 2)), np.zeros(300)])
+        points = np.rint(np.vstack([post, plate]) / 31.25) * 31.25 + rng.uniform(-15, 15, 3)
+        none = np.full(900, -1)
+        with pytest.raises(EvaluationError, match=r"coarse|straight pipe|cylinder"):
+            scanned(Part(points_mm=points, frame=none, line=none))
