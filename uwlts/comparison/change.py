@@ -23,6 +23,7 @@ from uwlts.comparison.change_reference import (
 from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.comparison.ideal_shapes import IdealShape, place_shape
 from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, average_locally
+from uwlts.comparison.seen_side import select_seen_side
 from uwlts.errors import EvaluationError
 from uwlts.fitting.point_groups import number_cubes
 from uwlts.fitting.point_spacing import choose_disc_diameter
@@ -335,6 +336,10 @@ def _compare_with_points(
     same_water: bool,
 ) -> _Distances:
     points, known, other, found = new.points_mm, new.uncertainty, surface.uncertainty, None
+    chosen, apart = _thin_points(points, disc / 2)
+    depths: float | np.ndarray = deep
+    if surface.normals is not None:
+        surface, depths = _restrict_to_seen(points[chosen], surface, deep_mm=deep, apart_mm=apart)
     if register:
         target = surface.points_mm
         normals = fit_local_normals(target, target, disc_mm=disc) if surface.normals is None else surface.normals
@@ -345,12 +350,11 @@ def _compare_with_points(
             # The registration follows systematic errors of the reference.
             followed = [found.moves_mm(step, target) for step in found.by_reference]
             other = replace(other, patterns_mm=other.patterns_mm - np.array(followed, np.float32))
-    chosen, apart = _thin_points(points, disc / 2)
     places = points[chosen]
     normals = fit_local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
-    here = average_locally(places, normals, points, uncertainty=known, frame=new.frame, disc_mm=disc, deep_mm=deep)
+    here = average_locally(places, normals, points, uncertainty=known, frame=new.frame, disc_mm=disc, deep_mm=depths)
     there = average_locally(
-        places, normals, surface.points_mm, uncertainty=other, frame=surface.frame, disc_mm=disc, deep_mm=deep
+        places, normals, surface.points_mm, uncertainty=other, frame=surface.frame, disc_mm=disc, deep_mm=depths
     )
     # The samples of a mesh are exact, so their scatter is no noise.
     variance = here.variance_mm2 + (0.0 if surface.meshed else there.variance_mm2)
@@ -359,6 +363,14 @@ def _compare_with_points(
         variance -= 2 * _shared_covariance(here.patterns_mm, known, there.patterns_mm, other, same_water=same_water)
     words = "mesh" if surface.meshed else "cloud"
     return _Distances(places, apart, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
+
+
+def _restrict_to_seen(
+    places: np.ndarray, surface: ReferencePoints, *, deep_mm: float, apart_mm: float
+) -> tuple[ReferencePoints, np.ndarray]:
+    assert surface.normals is not None
+    seen, deep = select_seen_side(places, surface.points_mm, surface.normals, deep_mm=deep_mm, apart_mm=apart_mm)
+    return replace(surface, points_mm=surface.points_mm[seen], normals=surface.normals[seen]), deep
 
 
 def _compare_with_shape(

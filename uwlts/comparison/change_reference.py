@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.comparison.ideal_shapes import KINDS, IdealShape, read_shape
+from uwlts.comparison.seen_side import orient_triangles
 from uwlts.errors import DescriptionError, EvaluationError, describe_problems
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
@@ -113,8 +114,8 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
 
 
 def sample_mesh(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> ReferencePoints:
-    """Sample points evenly over a mesh, with the normals of their triangles."""
-    corners = vertices[faces]
+    """Sample points evenly over a mesh, with the normals of their triangles, which agree across edges."""
+    corners = vertices[orient_triangles(vertices, faces)]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(across, axis=1) / 2
     total = float(area.sum())

@@ -41,7 +41,7 @@ def average_locally(
     uncertainty: PointUncertainty | None,
     frame: np.ndarray | None,
     disc_mm: float,
-    deep_mm: float,
+    deep_mm: float | np.ndarray,
 ) -> LocalMeans:
     """Average the signed distances of points in discs perpendicular to the normals at P places.
 
@@ -50,19 +50,20 @@ def average_locally(
 
     ``places`` and ``normals`` (P, 3) are the centres of the discs and unit normals there, ``points`` (N, 3) those to
     average. ``distance_mm`` (N,) is by default measured from each place along its normal. Points farther than
-    ``deep_mm`` along the normal are left out.
+    ``deep_mm`` (one number, or one for each place) along the normal are left out.
     """
     count, mean, rough, stated, other = (np.zeros(len(places)) for _ in range(5))
     together, alone = np.zeros(len(places)), np.zeros(len(places))
     patterns = np.zeros((len(places), 0 if uncertainty is None else len(uncertainty.patterns_mm)))
-    radius = float(np.hypot(disc_mm / 2, deep_mm))
+    deep = np.broadcast_to(deep_mm, len(places))
+    radius = float(np.hypot(disc_mm / 2, deep.max(initial=0.0)))
     for block, place, point in _nearby_pairs(KDTree(points), places, radius):
         # The numbers of places count within the block: no array of a block has the size of all places.
         size, own_normals = block.stop - block.start, normals[block]
         away = points[point] - places[block][place]
         along = np.einsum("ni,ni->n", away, own_normals[place])
         across = np.einsum("ni,ni->n", away, away) - along**2
-        inside = (across <= (disc_mm / 2) ** 2) & (np.abs(along) <= deep_mm)
+        inside = (across <= (disc_mm / 2) ** 2) & (np.abs(along) <= deep[block][place])
         if distance_mm is not None:
             along = distance_mm[point]
             inside &= np.isfinite(along)
