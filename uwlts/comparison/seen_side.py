@@ -14,8 +14,8 @@ _SMOOTH = 0.7
 _NEARER = 0.25
 """Ratio of the distances to both sides below which a place clearly belongs to the nearer one."""
 _BOTH = 0.25
-"""Share of places that clearly belong to the other side, from which the scan contains both sides. Wear nearly as deep
-as the part is thick must cover more than this share of a face to be mistaken for its other side."""
+"""Fraction of the places on the other side from which the scan contains both sides. Wear nearly as deep
+as the part is thick must cover more than this fraction of a face to be mistaken for its other side."""
 
 
 def orient_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -28,7 +28,7 @@ def orient_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     forward, edges = edges[:, 0] < edges[:, 1], np.sort(edges, axis=1)
     owner, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)[1:]
     order = np.argsort(owner, kind="stable")
-    # Edges of more than two triangles do not tell which of them continue each other.
+    # Edges of more than two triangles do not determine which of them continue each other.
     order = order[(count == 2)[owner.reshape(-1)[order]]].reshape(-1, 2)
     (one, other), turned = face[order].T, forward[order[:, 0]] == forward[order[:, 1]]
     # Each triangle is two nodes, as it is and turned. Consistent triangles are connected.
@@ -49,7 +49,7 @@ def select_seen_side(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a mask (M,) of the samples of a mesh on the side that a scan saw, and search depths (P,) at its places.
 
-    Where the opposite side lies within the search depth, neighbouring places of a face decide together: the scan saw
+    If the opposite side lies within the search depth, neighbouring places of a face decide together: the scan saw
     the side to which more of them are nearer. A scan of both sides keeps all samples, and the depth is half of the
     thickness there.
 
