@@ -112,8 +112,8 @@ def row(kind: str, seeds: range, counts: Counter[str]) -> list[str]:
 
 
 def main(
-    *, kinds: Sequence[str] = (), seeds: Literal["chosen", "judged", "both"] = "both", workers: int = 2,
-    each: bool = False, write: bool = False,
+    *, kinds: Sequence[str] = (), seeds: Literal["chosen", "judged", "both"] = "both", parts: int = 20,
+    workers: int = 2, each: bool = False, write: bool = False,
 ) -> None:  # fmt: skip
     """Print or write the table.
 
@@ -123,6 +123,8 @@ def main(
         Kinds of parts; all by default.
     seeds
         Seeds on which thresholds were chosen, on which they are judged, or both.
+    parts
+        Number of parts of each kind: the first seeds of each range.
     workers
         Processes that inspect parts.
     each
@@ -134,16 +136,17 @@ def main(
     chosen = [(name, kind) for kind, name in product(kinds or KINDS, SEEDS) if seeds in (name, "both")]
     with ProcessPoolExecutor(workers) as pool:
         for name, kind in chosen:
-            counted = list(pool.map(count_drawn, [kind] * len(SEEDS[name]), SEEDS[name]))
+            drawn = SEEDS[name][:parts]
+            counted = list(pool.map(count_drawn, [kind] * len(drawn), drawn))
             if each:
-                for seed, counts in zip(SEEDS[name], counted, strict=True):
+                for seed, counts in zip(drawn, counted, strict=True):
                     print(kind, seed, {key: number for key, number in counts.items() if number}, flush=True)
             summed = sum(counted, Counter[str]())
             total[name] += summed
-            rows.append(row(kind, SEEDS[name], summed))
+            rows.append(row(kind, drawn, summed))
             if not write:
                 print("\t".join(rows[-1]), flush=True)
-    rows += [row("all", SEEDS[name], counts) for name, counts in total.items() if counts]
+    rows += [row("all", SEEDS[name][:parts], counts) for name, counts in total.items() if counts]
     publish({"verdicts of inspections": table(HEAD, rows)}, write=write)
 
 

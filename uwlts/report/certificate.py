@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import JsonValue, PlainSerializer
 
 from uwlts._version import __version__
-from uwlts.calibration.joint.next_shot import WHOLE_VOLUME, Shot, rank_next_shots
+from uwlts.calibration.joint.next_shot import WHOLE_VOLUME, CandidateShot, rank_next_shots
 from uwlts.calibration.joint.observability import (
     Weakness,
     compute_mesh_lengths,
@@ -272,7 +272,7 @@ def _complete_joint(base: Certificate, calibration: Calibration) -> JointCertifi
     )
 
 
-def _shots(forecasts: Sequence[Forecast[Shot]]) -> tuple[NextShot, ...]:
+def _shots(forecasts: Sequence[Forecast[CandidateShot]]) -> tuple[NextShot, ...]:
     """Return the best shots, and the best of each kind, in order."""
     kinds = [each.candidate.words.split(",")[0] for each in forecasts]
     return tuple(

@@ -80,7 +80,7 @@ def test_fits_that_do_not_settle_are_errors(monkeypatch):
     with pytest.raises(EvaluationError, match="axis does not converge: after 1 rounds it still changes by"):
         fit_pipe(cloud)
     places = np.array([[0.0, 0.0], [1.0, 1e-12], [2.0, -1e-12], [3.0, 0.0]])
-    with pytest.raises(EvaluationError, match="no circle fits the 4 places"):
+    with pytest.raises(EvaluationError, match="no circle fits the 4 points"):
         fit_circle(places)
 
 

@@ -59,7 +59,7 @@ _TILTS = {
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Shot(Candidate):
+class CandidateShot(Candidate):
     """Possible image or scan, with its view, and for a target ``T_camera_target`` (4, 4)."""
 
     view: ViewMedium
@@ -70,7 +70,7 @@ _Simulated = tuple[StoredEstimate, Evidence, np.ndarray]
 """The estimate (with parameters that the image adds), the image's evidence, and its local parameters."""
 
 
-def rank_next_shots(calibration: Calibration) -> list[Forecast[Shot]]:
+def rank_next_shots(calibration: Calibration) -> list[Forecast[CandidateShot]]:
     """Return possible further images, the most helpful one first; empty if the evidence covers no area.
 
     They are compared by the standard uncertainty of lengths over the volume (root mean square), mm.
@@ -108,7 +108,7 @@ def advice_lines(calibration: Calibration) -> list[str]:
 
 def _generate_shots(
     known: StoredEstimate, medium: str, depths: Mapping[str, float], uncertainty: Uncertainty
-) -> Iterator[Shot]:
+) -> Iterator[CandidateShot]:
     """Generate the possible images with the information that they add."""
     simulated: list[tuple[str, _Simulated | None, np.ndarray | None]] = [*_simulate_targets(known, medium, depths)]
     for words, depth in depths.items():
@@ -118,7 +118,7 @@ def _generate_shots(
         simulated.append((spheres, _simulate_spheres(known, depth, uncertainty), None))
     for words, shot, pose in simulated:
         if shot is not None and (added := _compute_information(shot, len(known.values), uncertainty)) is not None:
-            yield Shot(words=words, information=added, view=shot[0].view, pose=pose)
+            yield CandidateShot(words=words, information=added, view=shot[0].view, pose=pose)
 
 
 def _simulate_targets(

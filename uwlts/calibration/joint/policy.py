@@ -354,6 +354,7 @@ class _Rule:
     times: int = 1
 
 
+# In the order in which they change least of what was described.
 _RULES = (
     # Other coefficients or another pixel shape, if something is odd and the options leave the lens open.
     _Rule(_Attempt._with_better_lens),
