@@ -275,6 +275,7 @@ PAGES_RUN = {
         prepare={"uwlts camera photographs": photographs_with_description},
         instead={"Path.cwd().parents": "Path(uwlts.__file__).parents"},
     ),
+    "docs/tutorials/run-an-experiment.md": Page(instead={"SEEDS = range(3)": "SEEDS = range(1)"}),
     "docs/tutorials/simulate-and-measure.md": Page(),
 }
 
