@@ -17,7 +17,7 @@ DAMAGED = [kind for kind in KINDS if kind != "clean pipe"]
 
 
 NOT_MENTIONED = ("pits with few points", 201)
-"""A pit of 0.67 mm on points 1.6 mm apart, which the search takes for outliers: docs/results/limits.md."""
+"""A pit on points 1.6 mm apart, which the search takes for outliers: docs/results/limits.md."""
 
 
 @pytest.mark.parametrize("seed", SEEDS)
