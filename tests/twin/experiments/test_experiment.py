@@ -146,7 +146,7 @@ def test_a_sensor_and_its_scenes_give_a_table(tmp_path: Path):
     sensor = load_sensor("thesis-small")
     scenes = [
         {"scene": "spheres", "name": "spheres", "motion": {"start_mm": -18.0, "step_mm": 6.0, "count": 7}},
-        {"scene": "head", "name": "head", "motion": {"count": 3}},
+        {"scene": "head", "name": "head", "motion": {"start_mm": -20.0, "step_mm": 20.0, "count": 3}},
     ]
     options = {"out": tmp_path / "out", "spp": 4, "imperfections": {}}
     found = twin.experiment(sensor, scenes, [3], **options).table
