@@ -55,7 +55,6 @@ MEANING = {
         "--stripe-method": "Method for the stripe's centre",
         "--stripe-peak": "Which of several stripes",
         "--trajectory": "times and poses of the platform",
-        "--trust-edited": "edited after they were written",
         "--unlock": "Accept the stage's position",
         "--unit": "Unit of (clouds|a cloud) of (an)?other programs?",
         "--wall-mm": "wall",

@@ -4,9 +4,9 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import model_validator
 
 from uwlts._version import __version__
 from uwlts.acceptance.acceptance_plan import SYMBOLS, AcceptancePlan, Interval, PlannedPosition, load_plan
@@ -23,7 +23,7 @@ from uwlts.acceptance.characteristics import (
 from uwlts.acceptance.requirements import Requirement, check_requirements
 from uwlts.argument_types import check_arguments
 from uwlts.errors import DescriptionError, Error
-from uwlts.files.json_files import EDITED, read_model, to_canonical_json, trusting, write_model
+from uwlts.files.json_files import EDITED, read_model, to_canonical_json, write_model
 from uwlts.files.reading import is_regular_file
 from uwlts.files.writing import hash_file
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest
@@ -89,7 +89,7 @@ class Acceptance(Brief, StoredPart):
     software, date : str
         Software, and time of the judgement (ISO 8601).
     edited : bool
-        True if the file was edited by hand and trusted.
+        True if the file, or the earlier result, was edited by hand.
     """
 
     plan: AcceptancePlan
@@ -114,11 +114,6 @@ class Acceptance(Brief, StoredPart):
             if others := {value.position for value in each.values} - {each.name}:
                 raise ValueError(f"the position {each.name!r} has values of {sorted(others)[0]!r}")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_default(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit ``edited`` unless it is set: it is an entry of edited files only."""
-        return {key: value for key, value in plain(self).items() if key != EDITED or value}
 
     @property
     def outstanding(self) -> tuple[JudgedPosition, ...]:
@@ -171,13 +166,8 @@ def format_characteristic(each: Characteristic) -> str:
     )
 
 
-@trusting
 def accept(
-    plan: str | Path,
-    *,
-    earlier: Acceptance | str | Path | None = None,
-    trust_edited: bool = False,
-    progress: ProgressListener = ignore_progress,
+    plan: str | Path, *, earlier: Acceptance | str | Path | None = None, progress: ProgressListener = ignore_progress
 ) -> Acceptance:
     """Judge a sensor by scans of artefacts against maximum permissible errors, position by position of a plan.
 
@@ -194,8 +184,6 @@ def accept(
         Plan of an acceptance test (TOML; docs: accept a sensor). Its files are beside it.
     earlier : Acceptance or path, optional
         Earlier result of the plan, from which unchanged positions are taken.
-    trust_edited : bool
-        As for `read`.
     progress : callable, optional
         Called after each position with the number of positions done and the total number.
 

@@ -224,7 +224,7 @@ def accept(
         # The command continues its own result.
         record_made(result)
         record_made(page)
-        known, title = uwlts.read(result, trust_edited=call.given.get("trust_edited", False)), load_plan(plan).title
+        known, title = uwlts.read(result), load_plan(plan).title
         if not isinstance(known, Acceptance) or known.plan.title != title:
             raise OutputError(
                 f"{result} is not of the test {title!r}: give another `out`, or `overwrite` to replace it"

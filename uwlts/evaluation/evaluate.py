@@ -13,7 +13,7 @@ from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
 from uwlts.evaluation.figures import ArtefactEvaluation, Figure, FigureKey, Quantity, figure_keys
 from uwlts.evaluation.truth_comparison import TruthComparison, compare_with_truth
-from uwlts.files.json_files import read_model, write_model
+from uwlts.files.json_files import EDITED, read_model, write_model
 from uwlts.fitting.least_squares import fit_rigid_transform
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
 from uwlts.model.brief import Brief
@@ -90,7 +90,7 @@ class StoredUncertainty(_Stored):
 class EvaluationRecord(_Stored):
     """Content of an evaluation file; ``calibration`` is the digest of the cloud's calibration.
 
-    ``edited`` is set if the file was edited by hand and trusted.
+    ``edited`` is set if the file, or one that the cloud comes from, was edited by hand.
     """
 
     cloud: str
@@ -188,6 +188,9 @@ class Evaluation(Brief):
         """Return the content of the evaluation file; EvaluationError if the cloud's metadata is not valid."""
         found = self.artefact
         content: dict[str, Any] = {"cloud": self.source, **self.cloud.metadata}
+        if EDITED in content:
+            # The cloud names the part; the record has a mark, which the seal protects.
+            content[EDITED] = bool(content[EDITED])
         content |= {"artefact": found and found.artefact, "evaluation": found and found.as_dict(), "truth": None}
         if self.truth is not None and self.truth_after_best_fit is not None:
             content["truth"] = self.truth.as_dict() | {"after_best_fit": self.truth_after_best_fit.as_dict()}

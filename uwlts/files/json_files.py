@@ -1,16 +1,15 @@
 """Files of JSON: an object identified by its "format" and "version" and sealed; and differences between two of them.
 
-The seal is the SHA-256 of the content. Edited files are refused unless a function's ``trust_edited`` is set.
+The seal is the SHA-256 of the content. A file whose seal is missing or does not fit is read with a warning, and the
+result records that it was edited.
 """
 
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from contextvars import ContextVar
-from functools import wraps
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, JsonValue, ValidationError
 
@@ -26,27 +25,9 @@ _BRIEF = 80
 
 SEAL = "sha256"
 EDITED = "edited"
-"""Keys of a file's seal, and of the record that an edited file was trusted."""
+"""Keys of a file's seal, and of the record that the file, or one that it comes from, was edited."""
 
 AnyModel = TypeVar("AnyModel", bound=BaseModel)
-Parameters = ParamSpec("Parameters")
-Result = TypeVar("Result")
-
-_trusts_edited: ContextVar[bool] = ContextVar("trusts_edited", default=False)
-
-
-def trusting(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Apply the parameter ``trust_edited`` of a function to all files that it reads."""
-
-    @wraps(function)
-    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        token = _trusts_edited.set(_trusts_edited.get() or bool(kwargs.get("trust_edited")))
-        try:
-            return function(*args, **kwargs)
-        finally:
-            _trusts_edited.reset(token)
-
-    return call
 
 
 def to_canonical_json(content: Mapping[str, Any]) -> bytes:
@@ -68,10 +49,10 @@ def add_seal(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_json(path: str | Path, *, called: str, check_seal: bool = True) -> dict[str, JsonValue]:
-    """Read the object in a file; raises CaptureError if it is missing, not JSON, truncated or edited.
+    """Read the object in a file; raises CaptureError if it is missing, not JSON, or truncated.
 
     ``called`` names the expected content in messages. Numbers are finite and keys are unique (`uwlts.files.reading`).
-    The object contains the seal, if there is one, and ``edited`` if it does not match but is trusted (`trusting`).
+    The object contains the seal, if there is one; a warning says if it does not match.
     """
     text = read_text(path, most_bytes=MOST_JSON_BYTES, called=called)
     try:
@@ -83,12 +64,7 @@ def read_json(path: str | Path, *, called: str, check_seal: bool = True) -> dict
     if not isinstance(content, dict):
         raise CaptureError(f"{path} is JSON but not {add_article(called)}: expected an object with named entries")
     if check_seal and SEAL in content and content[SEAL] != compute_seal(content):
-        if not _trusts_edited.get():
-            raise CaptureError(
-                f"{path} was edited after it was written: its content does not match its seal ({SEAL}). Use the "
-                "original file, or `trust_edited` to use the edited one"
-            )
-        content[EDITED] = True
+        log_warnings(path, [f"it was edited after it was written: its content does not match its seal ({SEAL})"])
     return content
 
 
@@ -117,17 +93,19 @@ def model_from_json(
     advice: str = "",
 ) -> AnyModel:
     """Convert the result of `read_json` to a model; raises CaptureError like `read_model`."""
-    content = dict(content)
+    content, edited = dict(content), content.get(SEAL) != compute_seal(content)
     if content.pop("format", None) != file_format:
         raise CaptureError(f'{path} is JSON but not {add_article(called)}: expected "format": "{file_format}"')
     if (found := content.pop("version", None)) != version:
         raise CaptureError(f"{path} has version {found}; this program reads {version}")
-    if content.pop(SEAL, None) is None:
-        log_warnings(path, [f"it has no seal ({SEAL}), as from older versions: edited numbers cannot be noticed"])
-    if EDITED in content:
-        log_warnings(path, ["it was edited after it was written, and is trusted all the same"])
-        if isinstance(provenance := content.get("provenance"), dict):
-            content["provenance"] = provenance | {EDITED: content.pop(EDITED)}
+    if edited:
+        if SEAL not in content:
+            log_warnings(path, [f"it has no seal ({SEAL}), and is treated as a file that was edited"])
+        if EDITED in model.model_fields:
+            content[EDITED] = True
+        elif isinstance(provenance := content.get("provenance"), dict):
+            content["provenance"] = provenance | {EDITED: True}
+    content.pop(SEAL, None)
     return validate_content(model, content, f"{path} is not a valid {called}", advice=advice)
 
 

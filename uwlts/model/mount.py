@@ -93,7 +93,7 @@ class Mount(Brief, Description):
     On a rotary table (``table``), the platform's z axis is the table's axis. Translation along it and rotation about it
     are conventions and have zero variance. ``sensor`` contains the contribution of the sensor's calibration to the
     covariance, if the calibration has a joint estimate. Otherwise the profiles are assumed exact apart from noise.
-    ``inputs`` holds the SHA-256 of every input file. ``edited`` is set if the file was edited by hand and trusted.
+    ``inputs`` holds the SHA-256 of every input file. ``edited`` is set if its file was edited by hand.
     """
 
     T_platform_sensor: Rows

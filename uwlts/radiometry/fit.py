@@ -16,7 +16,6 @@ from scipy.optimize import minimize_scalar
 from scipy.special import erf
 
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError
-from uwlts.files.json_files import trusting
 from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.any_calibration import calibration_digest
@@ -68,7 +67,6 @@ _FAN_STD = 0.1
 """Standard uncertainty of the described power along the fan, relative, at its edges: line lasers are specified so."""
 
 
-@trusting
 def fit_radiometry(
     capture: Capture | str | Path,
     calibration: Calibration | str | Path,
@@ -77,7 +75,6 @@ def fit_radiometry(
     repeats: Capture | str | Path | None = None,
     compared_with: str | Path | None = None,
     stripe: StripeSettings = None,
-    trust_edited: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> Radiometry:
     """Fit light, water and noise to what the images of a scan show, and describe the sensor with these values.
@@ -103,8 +100,6 @@ def fit_radiometry(
         Earlier result (JSON). The changes are listed with their significance.
     stripe : StripeOptions or dict, optional
         As for `reconstruct`.
-    trust_edited : bool
-        As for `read`.
     progress : callable, optional
         Called after each image with the number of images done and the total number.
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.files.json_files import EDITED, trusting
+from uwlts.files.json_files import EDITED
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount
@@ -37,7 +37,6 @@ _NOISE_SAMPLED = 100_000
 """Number of stripe centres that show whether their noise is correlated."""
 
 
-@trusting
 def reconstruct(
     capture: Capture | str | Path,
     calibration: AnyCalibration | str | Path,
@@ -52,7 +51,6 @@ def reconstruct(
     stripe: StripeSettings = None,
     index: float | None = None,
     with_uncertainty: bool | None = None,
-    trust_edited: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> PointCloud:
     """Turn a capture into a point cloud: find the stripes of all laser images and triangulate them.
@@ -91,8 +89,6 @@ def reconstruct(
     with_uncertainty : bool, optional
         Calculate the uncertainty of the points, which requires a joint calibration; by default if it is joint. Files
         are then more than ten times larger.
-    trust_edited : bool
-        As for `read`.
     progress : callable, optional
         Called after each image with the number of images done and the total number.
 

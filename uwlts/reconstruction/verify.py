@@ -10,7 +10,6 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError, RangeError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties
-from uwlts.files.json_files import trusting
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.sensor import Vector
@@ -112,13 +111,8 @@ class Verification:
         return write_verification(calibration, record)
 
 
-@trusting
 def verify(
-    capture: Capture | str | Path,
-    calibration: AnyCalibration | str | Path,
-    *,
-    limit_mm: float | None = None,
-    trust_edited: bool = False,
+    capture: Capture | str | Path, calibration: AnyCalibration | str | Path, *, limit_mm: float | None = None
 ) -> Verification:
     """Measure the artefact in a capture and compare it with its calibrated values.
 
@@ -133,8 +127,6 @@ def verify(
         Calibration of the sensor; only a joint one states its uncertainty.
     limit_mm : float, optional
         Maximum permissible error.
-    trust_edited : bool
-        As for `read`.
 
     Returns
     -------

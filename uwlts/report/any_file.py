@@ -5,7 +5,7 @@ from pathlib import Path
 from uwlts.acceptance.accept import FORMAT as ACCEPTANCE, Acceptance, read_acceptance
 from uwlts.errors import CaptureError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION, EvaluationRecord, read_evaluation
-from uwlts.files.json_files import read_json, trusting
+from uwlts.files.json_files import read_json
 from uwlts.files.reading import require_regular_file
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.mount import FORMAT as MOUNT, Mount
@@ -27,14 +27,12 @@ _READABLE = (
 )
 
 
-@trusting
 def read(
     path: str | Path,
     *,
     pose_format: PoseFormat = "quaternion-xyzw",
     pose_unit: Unit | None = None,
     unit: Unit | None = None,
-    trust_edited: bool = False,
 ) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Acceptance | Trajectory:
     """Read a file of the program, whose content determines the type of the result.
 
@@ -53,9 +51,6 @@ def read(
         Unit of a trajectory's positions; by default that in the names of its columns, else mm.
     unit : {"mm", "m"}, optional
         As for `export`.
-    trust_edited : bool
-        Accept calibrations, mounts, evaluations and acceptance tests that were edited after they were written; results
-        record it.
 
     Returns
     -------
@@ -81,7 +76,7 @@ def read(
     require_regular_file(path)
     ending = next((each for each in reversed(path.suffixes) if each != ".part"), "")
     if ending == ".json":
-        found = read_json(path, called="file of this program").get("format")
+        found = read_json(path, called="file of this program", check_seal=False).get("format")
         if found in (CALIBRATION, POLYNOMIALS_FORMAT):
             return load_calibration(path)
         if found == MOUNT:

@@ -13,7 +13,6 @@ from uwlts._version import __version__
 from uwlts.errors import OutputError, RangeError
 from uwlts.evaluation.evaluate import TruthComparisons
 from uwlts.files.inputs import protect_inputs
-from uwlts.files.json_files import trusting
 from uwlts.files.writing import refuse_unsuitable, require_ending
 from uwlts.model.brief import Brief
 from uwlts.pages.numbers import format_fixed, format_length, is_number, split_name, unit_of
@@ -67,7 +66,6 @@ class Report(Brief):
 
 
 @protect_inputs()
-@trusting
 def write_campaign(
     folder: str | Path,
     *,
@@ -75,7 +73,6 @@ def write_campaign(
     out: str | Path | None = None,
     pictures: str | Path | None = None,
     workers: int = 1,
-    trust_edited: bool = False,
     overwrite: bool = False,
 ) -> Report:
     """Report a campaign's files as one page with pictures, and write a numerical summary beside it.
@@ -93,8 +90,6 @@ def write_campaign(
         Folder for PNG files of the stripe and the cloud of every measurement (default: not written).
     workers : int
         Number of drawing processes; with more than one, a script needs Python's ``if __name__ == "__main__"``.
-    trust_edited : bool
-        Accept files that were edited after they were written; results record it.
     overwrite : bool
         Replace an existing report, summary and pictures.
 

@@ -14,7 +14,6 @@ from markupsafe import Markup
 from uwlts.calibration.joint.observability import list_regions
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.files.inputs import protect_inputs
-from uwlts.files.json_files import trusting
 from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
@@ -53,14 +52,12 @@ _WORST_IMAGES = 5  # listed
 
 
 @protect_inputs()
-@trusting
 def write_certificate(
     calibration: str | Path,
     *,
     out: str | Path | None = None,
     before: str | Path | None = None,
     administration: str | Path | None = None,
-    trust_edited: bool = False,
     overwrite: bool = False,
 ) -> tuple[Path, AnyCertificate]:
     """Write the certificate of a calibration: a page to read and print, and its content as sealed JSON.
@@ -76,8 +73,6 @@ def write_certificate(
     administration : str or Path, optional
         TOML file with laboratory, customer, item and persons. With it, the certificate is also written as digital
         calibration certificate (DCC, XML) beside the page.
-    trust_edited : bool
-        Accept files that were edited after they were written; results record it.
     overwrite : bool
         Replace existing files.
 

@@ -16,7 +16,7 @@ from uwlts.errors import EvaluationError
 from uwlts.evaluation.decision import VERDICTS
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.files.inputs import protect_inputs
-from uwlts.files.json_files import EDITED, json_text, trusting
+from uwlts.files.json_files import EDITED, json_text
 from uwlts.files.writing import hash_file
 from uwlts.inspection.features import (
     COVERAGE,
@@ -95,7 +95,6 @@ class _CheckedFigure:
 
 
 @protect_inputs()
-@trusting
 def write_findings(
     cloud: str | os.PathLike[str],
     kind: InspectionKind = "pipe",
@@ -110,7 +109,6 @@ def write_findings(
     order: str | Path | None = None,
     measured: str | Path | None = None,
     unit: Unit | None = None,
-    trust_edited: bool = False,
     overwrite: bool = False,
     **options: Any,
 ) -> Inspection:
@@ -145,8 +143,6 @@ def write_findings(
         List of values measured by hand (NAME.measured.json of the desk), shown as a table.
     unit
         Unit of a cloud of another program, mm or m, if neither format nor names of columns state it; by default mm.
-    trust_edited
-        Accept files that were edited after they were written; results record it.
     overwrite
         Replace existing files.
     **options
@@ -178,8 +174,9 @@ def write_findings(
     sources += [
         Source("verification", Path(each).name, hash_file(each), "by the same calibration") for each in verification
     ]
-    if measured is not None:
-        sources.append(Source("measured values", Path(measured).name, hash_file(measured), "measured by hand"))
+    if measured is not None and by_hand is not None:
+        note = f"measured by hand{', edited' if by_hand.edited else ''}"
+        sources.append(Source("measured values", Path(measured).name, hash_file(measured), note))
     found = inspect_cloud(points, kind, **options)
     if kind == "pipe" and (note := resolve_datum(stated.datum, found.features[0].axes[2])[2]):
         found = replace(found, notes=(*found.notes, note))

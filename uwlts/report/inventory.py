@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from uwlts.acceptance.accept import Acceptance
 from uwlts.errors import CaptureError
 from uwlts.evaluation.evaluate import EvaluationRecord, TruthComparisons
-from uwlts.files.json_files import trusting
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import BoardFound, Mount, SphereFound
@@ -31,10 +30,7 @@ from uwlts.storage.number_tables import Unit
 from uwlts.storage.truth import FORMAT as TRUTH, Truth, TruthHeader, TruthStatus, read_truth
 
 
-@trusting
-def describe(
-    path: str | Path, *, unit: Unit | None = None, schema: str | Path | None = None, trust_edited: bool = False
-) -> str:
+def describe(path: str | Path, *, unit: Unit | None = None, schema: str | Path | None = None) -> str:
     """Describe a file that `read` reads, a digital calibration certificate, or a sensor description (by name or path).
 
     Parameters
@@ -46,8 +42,6 @@ def describe(
     schema : str or Path, optional
         XML schema (dcc.xsd) by which a digital calibration certificate is validated. Schemas that it imports are beside
         it.
-    trust_edited : bool
-        As for `read`.
 
     Returns
     -------

@@ -84,12 +84,16 @@ class MeasuredValue(Description):
 
 
 class MeasuredValues(Description):
-    """List of measured values. Changes return a new list, which remembers the one before for `undo`."""
+    """List of measured values. Changes return a new list, which remembers the one before for `undo`.
+
+    ``edited`` is set if its file was edited by hand.
+    """
 
     model_config = ConfigDict(extra="ignore")
 
     coverage_factor: float = COVERAGE_FACTOR
     values: tuple[MeasuredValue, ...] = ()
+    edited: bool = False
     before: MeasuredValues | None = Field(default=None, exclude=True, repr=False)
 
     def add(self, measured: PickedMeasurement, *, source: str, without_interval: str) -> MeasuredValues:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from tests.system.in_process import run_program
 from uwlts.cli import app
-from uwlts.errors import CaptureError, DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.storage.cloud import PointCloud
 
 NOISE_MM = 0.02
@@ -222,14 +222,10 @@ def test_a_result_is_kept_whole_and_sealed(folder, found, tmp_path):
     content = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
     content["characteristics"][0]["mpe_mm"] = 9.0
     (tmp_path / "result.json").write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(CaptureError, match="edited"):
-        uwlts.read(tmp_path / "result.json")
-    with pytest.raises(CaptureError, match="edited"):
-        uwlts.accept(folder / "plan.toml", earlier=tmp_path / "result.json")
-    continued = uwlts.accept(folder / "plan.toml", earlier=tmp_path / "result.json", trust_edited=True)
+    continued = uwlts.accept(folder / "plan.toml", earlier=tmp_path / "result.json")
     assert continued.edited
     assert "the earlier result was edited after it was written" in continued.remarks
-    assert uwlts.read(tmp_path / "result.json", trust_edited=True).edited
+    assert uwlts.read(tmp_path / "result.json").edited
 
 
 def test_the_command_leads_through_the_plan(folder, tmp_path):

@@ -37,10 +37,11 @@ def test_a_calibration_without_verification_is_doubted_after_a_day(dated):
     assert describe_verification(path, CALIBRATION) == (None, []), "without a date"
 
 
-def test_a_verification_is_valid_for_a_day_and_for_its_calibration(dated):
+def test_a_verification_is_valid_for_a_day_and_for_its_calibration(dated, caplog):
     path, calibration = dated
     assert verified(path, calibration).name == "water.verification.json"
     until, doubts = describe_verification(path, calibration)
+    assert not caplog.text, "its seal fits"
     assert doubts == [] and until.startswith(f"{datetime.now(UTC) + timedelta(days=1):%Y-%m-%d}")
     later = datetime.now(UTC) + timedelta(hours=30)
     assert "today's check is missing" in describe_verification(path, calibration, now=later)[1][0]

@@ -25,7 +25,6 @@ from uwlts.calibration.joint.stored_estimate import (
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, sources_of
 from uwlts.errors import CalibrationError, RangeError
-from uwlts.files.json_files import trusting
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import Calibration, KnownStage
@@ -203,7 +202,6 @@ class Refreshed(Brief):
     warnings: list[str]
 
 
-@trusting
 def refresh(
     calibration: Calibration | str | Path,
     step: Sequence[Capture | str | Path],
@@ -211,7 +209,6 @@ def refresh(
     index: float | None = None,
     index_std: float | None = None,
     stripe: StripeSettings = None,
-    trust_edited: bool = False,
     progress: ProgressListener = ignore_progress,
 ) -> Refreshed:
     """Adapt a joint calibration to new water, or to another water temperature, with images of a step.
@@ -233,8 +230,6 @@ def refresh(
         known about the water.
     stripe : StripeOptions or dict, optional
         As for `reconstruct`.
-    trust_edited : bool
-        As for `read`.
     progress : callable, optional
         Called with the number of images done, the total, and the name of the stage.
 

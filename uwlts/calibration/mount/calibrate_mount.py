@@ -23,7 +23,6 @@ from uwlts.calibration.mount.restricted_likelihood import (
 )
 from uwlts.calibration.mount.start import NoFit, start
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.files.json_files import trusting
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose
 from uwlts.model.trajectory import Trajectory
@@ -43,7 +42,6 @@ _SURE = 5.0
 """The same in standard uncertainties (one in a million for normal errors); the larger limit applies."""
 
 
-@trusting
 def calibrate_mount(
     profiles: str | Path | Sequence[np.ndarray] | CapturedProfiles,
     poses: str | Path | np.ndarray | None = None,
@@ -59,7 +57,6 @@ def calibrate_mount(
     time: bool = False,
     profile_times_s: np.ndarray | None = None,
     pose_times_s: np.ndarray | None = None,
-    trust_edited: bool = False,
 ) -> Mount:
     """Calibrate the mount of a laser profiler on a robot or stage, from its profiles of a sphere or plane.
 
@@ -109,8 +106,6 @@ def calibrate_mount(
     profile_times_s, pose_times_s
         Times (P,) of the profiles and (M,) of the poses. The poses are then a trajectory with any number M of poses
         (`uwlts.Trajectory`).
-    trust_edited
-        As for `read`.
 
     Returns
     -------
