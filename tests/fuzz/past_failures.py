@@ -49,11 +49,6 @@ def _set(name: str, place: object, value: float) -> Callable[[h5py.File], None]:
     return change
 
 
-def _vary_text(file: h5py.File) -> None:
-    del file["json"]
-    file.create_dataset("json", data=["{}"] * 2, dtype=h5py.string_dtype())
-
-
 def _text(content: str) -> Build:
     return lambda path: _write(path, content.encode())
 
@@ -143,8 +138,6 @@ PAST: dict[str, tuple[str, Build]] = {
     "cloud with a link to another file": ("cloud-hdf5", _with_dataset(_external("intensity"), "cloud-hdf5")),
     "negative exposure": ("capture", _with_dataset(_set("exposure_ms", 1, -2.0), "capture")),
     "time running backwards": ("capture", _with_dataset(_set("time_s", 1, -100.0), "capture")),
-    # HDF5 may search a damaged text of this kind forever.
-    "shard with texts of variable length": ("shard-hdf5", _with_dataset(_vary_text, "shard-hdf5")),
     "covariance whose eigenvalues overflow": ("covariances", _replaced("covariances", "0.25,0.25", "0.25,1.7e308")),
     "pose that is not rigid": ("capture", _with_dataset(_set("pose", 1, 1.0), "capture")),
     "PNG of 20000 x 20000 pixels without any": ("image-png", _png(20_000, 20_000)),

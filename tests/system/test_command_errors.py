@@ -595,7 +595,7 @@ def test_reports_that_cannot_be(fails, folder: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ("no-campaign", "nothing is called 'no-campaign'; known are demo, detection, joint, prediction, thesis"),
+        ("no-campaign", "nothing is called 'no-campaign'; known are demo, detection, joint, prediction, quick, thesis"),
         ("no-campaign.toml", "no description at no-campaign.toml"),
         ("--campaigns 0", "campaigns is 0; it must be at least 1"),
         ("--campaigns -3", "campaigns is -3"),
