@@ -20,9 +20,9 @@ import uwlts
 from twin.scene.description import Scene
 from twin.scene.robot import Robot
 from uwlts.calibration.mount.captured_profiles import CapturedProfiles, reconstruct_profiles
-from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount, SphereFound
+from uwlts.shapes.sphere import Sphere
 from uwlts.storage.truth import read_truth, truth_path
 
 FOR_THE_MOUNT = 15
@@ -35,7 +35,7 @@ def scatter_mm(captured: CapturedProfiles, mount: np.ndarray, centre_mm: np.ndar
     points = np.vstack([p @ pose[:3, :3].T + pose[:3, 3] for p, pose in zip(captured.profiles, placed, strict=True)])
     for _ in range(5):
         near = np.abs(np.linalg.norm(points - centre_mm, axis=1) - RADIUS_MM) < 0.5
-        fit = fit_sphere(points[near], RADIUS_MM)
+        fit = Sphere.fit(points[near], RADIUS_MM)
         centre_mm = fit.centre_mm
     return float(np.sqrt(np.mean(fit.residuals_mm**2)))
 

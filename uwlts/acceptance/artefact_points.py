@@ -16,10 +16,11 @@ from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import StepEvaluation, evaluate_plane, evaluate_step, measure_step
 from uwlts.evaluation.figures import TOWARDS_SENSOR, spread_mm
 from uwlts.evaluation.spheres import evaluate_spheres
-from uwlts.evaluation.step_faces import StepFace
 from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE, FitT
-from uwlts.fitting.shapes import FlatFit, SphereFit, fit_plane, fit_sphere
 from uwlts.model.artefacts import PlaneStandard, SphereStandard, StepStandard
+from uwlts.shapes.flat import Plane
+from uwlts.shapes.sphere import Sphere
+from uwlts.shapes.step import StepFace
 
 _HEMISPHERE_DEG = 90.0
 """Largest angle between a sphere's surface normal and the direction to the sensor: all that light along Z reaches."""
@@ -33,7 +34,7 @@ class MeasuredSurface(Generic[FitT]):
 
     Attributes
     ----------
-    fit : SphereFit or FlatFit
+    fit : Sphere or Plane
         Fit to the kept points.
     range_mm : float
         Range of the distances of the kept points from the fit.
@@ -52,9 +53,7 @@ class MeasuredSurface(Generic[FitT]):
     rejected: int
 
 
-def measure_spheres(
-    points: np.ndarray, standard: SphereStandard, *, margin_mm: float
-) -> list[MeasuredSurface[SphereFit]]:
+def measure_spheres(points: np.ndarray, standard: SphereStandard, *, margin_mm: float) -> list[MeasuredSurface[Sphere]]:
     """Fit the spheres of a standard to points (N, 3), mm, in the order of the description.
 
     The points of a sphere are those within the margin of its surface, and all points in front of its outline along Z,
@@ -76,18 +75,18 @@ def measure_spheres(
         before = aside[:, number] <= np.sin(cap) * sphere.diameter_mm / 2
         own = (nearest == number) & facing[:, number] & (before | (np.abs(off[:, number]) <= margin_mm))
         name = f"sphere {number + 1}"
-        measured.append(_fit_kept(fit_sphere, points[own], off[own, number], margin_mm=margin_mm, name=name))
+        measured.append(_fit_kept(Sphere.fit, points[own], off[own, number], margin_mm=margin_mm, name=name))
     return measured
 
 
-def measure_plane(points: np.ndarray, standard: PlaneStandard, *, margin_mm: float) -> MeasuredSurface[FlatFit]:
+def measure_plane(points: np.ndarray, standard: PlaneStandard, *, margin_mm: float) -> MeasuredSurface[Plane]:
     """Fit a plane to all points (N, 3), mm.
 
     EvaluationError if the points show no plane, or more than 0.3 % of them are farther than the margin from it.
     """
     found = evaluate_plane(points, standard)
     off = (points - found.point_mm) @ np.array(found.normal)
-    return _fit_kept(partial(fit_plane, towards=TOWARDS_SENSOR), points, off, margin_mm=margin_mm, name="plane")
+    return _fit_kept(partial(Plane.fit, towards=TOWARDS_SENSOR), points, off, margin_mm=margin_mm, name="plane")
 
 
 def measure_step_height(points: np.ndarray, frame: np.ndarray, standard: StepStandard) -> StepEvaluation:

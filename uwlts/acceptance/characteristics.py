@@ -29,9 +29,10 @@ from uwlts.acceptance.artefact_points import MeasuredSurface, measure_plane, mea
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.decision import Verdict, judge_interval
 from uwlts.fitting.least_squares import principal_axes
-from uwlts.fitting.shapes import FlatFit, SphereFit
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.sensor import UnitVector, Vector
+from uwlts.shapes.flat import Plane
+from uwlts.shapes.sphere import Sphere
 from uwlts.storage.cloud import PointCloud
 
 Decision = Literal["nonconformity proven", "rejected", "undecided", "no MPE", "accepted", "conformity proven"]
@@ -275,7 +276,7 @@ def _probability(value: CharacteristicValue, limit_mm: float | None) -> float | 
 
 
 def _sphere_values(
-    surfaces: list[MeasuredSurface[SphereFit]],
+    surfaces: list[MeasuredSurface[Sphere]],
     standard: SphereStandard,
     artefact: CertifiedArtefact,
     position: str,
@@ -316,7 +317,7 @@ def _sphere_values(
 
 
 def _plane_values(
-    plane: MeasuredSurface[FlatFit], points: np.ndarray, artefact: CertifiedArtefact, position: str
+    plane: MeasuredSurface[Plane], points: np.ndarray, artefact: CertifiedArtefact, position: str
 ) -> Iterator[CharacteristicValue]:
     middle = points.mean(axis=0)
     along = (points - middle) @ principal_axes(points - middle)[1][:2].T

@@ -29,10 +29,10 @@ from uwlts.alignment.path_solution import (
     with_drift,
 )
 from uwlts.fitting.least_squares import rms_distance
-from uwlts.fitting.shapes import perpendicular_to
 from uwlts.model.calibration import rigid_transform
 from uwlts.registration.joint_registration import fit_pair
 from uwlts.runtime.progress import ProgressListener, ignore_progress
+from uwlts.shapes.flat import perpendicular_to
 
 
 @dataclass(frozen=True)

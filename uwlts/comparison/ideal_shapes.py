@@ -13,9 +13,11 @@ from uwlts.errors import DescriptionError, describe_problems
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.files.reading import MOST_TOML_BYTES, parse_toml, read_text
 from uwlts.fitting.least_squares import fit_robustly, thin_evenly
-from uwlts.fitting.shapes import fit_cylinder, fit_plane, fit_sphere
 from uwlts.model.sensor import Description, Positive, Vector
 from uwlts.registration.surface_registration import Nearest, Registration, shape_registration
+from uwlts.shapes.cylinder import Cylinder
+from uwlts.shapes.flat import Plane
+from uwlts.shapes.sphere import Sphere
 from uwlts.storage.cloud import PointUncertainty
 
 _MOST_FITTED = 50_000
@@ -176,16 +178,16 @@ def place_shape(
     points = points_mm[chosen]
     match shape:
         case IdealPlane():
-            robust = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), points)
+            robust = fit_robustly(Plane.fit, points, towards=TOWARDS_SENSOR)
             placed = PlacedShape("plane", robust.fit.point_mm, robust.fit.normal, 0.0)
         case IdealSphere():
             known = None if shape.diameter_mm is None else shape.diameter_mm / 2
-            robust = fit_robustly(lambda p: fit_sphere(p, radius_mm=known), points)
+            robust = fit_robustly(Sphere.fit, points, radius_mm=known)
             placed = PlacedShape("sphere", robust.fit.centre_mm, None, robust.fit.radius_mm)
         case IdealCylinder():
             known = None if shape.diameter_mm is None else shape.diameter_mm / 2
-            start = fit_cylinder(thin_evenly(points, 2000), radius_mm=known).axis
-            robust = fit_robustly(lambda p: fit_cylinder(p, radius_mm=known, axis_start=start), points)
+            start = Cylinder.fit(thin_evenly(points, 2000), radius_mm=known).axis
+            robust = fit_robustly(Cylinder.fit, points, radius_mm=known, axis_start=start)
             placed = PlacedShape("cylinder", robust.fit.point_mm, robust.fit.axis, robust.fit.radius_mm)
         case _:
             assert_never(shape)

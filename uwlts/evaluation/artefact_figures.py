@@ -10,10 +10,11 @@ import numpy as np
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
 from uwlts.evaluation.spheres import evaluate_spheres
-from uwlts.evaluation.step_faces import StepFace, label_step_faces, step_height
 from uwlts.fitting.least_squares import RobustFit, fit_robustly
-from uwlts.fitting.shapes import CylinderFit, FlatFit, fit_cylinder, fit_plane
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
+from uwlts.shapes.cylinder import Cylinder
+from uwlts.shapes.flat import Plane
+from uwlts.shapes.step import StepFace, label_step_faces, step_height
 from uwlts.storage.cloud import PointCloud
 
 _MOST_REJECTED = 0.1
@@ -27,7 +28,7 @@ _SECTORS = 72
 _LEAST_OF_PROFILE = 5
 """Least number of points on each face for the height of a profile; noise dominates a line through fewer."""
 
-_fit_facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
+_fit_facing_plane = partial(Plane.fit, towards=TOWARDS_SENSOR)
 
 
 def evaluate_cloud(cloud: PointCloud, artefact: Artefact) -> ArtefactEvaluation:
@@ -116,7 +117,7 @@ def evaluate_pipe(points: np.ndarray, artefact: PipeStandard) -> PipeEvaluation:
     EvaluationError for too few points, more than a tenth of outliers, an undetermined cylinder, or a diameter that
     differs from the artefact's by more than a fifth.
     """
-    robust, counts = _fit_robustly_checked(fit_cylinder, points, artefact.kind)
+    robust, counts = _fit_robustly_checked(Cylinder.fit, points, artefact.kind)
     fit = robust.fit
     error = 2 * fit.radius_mm - artefact.diameter_mm
     if abs(error) > _DIAMETER_TOLERANCE * artefact.diameter_mm:
@@ -153,7 +154,7 @@ def _fit_robustly_checked(
     return robust, {"points_used": used, "points_rejected": robust.rejected, "deviation_mm": deviation}
 
 
-def measure_ovality(points: np.ndarray, fit: CylinderFit) -> float | None:
+def measure_ovality(points: np.ndarray, fit: Cylinder) -> float | None:
     """Return 4 sqrt(a2 + b2) of the radius component a cos 2w + b sin 2w; circle shift and size are fitted too."""
     across = (points - fit.point_mm) @ fit.across.T
     angle = np.arctan2(across[:, 1], across[:, 0])
@@ -217,7 +218,7 @@ def measure_step(
     points: np.ndarray, frame: np.ndarray, labels: np.ndarray, artefact: StepStandard, *, rejected: int = 0
 ) -> StepEvaluation:
     """Evaluate points (N, 3), mm, of a step with known faces ``labels`` (N,); EvaluationError for too few points."""
-    planes: dict[StepFace, FlatFit] = {
+    planes: dict[StepFace, Plane] = {
         face: _fit_facing_plane(points[labels == face]) for face in (StepFace.LOWER, StepFace.UPPER)
     }
     height = step_height(points, labels, reference=artefact.reference)

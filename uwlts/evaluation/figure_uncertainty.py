@@ -1,7 +1,6 @@
 """Uncertainty of an artefact's figures and of a cloud's position, including correlations between points."""
 
 from dataclasses import replace
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -14,10 +13,13 @@ from uwlts.evaluation.artefact_figures import (
 )
 from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quantity, spread_mm
 from uwlts.evaluation.spheres import SphereEvaluation
-from uwlts.evaluation.step_faces import StepFace
 from uwlts.fitting.propagation import PointErrors, noise_shifts
-from uwlts.fitting.shapes import CylinderFit, FlatFit, SphereFit, fit_cylinder, fit_plane, fit_sphere
 from uwlts.model.artefacts import StepStandard
+from uwlts.shapes.cylinder import Cylinder
+from uwlts.shapes.flat import Plane
+from uwlts.shapes.linearised_fit import LinearisedFit
+from uwlts.shapes.sphere import Sphere
+from uwlts.shapes.step import StepFace
 from uwlts.storage.cloud import PointCloud
 
 _MOST_DRAWS, _FEWEST_DRAWS = 400, 50
@@ -86,45 +88,13 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     return np.sqrt(np.sum(moved**2, axis=0)) / count
 
 
-ShapeT = TypeVar("ShapeT", bound=FlatFit | SphereFit | CylinderFit)
-
-
-class _LinearisedFit(Generic[ShapeT]):
-    """Linearised fit of a shape to the ``used`` (K,) of points (N, 3).
-
-    A point's shift along the normal changes its distance from the shape. Normals and the distances' derivatives by the
-    shape's parameters are constant, since shifts are small compared with the shape.
-    """
-
-    def __init__(self, shape: ShapeT, points: np.ndarray, used: np.ndarray):
-        self.used, self.shape, self._outward = used, shape, shape.normals_at(points[used])
-        self._design = -shape.derivatives(points[used])
-        self._solve = np.linalg.solve(self._design.T @ self._design, self._design.T)
-
-    def shift(self, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return changes (P,) of the parameters and residuals (K,) after shifts (N, 3) of points."""
-        change = np.einsum("ni,ni->n", self._outward, moves[self.used])
-        step = self._solve @ change
-        return step, self.shape.residuals_mm + change - self._design @ step
-
-    def std_mm(self, residuals: np.ndarray) -> float:
-        """Return the standard deviation of residuals (K,), with the degrees of freedom of the fit."""
-        return float(np.sqrt(residuals @ residuals / (len(residuals) - len(self._solve))))
-
-    def gradient(self, weights: np.ndarray, count: int) -> np.ndarray:
-        """Return the derivatives (N, 3) of a weighted sum of the parameters by the shifts of N = ``count`` points."""
-        result = np.zeros((count, 3))
-        result[self.used] = (weights @ self._solve)[:, None] * self._outward
-        return result
-
-
 class _LinearisedPlane:
     """Linearised plane of an evaluation of points (N, 3), mm, with fixed outliers."""
 
     def __init__(self, points: np.ndarray, evaluation: PlaneEvaluation):
         used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
         self._evaluation = evaluation
-        self._fit = _LinearisedFit(fit_plane(points[used], towards=np.array(evaluation.normal)), points, used)
+        self._fit = LinearisedFit(Plane.fit(points[used], towards=np.array(evaluation.normal)), points, used)
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
         """Return the evaluation's figures after shifts (N, 3) of all points."""
@@ -143,8 +113,8 @@ class _LinearisedPipe:
     def __init__(self, points: np.ndarray, evaluation: PipeEvaluation):
         used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
         self._points, self._evaluation, self._count = points[used], evaluation, len(points)
-        self._pipe = fit_cylinder(points[used], axis_start=evaluation.axis)
-        self._fit = _LinearisedFit(self._pipe, points, used)
+        self._pipe = Cylinder.fit(points[used], axis_start=evaluation.axis)
+        self._fit = LinearisedFit(self._pipe, points, used)
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
         """Return the evaluation's figures after shifts (N, 3) of all points."""
@@ -180,8 +150,8 @@ class _LinearisedStep:
         """Return the derivatives (N, 3) of the height: mean distance of a face from the plane of the other."""
         points, base = self._cloud.points_mm, StepFace[self._artefact.reference.upper()]
         used, across = (np.flatnonzero(self._labels == face) for face in (base, base.other))
-        plane = fit_plane(points[used])
-        fit = _LinearisedFit(plane, points, used)
+        plane = Plane.fit(points[used])
+        fit = LinearisedFit(plane, points, used)
         result = fit.gradient(plane.derivatives(points[across]).mean(axis=0), len(points))
         result[across] = plane.normal / len(across)
         (name,) = (f.key.name for f in self._evaluation.figures if f.key.quantity is Quantity.HEIGHT_ERROR)
@@ -199,9 +169,9 @@ class LinearisedSpheres:
         radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
         off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
         members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
-        self._free = [_LinearisedFit(fit_sphere(points[own]), points, own) for own in members]
+        self._free = [LinearisedFit(Sphere.fit(points[own]), points, own) for own in members]
         self._known = [
-            _LinearisedFit(fit_sphere(points[own], d / 2), points, own)
+            LinearisedFit(Sphere.fit(points[own], d / 2), points, own)
             for own, d in zip(members, diameters, strict=True)
         ]
 
@@ -245,7 +215,7 @@ class LinearisedSpheres:
                     pass  # ranges and standard deviations are not linear in the points
         return found
 
-    def _spacing_gradient(self, spheres: tuple[int, ...], fits: list[_LinearisedFit[SphereFit]]) -> np.ndarray:
+    def _spacing_gradient(self, spheres: tuple[int, ...], fits: list[LinearisedFit[Sphere]]) -> np.ndarray:
         first, second = fits[spheres[0] - 1 if spheres else 0 :][:2]
         between = second.shape.centre_mm - first.shape.centre_mm
         along = np.append(between / np.linalg.norm(between), 0.0)[: len(first.shape.covariance)]

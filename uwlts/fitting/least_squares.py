@@ -68,14 +68,14 @@ class RobustFit(Generic[FitT]):
         return self.rejected / len(self.inliers)
 
 
-def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = DEFAULT_K) -> RobustFit[FitT]:
+def fit_robustly(fit: Callable[..., FitT], points: Any, *, k: float = DEFAULT_K, **known: Any) -> RobustFit[FitT]:
     """Fit a shape repeatedly, rejecting points beyond k robust standard deviations.
 
     The deviation of a point is the difference between its distance and the median distance. The robust standard
     deviation is 1.4826 times the median absolute deviation. A rejected point returns if a later fit passes within the
     limit. The rule suits a few outliers on one surface; it does not separate surfaces.
 
-    ``fit`` fits a shape to points (M, D), such as `fit_sphere`; ``points`` (N, D) are in mm.
+    ``fit`` fits a shape to points (M, D), such as `Sphere.fit`, with what is ``known``; ``points`` (N, D) are in mm.
 
     Raises EvaluationError if the points or the inliers do not determine the shape.
     """
@@ -85,7 +85,7 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
     inliers = np.ones(len(points), dtype=bool)
     rounds = 0
     while True:
-        shape = fit(points[inliers])
+        shape = fit(points[inliers], **known)
         rounds += 1
         distances = shape.distances_mm(points)
         # Deviations from the median, since outliers on one side shift the first fit away from most points.
@@ -113,12 +113,12 @@ def robust_std(residuals: np.ndarray) -> float:
 
 
 def noise_factor(relative: np.ndarray) -> float:
-    """Return the ratio of robust scatter to stated noise for normalise_points residuals (N,); at least 1."""
+    """Return the ratio of robust scatter to stated noise for normalised residuals (N,); at least 1."""
     return max(robust_std(relative), 1.0) if len(relative) else 1.0
 
 
 def biweight(relative: np.ndarray) -> np.ndarray:
-    """Return Tukey's biweight (N,) of normalise_points residuals: 1 at zero, 0 beyond `TUKEY_BOUND`."""
+    """Return Tukey's biweight (N,) of normalised residuals: 1 at zero, 0 beyond `TUKEY_BOUND`."""
     return np.square(np.clip(1 - np.square(relative / TUKEY_BOUND), 0, None))
 
 
@@ -170,9 +170,9 @@ def check_points(points: Any, *, least: int, what: str, dimensions: tuple[int, .
 
 @dataclass(frozen=True, eq=False)
 class Normalised:
-    """Points (N, D) for a fit, as given and normalise_points to zero mean and unit rms distance.
+    """Points (N, D) for a fit, as given and normalised to zero mean and unit rms distance.
 
-    ``extents`` (D,) are the root sums of squares of the normalise_points points along their principal ``axes`` (rows of
+    ``extents`` (D,) are the root sums of squares of the normalised points along their principal ``axes`` (rows of
     (D, D)), in descending order.
     """
 

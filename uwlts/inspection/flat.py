@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,13 +18,14 @@ from scipy.stats import norm
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
-from uwlts.evaluation.step_faces import StepFace, label_step_faces
-from uwlts.fitting.least_squares import fit_robustly, robust_std, thin_evenly
+from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors, group_neighbours
-from uwlts.fitting.shapes import fit_circle, fit_plane
 from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, FeatureValue, Inspection, plain_value
 from uwlts.inspection.noisy_extremes import BIAS_FACTOR
+from uwlts.shapes.circle import Circle
+from uwlts.shapes.flat import Plane
+from uwlts.shapes.step import StepFace, label_step_faces
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
 
@@ -39,12 +39,6 @@ class FlatRule:
     """
 
     fewest_points: int = 200  # fewest points of a cloud, a face or a plate
-    proposals: int = 600  # random planes through three points that are tried for the largest face
-    judging_points: int = 3000  # points, evenly thinned, that compare these planes
-    near: float = 2e-3
-    """Largest distance of a point from a proposed plane, as a fraction of the cloud's size. The plane is refined
-    afterwards."""
-    refinements: int = 4  # robust fits that refine the largest face
     off_face: float = 6.0  # largest distance of a point from its face, in standard deviations
     histogram_bins: int = 200  # bins of the histogram of heights that separates both faces of a step
     level_bins: int = 6  # bins next to the first face that belong to this face, not to the second one
@@ -69,8 +63,6 @@ class FlatRule:
 
 _RULE = FlatRule()
 
-_facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
-
 
 def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     """Measure the step between the two largest parallel faces of a cloud.
@@ -93,7 +85,7 @@ def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
         The cloud does not show two such faces.
     """
     cloud = _load_faces(cloud)
-    normal = _find_largest_plane(cloud.points_mm)[0]
+    normal = _find_largest_face(cloud.points_mm)[0]
     labels = label_step_faces(cloud.points_mm, height_mm=_estimate_step_height(cloud.points_mm @ normal))
     lower, upper = (np.flatnonzero(labels == face) for face in (StepFace.LOWER, StepFace.UPPER))
     base = _fit_face(cloud, lower)
@@ -147,7 +139,7 @@ def inspect_flange(
         The cloud does not contain frames and lines, or a face.
     """
     cloud, datum = _load_faces(cloud), None if datum is None else load_cloud(datum)
-    used = _find_largest_plane(cloud.points_mm)[1]
+    used = _find_largest_face(cloud.points_mm)[1]
     face = _fit_face(cloud, used)
     values = [_measure_flatness(cloud, face, used)]
     holes, features, notes = [], [], []
@@ -213,7 +205,7 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     cloud = _load_faces(cloud)
     # Gaps are searched for in all points, as the plates may be offset.
     everything = np.arange(len(cloud))
-    face = _fit_face(cloud, _find_largest_plane(cloud.points_mm)[1])
+    face = _fit_face(cloud, _find_largest_face(cloud.points_mm)[1])
     found = _find_gaps(cloud, face, everything)
     if not found:
         raise EvaluationError("no gap found: scan across it, so that each profile shows both edges")
@@ -311,30 +303,14 @@ def _load_faces(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
     return cloud
 
 
-def _find_largest_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_largest_face(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal (3,), towards the sensor, and the points' indices of the plane with most points."""
-    thinned = thin_evenly(points, _RULE.judging_points)
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    rng = np.random.default_rng(0)
-    corners = thinned[rng.integers(len(thinned), size=(_RULE.proposals, 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normals, axis=1)
-    normals, corners = normals[length > 0] / length[length > 0, None], corners[length > 0, 0]
-    levels = np.einsum("pi,pi->p", normals, corners)
-    near = np.abs(thinned @ normals.T - levels) < _RULE.near * size
-    best = int(np.argmax(near.sum(axis=0)))
-    inside = np.abs(points @ normals[best] - levels[best]) < _RULE.near * size
-    normal = normals[best]
-    for _ in range(_RULE.refinements):
-        fit = fit_robustly(_facing_plane, points[inside]).fit
-        normal, distance = fit.normal, fit.distances_mm(points)
-        spread = robust_std(distance[inside])
-        inside = np.abs(distance) < _RULE.off_face * max(spread, 1e-9)
+    plane, inside = Plane.find(points, towards=TOWARDS_SENSOR, off=_RULE.off_face)
     if np.count_nonzero(inside) < _RULE.fewest_points:
         raise EvaluationError(
             f"the largest flat face holds {np.count_nonzero(inside)} points; {_RULE.fewest_points} are needed"
         )
-    return normal, np.flatnonzero(inside)
+    return plane.normal, np.flatnonzero(inside)
 
 
 def _estimate_step_height(levels: np.ndarray) -> float:
@@ -351,7 +327,7 @@ def _estimate_step_height(levels: np.ndarray) -> float:
 
 def _fit_face(cloud: PointCloud, chosen: np.ndarray) -> _Face:
     points = cloud.points_mm[chosen]
-    fit = fit_plane(points, towards=TOWARDS_SENSOR)
+    fit = Plane.fit(points, towards=TOWARDS_SENSOR)
     axes = np.array([fit.axes[0], np.cross(fit.normal, fit.axes[0]), fit.normal])
     local = (points - fit.point_mm) @ axes.T
     design = np.column_stack([np.ones(len(local)), local[:, :2]])
@@ -517,7 +493,8 @@ def _fit_hole(edges: _Edges) -> _Hole:
     """
     if len(edges.places) < _RULE.fewest_edges:
         raise EvaluationError(f"its edge has {len(edges.places)} points, at least {_RULE.fewest_edges} are needed")
-    middle, radius = fit_circle(edges.places)
+    circle = Circle.fit(edges.places)
+    middle, radius = circle.centre_mm, circle.radius_mm
     away = edges.places - middle
     distance = np.linalg.norm(away, axis=1)
     left = distance - radius
@@ -548,7 +525,8 @@ def _make_diameter(kind: FeatureKind, name: str, hole: _Hole) -> FeatureValue:
 def _measure_bolt_circle(bolts: list[_Hole]) -> tuple[FeatureValue, list[float]]:
     """Return the bolt circle's diameter, and each hole's distance from its place on an even division."""
     middles = np.array([hole.middle for hole in bolts])
-    centre, radius = fit_circle(middles)
+    circle = Circle.fit(middles)
+    centre, radius = circle.centre_mm, circle.radius_mm
     away = middles - centre
     units = away / np.linalg.norm(away, axis=1, keepdims=True)
     rows = np.linalg.pinv(np.column_stack([units, np.ones(len(bolts))]))
@@ -582,7 +560,7 @@ def _make_hole_feature(face: _Face, hole: _Hole, number: int, offset: float) -> 
 
 def _measure_parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum: PointCloud) -> FeatureValue:
     """Return the angle to the largest face of another cloud, whose calibration is taken as independent."""
-    on_datum = _find_largest_plane(datum.points_mm)[1]
+    on_datum = _find_largest_face(datum.points_mm)[1]
     other = _fit_face(datum, on_datum)
     facing = 1.0 if face.axes[2] @ other.axes[2] > 0 else -1.0
     slopes = facing * face.axes[:2] @ other.axes[2]

@@ -10,14 +10,16 @@ from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import FigureUncertainty
 from uwlts.fitting.least_squares import fit_robustly
 from uwlts.fitting.propagation import PointErrors, noise_shifts
-from uwlts.fitting.shapes import CylinderFit, FlatFit, SphereFit, fit_cylinder, fit_plane, fit_sphere
+from uwlts.shapes.cylinder import Cylinder
+from uwlts.shapes.flat import Plane
+from uwlts.shapes.sphere import Sphere
 from uwlts.storage.cloud import PointCloud
 
 Shape = Literal["sphere", "plane", "cylinder"]
-_FITS: dict[Shape, Callable[[np.ndarray], SphereFit | FlatFit | CylinderFit]] = {
-    "sphere": fit_sphere,
-    "plane": fit_plane,
-    "cylinder": fit_cylinder,
+_FITS: dict[Shape, Callable[[np.ndarray], Sphere | Plane | Cylinder]] = {
+    "sphere": Sphere.fit,
+    "plane": Plane.fit,
+    "cylinder": Cylinder.fit,
 }
 _MOST_POINTS = 20_000
 """Most points of a fit; with more points the errors common to all of them dominate."""
@@ -119,6 +121,6 @@ def propagate_figures(
     return {name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(figures, random, systematic, strict=True)}
 
 
-def _figures(fit: SphereFit | FlatFit | CylinderFit) -> dict[str, float]:
+def _figures(fit: Sphere | Plane | Cylinder) -> dict[str, float]:
     form = {"standard deviation": fit.std_mm}
-    return form if isinstance(fit, FlatFit) else {"diameter": 2 * fit.radius_mm} | form
+    return form if isinstance(fit, Plane) else {"diameter": 2 * fit.radius_mm} | form

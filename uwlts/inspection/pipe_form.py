@@ -10,8 +10,8 @@ import numpy as np
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import fit_biweight, fit_robustly, thin_evenly
 from uwlts.fitting.propagation import PointErrors, group_neighbours
-from uwlts.fitting.shapes import CylinderFit, fit_cylinder
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, amplitude_value, plain_value
+from uwlts.shapes.cylinder import Cylinder
 from uwlts.storage.cloud import PointCloud
 
 LARGEST_OVALITY = 0.02
@@ -68,7 +68,7 @@ class PipeFrame:
     axes: np.ndarray  # (3, 3); unit vectors in rows: two directions across, and the axis
 
     @classmethod
-    def about(cls, cylinder: CylinderFit, points_mm: np.ndarray) -> PipeFrame:
+    def about(cls, cylinder: Cylinder, points_mm: np.ndarray) -> PipeFrame:
         """Return the frame of a cylinder, with its point in the middle of points (N, 3)."""
         point, axis = cylinder.point_mm, cylinder.axis
         return cls(point + axis * np.median((points_mm - point) @ axis), np.array([*cylinder.across, axis]))
@@ -128,9 +128,7 @@ class PipeForm:
         return self.arc >= FORM_RULE.oval_arc
 
 
-def fit_pipe(
-    cloud: PointCloud, *, largest_ovality: float = LARGEST_OVALITY, start: CylinderFit | None = None
-) -> PipeForm:
+def fit_pipe(cloud: PointCloud, *, largest_ovality: float = LARGEST_OVALITY, start: Cylinder | None = None) -> PipeForm:
     """Fit the form of the pipe that contains most points of a cloud.
 
     A cylinder is fitted by orthogonal distances, unless a ``start`` is given. Then harmonics of the radial distance
@@ -139,7 +137,7 @@ def fit_pipe(
     """
     fitted = thin_evenly(np.arange(len(cloud)), FORM_RULE.most_points)
     points = cloud.points_mm[fitted]
-    start = start or fit_robustly(fit_cylinder, thin_evenly(points, FORM_RULE.start_points)).fit
+    start = start or fit_robustly(Cylinder.fit, thin_evenly(points, FORM_RULE.start_points)).fit
     return _fit_from(cloud, fitted, PipeFrame.about(start, points), start.radius_mm, largest_ovality)
 
 

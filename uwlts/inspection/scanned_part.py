@@ -17,8 +17,9 @@ from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import MAD_TO_STD, robust_std, thin_evenly
-from uwlts.fitting.shapes import CylinderFit, fit_circle, fit_cylinder
 from uwlts.inspection.pipe_form import FORM_RULE, PipeForm, fit_pipe, refit_pipe
+from uwlts.shapes.circle import Circle
+from uwlts.shapes.cylinder import Cylinder
 from uwlts.storage.cloud import PointCloud
 
 
@@ -224,17 +225,17 @@ def _fit_straight(cloud: PointCloud, largest_ovality: float) -> tuple[PipeForm |
     return form, robust_std(form.distance_mm)
 
 
-def _find_largest_cylinder(points: np.ndarray) -> CylinderFit | None:
+def _find_largest_cylinder(points: np.ndarray) -> Cylinder | None:
     """Return the cylinder of a part of the points (N, 3) with which most points agree; None without one."""
     thinned = thin_evenly(points, _RULE.bend_points)
     tree, best, most = KDTree(thinned), None, 0
     for seed in thin_evenly(np.random.default_rng(0).permutation(thinned), _RULE.starts):
         near: Any = tree.query(seed, k=max(len(thinned) // _RULE.part, 30))
         try:
-            found = fit_cylinder(thinned[near[1]])
+            found = Cylinder.fit(thinned[near[1]])
             for _ in range(_RULE.refits):
                 on = np.abs(found.distances_mm(thinned)) < FORM_RULE.off_pipe * found.radius_mm
-                found = fit_cylinder(thinned[on], axis_start=found.axis)
+                found = Cylinder.fit(thinned[on], axis_start=found.axis)
         except EvaluationError:
             continue
         on = np.count_nonzero(np.abs(found.distances_mm(thinned)) < 0.5 * FORM_RULE.off_pipe * found.radius_mm)
@@ -325,7 +326,8 @@ def _refine_torus(places: np.ndarray, point: np.ndarray, direction: np.ndarray) 
 
     out, height, _ = meridian(np.zeros(4))
     try:
-        centre, tube = fit_circle(np.column_stack([out, height]))
+        circle = Circle.fit(np.column_stack([out, height]))
+        centre, tube = circle.centre_mm, circle.radius_mm
     except EvaluationError:
         centre, tube = np.array([np.median(out), np.median(height)]), float(np.ptp(height)) / 2
     start = np.array([0.0, 0.0, 0.0, 0.0, *centre, tube])

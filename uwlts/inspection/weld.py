@@ -20,7 +20,6 @@ from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.fitting.least_squares import MAD_TO_STD, fit_biweight, fit_robustly, principal_axes, robust_std, thin_evenly
 from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors
-from uwlts.fitting.shapes import fit_plane
 from uwlts.inspection.bead_profiles import NO_WEIGHT, BeadProfiles, interpolation_rows, profile_rows
 from uwlts.inspection.features import (
     BIAS_STD,
@@ -34,6 +33,7 @@ from uwlts.inspection.features import (
     plain_value,
 )
 from uwlts.inspection.noisy_extremes import Largest, largest_mean
+from uwlts.shapes.flat import Plane
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
 
@@ -256,7 +256,7 @@ def _locate_bead(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.
     Returns its axes (3, 3), middle (3,), approximate half width and ends (2,) along it, in mm, and the number of other
     beads.
     """
-    start = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), thin_evenly(points, _RULE.start_points))
+    start = fit_robustly(Plane.fit, thin_evenly(points, _RULE.start_points), towards=TOWARDS_SENSOR)
     up, heights = start.fit.normal, start.fit.distances_mm(points)
     noise = robust_std(heights - np.median(heights))
     top = float(np.quantile(heights, 0.995))

@@ -8,9 +8,9 @@ from itertools import permutations
 
 import numpy as np
 
-from uwlts.evaluation.spheres import find_sphere
 from uwlts.fitting.least_squares import fit_rigid_transform
-from uwlts.fitting.shapes import fit_sphere
+from uwlts.shapes.linearised_fit import LinearisedFit
+from uwlts.shapes.sphere import Sphere
 from uwlts.storage.cloud import PointCloud
 
 _AGREE = 0.05
@@ -32,19 +32,14 @@ def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
     """Find all spheres of the given diameter in a cloud."""
     usable, found = np.ones(len(cloud), bool), []
     rng = np.random.default_rng(0)
-    while (sphere := find_sphere(cloud.points_mm, diameter_mm / 2, usable=usable, rng=rng)) is not None:
+    while (sphere := Sphere.find(cloud.points_mm, diameter_mm / 2, usable=usable, rng=rng)) is not None:
         members = sphere.members[sphere.robust.inliers]
         usable[sphere.near] = False
         # On a cap, centre and radius are strongly correlated. The known diameter removes this correlation.
-        fit = fit_sphere(cloud.points_mm[members], diameter_mm / 2)
-        outwards = cloud.points_mm[members] - fit.centre_mm
-        outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-        # Shift of the least-squares centre for a displacement along the normals.
-        solve = np.linalg.pinv(outwards)
-        patterns = np.zeros((0, 3))
+        fit = Sphere.fit(cloud.points_mm[members], diameter_mm / 2)
+        linear, patterns = LinearisedFit(fit, cloud.points_mm, members), np.zeros((0, 3))
         if cloud.uncertainty is not None:
-            moved = np.einsum("mni,ni->mn", cloud.uncertainty.patterns_mm[:, members], outwards)
-            patterns = moved @ solve.T
+            patterns = np.array([linear.shift(each)[0] for each in cloud.uncertainty.patterns_mm]).reshape(-1, 3)
         found.append(MarkerSphere(fit.centre_mm, fit.covariance[:3, :3], patterns))
     return found
 

@@ -16,11 +16,11 @@ import numpy as np
 from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, CalibrationResult, Evidence, solve
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
-from uwlts.fitting.shapes import perpendicular_to
 from uwlts.model.sensor import Medium
 from uwlts.optics.camera import project
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import run_jobs
+from uwlts.shapes.flat import perpendicular_to
 from uwlts.thesis.sphere_spacing import SphereScan, spacing_error
 
 COVERAGE = 0.95  # of the stated intervals

@@ -10,7 +10,6 @@ from uwlts.calibration.sequential.step_images import StepImage, label_step, step
 from uwlts.calibration.sequential.window_distance import solve_window
 from uwlts.errors import CalibrationError
 from uwlts.evaluation.spheres import evaluate_spheres
-from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import SphereStandard
 from uwlts.model.calibration import Calibration, WindowModel
@@ -18,6 +17,7 @@ from uwlts.model.sensor import Medium
 from uwlts.model.stripe import stack_pixels
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
+from uwlts.shapes.sphere import Sphere
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 from uwlts.thesis.campaign_folder import STEP_PLACES, CampaignFolder
@@ -43,7 +43,7 @@ class SphereScan:
 
     def spacing_error(self, points: np.ndarray) -> float:
         """Return the sphere spacing error of points (N, 3) of these stripes, mm."""
-        first, second = (fit_sphere(points[self.sphere == number]).centre_mm for number in (0, 1))
+        first, second = (Sphere.fit(points[self.sphere == number]).centre_mm for number in (0, 1))
         return float(np.linalg.norm(second - first)) - self.spacing_mm
 
 

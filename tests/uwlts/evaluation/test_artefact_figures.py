@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.spheres import _propose_centres
-from uwlts.evaluation.step_faces import StepFace, label_step_faces, step_height
 from uwlts.evaluation.truth_comparison import compare_with_truth
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
+from uwlts.shapes.sphere import _propose_centres
+from uwlts.shapes.step import StepFace, label_step_faces, step_height
 from uwlts.storage.cloud import PointCloud
 
 SIGMA = 0.1

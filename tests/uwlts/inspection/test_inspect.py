@@ -18,7 +18,6 @@ from scipy.stats import norm
 import uwlts
 from uwlts.cli import app
 from uwlts.errors import EvaluationError
-from uwlts.fitting.shapes import fit_circle
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
@@ -26,6 +25,7 @@ from uwlts.inspection.flat import _estimate_step_height, _Hole, _mask_inner_poin
 from uwlts.inspection.inspect import inspect_cloud
 from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
 from uwlts.inspection.weld import _find_toes
+from uwlts.shapes.circle import Circle
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty, make_foreign_cloud
 
 NOISE_MM, IMAGE_MM = 0.02, 0.004
@@ -81,7 +81,7 @@ def test_fits_that_do_not_settle_are_errors(monkeypatch):
         fit_pipe(cloud)
     places = np.array([[0.0, 0.0], [1.0, 1e-12], [2.0, -1e-12], [3.0, 0.0]])
     with pytest.raises(EvaluationError, match="no circle fits the 4 points"):
-        fit_circle(places)
+        Circle.fit(places)
 
 
 def test_the_form_of_a_pipe_is_within_its_intervals():

@@ -11,9 +11,9 @@ import pytest
 
 import uwlts
 from tests.oracles.pipes import Bump, ScannedPipe, scan_pipe
-from uwlts.fitting.shapes import fit_cylinder
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.inspection.pipe_form import fit_pipe, refit_pipe
+from uwlts.shapes.cylinder import Cylinder
 from uwlts.storage.cloud import PointCloud
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0), "tilted": (1.0, 0.3, -0.2)}
@@ -97,7 +97,7 @@ def test_noise_turns_no_frame(axis: tuple[float, float, float]) -> None:
     for seed in range(20):
         rng = np.random.default_rng([seed, 4])
         pipe = scan_pipe(rng, axis=axis, length_mm=60.0, spacing_mm=4.0)
-        across.append(fit_cylinder(pipe.points_mm).across)
+        across.append(Cylinder.fit(pipe.points_mm).across)
         cloud = cloud_of(pipe)
         form = fit_pipe(cloud)
         again = refit_pipe(cloud, form, left_out=rng.random(len(cloud)) < 0.3)

@@ -17,7 +17,6 @@ from uwlts.errors import CalibrationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import LinearisedSpheres, figure_uncertainties, linearise_figures, shift_std_mm
 from uwlts.fitting.propagation import noise_shifts
-from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.calibration import KnownMedium, KnownStage
 from uwlts.model.parameter_keys import MediumIndex, StageParameter
@@ -30,6 +29,7 @@ from uwlts.reconstruction.point_uncertainty import (
     point_uncertainty,
     stage_components,
 )
+from uwlts.shapes.sphere import Sphere
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, describe_source
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
@@ -318,7 +318,7 @@ def test_figures_of_spheres_have_the_uncertainty_of_monte_carlo(spheres):
         move = rng.standard_normal((len(spheres), 1)) * along
         move = move + rng.standard_normal((20, 1))[spheres.frame] * known.position_mm
         move = move + np.einsum("m,mni->ni", rng.standard_normal(len(known.patterns_mm)), known.patterns_mm)
-        first, second = (fit_sphere((spheres.points_mm + move)[spheres.points_mm[:, 1] * side > 0]) for side in (-1, 1))
+        first, second = (Sphere.fit((spheres.points_mm + move)[spheres.points_mm[:, 1] * side > 0]) for side in (-1, 1))
         drawn.append((np.linalg.norm(second.centre_mm - first.centre_mm), 2 * first.radius_mm, 2 * second.radius_mm))
     names = ("SSE", "diameter error sphere 1", "diameter error sphere 2")
     for name, std in zip(names, np.std(drawn, axis=0), strict=True):

@@ -28,7 +28,6 @@ from uwlts.calibration.sequential.step_images import label_steps
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_pipe, evaluate_plane
 from uwlts.evaluation.spheres import evaluate_spheres
-from uwlts.evaluation.step_faces import StepFace
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
 from uwlts.model.parameter_keys import StepHeight
@@ -39,6 +38,7 @@ from uwlts.optics.brightness import BLUR_STD, IlluminatedPoints, brightness_shif
 from uwlts.optics.camera import directions
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.optics.window import trace_window
+from uwlts.shapes.step import StepFace
 
 _LARGEST_MISFIT_PX = 1.5  # largest median residual of the images that a start is found from, caused by stage errors
 _LARGEST_MISFIT = 1e-3  # the same divided by the focal length, for high-resolution images; the larger limit applies

@@ -10,9 +10,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from uwlts.calibration.mount.profiles import Detection, find_arc, find_line
-from uwlts.fitting.shapes import perpendicular_to
 from uwlts.model.mount import PlaneFound, SphereFound
+from uwlts.shapes.flat import perpendicular_to
+from uwlts.shapes.profile_curves import Detection, find_arc, find_line
 from uwlts.storage.mount_files import Artefact
 
 

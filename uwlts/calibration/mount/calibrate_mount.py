@@ -13,7 +13,6 @@ from uwlts.calibration.mount.captured_profiles import CapturedProfiles, mount_co
 from uwlts.calibration.mount.hand_eye import mount_by_board
 from uwlts.calibration.mount.next_pose import NextPose, next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, from_sheet, to_sheet
-from uwlts.calibration.mount.profiles import LEAST_POINTS
 from uwlts.calibration.mount.restricted_likelihood import (
     LARGEST_ROUGH,
     NotSettled,
@@ -26,6 +25,7 @@ from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose
 from uwlts.model.trajectory import Trajectory
+from uwlts.shapes.profile_curves import LEAST_POINTS
 from uwlts.storage.calibration_file import resolve_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, Artefact, MountEvidence, SensorAxis, read_mount_evidence

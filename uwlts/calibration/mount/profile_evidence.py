@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefact_shapes import Shape
-from uwlts.calibration.mount.profiles import LEAST_POINTS, Detection
 from uwlts.calibration.mount.restricted_likelihood import GroupedEvidence, solve_step
+from uwlts.shapes.profile_curves import LEAST_POINTS, Detection
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""

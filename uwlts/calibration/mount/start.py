@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet
-from uwlts.calibration.mount.profiles import Detection, ProfileArc, ProfileLine
 from uwlts.errors import CalibrationError
+from uwlts.shapes.profile_curves import Detection, ProfileArc, ProfileLine
 
 _SUBSET = 8  # poses of a random subset: 24 linear equations for 12 unknowns
 _SUBSETS = 40  # random subsets: with a fifth of the poses wrong, one of six subsets contains no wrong pose

@@ -10,9 +10,9 @@ from scipy.spatial import ConvexHull
 from uwlts.calibration.camera.target_poses import turned_like
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.fitting.least_squares import fit_robustly
-from uwlts.fitting.shapes import fit_plane
 from uwlts.model.calibration import CameraModel, SheetModel, rigid_transform
 from uwlts.optics.camera import directions
+from uwlts.shapes.flat import Plane
 
 # Smallest spread of the points along the shorter direction of the sheet, relative to their scatter across it, and
 # to their spread along the longer direction: below, the scatter rotates the plane. A single stripe scatters within
@@ -115,7 +115,7 @@ def fit_sheet(
         from the camera differs from ``nominal_offset_mm`` by a factor that indicates wrong units.
     """
     try:
-        robust = fit_robustly(lambda points: fit_plane(points, towards=nominal_normal), points_mm)
+        robust = fit_robustly(Plane.fit, points_mm, towards=nominal_normal)
     except EvaluationError as error:
         raise CalibrationError(f"no laser sheet through the stripe points: {error}") from error
     plane, used = robust.fit, robust.inliers

@@ -9,11 +9,11 @@ import numpy as np
 
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.step_faces import StepFace, label_step_faces
-from uwlts.fitting.shapes import fit_line, fit_plane
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.triangulation import points_on_sheet
+from uwlts.shapes.flat import Line, Plane
+from uwlts.shapes.step import StepFace, label_step_faces
 
 _FEWEST_PLACES = 3  # images of a face: fewer do not show that it is a plane
 _LEAST_TRAVEL_MM = 5.0  # travel of the stage across the stripe: less does not show that the face is a plane
@@ -147,12 +147,12 @@ def _estimate_turn(
     for image in images:
         pixels = image.pixels[image.labels == StepFace.LOWER]
         faces.append(step_profile(calibration, window, pixels, medium_index=image.medium_index))
-    lines = [fit_line(face) for face in faces]
+    lines = [Line.fit(face) for face in faces]
     aside = float(np.sqrt(np.mean([np.arctan(line.direction[1] / line.direction[0]) ** 2 for line in lines])))
     travel = np.array([image.travel_mm for image in images])
     if len(images) >= _FEWEST_PLACES and np.ptp(travel[:, 0]) > _LEAST_TRAVEL_MM:
         in_space = [np.pad(face, ((0, 0), (1, 0))) + moved for face, moved in zip(faces, travel, strict=True)]
-        plane = fit_plane(np.vstack(in_space))
+        plane = Plane.fit(np.vstack(in_space))
         scatter = float(np.sqrt(np.mean([line.std_mm**2 for line in lines])))
         if plane.std_mm < np.hypot(_STOOD_STILL * scatter, _STAGE_MM):
             about_stripe = float(np.arcsin(min(abs(plane.normal[0]), 1.0)))

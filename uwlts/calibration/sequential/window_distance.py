@@ -10,9 +10,9 @@ from scipy.optimize import least_squares, root_scalar
 
 from uwlts.calibration.sequential.step_images import StepImage, step_profile
 from uwlts.errors import CalibrationError
-from uwlts.evaluation.step_faces import StepFace, step_height
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Uncertainty
+from uwlts.shapes.step import StepFace, step_height
 
 _CURVE_POINTS = 31  # the curve has one minimum, several points wide
 _SEARCHED = (0.2, 2.5)  # fractions of the described distance, which is measured to better than half

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 import uwlts
 from tests.oracles.profilers import Kind, draw_set
 from tests.uwlts.drawn_mounts import SHORT_ARCS, differences, least_squares_mount, mount_of, rms_mm
-from uwlts.calibration.mount.profiles import find_arc
 from uwlts.errors import CalibrationError
+from uwlts.shapes.profile_curves import find_arc
 
 
 def test_plain_least_squares_finds_the_mount_of_perfect_sets():

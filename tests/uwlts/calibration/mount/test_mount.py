@@ -22,8 +22,8 @@ from tests.uwlts.mount_views import (
 from uwlts.calibration.mount import restricted_likelihood
 from uwlts.cli import main
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.fitting.shapes import fit_circle
 from uwlts.model.mount import Mount, PlaneFound, SphereFound
+from uwlts.shapes.circle import Circle
 from uwlts.storage.mount_files import read_mount, read_profiles
 from uwlts.storage.pose_files import read_poses
 
@@ -87,8 +87,8 @@ def test_a_short_arc_is_fitted_by_its_distances(rng):
     fit = least_squares(
         lambda circle: np.linalg.norm(points - circle[:2], axis=1) - circle[2], [300, -70, 20], xtol=1e-12
     )
-    centre, found = fit_circle(points)
-    np.testing.assert_allclose(np.append(centre, found), fit.x, atol=1e-4)
+    found = Circle.fit(points)
+    np.testing.assert_allclose(np.append(found.centre_mm, found.radius_mm), fit.x, atol=1e-4)
 
 
 def least_scatter_mm(campaign: Campaign) -> float:

@@ -11,11 +11,11 @@ from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.sequential.step_images import label_step
 from uwlts.calibration.sequential.window_distance import solve_window, step_profile as reconstructed
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
-from uwlts.evaluation.step_faces import StepFace
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import WindowModel
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.nominal import nominal_calibration
+from uwlts.shapes.step import StepFace
 
 SENSOR = built_sensor()
 AIR = nominal_calibration(SENSOR).model_copy(update={"window": None})

@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import fit_robustly
-from uwlts.fitting.shapes import fit_cylinder, fit_line, fit_plane, fit_sphere
+from uwlts.shapes.cylinder import Cylinder
+from uwlts.shapes.flat import Line, Plane
+from uwlts.shapes.sphere import Sphere
 
 poses = st.tuples(
     st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(random_state=seed).as_matrix()),
@@ -47,7 +49,7 @@ def flat(rng, count: int) -> np.ndarray:
 def test_exact_spheres_are_recovered_from_any_cap(pose, radius, half_angle, seed):
     rotation, shift = pose
     points = cap(np.random.default_rng(seed), 60, radius=radius, half_angle=half_angle) @ rotation.T + shift
-    for fit in (fit_sphere(points), fit_sphere(points, radius)):
+    for fit in (Sphere.fit(points), Sphere.fit(points, radius)):
         np.testing.assert_allclose(fit.centre_mm, shift, rtol=0, atol=1e-9)
         assert abs(fit.radius_mm - radius) < 1e-9
         assert np.abs(fit.residuals_mm).max() < 1e-10
@@ -58,7 +60,7 @@ def test_exact_spheres_are_recovered_from_any_cap(pose, radius, half_angle, seed
 def test_exact_cylinders_are_recovered_from_any_patch(pose, radius, arc, seed):
     rotation, shift = pose
     points = patch(np.random.default_rng(seed), 200, radius=radius, arc=arc, length=40) @ rotation.T + shift
-    for fit in (fit_cylinder(points), fit_cylinder(points, radius), fit_cylinder(points, axis_start=rotation[:, 0])):
+    for fit in (Cylinder.fit(points), Cylinder.fit(points, radius), Cylinder.fit(points, axis_start=rotation[:, 0])):
         assert 1 - abs(fit.axis @ rotation[:, 0]) < 1e-12
         assert np.linalg.norm(np.cross(fit.point_mm - shift, rotation[:, 0])) < 1e-7
         assert abs(fit.radius_mm - radius) < 1e-7
@@ -74,15 +76,15 @@ def test_exact_cylinders_are_recovered_from_any_patch(pose, radius, arc, seed):
 def test_exact_planes_and_lines_are_recovered(pose, seed):
     rotation, shift = pose
     rng = np.random.default_rng(seed)
-    plane = fit_plane(flat(rng, 30) @ rotation.T + shift, towards=rotation[:, 2])
+    plane = Plane.fit(flat(rng, 30) @ rotation.T + shift, towards=rotation[:, 2])
     np.testing.assert_allclose(plane.normal, rotation[:, 2], rtol=0, atol=1e-12)
     assert abs((plane.point_mm - shift) @ rotation[:, 2]) < 1e-11
     assert plane.distances_mm(shift + 5 * rotation[:, 2]) == pytest.approx(5, abs=1e-11)
     along = rng.uniform(-90, 90, (20, 1))
-    line = fit_line(shift + along * rotation[:, 0], towards=rotation[:, 0])
+    line = Line.fit(shift + along * rotation[:, 0], towards=rotation[:, 0])
     np.testing.assert_allclose(line.direction, rotation[:, 0], rtol=0, atol=1e-12)
     assert line.distances_mm((shift + 3 * rotation[:, 1])[None])[0] == pytest.approx(3, abs=1e-11)
-    in_profile = fit_line(shift[:2] + along * [0.6, 0.8], towards=[0.6, 0.8])
+    in_profile = Line.fit(shift[:2] + along * [0.6, 0.8], towards=[0.6, 0.8])
     np.testing.assert_allclose(in_profile.direction, [0.6, 0.8], rtol=0, atol=1e-12)
     assert in_profile.distances_mm(shift[:2] + np.array([[-1.6, 1.2]]))[0] == pytest.approx(2, abs=1e-11)
     assert in_profile.distances_mm(shift[:2] + np.array([[1.6, -1.2]]))[0] == pytest.approx(-2, abs=1e-11)
@@ -91,8 +93,8 @@ def test_exact_planes_and_lines_are_recovered(pose, seed):
 def test_residuals_are_positive_outside():
     rng = np.random.default_rng(0)
     ball, tube = cap(rng, 300, radius=25, half_angle=1.0), patch(rng, 300, radius=150, arc=1.2, length=40)
-    assert fit_sphere(ball).distances_mm([[0, 0, 26], [0, 0, 23]]) == pytest.approx([1, -2])
-    assert fit_cylinder(tube).distances_mm([[7, 0, 151], [-7, 0, 148]]) == pytest.approx([1, -2])
+    assert Sphere.fit(ball).distances_mm([[0, 0, 26], [0, 0, 23]]) == pytest.approx([1, -2])
+    assert Cylinder.fit(tube).distances_mm([[7, 0, 151], [-7, 0, 148]]) == pytest.approx([1, -2])
 
 
 # --- noisy points: the least sum of squares, no bias, and the covariance that repeats show
@@ -103,24 +105,24 @@ SIGMA = 0.1
 
 def shifted_line(points):
     """Offset and slope of a line along X in a profile."""
-    fit = fit_line(points, towards=[1, 0])
+    fit = Line.fit(points, towards=[1, 0])
     return np.array([fit.distances_mm(np.zeros((1, 2)))[0] * -1, np.arctan2(fit.direction[1], fit.direction[0])]), fit
 
 
 def plane_parameters(points):
     """Height over the origin and slopes along X and Y."""
-    fit = fit_plane(points, towards=[0, 0, 1])
+    fit = Plane.fit(points, towards=[0, 0, 1])
     return np.array([-fit.distances_mm(np.zeros(3)), -fit.normal[0], -fit.normal[1]]), fit
 
 
 def sphere_parameters(points, radius_mm=None):
-    fit = fit_sphere(points, radius_mm)
+    fit = Sphere.fit(points, radius_mm)
     return np.array([*fit.centre_mm, fit.radius_mm][: len(fit.covariance)]), fit
 
 
 def cylinder_parameters(points, radius_mm=None):
     """Offsets of the axis along Y and Z at X = 0, its slopes, and the radius; the true axis is X."""
-    fit = fit_cylinder(points, radius_mm, axis_start=[1, 0, 0])
+    fit = Cylinder.fit(points, radius_mm, axis_start=[1, 0, 0])
     offset = fit.point_mm - fit.axis * fit.point_mm[0] / fit.axis[0]
     return np.array([*offset[1:], *(fit.axis[1:] / fit.axis[0]), fit.radius_mm][: len(fit.covariance)]), fit
 
@@ -193,7 +195,7 @@ def test_no_neighbouring_shape_has_a_smaller_sum_of_squares(size):
     rng = np.random.default_rng(5)
     ball = cap(rng, 500, radius=25, half_angle=0.6) + rng.normal(0, SIGMA, (500, 3)) + [100, -30, 320]
     tube = patch(rng, 500, radius=150, arc=1.2, length=40) + rng.normal(0, SIGMA, (500, 3)) + [100, -30, 320]
-    sphere, cylinder = fit_sphere(ball), fit_cylinder(tube)
+    sphere, cylinder = Sphere.fit(ball), Cylinder.fit(tube)
     least = [np.sum(sphere.residuals_mm**2), np.sum(cylinder.residuals_mm**2)]
     for _ in range(200):
         centre = sphere.centre_mm + rng.normal(0, size, 3)
@@ -210,7 +212,7 @@ def test_pipe_patches_in_any_pose_find_the_axis_without_a_start():
     for seed in range(20):
         rotation = Rotation.random(random_state=seed).as_matrix()
         points = patch(rng, 1500, radius=150, arc=np.radians(rng.uniform(60, 80)), length=40)
-        fit = fit_cylinder(points @ rotation.T + rng.uniform(-300, 300, 3) + rng.normal(0, SIGMA, points.shape))
+        fit = Cylinder.fit(points @ rotation.T + rng.uniform(-300, 300, 3) + rng.normal(0, SIGMA, points.shape))
         # 6 standard deviations as the fit states them, tested above.
         assert abs(fit.radius_mm - 150) < 6 * np.sqrt(fit.covariance[4, 4])
         assert np.hypot(*(fit.across @ rotation[:, 0])) < 6 * np.sqrt(fit.covariance[2, 2] + fit.covariance[3, 3])
@@ -225,7 +227,7 @@ def test_the_known_radius_does_not_end_on_the_wrong_side_of_a_noisy_cap():
     for seed in range(60):
         rng = np.random.default_rng(seed)
         points = cap(rng, 400, radius=25, half_angle=np.radians(5)) + rng.normal(0, SIGMA, (400, 3))
-        wrong += fit_sphere(points, 25).centre_mm[2] > 12.5
+        wrong += Sphere.fit(points, 25).centre_mm[2] > 12.5
     assert wrong == 0
 
 
@@ -240,20 +242,20 @@ def circle(count):
 @pytest.mark.parametrize(
     "fit, points, message",
     [
-        (fit_sphere, circle(4), "at least 5"),
-        (partial(fit_sphere, radius_mm=2.0), circle(3), "at least 4"),
-        (fit_plane, circle(3), "at least 4"),
-        (fit_line, circle(2), "at least 3"),
-        (fit_cylinder, circle(5), "at least 6"),
-        (partial(fit_cylinder, radius_mm=2.0), circle(4), "at least 5"),
-        (fit_sphere, circle(50), "in one plane"),
-        (partial(fit_sphere, radius_mm=2.0), circle(50), "in one plane"),
-        (fit_cylinder, circle(50), "in one plane"),
-        (fit_plane, np.outer(np.arange(9.0), [1, 2, 3]), "on one line"),
-        (fit_line, np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]), "equally"),
-        (fit_plane, np.ones((9, 3)), "points coincide"),
-        (fit_sphere, np.full((9, 3), np.nan), "9 of 9 points are not finite"),
-        (partial(fit_robustly, fit_plane), np.full((9, 3), np.inf), "9 of 9 points are not finite"),
+        (Sphere.fit, circle(4), "at least 5"),
+        (partial(Sphere.fit, radius_mm=2.0), circle(3), "at least 4"),
+        (Plane.fit, circle(3), "at least 4"),
+        (Line.fit, circle(2), "at least 3"),
+        (Cylinder.fit, circle(5), "at least 6"),
+        (partial(Cylinder.fit, radius_mm=2.0), circle(4), "at least 5"),
+        (Sphere.fit, circle(50), "in one plane"),
+        (partial(Sphere.fit, radius_mm=2.0), circle(50), "in one plane"),
+        (Cylinder.fit, circle(50), "in one plane"),
+        (Plane.fit, np.outer(np.arange(9.0), [1, 2, 3]), "on one line"),
+        (Line.fit, np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]), "equally"),
+        (Plane.fit, np.ones((9, 3)), "points coincide"),
+        (Sphere.fit, np.full((9, 3), np.nan), "9 of 9 points are not finite"),
+        (partial(fit_robustly, Plane.fit), np.full((9, 3), np.inf), "9 of 9 points are not finite"),
     ],
 )
 def test_points_that_leave_the_shape_open_are_refused(fit, points, message):
@@ -261,7 +263,7 @@ def test_points_that_leave_the_shape_open_are_refused(fit, points, message):
         fit(points)
 
 
-@pytest.mark.parametrize("fit", [fit_sphere, fit_cylinder])
+@pytest.mark.parametrize("fit", [Sphere.fit, Cylinder.fit])
 def test_a_noisy_plane_is_no_sphere_and_no_cylinder(fit):
     refused = 0
     for seed in range(8):
@@ -275,11 +277,11 @@ def test_a_noisy_plane_is_no_sphere_and_no_cylinder(fit):
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: fit_sphere(np.zeros((9, 2))),
-        lambda: fit_plane(np.zeros(9)),
-        lambda: fit_sphere(circle(9), -1.0),
-        lambda: fit_cylinder(circle(9) + np.arange(9.0)[:, None] ** 2, np.nan),
-        lambda: fit_cylinder(circle(9) + np.arange(9.0)[:, None] ** 2, axis_start=[0, 0, 0]),
+        lambda: Sphere.fit(np.zeros((9, 2))),
+        lambda: Plane.fit(np.zeros(9)),
+        lambda: Sphere.fit(circle(9), -1.0),
+        lambda: Cylinder.fit(circle(9) + np.arange(9.0)[:, None] ** 2, np.nan),
+        lambda: Cylinder.fit(circle(9) + np.arange(9.0)[:, None] ** 2, axis_start=[0, 0, 0]),
     ],
 )
 def test_wrong_calls_are_refused(call):
@@ -293,9 +295,9 @@ def test_wrong_calls_are_refused(call):
 @pytest.mark.parametrize(
     "fit, draw",
     [
-        (fit_sphere, partial(cap, radius=25.06, half_angle=1.0)),
-        (fit_plane, flat),
-        (partial(fit_cylinder, axis_start=[1, 0, 0]), partial(patch, radius=150, arc=1.2, length=40)),
+        (Sphere.fit, partial(cap, radius=25.06, half_angle=1.0)),
+        (Plane.fit, flat),
+        (partial(Cylinder.fit, axis_start=[1, 0, 0]), partial(patch, radius=150, arc=1.2, length=40)),
     ],
 )
 def test_planted_outliers_and_only_they_are_rejected(fit, draw):
@@ -318,12 +320,12 @@ def test_clean_points_are_all_kept_noisy_or_exact():
     rng = np.random.default_rng(9)
     points = cap(rng, 20000, radius=25, half_angle=1.0)
     # 20000 normal residuals: 0.01 expected beyond 5 standard deviations.
-    assert fit_robustly(fit_sphere, points + rng.normal(0, SIGMA, points.shape)).rejected == 0
-    assert fit_robustly(fit_sphere, points + np.array([0, 0, 500])).rejected == 0
+    assert fit_robustly(Sphere.fit, points + rng.normal(0, SIGMA, points.shape)).rejected == 0
+    assert fit_robustly(Sphere.fit, points + np.array([0, 0, 500])).rejected == 0
 
 
 def test_the_limit_follows_k():
     rng = np.random.default_rng(10)
     points = flat(rng, 20000) + rng.normal(0, SIGMA, (20000, 3))
     # 0.27 % of a normal distribution are beyond 3 standard deviations: 54 +- 7.3; iterations shift the limit by 1 %.
-    assert fit_robustly(fit_plane, points, k=3.0).rejected == pytest.approx(54, abs=35)
+    assert fit_robustly(Plane.fit, points, k=3.0).rejected == pytest.approx(54, abs=35)

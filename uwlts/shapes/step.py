@@ -12,8 +12,8 @@ from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import DEFAULT_K, check_points, principal_axes, robust_std, thin_evenly
-from uwlts.fitting.shapes import fit_line, fit_plane
 from uwlts.runtime.compiled import compiled
+from uwlts.shapes.flat import Line, Plane
 
 _SEARCH_LIMIT = 0.05
 """Half width (unit: step height) of the band of points that support a proposed face."""
@@ -111,7 +111,7 @@ def step_height(
     """
     base = StepFace[reference.upper()]
     points = np.asarray(points, dtype=np.float64)
-    surface = (fit_line if points.shape[1] == 2 else fit_plane)(points[labels == base])
+    surface = (Line.fit if points.shape[1] == 2 else Plane.fit)(points[labels == base])
     across = check_points(points[labels == base.other], least=2, what="a step face", dimensions=(2, 3))
     distances = surface.distances_mm(across)
     lever = np.array([1.0, *(surface.axes @ (across.mean(axis=0) - surface.point_mm))])

@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
-from uwlts.fitting.shapes import fit_circle
+from uwlts.shapes.circle import Circle
 
 LEAST_POINTS = 12
 """Points on the artefact that a profile needs: four for each of a circle's three parameters."""
@@ -171,25 +171,24 @@ def _refit_inliers(
 
 def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
     def off(some: np.ndarray) -> np.ndarray:
-        centre, radius = fit_circle(points[some])
-        return np.linalg.norm(points - centre, axis=1) - radius
+        return Circle.fit(points[some]).distances_mm(points)
 
     try:
         if (found := _refit_inliers(members, tolerance, off)) is None:
             return None
         members, std = found
-        centre, radius = fit_circle(points[members])
+        circle = Circle.fit(points[members])
     except EvaluationError:
         return None  # the points are on a line
-    if _arc_angle(points[members] - centre) < _LEAST_ARC:
+    if _arc_angle(points[members] - circle.centre_mm) < _LEAST_ARC:
         return None
     # Scattered points fill the band of 2 tolerances evenly: their robust standard deviation is 1.5 tolerances, that of
     # an arc at most 0.9. They are as dense beside the circle, in a band twice as wide.
-    away = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
+    away = np.abs(circle.distances_mm(points))
     chance = np.count_nonzero((away > 2 * tolerance) & (away < 4 * tolerance)) / 2
     if std > tolerance or np.count_nonzero(members) < LEAST_POINTS + chance + _REJECTED_BEYOND * np.sqrt(chance):
         return None
-    return ProfileArc(members=members, std_mm=std, centre_mm=centre, radius_mm=radius)
+    return ProfileArc(members=members, std_mm=std, centre_mm=circle.centre_mm, radius_mm=circle.radius_mm)
 
 
 def _arc_angle(away: np.ndarray) -> float:

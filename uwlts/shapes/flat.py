@@ -1,0 +1,138 @@
+"""Planes and straight lines: orthogonal-distance fits, and the largest plane of a cloud."""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from uwlts.errors import EvaluationError
+from uwlts.fitting.least_squares import Normalised, fit_robustly, normalise_points, robust_std, thin_evenly
+
+_PROPOSALS = 600
+"""Random planes through three points that are tried for the largest one."""
+_JUDGING_POINTS = 3000
+"""Points, evenly thinned, that compare these planes."""
+_NEAR = 2e-3
+"""Largest distance of a point from a proposed plane, as a fraction of the cloud's size; the plane is refined then."""
+_REFINEMENTS = 4
+"""Robust fits that refine the largest plane."""
+
+
+@dataclass(frozen=True, eq=False)
+class Flat:
+    """Straight line (K = 1) or plane (K = 2) fitted to N points with D coordinates."""
+
+    point_mm: np.ndarray  # (D,); centroid of the points
+    axes: np.ndarray  # (K, D); unit directions in the shape, the longest extent of the points first
+    normals: np.ndarray  # (D - K, D); unit directions normal to the shape
+    residuals_mm: np.ndarray  # (N,); distances of the points: signed if there is one normal, else non-negative
+    std_mm: float  # standard deviation of one normal coordinate, with (D - K) (N - K - 1) degrees of freedom
+    covariance: np.ndarray
+    """Covariance of the offsets along the normals at the point (mm), then of the slopes (rad) along the axes."""
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit normal (D,) of a plane, or of a line in a plane."""
+        return self.normals[0]
+
+    @property
+    def direction(self) -> np.ndarray:
+        """Unit direction (D,) of a line."""
+        return self.axes[0]
+
+    def distances_mm(self, points: np.ndarray) -> np.ndarray:
+        """Return the distances (M,) of points (M, D), as in `residuals_mm`."""
+        return _norms((np.asarray(points, dtype=np.float64) - self.point_mm) @ self.normals.T)
+
+    def normals_at(self, points: np.ndarray) -> np.ndarray:
+        """Return the unit normals (M, D) of the distances of points (M, D) from a plane, or from a line in a plane."""
+        return np.broadcast_to(self.normal, points.shape)
+
+    def derivatives(self, points: np.ndarray) -> np.ndarray:
+        """Return the derivatives (M, K + 1) of these distances by the parameters, in the order of the covariance."""
+        return -np.column_stack([np.ones(len(points)), (points - self.point_mm) @ self.axes.T])
+
+    @classmethod
+    def _from_axes(cls, unit: Normalised, axes: np.ndarray, normals: np.ndarray) -> Self:
+        across = (unit.given_mm - unit.centroid_mm) @ normals.T
+        variance = float(np.sum(across**2)) / (len(normals) * (len(across) - len(axes) - 1))
+        leverage = np.array([len(across), *(unit.extents[: len(axes)] * unit.scale_mm) ** 2])
+        covariance = np.diag(variance / np.repeat(leverage, len(normals)))
+        return cls(unit.centroid_mm, axes, normals, _norms(across), variance**0.5, covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class Plane(Flat):
+    """Plane fitted to N points (N, 3)."""
+
+    @classmethod
+    def fit(cls, points: Any, towards: Any = None) -> Self:
+        """Fit a plane to points (N, 3), mm, by least squares.
+
+        The normal is oriented ``towards`` (3,); by default its largest component is positive. EvaluationError for fewer
+        than 4 points, points that are not finite, or points on one line.
+        """
+        unit = normalise_points(points, least=4, what="a plane fit")
+        if unit.is_flat(1):
+            raise EvaluationError(f"a plane fit: all {len(unit.points)} points lie on one line")
+        return cls._from_axes(unit, unit.axes[:2], _orient(unit.axes[2], towards)[None])
+
+    @classmethod
+    def find(cls, points: np.ndarray, *, towards: Any, off: float) -> tuple[Self, np.ndarray]:
+        """Find the plane with most points (N, 3), mm; return it with the mask (N,) of its points.
+
+        Random triples propose planes (RANSAC), and robust fits refine the best one. Points belong to it within ``off``
+        robust standard deviations. Errors as for `fit`.
+        """
+        thinned = thin_evenly(points, _JUDGING_POINTS)
+        size = float(np.linalg.norm(np.ptp(points, axis=0)))
+        corners = thinned[np.random.default_rng(0).integers(len(thinned), size=(_PROPOSALS, 3))]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(normals, axis=1)
+        normals, corners = normals[length > 0] / length[length > 0, None], corners[length > 0, 0]
+        levels = np.einsum("pi,pi->p", normals, corners)
+        best = int(np.argmax((np.abs(thinned @ normals.T - levels) < _NEAR * size).sum(axis=0)))
+        inside = np.abs(points @ normals[best] - levels[best]) < _NEAR * size
+        plane = None
+        for _ in range(_REFINEMENTS):
+            plane = fit_robustly(cls.fit, points[inside], towards=towards).fit
+            distance = plane.distances_mm(points)
+            inside = np.abs(distance) < off * max(robust_std(distance[inside]), 1e-9)
+        assert plane is not None
+        return plane, inside
+
+
+@dataclass(frozen=True, eq=False)
+class Line(Flat):
+    """Straight line fitted to N points (N, 2) or (N, 3)."""
+
+    @classmethod
+    def fit(cls, points: Any, towards: Any = None) -> Self:
+        """Fit a straight line to points (N, 2) or (N, 3), mm, by least squares.
+
+        The direction is oriented ``towards`` (D,); by default its largest component is positive. For D = 2, the normal
+        is the direction rotated by 90 degrees from the first axis to the second. EvaluationError for fewer than 3
+        points, points that are not finite, or points without a longest direction.
+        """
+        unit = normalise_points(points, least=3, what="a line fit", dimensions=(2, 3))
+        if unit.extents[0] - unit.extents[1] <= 1e-9 * unit.extents[0]:
+            raise EvaluationError(f"a line fit: the {len(unit.points)} points extend equally in two directions")
+        x, y, *z = direction = _orient(unit.axes[0], towards)
+        return cls._from_axes(unit, direction[None], unit.axes[1:] if z else np.array([[-y, x]]))
+
+
+def _orient(direction: np.ndarray, towards: Any) -> np.ndarray:
+    side = direction[np.argmax(np.abs(direction))] if towards is None else float(direction @ np.asarray(towards))
+    return -direction if side < 0 else direction
+
+
+def _norms(across: np.ndarray) -> np.ndarray:
+    """Return distances from normal components (..., C), signed if there is one component."""
+    return across[..., 0] if across.shape[-1] == 1 else np.linalg.norm(across, axis=-1)
+
+
+def perpendicular_to(direction: np.ndarray) -> np.ndarray:
+    """Return two unit directions (2, 3) perpendicular to a unit direction and to each other."""
+    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(direction, first)])
