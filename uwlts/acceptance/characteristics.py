@@ -27,7 +27,7 @@ from uwlts.acceptance.acceptance_plan import (
 )
 from uwlts.acceptance.artefact_points import MeasuredSurface, measure_plane, measure_spheres, measure_step_height
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.decision import Verdict, judge_interval
+from uwlts.evaluation.figures import Verdict, judge_interval
 from uwlts.fitting.least_squares import principal_axes
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.sensor import UnitVector, Vector

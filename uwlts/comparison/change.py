@@ -25,8 +25,7 @@ from uwlts.comparison.ideal_shapes import IdealShape, place_shape
 from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, average_locally
 from uwlts.comparison.seen_side import select_seen_side
 from uwlts.errors import EvaluationError
-from uwlts.fitting.point_groups import number_cubes
-from uwlts.fitting.point_spacing import choose_disc_diameter
+from uwlts.fitting.point_spacing import choose_disc_diameter, number_cubes
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface

@@ -13,11 +13,10 @@ from uwlts.evaluation.artefact_figures import (
 )
 from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, Quantity, spread_mm
 from uwlts.evaluation.spheres import SphereEvaluation
-from uwlts.fitting.propagation import PointErrors, noise_shifts
+from uwlts.fitting.propagation import LinearisedFit, PointErrors, noise_shifts
 from uwlts.model.artefacts import StepStandard
 from uwlts.shapes.cylinder import Cylinder
 from uwlts.shapes.flat import Plane
-from uwlts.shapes.linearised_fit import LinearisedFit
 from uwlts.shapes.sphere import Sphere
 from uwlts.shapes.step import StepFace
 from uwlts.storage.cloud import PointCloud

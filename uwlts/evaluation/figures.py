@@ -1,10 +1,11 @@
-"""Figures of artefact evaluations: typed keys, calibrated values and uncertainties."""
+"""Figures of artefact evaluations: typed keys, calibrated values, uncertainties and verdicts."""
 
 import dataclasses
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, ClassVar, assert_never
+from typing import Any, ClassVar, Literal, assert_never, get_args
 
 import numpy as np
 
@@ -214,3 +215,21 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+Verdict = Literal["exceeds the limit", "undecided", "within the limit", "no limit"]
+VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
+"""Verdicts in order of severity."""
+
+
+def judge_interval(low: float, high: float, *, lower: float | None = None, upper: float | None = None) -> Verdict:
+    """Return the verdict on a coverage interval from ``low`` to ``high``: conformity and non-conformity are proven.
+
+    This is the decision rule of ISO 14253-1. An interval that contains a limit leaves the verdict undecided.
+    """
+    if lower is None and upper is None:
+        return "no limit"
+    least, most = -math.inf if lower is None else lower, math.inf if upper is None else upper
+    if least <= low and high <= most:
+        return "within the limit"
+    return "exceeds the limit" if high < least or low > most else "undecided"

@@ -9,7 +9,7 @@ from itertools import permutations
 import numpy as np
 
 from uwlts.fitting.least_squares import fit_rigid_transform
-from uwlts.shapes.linearised_fit import LinearisedFit
+from uwlts.fitting.propagation import LinearisedFit
 from uwlts.shapes.sphere import Sphere
 from uwlts.storage.cloud import PointCloud
 

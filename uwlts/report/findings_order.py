@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.decision import VERDICTS, Verdict, judge_interval
+from uwlts.evaluation.figures import VERDICTS, Verdict, judge_interval
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue
 from uwlts.model.library import read_table, validate_description
 from uwlts.model.sensor import Description, Positive, Vector

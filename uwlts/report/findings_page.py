@@ -13,8 +13,8 @@ import numpy as np
 
 from uwlts._version import __version__
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.decision import VERDICTS
 from uwlts.evaluation.evaluate import read_evaluation
+from uwlts.evaluation.figures import VERDICTS
 from uwlts.files.inputs import protect_inputs
 from uwlts.files.json_files import EDITED, json_text
 from uwlts.files.writing import hash_file

@@ -11,7 +11,7 @@ from typing import Annotated, Self
 from pydantic import ConfigDict, Field, computed_field, model_validator
 
 from uwlts.errors import DescriptionError
-from uwlts.evaluation.decision import Verdict, judge_interval
+from uwlts.evaluation.figures import Verdict, judge_interval
 from uwlts.files.json_files import read_model, write_model
 from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.inspection.picking import PickedMeasurement

@@ -17,7 +17,7 @@ from uwlts.fitting.least_squares import (
     parameter_covariance,
     robust_std,
 )
-from uwlts.fitting.point_groups import number_cubes
+from uwlts.fitting.point_spacing import number_cubes
 from uwlts.shapes.circle import fit_algebraic_centres, initial_centre, prepare_round, unit_vectors
 
 LEAST_POINTS = 50

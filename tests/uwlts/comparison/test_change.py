@@ -16,7 +16,7 @@ from uwlts.comparison.change_reference import read_reference, sample_mesh
 from uwlts.comparison.comparison_options import ComparisonOptions
 from uwlts.comparison.ideal_shapes import IdealCylinder, IdealPlane, IdealSphere, place_shape
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
-from uwlts.fitting.point_groups import number_cubes
+from uwlts.fitting.point_spacing import number_cubes
 from uwlts.registration.surface_registration import SampledSurface, register_to_surface
 from uwlts.storage.cloud import STEP, WATER, PointCloud, PointUncertainty
 from uwlts.storage.ply import read_ply
