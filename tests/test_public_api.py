@@ -15,7 +15,7 @@ import twin.cli
 import uwlts
 import uwlts.cli
 import uwlts.thesis
-from uwlts.files.inputs import OUTPUTS
+from uwlts.argument_types import OUTPUTS
 from uwlts.runtime.command_line import DerivedCommand, Job, option_type
 
 ROOT = Path(__file__).resolve().parents[1]

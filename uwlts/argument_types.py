@@ -1,4 +1,4 @@
-"""Check of the arguments of public functions against their annotations, in one place for all of them.
+"""Check of the arguments of public functions, in one place for all of them: their types, and no input as an output.
 
 `attach_public` makes the names of a package's stub available when they are first used; functions among them check their
 arguments. Modules inside the packages import the functions themselves, which do not.
@@ -7,8 +7,9 @@ arguments. Modules inside the packages import the functions themselves, which do
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from contextvars import ContextVar
 from functools import cache, wraps
 from itertools import repeat
 from numbers import Integral, Real
@@ -19,7 +20,7 @@ from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args,
 
 import lazy_loader
 
-from uwlts.errors import ArgumentError
+from uwlts.errors import ArgumentError, OutputError
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -29,8 +30,47 @@ _SHORT = Repr()
 _SHORT.maxstring = _SHORT.maxother = 60
 
 
+OUTPUTS = frozenset({"out", "coloured", "pictures", "aligned", "page", "poses_out"})
+"""Names of command parameters that are outputs; all other parameters that name a file are inputs."""
+_WRITTEN = OUTPUTS | {"path"}
+"""Names of function parameters that may be outputs; a function that reads its ``path`` writes nothing else."""
+_inputs: ContextVar[tuple[str, ...]] = ContextVar("inputs", default=())
+
+
 class _MisfitError(Exception):
     """A value does not have a type."""
+
+
+@contextmanager
+def protect_inputs(arguments: Mapping[str, object]) -> Iterator[None]:
+    """Protect the files that arguments name as inputs: in this context `refuse_input` refuses them as outputs."""
+    named = [name for key in arguments.keys() - _WRITTEN for name in _file_names(arguments[key])]
+    token = _inputs.set((*_inputs.get(), *filter(os.path.isfile, named)))
+    try:
+        for key in _WRITTEN.intersection(arguments):
+            for name in _file_names(arguments[key]):
+                refuse_input(name)
+        yield
+    finally:
+        _inputs.reset(token)
+
+
+def refuse_input(target: str | os.PathLike[str]) -> None:
+    """Raise OutputError if a file to be written is an input (`protect_inputs`), under whatever name."""
+    for path in _inputs.get():
+        if os.path.isfile(target) and os.path.isfile(path) and os.path.samefile(target, path):
+            also = "" if os.path.abspath(target) == os.path.abspath(path) else f" (it is the same file as {path})"
+            raise OutputError(f"cannot write {target}: it is an input of this command{also}; give another name")
+
+
+def _file_names(value: object) -> Iterable[str]:
+    """Iterate over names of files that an argument may contain, also after a prefix, as in replay:PATH."""
+    if isinstance(value, str | os.PathLike):
+        name = os.fspath(value)
+        yield from (name, name.partition(":")[2])
+    elif isinstance(value, Sequence) and not isinstance(value, bytes):
+        for each in value:
+            yield from _file_names(each)
 
 
 def attach_public(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
@@ -40,7 +80,7 @@ def attach_public(package: str, file: str) -> tuple[Callable[[str], Any], Callab
     def find_checked(name: str) -> Any:
         found = find(name)
         if inspect.isfunction(found):
-            found = check_arguments(found)
+            found = check_arguments(found, keep_inputs=True)
             # Pickled by its public name, under which it is found again.
             found.__module__, found.__qualname__ = package, name
             # The loader keeps what it has found, without the check.
@@ -50,10 +90,11 @@ def attach_public(package: str, file: str) -> tuple[Callable[[str], Any], Callab
     return find_checked, list_names, names
 
 
-def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
+def check_arguments(function: Callable[P, R], *, keep_inputs: bool = False) -> Callable[P, R]:
     """Make a function raise ArgumentError for arguments that do not have the types of its parameters.
 
-    Lists of numbers become arrays where the function takes an array.
+    Lists of numbers become arrays where the function takes an array. With ``keep_inputs`` the function cannot replace
+    its inputs (`protect_inputs`).
     """
 
     @wraps(function)
@@ -71,7 +112,8 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
             several = kind is inspect.Parameter.VAR_POSITIONAL
             values = [_checked(name, each, hints[name]) for each in (value if several else (value,))]
             bound.arguments[name] = tuple(values) if several else values[0]
-        return function(*bound.args, **bound.kwargs)
+        with protect_inputs(bound.arguments) if keep_inputs else nullcontext():
+            return function(*bound.args, **bound.kwargs)
 
     return checked
 

@@ -12,8 +12,8 @@ from cyclopts import App
 
 from tests.system.in_process import run_program, uwlts
 from twin.cli import app as twin_app
+from uwlts.argument_types import OUTPUTS
 from uwlts.cli import app as uwlts_app
-from uwlts.files.inputs import OUTPUTS
 from uwlts.pages.toolkit import json_beside
 from uwlts.runtime.command_line import PathText
 

@@ -7,11 +7,10 @@ shard.
 
 from __future__ import annotations
 
-import math
+import random
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,8 +24,6 @@ from twin.datasets.labels import make_labels
 from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
 from twin.rendering_options import CPU, Variant, use_variant
 from uwlts.errors import DesignError
-from uwlts.files.inputs import protect_inputs
-from uwlts.files.writing import OtherWriterError, lock_output, refuse_other_writer
 from uwlts.model.placement import camera_from_object
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import run_jobs
@@ -39,15 +36,11 @@ if TYPE_CHECKING:
 
 MOST_ATTEMPTS = 20
 """Largest number of draws of a scene until the sensor can measure it; more indicate an error in the description."""
-_PATIENCE_S = 30.0
-"""Waiting time for the plan, which other runs lock briefly at their start."""
 _OUTPUT = re.compile(
     rf"({'|'.join(SPLITS)})-\d{{6}}\.tar|coco-({'|'.join(SPLITS)})\.json|{re.escape(CARD)}|{re.escape(PLAN)}"
 )
-_UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.(tar|json)")
 
 
-@protect_inputs()
 def dataset(
     description: str | Path | DataSetDescription,
     *,
@@ -61,9 +54,9 @@ def dataset(
 ) -> Path:
     """Render a data set of labelled images, for training and testing, from a description of its random variations.
 
-    An interrupted run continues when it is run again. Several runs can share the folder at the same time, also from
-    other machines: each run renders shards that no other run is writing, and ends when all shards are complete. The
-    folder is returned; `load_dataset` reads it.
+    An interrupted run continues when it is run again. Several runs can share the folder, also from other machines: each
+    renders in its own order the shards that are still missing, and ends when all are complete. The folder is returned;
+    `load_dataset` reads it.
 
     Parameters
     ----------
@@ -111,8 +104,12 @@ def dataset(
     jobs = _jobs(described, folder, variant)
     plan = _plan(described, variant)
     make_folder(folder)
-    with lock_output(folder / PLAN, patience_s=_PATIENCE_S):
-        _prepare(folder, jobs, plan, overwrite=overwrite)
+    if overwrite and (folder / PLAN).is_file():
+        for path in folder.iterdir():
+            if path.is_file() and _OUTPUT.fullmatch(path.name):
+                path.unlink()
+    files, pattern = {job.path for job in jobs}, f"*{SUFFIX}"
+    keep_to_plan(folder, plan, files, recorded=pattern, called="a data set", overwrite=overwrite)
     waiting = [job for job in jobs if not job.path.is_file()]
     total = sum(job.frames for job in jobs)
     done = total - sum(job.frames for job in waiting)
@@ -123,13 +120,11 @@ def dataset(
         done += 1
         progress(done, total)
 
-    # First skip shards that other runs are writing, then wait for them and render those that failed.
-    for patience_s in (0.0, math.inf):
-        waiting = [job for job in waiting if not job.path.is_file()]
-        run_jobs(partial(_render_shard, patience_s), waiting, workers=workers, on_message=count)
-    with lock_output(folder / CARD, patience_s=math.inf):
-        if not (folder / CARD).is_file():
-            write_card(folder, described, [(job.path, job.split, job.frames) for job in jobs], plan)
+    # In an order of its own, so that runs that share the folder rarely render the same shard.
+    random.shuffle(waiting)
+    run_jobs(_render_shard, waiting, workers=workers, on_message=count)
+    if not (folder / CARD).is_file():
+        write_card(folder, described, [(job.path, job.split, job.frames) for job in jobs], plan)
     return folder
 
 
@@ -174,41 +169,11 @@ def _plan(description: DataSetDescription, variant: str) -> dict[str, JsonValue]
     return {"description": description.model_dump(mode="json"), "variant": variant, "versions": versions}
 
 
-def _prepare(folder: Path, jobs: list[_Job], plan: dict[str, JsonValue], *, overwrite: bool) -> None:
-    """Prepare the folder for a plan; OutputError if another run is writing files that are to be replaced."""
-    try:
-        for job in jobs:
-            refuse_other_writer(job.path)
-    except OtherWriterError:
-        if overwrite:
-            raise
-    else:
-        _clear(folder, all_of_it=overwrite and (folder / PLAN).is_file())
-    files = {job.path for job in jobs}
-    pattern = f"*{SUFFIX}"
-    keep_to_plan(folder, plan, files, recorded=pattern, called="a data set", overwrite=overwrite)
-
-
-def _clear(folder: Path, *, all_of_it: bool) -> None:
-    """Remove temporary files of a killed run, and with ``all_of_it`` the data set; other files stay."""
-    for path in folder.iterdir():
-        if path.is_file() and (_UNFINISHED.fullmatch(path.name) or (all_of_it and _OUTPUT.fullmatch(path.name))):
-            path.unlink()
-
-
-def _render_shard(patience_s: float, job: _Job, report: Callable[[None], None]) -> None:
-    """Render the scenes of a shard to its file, and call ``report`` after each frame.
-
-    The shard is skipped if another process is still writing it after ``patience_s``.
-    """
-    try:
-        with lock_output(job.path, patience_s=patience_s):
-            if not job.path.is_file():
-                _render(job, report)
-                return
-    except OtherWriterError:
+def _render_shard(job: _Job, report: Callable[[None], None]) -> None:
+    """Render the scenes of a shard to its file, unless another run has done so, and call ``report`` for each frame."""
+    if not job.path.is_file():
+        _render(job, report)
         return
-    # Another process has written the shard.
     for _ in range(job.frames):
         report(None)
 

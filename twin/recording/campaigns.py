@@ -11,9 +11,8 @@ from pydantic import JsonValue
 from twin.rendering_options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign
 from uwlts.errors import CaptureError, DescriptionError, Error, OutputError, SetupError
-from uwlts.files.inputs import record_made, refuse_input
 from uwlts.files.json_files import describe_other_plan, read_json
-from uwlts.files.writing import lock_output, write_atomically
+from uwlts.files.writing import write_atomically
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import open_workers, run_jobs
 from uwlts.storage.capture import part_path
@@ -165,31 +164,29 @@ def _record_all(
 ) -> None:
     """Render incomplete recordings into a folder that follows a plan; ``recorded`` is the pattern of its captures."""
     make_folder(folder)
-    # Concurrent runs would resume each other's unfinished recordings.
-    with lock_output(folder / PLAN):
-        files = {file for job in jobs for file in job.files}
-        keep_to_plan(folder, plan, files, recorded=recorded, called="recordings", overwrite=overwrite)
-        for place in {job.path.parent for job in jobs}:
-            place.mkdir(exist_ok=True)
-        if overwrite:
-            # Remove all files first: after an interruption, old recordings must not pass for new ones.
-            for path in (path for job in jobs for path in job.files):
-                path.unlink(missing_ok=True)
-        # The longest first, so that the processes finish at about the same time.
-        waiting = [job for job in jobs if [path.is_file() for path in job.files] != [True, True, False]]
-        waiting.sort(key=lambda job: job.images, reverse=True)
-        total = sum(job.images for job in jobs)
-        counted = count(total - sum(job.images for job in waiting))
-        progress(next(counted), total)
-        if scheduler is None:
-            run_jobs(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
-            return
-        with open_workers(scheduler=scheduler) as cluster:
-            for job, lost in cluster.map_unordered(_record, waiting):
-                if lost is not None:
-                    raise SetupError(f"{job.path}: {lost.reason}")
-                for done in islice(counted, job.images):
-                    progress(done, total)
+    files = {file for job in jobs for file in job.files}
+    keep_to_plan(folder, plan, files, recorded=recorded, called="recordings", overwrite=overwrite)
+    for place in {job.path.parent for job in jobs}:
+        place.mkdir(exist_ok=True)
+    if overwrite:
+        # Remove all files first: after an interruption, old recordings must not pass for new ones.
+        for path in (path for job in jobs for path in job.files):
+            path.unlink(missing_ok=True)
+    # The longest first, so that the processes finish at about the same time.
+    waiting = [job for job in jobs if [path.is_file() for path in job.files] != [True, True, False]]
+    waiting.sort(key=lambda job: job.images, reverse=True)
+    total = sum(job.images for job in jobs)
+    counted = count(total - sum(job.images for job in waiting))
+    progress(next(counted), total)
+    if scheduler is None:
+        run_jobs(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
+        return
+    with open_workers(scheduler=scheduler) as cluster:
+        for job, lost in cluster.map_unordered(_record, waiting):
+            if lost is not None:
+                raise SetupError(f"{job.path}: {lost.reason}")
+            for done in islice(counted, job.images):
+                progress(done, total)
 
 
 def make_folder(folder: Path) -> Path:
@@ -218,9 +215,6 @@ def keep_to_plan(
     except OSError as error:
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
     try:
-        # The plan is an output: it must not replace an input file.
-        refuse_input(path)
-        record_made(path)
         known = read_json(path, called="plan") if path.is_file() else None
     except CaptureError:
         known = None

@@ -16,7 +16,6 @@ from twin.rendering_options import CPU, Options, Variant, use_variant
 from twin.scene.campaign import AnySensor, choose_sensors
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError
-from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import require_ending
 from uwlts.model.brief import Brief
 from uwlts.model.library import validate_description
@@ -124,7 +123,6 @@ def render(
     )
 
 
-@protect_inputs()
 def simulate(
     scene: AnyScene,
     *,

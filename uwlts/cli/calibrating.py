@@ -213,7 +213,6 @@ def accept(
     """
     from uwlts.acceptance.accept import Acceptance
     from uwlts.acceptance.acceptance_plan import load_plan
-    from uwlts.files.inputs import record_made
     from uwlts.pages.toolkit import json_beside, refuse_unsuitable_page
     from uwlts.report.acceptance_page import KIND
 
@@ -222,8 +221,6 @@ def accept(
     result = json_beside(page, KIND)
     if result.is_file() and not overwrite:
         # The command continues its own result.
-        record_made(result)
-        record_made(page)
         known, title = uwlts.read(result), load_plan(plan).title
         if not isinstance(known, Acceptance) or known.plan.title != title:
             raise OutputError(

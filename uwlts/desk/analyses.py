@@ -17,10 +17,10 @@ from types import MappingProxyType, ModuleType
 from typing import Any, get_type_hints
 
 import uwlts
+from uwlts.argument_types import protect_inputs
 from uwlts.desk.desk_files import find_file, new_path
 from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error, OutputError
-from uwlts.files.inputs import protect_inputs, record_input, record_made
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.inspection.features import Inspection
 from uwlts.inspection.inspect import INSPECTIONS
@@ -381,9 +381,7 @@ class Analyses:
             if self._cancel.is_set():
                 raise _Cancelled
 
-        with protect_inputs():
-            for each in inputs:
-                record_input(each)
+        with protect_inputs({"inputs": inputs}):
             for each in targets:
                 refuse_unsuitable(each, overwrite=overwrite)
             with TemporaryDirectory(prefix=".", dir=self._folder) as aside:
@@ -395,5 +393,4 @@ class Analyses:
                         raise OutputError(f"{each.name} has appeared meanwhile: give another name")
                 for each in targets:
                     os.replace(Path(aside) / each.name, each)
-                    record_made(each)
         return outcome

@@ -25,7 +25,6 @@ from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import BackgroundView, RecordingView
 from uwlts.desk.shown_state import Board, Picture
 from uwlts.errors import DescriptionError, Error, HardwareError
-from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
@@ -212,8 +211,7 @@ class Instrument:
 
     def _do(self, work: Callable[[], None]) -> None:
         try:
-            with protect_inputs():
-                work()
+            work()
         except Ended:
             self._board.say("stopped")
         except Error as error:

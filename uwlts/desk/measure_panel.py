@@ -15,7 +15,6 @@ from uwlts.desk.number_field import NumberField
 from uwlts.desk.plot_view import Plot, PlotView
 from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error
-from uwlts.files.inputs import protect_inputs
 from uwlts.inspection.picking import PickedMeasurement, Shape, find_nearest_point, fit_shape_near, measure_length
 from uwlts.inspection.section import Section, cut_section, measure_step
 from uwlts.report.measured_values import MEASURED_ENDINGS, MeasuredValue, MeasuredValues, read_measured, write_measured
@@ -267,8 +266,7 @@ class MeasurePanel:
         title = f"Measured values of {name}"
 
         def save() -> list[Path]:
-            with protect_inputs():
-                return write_measured(page, values, title=title, overwrite=overwrite)
+            return write_measured(page, values, title=title, overwrite=overwrite)
 
         self._board.say(f"wrote {', '.join(each.name for each in await asyncio.to_thread(save))}")
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Self
 
 from uwlts.errors import DescriptionError
-from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
@@ -29,7 +28,6 @@ _SIGNAL_WHEN_PARENT_ENDS = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""
 
 
-@protect_inputs()
 def scan(
     plan: str | Path | ScanPlan,
     out: str | Path,

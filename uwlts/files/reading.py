@@ -1,7 +1,7 @@
 """Reading of foreign files: regular files of limited size, and text formats of limited depth with plain numbers.
 
-Every reader opens its file here, so that no pipe blocks it, no size, depth or number in a file exhausts the machine,
-and no output replaces it. Limits are checked before parsing; the reader checks the meaning of the content afterwards.
+Every reader opens its file here, so that no pipe blocks it, and no size, depth or number in a file exhausts the
+machine. Limits are checked before parsing; the reader checks the meaning of the content afterwards.
 """
 
 import json
@@ -20,7 +20,6 @@ from tokenize import TokenError
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from uwlts.errors import CaptureError, Error, make_printable
-from uwlts.files.inputs import record_input
 
 if TYPE_CHECKING:
     from pydantic import JsonValue
@@ -68,7 +67,7 @@ def require_regular_file(
 def open_regular(
     path: str | Path, *, most_bytes: int | None = None, error: type[Error] = CaptureError, called: str = "file"
 ) -> Iterator[BufferedReader]:
-    """Return a context with a regular file opened for reading bytes, which no output of the task may replace.
+    """Return a context with a regular file opened for reading bytes.
 
     Raises ``error`` if the file is missing, unreadable, not regular (a pipe or device would block) or larger than
     ``most_bytes``, or its name is too long or contains a null character. ``called`` names the expected content.
@@ -88,7 +87,6 @@ def open_regular(
     if most_bytes is not None and found.st_size > most_bytes:
         sizes = f"{found.st_size / MiB:,.1f} MiB; this program reads up to {most_bytes / MiB:,.1f} MiB"
         raise error(f"the {called} {_printable_name(path)} has {sizes}")
-    record_input(path)
     try:
         with open(path, "rb") as file:
             yield file

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import DescriptionError, HardwareError
-from uwlts.files.inputs import protect_inputs
 from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.continuous import plan_passes, record_continuously
 from uwlts.hardware.grbl import GrblStage
@@ -76,7 +75,6 @@ class ScanProgress:
         return texts
 
 
-@protect_inputs()
 def record_scan(
     plan: ScanPlan,
     out: Path,

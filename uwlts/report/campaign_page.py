@@ -12,7 +12,6 @@ from typing import Any
 from uwlts._version import __version__
 from uwlts.errors import OutputError, RangeError
 from uwlts.evaluation.evaluate import TruthComparisons
-from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable, require_ending
 from uwlts.model.brief import Brief
 from uwlts.pages.numbers import format_fixed, format_length, is_number, split_name, unit_of
@@ -65,7 +64,6 @@ class Report(Brief):
         return summary_table(self.campaign, self.reference)
 
 
-@protect_inputs()
 def write_campaign(
     folder: str | Path,
     *,

@@ -13,7 +13,6 @@ from markupsafe import Markup
 
 from uwlts.calibration.joint.observability import list_regions
 from uwlts.calibration.joint.stored_estimate import require_joint
-from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable, write_atomically
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
@@ -51,7 +50,6 @@ from uwlts.storage.calibration_file import read_calibration
 _WORST_IMAGES = 5  # listed
 
 
-@protect_inputs()
 def write_certificate(
     calibration: str | Path,
     *,

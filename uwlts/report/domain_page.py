@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwlts.files.inputs import protect_inputs
 from uwlts.files.json_files import json_text
 from uwlts.pages.toolkit import (
     BLUE,
@@ -33,7 +32,6 @@ _GAMMA = 0.5
 """Exponent of the displayed brightness, which makes a halo visible."""
 
 
-@protect_inputs()
 def write_domain_gap(
     generated: Sequence[str | Path] = (),
     *,

@@ -15,7 +15,6 @@ from uwlts._version import __version__
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.evaluation.figures import VERDICTS
-from uwlts.files.inputs import protect_inputs
 from uwlts.files.json_files import EDITED, json_text
 from uwlts.files.writing import hash_file
 from uwlts.inspection.features import (
@@ -94,7 +93,6 @@ class _CheckedFigure:
     expanded_mm: float | None
 
 
-@protect_inputs()
 def write_findings(
     cloud: str | os.PathLike[str],
     kind: InspectionKind = "pipe",

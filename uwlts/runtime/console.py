@@ -15,8 +15,8 @@ from cyclopts import App, CycloptsError, CycloptsPanel, MissingArgumentError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from uwlts.argument_types import protect_inputs
 from uwlts.errors import DescriptionWarning, Error, make_printable
-from uwlts.files.inputs import protect_inputs, refuse_named_inputs
 from uwlts.runtime.interrupts import preserve_interrupts
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 
@@ -114,8 +114,7 @@ def run(app: App) -> int:
             command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
             if _quiet:
                 output.enter_context(redirect_stdout(output.enter_context(open(os.devnull, "w", encoding="utf-8"))))
-            with protect_inputs():
-                refuse_named_inputs(bound.arguments)
+            with protect_inputs(bound.arguments):
                 command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
     except CycloptsError as error:

@@ -27,7 +27,6 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.errors import Error, SetupError
-from uwlts.files.writing import remove_unfinished
 from uwlts.runtime.interrupts import preserve_interrupts
 from uwlts.runtime.optional_library import pip_install, read_requirements
 
@@ -358,7 +357,6 @@ def _serve(connection: Connection) -> None:
     finally:
         # Whatever a library has made of the interrupt, there is nothing to report.
         if stopped.is_set():
-            remove_unfinished()
             os._exit(1)
 
 
@@ -383,7 +381,6 @@ def _end_when_stopped(signals: socket.socket) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
             break
     time.sleep(_GRACE_S)
-    remove_unfinished()
     os._exit(1)
 
 

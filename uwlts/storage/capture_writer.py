@@ -3,7 +3,8 @@
 import math
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from io import BufferedReader
 from pathlib import Path
 from typing import cast
 
@@ -12,9 +13,8 @@ import hdf5plugin
 import numpy as np
 
 from uwlts.errors import CaptureError, ImageError, OutputError
-from uwlts.files.inputs import record_made, refuse_input
 from uwlts.files.json_files import describe_differences
-from uwlts.files.writing import lock_output, refuse_unsuitable
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, stack_rows
@@ -32,6 +32,11 @@ from uwlts.storage.capture import (
     require_covariances,
 )
 from uwlts.storage.hdf5_file import forget_plan, write_label, write_plan
+
+try:
+    import fcntl
+except ImportError:
+    fcntl = None
 
 # Space for HDF5's metadata of an added frame: its index and the chunks of the other datasets.
 _MARGIN_BYTES = 2**18
@@ -62,8 +67,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     Raises
     ------
     OutputError
-        The file exists, is an input of the running command or is being written by another process, a part exists, or
-        writing fails.
+        The file exists or is an input of the running command, a part exists, or writing fails.
     CaptureError
         The part to resume is damaged, or has another header or plan.
     """
@@ -90,22 +94,21 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._lines, self._moving = camera.lines() if centre_lines else 0, moving
         if self._dtype not in (np.uint8, np.uint16):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
-        with self._storage(), ExitStack() as claimed:
+        with self._storage():
             refuse_unsuitable(self.path, overwrite=overwrite, endings=CAPTURES)
-            claimed.enter_context(lock_output(self.path))
-            if not resume:
-                refuse_input(self._part)
             if self._part.exists() and not (resume or overwrite):
                 raise OutputError(
                     f"{self._part} is left from an interrupted run; give `resume` to continue it or `overwrite`"
                 )
+            if self._part.exists():
+                _lock(self._part).close()
             with self._open_part() if resume and self._part.exists() else nullcontext(()) as unfinished:
                 self._begin(unfinished)
             # Without a lock, so that readers cannot stop a running recording.
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
+            self._locked = _lock(self._part)
             self._arrays = _arrays(self._file)
-            self._claimed = claimed.pop_all()
 
     def _open_part(self) -> "Capture":
         """Open the unfinished recording to continue; raises CaptureError if it is not one of this capture."""
@@ -291,15 +294,27 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             raise OutputError(f"cannot write {self.path}: {reason}{kept}") from error
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        with self._claimed, self._storage():
+        with self._locked, self._storage():
             self._file.close()
             if kind is None:
                 if self._plan is not None:
                     forget_plan(self._part)
                 _truncate(self._part)
-                refuse_input(self.path)
                 os.replace(self._part, self.path)
-                record_made(self.path)
+
+
+def _lock(part: Path) -> BufferedReader:
+    """Lock a part until the returned file is closed; raises OutputError if another process is recording it."""
+    file = open(part, "rb")  # noqa: SIM115 - kept open as long as the lock
+    try:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        file.close()
+        raise OutputError(f"another process is writing {part}; wait until it ends, or give another name") from error
+    except OSError:
+        pass  # a file system without locks
+    return file
 
 
 def _truncate(path: Path) -> None:

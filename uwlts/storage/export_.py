@@ -12,7 +12,6 @@ import numpy as np
 import tomli_w
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import require_possible_name
 from uwlts.model.stripe import stack_rows
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -38,7 +37,6 @@ _COLUMNS = ("file", "light", "stage_mm", "exposure_ms", "time_s")
 Corner = tuple[float, float, float]
 
 
-@protect_inputs()
 def export(
     file: str | Path,
     out: str | Path,

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,6 @@ def test_an_interrupted_run_goes_on(folder, tmp_path):
     made, lost = hashes(copy), sorted(copy.glob("*.tar"))[1]
     lost.unlink()
     (copy / "dataset.json").unlink()
-    (copy / ".0123456789abcdef.tar").write_bytes(b"of a killed run")
     (copy / "mine.txt").write_text("kept", encoding="utf-8")
     kept = {path: path.stat().st_mtime_ns for path in copy.glob("[a-z]*.tar")}
     with pytest.raises(CaptureError, match="run twin dataset again"):
@@ -275,26 +275,12 @@ def test_presets_are_rendered(name, tmp_path):
         assert np.isfinite(samples[0]["target_px"]).all(axis=1).sum() > 50
 
 
-def test_shards_that_another_run_holds_are_left_to_it_and_then_waited_for(folder, tmp_path):
-    out, made = tmp_path / "shared", hashes(folder)
-    out.mkdir()
-    held = sorted(made)[-1]
-    # A run on another machine claims a shard and ends before it is written.
-    program = (
-        "import sys, time, pathlib\nfrom uwlts.files.writing import lock_output\n"
-        "with lock_output(pathlib.Path(sys.argv[1])):\n"
-        "    print('held', flush=True)\n"
-        "    while len(list(pathlib.Path(sys.argv[1]).parent.glob('*.tar'))) < int(sys.argv[2]):\n"
-        "        time.sleep(0.02)\n"
-    )
-    line = [sys.executable, "-c", program, str(out / held), str(len(made) - 1)]
-    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None and other.stdout.readline() == "held\n"
-        with pytest.raises(OutputError, match="is writing it"):
-            twin.dataset(small(), out=out, workers=1, overwrite=True)
-        twin.dataset(small(), out=out, workers=1)
-    assert hashes(out) == made
-    assert not list(out.glob(".*"))
+def test_runs_that_share_a_folder_make_the_same_files(folder, tmp_path):
+    with ThreadPoolExecutor(2) as runs:
+        made = [runs.submit(twin.dataset, small(), out=tmp_path / "shared", workers=2) for _ in range(2)]
+    assert {each.result() for each in made} == {tmp_path / "shared"}
+    assert hashes(tmp_path / "shared") == hashes(folder)
+    assert not list((tmp_path / "shared").glob(".*"))
 
 
 def decoded(code: dict) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import errno
 import json
-import os
 import random
 import re
 import signal
@@ -368,7 +367,7 @@ def test_two_recordings_at_a_time_are_refused(tmp_path: Path):
         )
         for how in ("resume", "overwrite"):
             second = subprocess.run([sys.executable, "-c", code, path, how], capture_output=True, text=True, cwd=ROOT)
-            assert f"process {os.getpid()} on" in second.stderr and "is writing it" in second.stderr
+            assert "another process is writing" in second.stderr
         writer.append(a_frame(1))
     with Capture(path) as capture:
         assert_holds(capture, 2)

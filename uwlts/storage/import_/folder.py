@@ -9,7 +9,6 @@ import numpy as np
 
 from uwlts._version import __version__
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.inputs import protect_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.sensor import Sensor, Table
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -159,7 +158,6 @@ class Imported:
     warnings: tuple[str, ...]
 
 
-@protect_inputs()
 def import_images(
     folder: str | Path,
     out: str | Path,

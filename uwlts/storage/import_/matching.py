@@ -11,7 +11,6 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.inputs import record_input
 from uwlts.files.reading import is_regular_file, natural_key, read_text
 from uwlts.model.calibration import is_rigid
 from uwlts.storage.capture import NO_STAGE, POSE_ROUNDED
@@ -140,8 +139,6 @@ def image_files(folder: Path, *, more: tuple[str, ...] = ()) -> list[str]:
     files = [name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts)]
     if not files:
         raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(wanted)}")
-    for name in files:
-        record_input(folder / name)
     return sorted(files, key=natural_key)
 
 
