@@ -165,25 +165,26 @@ def limit_deviations(
     off, most = surface.heights - middle, SEARCH_RULE.most_deviation * spread
     outliers, limited = np.abs(off) > SEARCH_RULE.outlier * spread, np.clip(off, -most, most)
     for sign in (-1, 1):
-        together = _find_together(surface.places, outliers & (sign * off > 0), together_mm, false_alarm)
+        together = find_together(surface.places, outliers & (sign * off > 0), together_mm, false_alarm)
         outliers[together], limited[together] = False, off[together]
     usual = ~outliers & (spread <= 2 * usually)
     ratio = float(np.std(off[usual]) / max(np.std(limited[usual]), 1e-300)) if usual.any() else 1.0
     return replace(surface, heights=middle + limited), outliers, max(ratio, 1.0)
 
 
-def _find_together(places: np.ndarray, chosen: np.ndarray, radius: float, false_alarm: float) -> np.ndarray:
+def find_together(places: np.ndarray, chosen: np.ndarray, radius: float, false_alarm: float) -> np.ndarray:
     """Return the ``chosen`` (N,) bool points (K,) int near more of them than random places would give anywhere.
 
-    The share of chosen points gives a binomial distribution of pairs: neighbours along a stripe share their noise.
+    Chosen points count as pairs of a binomial distribution, because neighbours along a stripe share their noise.
     """
     points = np.flatnonzero(chosen)
     if len(points) < 2:
         return points[:0]
     tree = KDTree(places[points])
     beside = tree.query_ball_point(places[points], radius, return_length=True) - 1
-    share, neighbours = len(points) / len(places), SEARCH_RULE.points_in_smallest - 1
-    rare = stats.binom.sf(np.arange(neighbours + 1) // 2 - 1, neighbours, share) * len(points) < false_alarm
+    pairs, neighbours = 0.5 * len(points), SEARCH_RULE.points_in_smallest - 1
+    chances = pairs * stats.binom.sf(np.arange(neighbours + 1) // 2 - 1, neighbours, pairs / len(places))
+    rare = chances < false_alarm
     fewest = int(np.argmax(rare)) if rare.any() else neighbours + 1
     full = tree.query_ball_point(places[points[beside >= fewest]], radius)
     return points[np.unique(np.concatenate([np.zeros(0, int), *(np.array(each, int) for each in full)]))]

@@ -18,12 +18,21 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import ndimage, optimize
+from scipy import ndimage, optimize, sparse, stats
+from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import fit_biweight
-from uwlts.inspection.bell_maps import SEARCH_RULE, BellMap, Tail, UnrolledSurface, fit_bells, limit_deviations
+from uwlts.inspection.bell_maps import (
+    SEARCH_RULE,
+    BellMap,
+    Tail,
+    UnrolledSurface,
+    find_together,
+    fit_bells,
+    limit_deviations,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +70,7 @@ class BlemishSearch:
     level_mm: np.ndarray  # (N,); least significant height of an indication of the smallest size
     noise_mm: np.ndarray  # (N,); effective noise of each point
     smallest_mm: float  # smallest radius of the search
+    threshold: float  # least significant z
     false_alarm: float  # probability of any false indication
 
 
@@ -83,7 +93,8 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
     smallest = float(
         np.median(tree.query(places[:: max(1, len(places) // 2000)], k=SEARCH_RULE.points_in_smallest)[0][:, -1])
     )
-    surface, outliers, wider = limit_deviations(surface, tree, together_mm=smallest, false_alarm=false_alarm)
+    seen, together = surface, smallest
+    surface, outliers, wider = limit_deviations(seen, tree, together_mm=together, false_alarm=false_alarm)
     extent = surface.corners[1] - surface.corners[0]
     largest = min(SEARCH_RULE.largest_size * float(np.min(extent)), largest_mm)
     largest = max(largest, smallest)
@@ -126,14 +137,15 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
         tail, found = _confirm(surface, undamaged, maps[0], threshold, found)
         level = tail.scatter_at(threshold) * maps[0].level_at(places)
         noise = maps[0].noise_at(places)
+    small = _assign_outliers(seen, outliers, found, together, false_alarm)
     kept: list[Indication] = []
     for peak, outcome, _ in found:
         if isinstance(outcome, Indication):
             chance = min(1.0, sum(each.false_alarms(peak.z) for each in maps))
             kept.append(replace(outcome, z=peak.z, false_alarm=chance, noise_mm=wider * outcome.noise_mm))
-    departures = tuple(each.outcome for each in found if isinstance(each.outcome, UnresolvedDeparture))
-    known = tuple(kept), departures, outliers, undamaged, level, wider * noise
-    return BlemishSearch(*known, smallest, false_alarm)
+    departures = [each.outcome for each in found if isinstance(each.outcome, UnresolvedDeparture)]
+    known = tuple(kept), (*departures, *small), outliers, undamaged, level, wider * noise
+    return BlemishSearch(*known, smallest, threshold, false_alarm)
 
 
 class _Candidate(NamedTuple):
@@ -164,6 +176,47 @@ def _confirm(
             return tail, kept
         found = kept
         smallest = fit_bells(surface, undamaged, smallest.radius)
+
+
+def _assign_outliers(
+    surface: UnrolledSurface, outliers: np.ndarray, found: list[_Candidate], radius: float, false_alarm: float
+) -> list[UnresolvedDeparture]:
+    """Give outliers to the indications around them, and return groups of others as departures.
+
+    The outliers of an indication have its direction, and are more than their share elsewhere explains.
+    """
+    heights, left = surface.heights, outliers.copy()
+    for number, (peak, outcome, points) in enumerate(found):
+        away = np.flatnonzero(outliers & (heights * peak.height > 0))
+        if not len(away) or not len(points):
+            continue
+        is_near = KDTree(surface.places[points]).query(surface.places[away])[0] <= radius
+        near, share = away[is_near], np.count_nonzero(~is_near) / (len(outliers) - len(points))
+        left[near] = False
+        is_rare = stats.binom.sf(len(near) - 1, len(points) + len(near), share) * len(found) < false_alarm
+        if is_rare and isinstance(outcome, Indication):
+            outliers[near] = False
+            points = np.concatenate([points, near])
+            found[number] = _Candidate(peak, replace(outcome, points=points), points)
+    departures = []
+    for sign in (-1, 1):
+        together = find_together(surface.places, left & (sign * heights > 0), radius, false_alarm)
+        if not len(together):
+            continue
+        pairs: Any = KDTree(surface.places[together]).query_pairs(radius, output_type="ndarray")
+        shape = len(together), len(together)
+        joined = sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=shape)
+        count, group = csgraph.connected_components(joined, directed=False)
+        departures += [_name_group(together[group == k], heights) for k in range(count)]
+    return departures
+
+
+def _name_group(points: np.ndarray, heights: np.ndarray) -> UnresolvedDeparture:
+    """Return a group of outliers (K,) of one direction as a departure, bounded by the least of them."""
+    away = np.abs(heights[points])
+    reason = f"{len(points)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
+    top = int(points[np.argmax(away)])
+    return UnresolvedDeparture(top, float(heights[top]), float(away.min()), reason)
 
 
 def _solve_threshold(maps: Sequence[BellMap], false_alarm: float) -> float:

@@ -21,7 +21,7 @@ from uwlts.fitting.least_squares import MAD_TO_STD, biweight, thin_evenly
 from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication, search_blemishes
-from uwlts.inspection.blemishes import Blemish, measure_blemish
+from uwlts.inspection.blemishes import Blemish, NotSignificantError, measure_blemish
 from uwlts.inspection.features import FeatureKind, plain_value
 
 
@@ -71,18 +71,12 @@ class LargeBlemish:
     largest_mm: float  # largest radius of this search
 
     def explains(self, other: Indication) -> bool:
-        """Return whether an indication of the first search was searched for again, or is the rest of the large one.
-
-        A rest touches the large one and is lower than its edge.
-        """
+        """Return whether an indication of the first search is the large one or was searched for again."""
         if other is self.own:
             return True
         if np.mean(np.isin(other.points, self.chosen)) < 0.5:
             return False
-        own, around = (self.surface.places[np.isin(self.chosen, each.points)] for each in (self.own, other))
-        touches = float(KDTree(own).query(around)[0].min()) <= self.search.smallest_mm
-        is_rest = touches and 0 < other.height_mm / self.own.height_mm < SEARCH_RULE.edge_share
-        return other.radius_mm <= self.largest_mm or is_rest
+        return other.radius_mm <= self.largest_mm
 
     def parts_beside(self, others: Sequence[Indication]) -> list[Indication]:
         """Return the indications of the window, without those at larger ones of the first search, ``others``."""
@@ -91,16 +85,21 @@ class LargeBlemish:
         return [each for each in self.search.indications if not np.isin(self.chosen[each.points], taken).any()]
 
     def is_rough(self, share: float) -> bool:
-        """Return whether the ground of a hollow is rough: hollows cover a share of it, or parts of it are raised."""
+        """Return whether the ground of a hollow is rough: hollows and raised parts cover a share of it."""
         parts = [each for each in self.search.indications if not self.is_form(each)]
         inside = [each for each in parts if np.isin(self.chosen[each.points], self.own.points).mean() > 0.5]
-        covered = sum(len(each.points) for each in inside) / len(self.own.points)
-        return covered > share or any(each.height_mm * self.own.height_mm < 0 for each in inside)
+        return sum(len(each.points) for each in inside) > share * len(self.own.points)
+
+    def is_raised(self, indication: Indication) -> bool:
+        """Return whether an indication is a raised part of a hollow that stays below the undamaged surface."""
+        beneath = float(np.median(self.height_mm[indication.points]))
+        return indication.height_mm * self.own.height_mm < 0 < beneath * (beneath + indication.height_mm)
 
     def is_form(self, indication: Indication) -> bool:
         """Return whether an indication of the window belongs to the form of the large one.
 
-        It follows its rim, or is not larger than the errors of a smooth surface elsewhere: those at sharp edges.
+        It follows its rim, or is not significant if its height contains the errors of a smooth surface elsewhere: those
+        at sharp edges.
         """
         places = self.surface.places[indication.points]
         middle = places.mean(axis=0)
@@ -111,7 +110,8 @@ class LargeBlemish:
             return True
         elsewhere = np.hypot(*(self.surface.places - middle).T) > reach + 2 * self.largest_mm
         error = float(np.quantile(self.std_mm[elsewhere], _RULE.worst)) if elsewhere.any() else np.inf
-        return abs(indication.height_mm) < _RULE.significant * error
+        significant = abs(indication.height_mm) * self.search.threshold / indication.z
+        return abs(indication.height_mm) < significant + _RULE.significant * error
 
     def without(self, surface: UnrolledSurface, points: np.ndarray) -> UnrolledSurface:
         """Return the whole surface with the heights of the large one at the given points (N,) bool."""
@@ -124,22 +124,25 @@ class LargeBlemish:
     ) -> Blemish:
         """Measure an indication of the window; a pit in a dent also has its total depth.
 
-        ``errors`` are those of all points. EvaluationError as `measure_blemish`.
+        ``errors`` are those of all points. EvaluationError as `measure_blemish`; NotSignificantError also for a part
+        that is not sized, in a hollow that is deeper.
         """
         sizes = {"diameter_mm": diameter_mm, "wall_mm": wall_mm, "beneath_mm": self.height_mm}
         found = measure_blemish(self.surface, self.search, indication, errors[self.chosen], **sizes)
         points, depth = self.chosen[indication.points], found.values[0]
         random = float(np.hypot(depth.random, float(self.std_mm[indication.points].max())))
         values = [plain_value(found.kind, depth.name, depth.value, random, depth.systematic, least=0.0)]
-        if found.reason is not None:
-            raise EvaluationError(found.reason)
         if values[0].low <= 0:
-            raise EvaluationError(f"it is not significant relative to the surface below: {values[0].text()}")
-        in_hollow = self.own.height_mm < 0 and found.beneath_mm > SEARCH_RULE.edge_share * np.abs(self.height_mm).max()
+            raise NotSignificantError(f"it is not significant relative to the surface below: {values[0].text()}")
+        deepest, total = float(np.abs(self.height_mm).max()), depth.value + found.beneath_mm
+        in_hollow = self.own.height_mm < 0 and found.beneath_mm > SEARCH_RULE.edge_share * deepest
+        if found.reason is not None and in_hollow and total < deepest:
+            raise NotSignificantError(f"{found.reason}, and the hollow around it is deeper")
         if found.kind != FeatureKind.PROTRUSION and in_hollow:
             # The sum of both depths does not depend on the surface between them.
-            total = depth.value + found.beneath_mm
             values.append(plain_value(found.kind, "total depth", total, depth.random, depth.systematic))
+        if found.reason is not None:
+            values = [value.as_bound() for value in values]
         return replace(found, values=(*values, *found.values[1:]), points=points)
 
 

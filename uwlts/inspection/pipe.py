@@ -14,7 +14,7 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.point_spacing import project_footprint
 from uwlts.fitting.propagation import PointErrors
-from uwlts.inspection.bell_maps import UnrolledSurface
+from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication, search_blemishes
 from uwlts.inspection.blemishes import DENT_SHARE, Blemish, NotSignificantError, measure_blemish
 from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, Inspection, plain_value
@@ -175,10 +175,14 @@ def _search_form(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, false_al
     search = search_blemishes(surface, false_alarm=false_alarm)
     beyond = np.abs(surface.places[:, 1] / form.radius_mm - np.pi) - np.pi
     found = [each for each in search.indications if np.median(beyond[each.points]) <= _BEYOND_CUT]
-    unresolved = tuple(
-        replace(each, point=int(copied[each.point])) for each in search.unresolved if beyond[each.point] <= _BEYOND_CUT
-    )
-    return _join_copies(replace(search, indications=tuple(found), unresolved=unresolved), copied, len(chosen))
+    # Of copies on both sides of the cut one remains.
+    unresolved = {
+        int(copied[each.point]): replace(each, point=int(copied[each.point]))
+        for each in search.unresolved
+        if beyond[each.point] <= _BEYOND_CUT
+    }
+    search = replace(search, indications=tuple(found), unresolved=tuple(unresolved.values()))
+    return _join_copies(search, copied, len(chosen))
 
 
 def _join_copies(search: BlemishSearch, copied: np.ndarray, count: int) -> BlemishSearch:
@@ -275,9 +279,6 @@ def _blemish_features(
             notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
             return False
         except EvaluationError as error:
-            if any(np.isin(points, whole.own.points).all() and indication is not whole.own for whole, _ in large):
-                notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
-                return False
             add_unsized(points, indication.height_mm, 0.0, str(error))
             return False
         measured.append((blemish, middle, indication.false_alarm))
@@ -298,14 +299,17 @@ def _blemish_features(
     taken = np.zeros(len(chosen), bool)
     for whole, middle in large:
         parts = whole.parts_beside(search.indications)
-        formed = [abs(part.height_mm) for part in parts if whole.is_form(part)]
+        formed = [abs(part.height_mm) for part in parts if whole.is_form(part) or whole.is_raised(part)]
         if formed:
             reason = f"{len(formed)} departures of up to {max(formed):.2g} mm from a smooth surface belong to its form"
             notes.append(_note_large(cloud, chosen[whole.own.points], whole.own.height_mm, reason))
         for part in parts:
             points = whole.chosen[part.points]
-            if not taken[points].any() and not whole.is_form(part):
+            if not (taken[points].any() or whole.is_form(part) or whole.is_raised(part)):
                 taken[points] = measure(part, points, middle, partial(whole.measure, part, errors, **sizes))
+        for each in whole.search.unresolved:
+            if (point := whole.chosen[each.point]) in whole.own.points:
+                add_unsized(np.array([point]), each.height_mm, each.bound_mm, each.reason)
         bare = whole.without(unroll_about(whole.own)[0], taken)
         own = partial(measure_blemish, bare, search, whole.own, errors, **sizes)
         measure(whole.own, whole.own.points, middle, own)
@@ -402,6 +406,11 @@ def _note_limits(cloud: PointCloud, form: PipeForm, search: BlemishSearch) -> li
         f"blemishes of {2 * search.smallest_mm:.2g} mm diameter are significant from {level:.2g} mm depth (median), "
         f"larger ones from less; the probability of any false indication is {search.false_alarm:g}"
     )
+    if stray := np.count_nonzero(search.outliers):
+        notes.append(
+            f"{stray} of {len(search.outliers)} points are left out as stray points: each departs from its neighbours "
+            f"by more than {SEARCH_RULE.outlier:g} standard deviations, and too few beside it do"
+        )
     return notes
 
 

@@ -19,11 +19,7 @@ CASES = [
     pytest.param(profile, seed, marks=[pytest.mark.slow] if seed > 21 else [])
     for profile in ("cosine", "bell")
     for seed in range(21, 26)
-    if (profile, seed) != ("cosine", 23)
 ]
-# A region that grows to its whole extent takes this pit for a part of the dent: docs/results/limits.md.
-_ABSORBED = pytest.mark.xfail(strict=True, reason="known: docs/results/limits.md")
-CASES.append(pytest.param("cosine", 23, marks=[pytest.mark.slow, _ABSORBED]))
 
 
 @pytest.mark.parametrize(("profile", "seed"), CASES)

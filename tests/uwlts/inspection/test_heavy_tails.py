@@ -50,3 +50,22 @@ def test_pits_are_found_in_heavy_tails(noise: Noise) -> None:
         place = np.array([pit.along_mm, 60.0 * pit.angle])
         own = [each for each in found if np.hypot(*(each.place - place)) < 0.5 * pit.diameter_mm]
         assert len(own) == 1 and own[0].height_mm < -0.1, pit
+
+
+@pytest.mark.parametrize("wild", [5, 40])
+def test_a_group_of_outliers_is_mentioned_and_lone_ones_are_not(wild: int) -> None:
+    """Four points beside each other are off together; elsewhere single ones are, as far."""
+    rng = np.random.default_rng(3)
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(70.0), np.arange(70.0), indexing="ij"))
+    heights = 0.02 * rng.standard_normal(x.size)
+    group = np.flatnonzero((np.abs(x - 30.5) < 1) & (np.abs(y - 40.5) < 1))
+    alone = rng.choice(
+        np.flatnonzero((x % 6 == 0) & (y % 6 == 0) & (np.hypot(x - 30, y - 40) > 6)), wild, replace=False
+    )
+    heights[[*group, *alone]] -= 0.8
+    surface = UnrolledSurface(np.column_stack([x, y]), heights, np.full(x.size, 0.02), np.zeros((x.size, 2)))
+    found = search_blemishes(surface, false_alarm=FALSE_ALARM)
+    mentioned = [*(each.point for each in found.unresolved), *(k for each in found.indications for k in each.points)]
+    # With many single ones elsewhere chance explains four: they are counted as stray points.
+    assert np.isin(group, mentioned).any() if wild == 5 else found.outliers[group].all()
+    assert not np.isin(alone, mentioned).any() and found.outliers[alone].all()
