@@ -138,7 +138,7 @@ JOBS: dict[str, str] = {
             --out align/corrected.csv --aligned align/aligned.full.ply""",
     "formats": "\n".join(
         f"uwlts export moving/vehicle.full.ply --out formats/vehicle{ending}"
-        for ending in (".h5", ".xyz", ".laz", ".e57", ".mcap", ".foxglove.mcap")
+        for ending in (".h5", ".xyz", ".laz", ".e57", ".mcap")
     ),
     "report": """
         copy inputs/scans/spheres.h5 report/spheres.h5

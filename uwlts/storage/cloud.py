@@ -231,7 +231,7 @@ class PointCloud(Brief):
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the cloud in the format of the ending; raises the errors of `uwlts.storage.cloud_files.write_cloud`.
 
-        .ply, .h5, .xyz (text), .laz, .las, .e57, .mcap (ROS 2) or .foxglove.mcap.
+        .ply, .h5, .xyz (text), .laz, .las, .e57 or .mcap (ROS 2).
         """
         self.writer(path, self, overwrite=overwrite)
 

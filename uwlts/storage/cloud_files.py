@@ -47,7 +47,7 @@ POINTS_OF_PART = 1_000_000
 CLOUD_ENDINGS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.read))
 """Endings of the clouds that can be read."""
 CLOUD_FORMATS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.write))
-"""Endings of the clouds that can be written, including ``.foxglove.mcap``."""
+"""Endings of the clouds that can be written."""
 COLOURED_FORMATS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.coloured))
 """Endings of the clouds that can be written with a colour of each point."""
 PLY_COLOURS = ("red", "green", "blue")
@@ -90,8 +90,8 @@ def write_cloud(
     - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the image as
       column and the line as row if both are known and below 65536; ``timeStamp`` in 64 bits since ``acquisitionStart``
       if times are known; the covariance as an extension, ``uwlts:cov_xx_mm2`` to ``uwlts:cov_zz_mm2``.
-    - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, or foxglove.PointCloud if the name ends with
-      ``.foxglove.mcap``; one for each image if the points' times are known (`uwlts.storage.mcap_clouds`).
+    - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, one for each image if the points' times are known
+      (`uwlts.storage.mcap_clouds`).
 
     ``colours`` (N, 3) uint8, red, green and blue, are stored for other programs in PLY, LAS, LAZ and E57
     (`COLOURED_FORMATS`); HDF5 has the deviation instead. A PLY with colours names the intensity ``scalar_intensity``.

@@ -56,7 +56,7 @@ def export(
         Capture (.h5) or cloud (.ply, .h5, or .xyz, .txt, .csv, .asc, .las, .laz, .e57 of other programs).
     out : str or Path
         New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
-        .las, .e57, .mcap (ROS 2) or .foxglove.mcap.
+        .las, .e57 or .mcap (ROS 2).
     images : {"png", "tiff"}
         Format of a capture's images; both keep all bits.
     region_mm : pair of (3,), optional

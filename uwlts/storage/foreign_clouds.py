@@ -36,9 +36,8 @@ class CloudFormat:
 
 
 def find_format(path: str | os.PathLike[str]) -> CloudFormat | None:
-    """Return the format of a file by its ending, the longest that fits; None if it is no foreign format."""
-    name = Path(path).name.lower()
-    return FORMATS.get(max((ending for ending in FORMATS if name.endswith(ending)), key=len, default=""))
+    """Return the format of a file by its ending; None if it is no foreign format."""
+    return FORMATS.get(Path(path).suffix.lower())
 
 
 def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
@@ -113,7 +112,7 @@ def _write_las(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> 
 
 
 def _write_mcap(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
-    aside.write_bytes(mcap_content(cloud, foxglove=path.name.lower().endswith(".foxglove.mcap")))
+    aside.write_bytes(mcap_content(cloud))
 
 
 def _write_e57(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Clouds as MCAP recordings: messages PointCloud2 of ROS 2, or foxglove.PointCloud; without ROS installed."""
+"""Clouds as MCAP recordings: messages PointCloud2 of ROS 2; without ROS installed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from uwlts.storage.point_cloud2 import (
     MessageTypes,
     covariance_columns,
     pack_points,
-    packed_layout,
     point_cloud2,
 )
 
@@ -26,7 +25,7 @@ TOPIC = "/points"
 _POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
 
 
-def mcap_content(cloud: PointCloud, *, foxglove: bool) -> bytes:
+def mcap_content(cloud: PointCloud) -> bytes:
     """Return a recording of a cloud on the topic ``/points``, with one message per time if times are known.
 
     Points have the fields x, y, z (m) and intensity as 32-bit floating point numbers, which viewers expect; frame and
@@ -37,21 +36,6 @@ def mcap_content(cloud: PointCloud, *, foxglove: bool) -> bytes:
     """
     if cloud.time_s is not None and cloud.time_s.min() < 0:
         raise OutputError(f"a point has the time {cloud.time_s.min():g} s: messages have no time before 0")
-    return _foxglove(cloud) if foxglove else _ros2(cloud)
-
-
-def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
-    """Iterate over the times in ns, and the indices of the points of each."""
-    if cloud.time_s is None:
-        yield 0, np.arange(len(cloud))
-        return
-    order = np.argsort(cloud.time_s, kind="stable")
-    _, first = np.unique(cloud.time_s[order], return_index=True)
-    for rows in np.split(order, first[1:]):
-        yield round(float(cloud.time_s[rows[0]]) * NANOSECONDS), rows
-
-
-def _ros2(cloud: PointCloud) -> bytes:
     mcap, typesys = _library("mcap.writer"), _library("rosbags.typesys")
     store: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     types = bag_types(store)
@@ -70,32 +54,15 @@ def _ros2(cloud: PointCloud) -> bytes:
     return content.getvalue()
 
 
-def _foxglove(cloud: PointCloud) -> bytes:
-    foxglove, channels, messages = (_library(f"foxglove{part}") for part in ("", ".channels", ".messages"))
-    kind_of = messages.PackedElementFieldNumericType
-    kinds = {"<f4": kind_of.Float32, "<f8": kind_of.Float64, "<i4": kind_of.Int32}
-    table = pack_points(cloud, covariance_columns(cloud))
-    fields = [
-        messages.PackedElementField(name=name, offset=int(offset), type=kinds[kind.str])
-        for name, (kind, offset) in packed_layout(table).items()
-    ]
-    pose = messages.Pose(
-        position=messages.Vector3(x=0.0, y=0.0, z=0.0), orientation=messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
-    )
-    content, context = BytesIO(), foxglove.Context()
-    with foxglove.open_mcap(content, context=context):
-        channel = channels.PointCloudChannel(TOPIC, context=context)
-        for time, rows in _moments(cloud):
-            message = messages.PointCloud(
-                timestamp=messages.Timestamp(time // NANOSECONDS, time % NANOSECONDS),
-                frame_id=FRAME_ID,
-                pose=pose,
-                point_stride=table.itemsize,
-                fields=fields,
-                data=table[rows].tobytes(),
-            )
-            channel.log(message, log_time=time)
-    return content.getvalue()
+def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
+    """Iterate over the times in ns, and the indices of the points of each."""
+    if cloud.time_s is None:
+        yield 0, np.arange(len(cloud))
+        return
+    order = np.argsort(cloud.time_s, kind="stable")
+    _, first = np.unique(cloud.time_s[order], return_index=True)
+    for rows in np.split(order, first[1:]):
+        yield round(float(cloud.time_s[rows[0]]) * NANOSECONDS), rows
 
 
 def bag_types(store: Any) -> MessageTypes:

@@ -83,24 +83,6 @@ def test_point_cloud2_of_ros_2(cloud, tmp_path):
         assert [c.msgtype for c in bag.connections] == ["sensor_msgs/msg/PointCloud2"] and bag.message_count == 12
 
 
-def test_point_cloud_of_foxglove(cloud, tmp_path):
-    from foxglove.messages import PointCloud as Message
-
-    path = tmp_path / "a.foxglove.mcap"
-    write_cloud(path, cloud)
-    parts = []
-    with path.open("rb") as file:
-        for schema, _, message in make_reader(file).iter_messages():
-            assert schema.name == "foxglove.PointCloud" and schema.encoding == "protobuf"
-            assert message.log_time == round(1e9 * cloud.time_s[50 * len(parts)])
-            parts.append(message.data)
-    assert len(parts) == 12
-    # The library cannot read protobuf: the packed points are in the message unchanged.
-    first = cloud.points_mm[0].astype(np.float64) * 1e-3
-    assert first.astype("<f4").tobytes() in parts[0] and b"cov_xx_mm2" in parts[0]
-    assert Message.get_schema().name == "foxglove.PointCloud"
-
-
 def test_a_cloud_without_times_is_one_message(cloud, tmp_path):
     plain = PointCloud(cloud.points_mm, cloud.intensity, cloud.frame, cloud.line)
     write_cloud(tmp_path / "a.mcap", plain)
