@@ -28,7 +28,7 @@ from uwlts.reconstruction.latency import measure_latency
 from uwlts.runtime.progress import ProgressListener
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.encoder_counts import unwrap_counts
+from uwlts.storage.numbering import unwrap_counts
 from uwlts.stripe import find_stripe
 
 _SPARE_MM, _SPARE_S = 1.0, 0.3

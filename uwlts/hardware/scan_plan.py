@@ -121,7 +121,7 @@ class Continuous(Description):
     With ``both_ways`` the stage also travels back, which measures the latency between camera and stage. Alternatively
     ``latency_ms`` gives the age of the stage's positions relative to the frames. ``mm_per_count`` assigns positions by
     an encoder that is wired to the camera and sent with the frames (GenICam's ChunkEncoderValue), a counter of
-    ``encoder_bits`` (`uwlts.storage.encoder_counts`). A 3D camera sends
+    ``encoder_bits`` (`uwlts.storage.numbering`). A 3D camera sends
     ``profiles_per_frame`` profiles together: larger values reduce the load on network and computer.
     """
 

@@ -10,13 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
 from uwlts.files.json_files import read_model
-from uwlts.files.reading import natural_key
+from uwlts.files.reading import log_warnings, natural_key
 from uwlts.files.writing import hash_file
 from uwlts.model.library import read_table, validate_description
 from uwlts.model.mount import FORMAT, VERSION, Mount
 from uwlts.model.sensor import Description, Positive
 from uwlts.storage.cloud_files import is_cloud, read_cloud
 from uwlts.storage.number_tables import NumberTable, Unit, read_number_table
+from uwlts.storage.numbering import count_names, name_gaps
 from uwlts.storage.pose_files import FARTHEST_MM, check_matrices, read_poses
 
 Artefact = Literal["sphere", "plane"]
@@ -238,6 +239,8 @@ def read_profiles(
         )
         if not files:
             raise DescriptionError(f"{path} holds no CSV files: expected one for each pose")
+        listed = [file.name for file in files]
+        log_warnings(path, name_gaps(listed, count_names(listed)))
         names, profiles, times = [], [], []
         for file in files:
             table = read_number_table(file, digests)

@@ -229,7 +229,8 @@ def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tu
     path = table.path
     columns = {name: values for name, values in table.columns.items() if name not in COVARIANCE_COLUMNS}
     times = columns.pop("time_s", None)
-    columns.pop("pose", None)
+    if (numbers := columns.pop("pose", None)) is not None:
+        log_warnings(path, _number_gaps(numbers, path))
     names = _order_names([*columns], pose_format, path)
     for name in names:
         stated = table.units.get(name, "")
@@ -247,6 +248,23 @@ def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tu
     poses = poses_from_rows(rows, pose_format, path)
     poses[:, :3, 3] *= table.mm_per_unit(unit=unit)
     return poses, times
+
+
+def _number_gaps(numbers: np.ndarray, path: Path) -> list[str]:
+    """Return a warning about numbers (P,) of poses that are left out; DescriptionError unless they increase."""
+    steps = np.diff(numbers)
+    if not (steps > 0).all():
+        row = int(np.argmin(steps > 0)) + 1
+        raise DescriptionError(
+            f"{path}: pose {numbers[row]:g} follows pose {numbers[row - 1]:g}; expected each once, in order"
+        )
+    if len(steps) and steps.max() > (usual := steps.min()):
+        row = int(np.argmax(steps > usual))
+        return [
+            f"there is no pose between {numbers[row]:g} and {numbers[row + 1]:g}: poses belong to images by their "
+            "order, not by their numbers"
+        ]
+    return []
 
 
 def _order_names(names: list[str], pose_format: PoseFormat, path: Path) -> list[str]:

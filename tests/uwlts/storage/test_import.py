@@ -105,8 +105,8 @@ def test_everything_described_is_in_the_capture(tmp_path: Path):
     target = {"kind": "chessboard", "columns": 9, "rows": 6, "square_mm": 15.0}
     artefact = {"kind": "step", "height_mm": 23.17}
     given = without("laser", laser="l*", lamp="w*", exposure_ms=4.0, lamp_exposure_ms=9.0, target=target, name="bench")
-    images = {f"l{n}.png": stripe_image(20.0 + n) for n in (1, 10, 9)} | {
-        f"w{n}.png": lamp_image(n) for n in (1, 9, 10)
+    images = {f"l{n}.png": stripe_image(20.0 + n) for n in (8, 10, 9)} | {
+        f"w{n}.png": lamp_image(n) for n in (8, 9, 10)
     }
     folder = folder_of(tmp_path, images, given | {"artefact": artefact})
     imported = import_images(folder, tmp_path / "a.h5")
@@ -121,13 +121,72 @@ def test_everything_described_is_in_the_capture(tmp_path: Path):
         assert capture.stage_mm.tolist() == [5.0, 5.0, 5.5, 5.5, 6.0, 6.0]
         assert capture.laser_on.tolist() == [False, True] * 3
         assert capture.exposure_ms.tolist() == [9.0, 4.0] * 3
-        for index, name in enumerate(("w1", "l1", "w9", "l9", "w10", "l10")):
+        for index, name in enumerate(("w8", "l8", "w9", "l9", "w10", "l10")):
             assert np.array_equal(capture.image(index), images[f"{name}.png"])
 
 
 def test_names_are_sorted_as_people_count():
     names = ["b2", "a10.png", "A9.png", "a1/f12", "a1/f2"]
     assert sorted(names, key=natural_key) == ["a1/f2", "a1/f12", "A9.png", "a10.png", "b2"]
+
+
+def numbered(tmp_path: Path, laser: str, lamp: str = "", **given) -> tuple[list[float], tuple[str, ...]]:
+    """Positions of imported images with these names, and warnings."""
+    described = without("laser", laser="l*", lamp="w*", **given)
+    images = {f"{name}.png": stripe_image(20 + n / 2, seed=n) for n, name in enumerate([*laser.split(), *lamp.split()])}
+    warnings = import_images(folder_of(tmp_path, images, described), tmp_path / "a.h5").warnings
+    with Capture(tmp_path / "a.h5") as capture:
+        return capture.stage_mm.tolist(), warnings
+
+
+@pytest.mark.parametrize(
+    ("laser", "lamp", "positions", "missing"),
+    [
+        ("l1 l2 l4", "", [5, 5.5, 6.5], "1 file is missing"),
+        ("l0004_x l0006_x l0012_x", "", [5, 5.5, 7], "2 files are missing"),
+        ("l1 l2 l4", "w1 w3 w4", [5, 5, 5.5, 6, 6.5, 6.5], "1 file is missing"),
+        ("l2 l4 l6 l10", "w1 w3 w5 w9", [5, 5, 5.5, 5.5, 6, 6, 7, 7], "1 file is missing"),
+        ("l_0829_101158 l_0829_101159 l_0829_101200", "", [5, 5.5, 6], ""),
+        ("l1a3_7 l1a4_8 l1a5_10", "", [5, 5.5, 6], ""),
+        ("lb la lc", "", [5, 5.5, 6], ""),
+    ],
+)
+def test_positions_follow_the_numbers_in_names(tmp_path: Path, laser, lamp, positions, missing):
+    found, warnings = numbered(tmp_path, laser, lamp)
+    assert sorted(found) == positions
+    assert [missing in each for each in warnings] == [True] * (bool(missing) + (bool(missing) and bool(lamp)))
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ("l1 l2 l02", "l2.png and l02.png have the same number|l02.png and l2.png have the same number"),
+        ("l1 l2 l-3", "l1.png and l-3.png are named in different ways"),
+        ("l1 l2 l2_copy", "are named in different ways"),
+    ],
+)
+def test_names_that_do_not_tell_the_order_are_refused(tmp_path: Path, names, words):
+    with pytest.raises(DescriptionError, match=words):
+        numbered(tmp_path, names)
+
+
+def test_a_table_against_the_numbers_is_refused(tmp_path: Path):
+    folder = three(tmp_path, without("laser", table="t.csv"))
+    (folder / "t.csv").write_text("file,light\nl3.png,laser\nl2.png,laser\nl1.png,laser\n")
+    with pytest.raises(DescriptionError, match="reverse order of their numbers"):
+        import_images(folder, tmp_path / "a.h5")
+
+
+def test_a_jump_of_the_times_is_a_warning(tmp_path: Path):
+    names = [f"l{letter}.png" for letter in "abcdefgh"]
+    given = without("laser", table="t.csv")
+    folder = folder_of(tmp_path, {name: stripe_image(20.0 + n) for n, name in enumerate(names)}, given)
+    times = 0.1 * np.array([0, 1, 2, 3, 5, 6, 7, 8])
+    (folder / "t.csv").write_text(
+        "file,light,time_s\n" + "".join(f"{n},laser,{t}\n" for n, t in zip(names, times, strict=True))
+    )
+    (warning,) = import_images(folder, tmp_path / "a.h5").warnings
+    assert "jump by 0.2 s after image 4, ld.png, usually by 0.1 s" in warning
 
 
 @pytest.mark.parametrize("channel", ["blue", "green", "red", "grey", "max"])
@@ -614,11 +673,11 @@ def test_an_interruption_leaves_nothing(tmp_path: Path):
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    folder = three(tmp_path, extra=np.dstack([stripe_image(), lamp_image(), lamp_image()]))
+    folder = three(tmp_path, l4=np.dstack([stripe_image(), lamp_image(), lamp_image()]))
     monkeypatch.setattr("sys.argv", ["uwlts", "import", str(folder), "--out", str(tmp_path / "a.h5")])
     assert run(cli.app) == 2
-    assert "error: extra.png is a colour image" in capsys.readouterr().err
-    (folder / "import.toml").write_text(tomli_w.dumps(GIVEN | {"laser": "l*"}))
+    assert "error: l4.png is a colour image" in capsys.readouterr().err
+    (folder / "import.toml").write_text(tomli_w.dumps(GIVEN | {"laser": "l[123].png"}))
     assert run(cli.app) == 0
     printed = capsys.readouterr()
     assert "with 3 laser and 0 lamp images" in printed.out and "warning: 1 images of the folder" in printed.err

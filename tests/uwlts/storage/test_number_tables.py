@@ -166,3 +166,13 @@ def test_a_row_of_units_that_contradicts_the_names_is_refused(tmp_path: Path):
     (tmp_path / "a.csv").write_text("x_mm,y_mm,z_mm\nm,m,m\n1,2,3\n")
     with pytest.raises(uwlts.Error, match="'x_mm' and the unit m in the row below"):
         read_cloud(tmp_path / "a.csv")
+
+
+def test_numbers_of_poses_have_no_gaps(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    path = tmp_path / "a.csv"
+    path.write_text("pose,x,y,z,rx,ry,rz\n" + "".join(f"{n},{n},0,0,0,0,0\n" for n in (1, 2, 4)))
+    assert read_poses(path, pose_format="rotvec-rad")[0][:, 0, 3].tolist() == [1, 2, 4]
+    assert "there is no pose between 2 and 4" in caplog.text
+    path.write_text("pose,x,y,z,rx,ry,rz\n" + "".join(f"{n},{n},0,0,0,0,0\n" for n in (1, 2, 2)))
+    with pytest.raises(uwlts.Error, match="pose 2 follows pose 2"):
+        read_poses(path, pose_format="rotvec-rad")

@@ -11,10 +11,10 @@ from uwlts.errors import DescriptionError, ImageError
 from uwlts.files.reading import NPY_DAMAGE, read_bytes, read_text
 from uwlts.model.sensor import Camera
 from uwlts.model.stripe import ROWS, Coordinates
-from uwlts.storage.encoder_counts import unwrap_counts
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.folder_description import CentreLines
 from uwlts.storage.import_.matching import ImageRow
+from uwlts.storage.numbering import unwrap_counts
 
 _MOST_BYTES = 2**28  # ten thousand profiles and more
 _OF_PROFILES = ("stage_mm", "exposure_ms", "time_s", "encoder")
@@ -64,8 +64,12 @@ def read_profiles(path: Path, lines: int) -> np.ndarray:
     return numbers
 
 
-def profile_rows(rows: list[ImageRow], given: CentreLines, camera: Camera, *, folder: Path) -> list[ImageRow]:
+def profile_rows(
+    rows: list[ImageRow], given: CentreLines, camera: Camera, *, folder: Path, repeated: bool = False
+) -> list[ImageRow]:
     """Return one row for each profile in the laser files, in order, with stage positions from the encoder if given.
+
+    ``repeated``: the stage may return.
 
     Raises ImageError if a file or centre line does not match the sensor's description, and DescriptionError if the
     table of profiles has another length or wrong columns.
@@ -89,7 +93,7 @@ def profile_rows(rows: list[ImageRow], given: CentreLines, camera: Camera, *, fo
         if "encoder" not in known[0] or "stage_mm" in known[0]:
             raise DescriptionError(f"mm_per_count needs a column encoder in {given.table}, and no stage_mm")
         try:
-            counts = unwrap_counts(np.array([values["encoder"] for values in known]), given.encoder_bits)
+            counts = unwrap_counts([values["encoder"] for values in known], given.encoder_bits, returns=repeated)
         except DescriptionError as error:
             raise DescriptionError(f"{given.table}: {error}") from error
         stages = (given.mm_per_count * counts).tolist()

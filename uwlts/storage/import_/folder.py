@@ -209,9 +209,9 @@ def import_images(
     rows = None if given.table is None else read_rows(path.parent / given.table)
     matched = match(folder, given, rows)
     if given.centre_lines is not None:
-        laser = profile_rows(matched.laser, given.centre_lines, sensor.camera, folder=folder)
+        laser = profile_rows(matched.laser, given.centre_lines, sensor.camera, folder=folder, repeated=given.repeated)
         matched = replace(matched, laser=laser)
-    frames = planned_frames(given, matched, in_table=rows is not None)
+    frames, doubts = planned_frames(given, matched, in_table=rows is not None)
     reader = _Reader(given, sensor, folder)
     images = [row for row in frames if row.profile is None]
     bits, zero = sensor.detector.bits, 0
@@ -267,7 +267,7 @@ def import_images(
         # Unlike a recording, an import can be repeated: a partial one is useless.
         part_path(out).unlink(missing_ok=True)
         raise
-    warnings = content.warnings()
+    warnings = [*doubts, *content.warnings()]
     if not in_time:
         warnings.append(
             "the images are not in the order of their times, so times are left out; the table's order is kept"

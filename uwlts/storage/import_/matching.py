@@ -16,6 +16,7 @@ from uwlts.model.calibration import is_rigid
 from uwlts.storage.capture import NO_STAGE, POSE_ROUNDED
 from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_.folder_description import ImportDescription, Patterns
+from uwlts.storage.numbering import Counted, count_names, name_gaps, time_gaps
 from uwlts.stripe import Stripe
 
 POSE_COLUMNS = tuple(f"pose_{row}{column}" for row in range(4) for column in range(4))
@@ -212,22 +213,28 @@ def _add_backgrounds(folder: Path, found: list[str], given: ImportDescription, l
             f"there are {len(found)} background images for {len(laser)} laser images: expected one for all or one for "
             "each, else name them in a table's column background"
         )
+    one, other = count_names(found), count_names([row.file for row in laser])
+    if one and other and len(found) > 1 and (one.places() != other.places()).any():
+        raise DescriptionError(
+            "the numbers of laser and background images have different gaps: name the backgrounds in a table's column "
+            "background"
+        )
     names = found * len(laser) if len(found) == 1 else found
     return [replace(row, background=name) for row, name in zip(laser, names, strict=True)]
 
 
-def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool) -> list[ImageRow]:
-    """Return all images in the order of the table, or of their positions, lamp images before laser images.
+def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool) -> tuple[list[ImageRow], list[str]]:
+    """Return all images in the order of the table, or of their positions, and warnings; lamp images are first.
 
     Each has its position and its light, laser or lamp. Raises DescriptionError if positions are missing, given twice,
     or equal for two images of one light.
     """
-    positions = _positions(given, matched)
+    positions, warnings = _positions(given, matched)
     lamp_ms = given.exposure_ms if given.lamp_exposure_ms is None else given.lamp_exposure_ms
     frames = []
     for light, rows, usual_ms in (("lamp", matched.lamp, lamp_ms), ("laser", matched.laser, given.exposure_ms)):
         for place, row in enumerate(rows):
-            stage_mm = row.stage_mm if positions is None else positions[place]
+            stage_mm = row.stage_mm if positions is None else positions[light][place]
             if math.isnan(stage_mm):
                 advice = "fill in stage_mm in the table, or leave it out"
                 raise DescriptionError(f"the position of {row.file} is missing: {advice}")
@@ -237,7 +244,7 @@ def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool
     frames.sort(key=lambda row: (row.number, row.light == "laser"))
     if not given.repeated:
         _refuse_repeated(row for row in frames if row.pose is None)
-    return frames
+    return frames, warnings
 
 
 def stage_remark(given: ImportDescription) -> str:
@@ -249,36 +256,63 @@ def stage_remark(given: ImportDescription) -> str:
     return "positions as listed"
 
 
-def _positions(given: ImportDescription, matched: Matched) -> list[float] | None:
-    """Return the position of each image in natural order; None if the table gives them."""
+def _positions(given: ImportDescription, matched: Matched) -> tuple[dict[str, list[float]] | None, list[str]]:
+    """Return the positions of the images of each light in their order, None if the table gives them; and warnings."""
     stage = given.stage
+    lights = {"laser": matched.laser, "lamp": matched.lamp}
     in_column = any(math.isfinite(row.stage_mm) for row in (*matched.laser, *matched.lamp))
     elsewhere = stage.free or stage.start_mm is not None or stage.positions_mm is not None
     if in_column and elsewhere:
         raise DescriptionError("the table has a column stage_mm, and [stage] gives positions too: give one of them")
     if in_column:
-        return None
+        return None, []
     if not elsewhere:
         raise DescriptionError(
             "the positions of the stage are missing: give [stage] start_mm and step_mm, or positions_mm, or a table "
             "with a column stage_mm; or [stage] free = true if every image has a pose of its own"
         )
-    count, *other = (len(rows) for rows in (matched.laser, matched.lamp) if rows)
+    count, *other = (len(rows) for rows in lights.values() if rows)
     if other not in ([], [count]):
         raise DescriptionError(
             f"there are {count} laser and {other[0]} lamp images: it is unknown which share a "
             "position; give a table with a column stage_mm"
         )
+    if stage.free:  # numbered, as they have no positions
+        return {light: [float(place) for place in range(len(rows))] for light, rows in lights.items()}, []
+    counts, warnings = _counts(lights)
     if stage.positions_mm is not None:
         if len(stage.positions_mm) != count:
             raise DescriptionError(
                 f"positions_mm has {len(stage.positions_mm)} positions for {count} images of a light: expected one for "
                 "each"
             )
-        return list(stage.positions_mm)
-    # Free poses have no positions; they are numbered.
-    start_mm, step_mm = stage.start_mm or 0.0, 1.0 if stage.step_mm is None else stage.step_mm
-    return [start_mm + place * step_mm for place in range(count)]
+        return {light: [*stage.positions_mm] for light in lights}, warnings
+    start_mm, step_mm = stage.start_mm or 0.0, stage.step_mm or 0.0
+    return {light: [start_mm + place * step_mm for place in each] for light, each in counts.items()}, warnings
+
+
+def _counts(lights: dict[str, list[ImageRow]]) -> tuple[dict[str, list[int]], list[str]]:
+    """Return the number of each image from that of the first one, by the names of the files; and warnings of gaps.
+
+    Both lights have the same first image if they have numbers in common.
+    """
+    counts: dict[str, list[int]] = {light: [*range(len(rows))] for light, rows in lights.items()}
+    found: dict[str, Counted] = {}
+    warnings = []
+    for light, rows in lights.items():
+        names = [*dict.fromkeys(row.file for row in rows)]
+        counted = count_names(names)
+        gaps = name_gaps(names, counted)
+        if gaps and len(names) < len(rows):
+            raise DescriptionError(f"{gaps[0]}, so that positions of profiles are unknown: import the files apart")
+        if counted is not None and len(names) == len(rows):
+            found[light] = counted
+        warnings += [f"{gap}. Positions from start_mm follow the numbers, positions_mm the order" for gap in gaps]
+        if not gaps:
+            warnings += time_gaps([row.file for row in rows], np.array([row.time_s for row in rows]))
+    shared = len(found) == 2 and bool(set.intersection(*(set(each.numbers.tolist()) for each in found.values())))
+    first = min((int(each.numbers[0]) for each in found.values()), default=0) if shared else None
+    return counts | {light: each.places(first).tolist() for light, each in found.items()}, warnings
 
 
 def _refuse_repeated(frames: Iterable[ImageRow]) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwlts.errors import DescriptionError
-from uwlts.storage.encoder_counts import unwrap_counts
+from uwlts.storage.numbering import unwrap_counts
 
 
 def wrapped(counts: np.ndarray, bits: int, *, signed: bool) -> np.ndarray:
@@ -39,7 +39,18 @@ def test_a_jump_that_is_not_plain_is_refused_unless_the_width_is_stated():
     counts = np.concatenate([np.arange(40_000, 40_400), np.arange(200, 600)])
     with pytest.raises(DescriptionError, match=r"jumps from 40399 to 200: give the width .*encoder_bits"):
         unwrap_counts(counts)
-    assert np.array_equal(unwrap_counts(counts, 32), counts)
+    with pytest.raises(DescriptionError, match="its counter started again"):
+        unwrap_counts(counts, 32)
     assert unwrap_counts(counts, 16)[-1] == 65_536 + 599
     with pytest.raises(DescriptionError, match="more than its 8 bits"):
         unwrap_counts(counts, 8)
+
+
+@pytest.mark.parametrize("start", [0, 7000])
+def test_a_counter_that_starts_again_is_refused(start):
+    counts = np.concatenate([start + np.arange(0, 400, 10), start + np.arange(0, 300, 10)])
+    with pytest.raises(DescriptionError, match=f"jumps back from {start + 390} to {start} after image 40"):
+        unwrap_counts(counts)
+    assert np.array_equal(unwrap_counts(counts, returns=True), counts)
+    lost = np.concatenate([np.arange(0, 400, 10), np.arange(900, 1300, 10), np.arange(1295, 1290, -1)])
+    assert np.array_equal(unwrap_counts(lost), lost)

@@ -1,0 +1,159 @@
+"""Numbers, times and encoder counts of images: gaps, duplicates, mixtures of naming, and counters that start again."""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from uwlts.errors import DescriptionError
+
+_LONGEST = 18
+"""Digits of a number of 64 bits."""
+_OF_CLOCK = 6
+"""Fewest digits of a time of day (HHMMSS)."""
+_REGULAR = 0.2
+"""Largest relative deviation of regular time steps, and largest fraction of steps that exceed it."""
+_FEWEST_STEPS = 5
+_WIDTHS = (16, 24, 32)
+"""Bits of usual counters."""
+_PLAIN = 3.0
+"""Largest ratio of the step at an overflow to the largest other step, for a stage that accelerates meanwhile."""
+
+
+class Counted(NamedTuple):
+    """Increasing numbers (N,) of images, multiples of a step from each other."""
+
+    numbers: np.ndarray
+    step: int
+
+    def places(self, first: int | None = None) -> np.ndarray:
+        """Return the number of steps (N,) from a first number, by default that of the first image."""
+        return (self.numbers - (self.numbers[0] if first is None else first)) // self.step
+
+
+def count_names(names: Sequence[str]) -> Counted | None:
+    """Return the increasing numbers of images in their names.
+
+    The names differ in one number, or in several of which one counts with the fewest gaps. None if no number counts, as
+    in names without digits and in times.
+
+    Raises DescriptionError for a mixture of naming, a number that occurs twice, or an order against the numbers.
+    """
+    parts = [re.split(r"([0-9]+)", name.casefold()) for name in names]
+    forms = Counter(tuple(part[::2]) for part in parts)
+    if len(names) < 2 or all(len(form) == 1 for form in forms):
+        return None
+    if len(forms) > 1:
+        usual = forms.most_common(1)[0][0]
+        one, other = (
+            next(n for n, part in zip(names, parts, strict=True) if (tuple(part[::2]) == usual) is alike)
+            for alike in (True, False)
+        )
+        raise DescriptionError(
+            f"{one} and {other} are named in different ways, so that their order is unknown: narrow the patterns, or "
+            "give a table with a column stage_mm"
+        )
+    columns = [[int(number) for number in column] for column in zip(*(part[1::2] for part in parts), strict=True)]
+    varying = [column for column in columns if len(set(column)) > 1]
+    if len(varying) < 2:
+        _require_increasing(names, varying[0] if varying else columns[0])
+    counts = [_count(np.array(column)) for column in varying if max(column) < 10**_LONGEST]
+    return min((each for each in counts if each is not None), key=lambda each: each.places()[-1], default=None)
+
+
+def _require_increasing(names: Sequence[str], numbers: list[int]) -> None:
+    """Raise DescriptionError if a number occurs twice, or is smaller than the one before."""
+    for place, (one, two) in enumerate(pairwise(numbers)):
+        if one >= two:
+            problem = "have the same number: remove one" if one == two else "are in the reverse order of their numbers"
+            raise DescriptionError(
+                f"{names[place]} and {names[place + 1]} {problem}, or give a table with a column stage_mm"
+            )
+
+
+def _count(numbers: np.ndarray) -> Counted | None:
+    """Return increasing numbers (N,) with their commonest step; None if others are no multiples of it, or for times.
+
+    The seconds and minutes of a time of day are below 60, which no count through a hundred is.
+    """
+    steps = np.diff(numbers)
+    if steps.min() <= 0:
+        return None
+    values, occurrences = np.unique(steps, return_counts=True)
+    step = int(values[np.argmax(occurrences)])
+    in_time = numbers[-1] >= 10 ** (_OF_CLOCK - 1) and numbers[-1] // 100 > numbers[0] // 100
+    if (steps % step).any() or (in_time and (numbers % 100 < 60).all()):
+        return None
+    return Counted(numbers, step)
+
+
+def name_gaps(names: Sequence[str], counted: Counted | None) -> list[str]:
+    """Return a warning about gaps in the numbers of images, if there are any."""
+    if counted is None or not (missing := np.diff(counted.places()) - 1).any():
+        return []
+    place = int(np.argmax(missing > 0))
+    between = f"between {PurePosixPath(names[place]).name} and {PurePosixPath(names[place + 1]).name}"
+    total = int(missing.sum())
+    return [f"{total} file{'s are' if total > 1 else ' is'} missing by the numbers in the names, first {between}"]
+
+
+def time_gaps(names: Sequence[str], times_s: np.ndarray) -> list[str]:
+    """Return a warning about a gap in the times (N,) of images that are otherwise regular, if there is any."""
+    steps = np.diff(times_s)
+    if len(steps) < _FEWEST_STEPS or not np.isfinite(steps).all() or not steps.min() > 0:
+        return []
+    usual = np.median(steps)
+    if np.mean(np.abs(steps - usual) > _REGULAR * usual) > _REGULAR or steps.max() < (2 - _REGULAR) * usual:
+        return []
+    place = int(np.argmax(steps))
+    after = f"after image {place + 1}, {PurePosixPath(names[place]).name}"
+    return [f"the times jump by {steps[place]:.4g} s {after}, usually by {usual:.4g} s: images may be missing"]
+
+
+def unwrap_counts(counts: ArrayLike, bits: int | None = None, *, returns: bool = False) -> np.ndarray:
+    """Return counts (N,) that continue where the counter passes the end of its range.
+
+    Counts are in the order of time. The width ``bits`` is by default that for which the steps at overflows are like the
+    others. ``returns``: the stage may return to measure the same positions again.
+
+    Raises DescriptionError if the counts exceed the counter, a jump may be an overflow of a counter of unknown width,
+    or the counter starts again.
+    """
+    counts = np.asarray(counts, np.float64)
+    steps, extent = np.diff(counts), np.ptp(counts) if len(counts) else 0.0
+    if bits is not None and extent >= 2.0**bits:
+        raise DescriptionError(f"the encoder counts over {extent:.0f}, more than its {bits} bits (encoder_bits)")
+    for width in _WIDTHS if bits is None else (bits,):
+        span = 2.0**width
+        over = np.abs(steps) > span / 2
+        if extent >= span or not over.any():
+            continue
+        continued = np.unwrap(counts, period=span)
+        others = np.abs(steps[~over]).max(initial=0)
+        if bits is None and not np.abs(np.diff(continued)[over]).max() <= _PLAIN * others:
+            place = int(np.argmax(over))
+            raise DescriptionError(
+                f"the encoder jumps from {counts[place]:.0f} to {counts[place + 1]:.0f}: give the width of its counter "
+                "(encoder_bits), such as 16 or 32"
+            )
+        counts, steps = continued, np.diff(continued)
+        break
+    if not returns:
+        _refuse_restart(counts, steps)
+    return counts
+
+
+def _refuse_restart(counts: np.ndarray, steps: np.ndarray) -> None:
+    """Raise DescriptionError for a jump against the motion that no other step comes near."""
+    against = steps * -np.sign(np.median(steps)) if len(steps) else steps
+    if (worst := against.max(initial=0)) > _PLAIN * max(-against.min(initial=0), 1):
+        place = int(np.argmax(against))
+        raise DescriptionError(
+            f"the encoder jumps back from {counts[place]:.0f} to {counts[place + 1]:.0f} after image {place + 1}, by "
+            f"{worst:.0f} counts: its counter started again, or the stage returned (repeated = true)"
+        )
