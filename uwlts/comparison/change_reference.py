@@ -28,7 +28,6 @@ _SAMPLES_PER_DISC = 60
 _MOST_SAMPLES = 3_000_000
 """Limit of memory for samples of a mesh."""
 _AT_A_TIME = 20_000  # places, to limit memory
-_IN_METRES = (".glb", ".gltf")
 
 Reference = PointCloud | IdealShape | str | os.PathLike[str]
 
@@ -99,12 +98,8 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
             cloud = load_cloud(path, unit=unit)
             return ReferencePoints(cloud.points_mm, None, cloud.uncertainty, cloud.frame, rounding_std_mm(cloud))
         else:
-            if path.suffix.lower() in _IN_METRES:
-                if unit == "mm":
-                    raise DescriptionError(f"{path} is in m, as glTF prescribes, but the unit mm was given: omit it")
-                scale = MM_PER_UNIT["m"]
-            mesh = load_triangles(path)
-            return sample_mesh(scale * np.asarray(mesh.vertices, float), np.asarray(mesh.faces), disc_mm=disc_mm)
+            mesh = load_triangles(path, unit=unit)
+            return sample_mesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), disc_mm=disc_mm)
     if not isinstance(reference, PointCloud):
         return reference
     if scale != 1.0 and reference.uncertainty is not None:

@@ -13,14 +13,16 @@ from uwlts.model.trajectory import Trajectory
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION, POLYNOMIALS_FORMAT, load_calibration
 from uwlts.storage.capture import FORMAT as CAPTURE, Capture
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import CLOUD_ENDINGS, is_cloud, read_cloud
+from uwlts.storage.cloud_files import CLOUD_ENDINGS, is_readable_cloud, read_cloud
 from uwlts.storage.hdf5_file import read_format
 from uwlts.storage.mesh_file import READ_FORMATS as MESH_FORMATS, SurfaceMesh, has_faces, read_mesh
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.number_tables import Unit
-from uwlts.storage.pose_files import PoseFormat, read_trajectory
+from uwlts.storage.pose_files import SAVED_FORMAT, PoseFormat, holds_trajectory, read_trajectory
 from uwlts.storage.truth import FORMAT as TRUTH, Truth, read_truth
 
+_TABLES = (".csv", ".txt", ".asc")
+"""Endings of text with a cloud or a trajectory."""
 _READABLE = (
     f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
     "calibrations, mounts, evaluations and acceptance tests (.json), trajectories (.csv, .tum, ROS bags)"
@@ -28,18 +30,14 @@ _READABLE = (
 
 
 def read(
-    path: str | Path,
-    *,
-    pose_format: PoseFormat = "quaternion-xyzw",
-    pose_unit: Unit | None = None,
-    unit: Unit | None = None,
+    path: str | Path, *, pose_format: PoseFormat = SAVED_FORMAT, pose_unit: Unit | None = None, unit: Unit | None = None
 ) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Acceptance | Trajectory:
     """Read a file of the program, whose content determines the type of the result.
 
     The result is an opened capture, a cloud, a mesh, ground truth, a calibration, a mount, the record of an evaluation,
-    an acceptance test, or a trajectory. A PLY file with faces is a mesh. The metadata of a capture's frames are read at
-    once, and images on demand: ``capture[12]`` is a `Frame`. A recording in progress can be opened by its name
-    ``NAME.part``. Close a capture, or use it as a context manager.
+    an acceptance test, or a trajectory. A PLY file with faces is a mesh, and text with times and rotations is a
+    trajectory. The metadata of a capture's frames are read at once, and images on demand: ``capture[12]`` is a `Frame`.
+    A recording in progress can be opened by its name ``NAME.part``. Close a capture, or use it as a context manager.
 
     Parameters
     ----------
@@ -86,11 +84,11 @@ def read(
         if found == ACCEPTANCE:
             return read_acceptance(path)
         raise CaptureError(f"{path} is JSON of the format {found!r}; this reads {_READABLE}")
-    if ending == ".csv":
+    if ending.lower() in _TABLES and (pose_format != SAVED_FORMAT or holds_trajectory(path)):
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
     if ending.lower() in MESH_FORMATS and (ending.lower() != ".ply" or has_faces(path)):
         return read_mesh(path, unit=unit)
-    if is_cloud(path):
+    if is_readable_cloud(path):
         return read_cloud(path, unit=unit)
     if ending == ".h5":
         found = read_format(path)

@@ -23,7 +23,6 @@ from uwlts.report.parameters import parameter_rows
 from uwlts.report.schema_check import digital_certificate_lines
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import is_readable_cloud, read_cloud
 from uwlts.storage.hdf5_file import read_format
 from uwlts.storage.mesh_file import SurfaceMesh
 from uwlts.storage.number_tables import Unit
@@ -63,8 +62,6 @@ def describe(path: str | Path, *, unit: Unit | None = None, schema: str | Path |
         lines = digital_certificate_lines(path, schema)
     elif endings[-2:] == [".truth", ".h5"] or (endings[-1] == ".h5" and read_format(path) == TRUTH):
         lines = truth_lines(*read_truth(path))
-    elif is_readable_cloud(path):
-        lines = cloud_lines(read_cloud(path, unit=unit))
     else:
         try:
             lines = _lines_of(read(path, unit=unit))
@@ -86,6 +83,8 @@ def _lines_of(found: object) -> list[str]:
             return evaluation_lines(found)
         case Mount():
             return mount_lines(found)
+        case PointCloud():
+            return cloud_lines(found)
         case Acceptance() | SurfaceMesh():
             return found.lines()
         case _:

@@ -35,8 +35,8 @@ from uwlts.storage.cloud import (
 from uwlts.storage.foreign_clouds import FORMATS, find_format, read_foreign, require_libraries, write_foreign
 from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_format, read_label, write_label
 from uwlts.storage.normal_std import compute_normal_std
-from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
-from uwlts.storage.ply import encode_ply, read_ply
+from uwlts.storage.number_tables import Unit, choose_scale, find_stated_unit
+from uwlts.storage.ply import encode_ply, read_comments, read_ply
 
 FORMAT = "uwlts-cloud"
 VERSION = 1  # of the file format
@@ -264,8 +264,10 @@ def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -
                 f"{path} is in {stated}, as its format prescribes, but the unit {unit} was given: omit it"
             )
         if Path(path).suffix.lower() == ".ply":
-            scale, step = MM_PER_UNIT[check_unit(unit or "mm")], find_float_step(cloud.points_mm)
-            cloud = note_step(replace(cloud, points_mm=scale * cloud.points_mm), scale * step)
+            named, doubts = ("mm", []) if own else find_stated_unit(read_comments(Path(path)))
+            scale, step = choose_scale(named, unit, Path(path), CaptureError), find_float_step(cloud.points_mm)
+            known = replace(cloud, points_mm=scale * cloud.points_mm, warnings=[*doubts, *cloud.warnings])
+            cloud = note_step(known, scale * step)
     log_warnings(path, cloud.warnings)
     return cloud
 
@@ -418,7 +420,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         if name not in known:
             return np.full(len(vertices), default, kind)
         values = vertices[known[name]]
-        if values.dtype.kind not in "iuf":
+        if values.dtype.kind not in "iuf" or values.ndim > 1:
             raise CaptureError(f"the property {known[name]} is a list; expected one number per point")
         return values.astype(kind)
 

@@ -12,7 +12,8 @@ import numpy as np
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import require_regular_file
 from uwlts.storage.cloud import FEW_ZEROS, PointCloud, find_float_step, make_foreign_cloud
-from uwlts.storage.las_file import load_library, shorten_error
+from uwlts.storage.las_file import describe_units, load_library, shorten_error
+from uwlts.storage.number_tables import Unit
 
 PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"
 """Extension for fields that the standard does not define: the prefix of their names, and its name as a URI."""
@@ -109,10 +110,11 @@ def _limits(named: Sequence[tuple[str, np.ndarray]], kind: type[int] | type[floa
     return {f"{label}{end}": kind(of(values)) for label, values in named for end, of in _LIMITS}
 
 
-def read_e57(path: Path) -> PointCloud:
-    """Read all points of a file, each scan at its pose; times are on the scanner's clock.
+def read_e57(path: Path, unit: Unit | None = None) -> PointCloud:
+    """Read all points of a file in m, each scan at its pose; times are on the scanner's clock.
 
-    Raises CaptureError if the file is damaged or has no scans; SetupError if pye57 is not installed.
+    Raises CaptureError if the file is damaged or has no scans, or states a coordinate system in another unit than m,
+    and ``unit`` is not given; SetupError if pye57 is not installed.
     """
     pye57 = load_library("pye57", "E57")
     require_regular_file(path, called="cloud")
@@ -124,12 +126,17 @@ def read_e57(path: Path) -> PointCloud:
                 for number in range(file.scan_count)
             ]
             headers = [file.get_header(number) for number in range(file.scan_count)]
+            system = file.root["coordinateMetadata"].value() if file.root.isDefined("coordinateMetadata") else ""
             total = sum(header.point_count for header in headers)
             origins = [header.translation if header.has_pose() else np.zeros(3) for header in headers]
     except (pye57.libe57.E57Exception, OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
         raise CaptureError(f"{path} is not a complete E57 file: {shorten_error(error)}") from error
     if not scans:
         raise CaptureError(f"{path} is an E57 file without scans")
+    if unit is None and (stated := describe_units(system)).metres != (1.0, 1.0, 1.0):
+        raise CaptureError(
+            f"{path} states a coordinate system in {stated.name}, but E57 prescribes m: give the unit m if it is right"
+        )
     placed = [np.column_stack([scan[f"cartesian{axis}"] for axis in "XYZ"]) for scan in scans]
     points = 1e3 * np.concatenate(placed)
     # Unmeasured points at 0 0 0 of their scan.

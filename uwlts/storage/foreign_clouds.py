@@ -1,4 +1,4 @@
-"""Clouds in formats of other programs and scanners: text, LAS, LAZ and E57; MCAP is only written."""
+"""Clouds in formats of other programs and scanners: text, LAS, LAZ, E57 and ROS bags."""
 
 import os
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from uwlts.files.writing import write_atomically
 from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
-from uwlts.storage.mcap_clouds import mcap_content
+from uwlts.storage.mcap_clouds import mcap_content, read_bag_cloud
 from uwlts.storage.number_tables import Unit, read_number_table
 from uwlts.storage.point_cloud2 import covariance_columns
 
@@ -133,12 +133,11 @@ def _write_e57(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> 
 
 FORMATS = {
     ".xyz": CloudFormat(_read_text, _write_text),
-    ".laz": CloudFormat(
-        lambda path, unit: read_las(path), _write_las, libraries=("laspy", "lazrs"), coloured=True, unit="m"
-    ),
-    ".e57": CloudFormat(lambda path, unit: read_e57(path), _write_e57, libraries=("pye57",), coloured=True, unit="m"),
-    ".las": CloudFormat(lambda path, unit: read_las(path), _write_las, libraries=("laspy",), coloured=True, unit="m"),
-    ".mcap": CloudFormat(None, _write_mcap, unit="m", ambiguous=True),
+    ".laz": CloudFormat(read_las, _write_las, libraries=("laspy", "lazrs"), coloured=True, unit="m"),
+    ".e57": CloudFormat(read_e57, _write_e57, libraries=("pye57",), coloured=True, unit="m"),
+    ".las": CloudFormat(read_las, _write_las, libraries=("laspy",), coloured=True, unit="m"),
+    ".mcap": CloudFormat(read_bag_cloud, _write_mcap, unit="m", ambiguous=True),
+    ".bag": CloudFormat(read_bag_cloud, unit="m", ambiguous=True),
     ".txt": CloudFormat(_read_text, ambiguous=True),
     ".csv": CloudFormat(_read_text, ambiguous=True),
     ".asc": CloudFormat(_read_text, ambiguous=True),

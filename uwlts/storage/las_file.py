@@ -1,7 +1,9 @@
-"""LAS and LAZ for other programs: points in m, in steps of 0.1 um, with extra fields."""
+"""LAS and LAZ for other programs: points in m, in steps of 0.1 um, with extra fields; units of coordinate systems."""
 
 import os
+import re
 import struct
+from dataclasses import dataclass, replace
 from io import BufferedReader, BytesIO
 from pathlib import Path
 from types import ModuleType
@@ -13,6 +15,7 @@ from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import open_regular
 from uwlts.runtime.optional_library import optional_library
 from uwlts.storage.cloud import PointCloud, make_foreign_cloud
+from uwlts.storage.number_tables import Unit
 
 LAZ_STEP_M = 1e-7
 """Resolution of coordinates in LAZ, integers relative to the middle of the cloud: up to 214 m to either side."""
@@ -26,6 +29,8 @@ _BOX_MARGIN = 1e-3
 _LONGEST_HEADER = 375  # bytes (LAS 1.4, table 3)
 _RECORD_BYTES = 54
 """Smallest size of a variable length record in bytes: its header (LAS 1.4, 2.5)."""
+_LONGEST_SYSTEM = 2**20  # bytes
+_WKT = re.compile(rb"(?:COMPD_CS|COMPOUNDCRS|PROJCS|PROJCRS|GEOGCS|GEOGCRS|LOCAL_CS)\[[^\0]*")
 _COMPRESSED = 0x80  # bit of the point format
 _POINT_BYTES = {0: (20, 0), 1: (28, 0), 2: (26, 0), 3: (34, 0), 6: (30, 9), 7: (36, 10), 8: (38, 11)}
 """Bytes of a point (LAS 1.4, 2.6) and compressed layers of a chunk by point format; each extra byte is one more."""
@@ -43,6 +48,60 @@ _ITEMS_OF_FORMAT = {
 """Types and bytes of the compressed items of a point by point format, before those of extra bytes (LASzip)."""
 _LARGEST_RATIO = 10_000
 """Largest number of points in a byte; equal points have 600. Higher ones are damage, and exhaust the memory."""
+_UNIT = re.compile(r'UNIT\s*\[\s*"(?!deg|rad|grad|gon|arc|unity)([^"]*)"\s*,\s*([-+.0-9eE]+)', re.IGNORECASE)
+_VERTICAL = re.compile(r"VERT_CS|VERTCRS|VERTICALCRS")
+_PLANE, _ANGULAR = re.compile(r"PROJ|LOCAL_CS|ENG"), re.compile(r"GEOG|GEOD|GEODETICCRS")
+_MODEL, _SYSTEM, _LINEAR, _VERTICAL_UNIT = 1024, 3072, 3076, 4099
+"""Keys of GeoTIFF: type of model (2: degrees), projected system, its unit, and that of heights (OGC 19-008)."""
+_DEGREES = 2
+_OF_CODE = {9001: ("m", 1.0), 9002: ("foot", 0.3048), 9003: ("US survey foot", 1200 / 3937)}
+_UTM = (258, 269, 322, 326, 327)
+"""Codes of the EPSG register in hundreds, with metres."""
+
+
+@dataclass(frozen=True)
+class SystemUnits:
+    """Units of x, y and z in m, None for degrees and unknown ones; their name if stated; and notes for the user."""
+
+    metres: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
+    name: str = ""
+    notes: tuple[str, ...] = ()
+
+    def require(self, path: Path, unit: Unit | None) -> tuple[float, float, float]:
+        """Return the units in m; raises CaptureError if they are unknown, or not ``unit``."""
+        if self.metres is None:
+            raise CaptureError(f"{path} has coordinates in {self.name}: convert it to a coordinate system in m first")
+        if unit is not None and self.notes and self.name:
+            raise CaptureError(f"{path} states the unit {self.name}, but the unit {unit} was given: omit it")
+        return self.metres
+
+
+def describe_units(wkt: str = "", keys: dict[int, int] | None = None) -> SystemUnits:
+    """Return the units of a coordinate system; heights have that of x and y if they state none."""
+    keys = keys or {}
+    plane, *heights = _VERTICAL.split(wkt)
+    if (_ANGULAR.search(plane) and not _PLANE.search(plane)) or (not wkt and keys.get(_MODEL) == _DEGREES):
+        return SystemUnits(None, "degrees")
+    # The unit of a system follows those of what it is based on.
+    found = [units[-1] for part in (plane, *heights[:1]) if (units := _UNIT.findall(part))]
+    stated = [(name, float(factor)) for name, factor in found]
+    if not wkt:
+        codes = [code for key in (_LINEAR, _VERTICAL_UNIT) if (code := keys.get(key))]
+        if unknown := [code for code in codes if code not in _OF_CODE]:
+            return SystemUnits(None, f"the unit EPSG:{unknown[0]}")
+        stated = [_OF_CODE[code] for code in codes]
+        if _LINEAR not in keys and _SYSTEM in keys and keys[_SYSTEM] // 100 not in _UTM:
+            return SystemUnits(
+                notes=(f"its coordinate system EPSG:{keys[_SYSTEM]} is taken as one in m: is it in feet?",)
+            )
+    if not stated:
+        return SystemUnits()
+    (name, across), (high, height) = stated[0], stated[-1]
+    if {across, height} == {1.0}:
+        return SystemUnits(name=name)
+    names = name if name == high else f"{name}, heights in {high}"
+    note = f"its coordinates are in {names}, as its coordinate system states ({across:.7g} m), and read as such"
+    return SystemUnits((across, across, height), name, (note,))
 
 
 def encode_las(
@@ -94,8 +153,12 @@ def _las_middle(low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
     return middle
 
 
-def read_las(path: Path) -> PointCloud:
-    """Read all points of a LAS or LAZ file; raises CaptureError if it is damaged, SetupError without laspy or lazrs."""
+def read_las(path: Path, unit: Unit | None = None) -> PointCloud:
+    """Read all points of a LAS or LAZ file, in the unit that its coordinate system states, by default m.
+
+    Raises CaptureError if the file is damaged, states another unit than ``unit``, or is in degrees; SetupError without
+    laspy or lazrs.
+    """
     form = path.suffix.strip(".").upper()
     laspy = load_library("laspy", form)
     if form == "LAZ":
@@ -109,8 +172,10 @@ def read_las(path: Path) -> PointCloud:
                 if header.are_points_compressed:
                     _require_sound_items(header)
                 found = reader.read_points(header.point_count)
-        points, step = 1e3 * np.column_stack([found.x, found.y, found.z]), 1e3 * float(np.max(header.scales))
-        _require_in_box(points, header)
+            file.seek(header.start_of_first_evlr)
+            system = describe_units(*_system(header, file.read(_LONGEST_SYSTEM) if header.number_of_evlrs else b""))
+        points = np.column_stack([found.x, found.y, found.z])
+        _require_in_box(1e3 * points, header)
         names = set(found.point_format.dimension_names)
         column = {name: np.asarray(found[name]) for name in names & {"frame", "line", "deviation_mm", "gps_time"}}
         intensity = np.asarray(found["amplitude" if "amplitude" in names else "intensity"], np.float32)
@@ -123,15 +188,26 @@ def read_las(path: Path) -> PointCloud:
     if np.isnan(column.get("deviation_mm", np.nan)).all():
         column.pop("deviation_mm", None)
     times = column.pop("gps_time", None)
+    scale_mm = 1e3 * np.array(system.require(path, unit))
     # Programs write 0 if times are unknown.
-    return make_foreign_cloud(
-        points,
+    cloud = make_foreign_cloud(
+        scale_mm * points,
         intensity=intensity,
         time_s=None if times is None or not times.any() else times,
         omitted=omitted,
-        step_mm=step,
+        step_mm=float(np.max(scale_mm * header.scales)),
         **column,
     )
+    return replace(cloud, warnings=[*system.notes, *cloud.warnings])
+
+
+def _system(header: Any, behind: bytes) -> tuple[str, dict[int, int]]:
+    """Return the coordinate system as WKT, also from the records ``behind`` the points, and as keys of GeoTIFF."""
+    texts = [record.string for record in header.vlrs.get("WktCoordinateSystemVlr")]
+    if match := _WKT.search(behind):
+        texts.append(match[0].decode("latin-1"))
+    directories = header.vlrs.get("GeoKeyDirectoryVlr")
+    return "".join(texts[:1]), {key.id: key.value_offset for each in directories for key in each.geo_keys}
 
 
 def _require_sound_points(file: BufferedReader) -> None:

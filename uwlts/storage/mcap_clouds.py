@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from io import BytesIO
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from uwlts.errors import OutputError
+from uwlts.errors import CaptureError, OutputError
+from uwlts.files.reading import require_regular_file
 from uwlts.runtime.optional_library import optional_library
-from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
+from uwlts.storage.number_tables import Unit
 from uwlts.storage.point_cloud2 import (
     FRAME_ID,
     NANOSECONDS,
@@ -19,6 +22,7 @@ from uwlts.storage.point_cloud2 import (
     covariance_columns,
     pack_points,
     point_cloud2,
+    unpack_points,
 )
 
 TOPIC = "/points"
@@ -63,6 +67,32 @@ def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
     _, first = np.unique(cloud.time_s[order], return_index=True)
     for rows in np.split(order, first[1:]):
         yield round(float(cloud.time_s[rows[0]]) * NANOSECONDS), rows
+
+
+def read_bag_cloud(path: Path, unit: Unit | None = None) -> PointCloud:
+    """Read the points of all messages PointCloud2 of a recording of ROS 1 or 2, in m, without moving them.
+
+    Raises CaptureError if the file is damaged, or has no such message; SetupError if the library is not installed.
+    """
+    highlevel, typesys = _library("rosbags.highlevel"), _library("rosbags.typesys")
+    require_regular_file(path, called="cloud")
+    try:
+        with highlevel.AnyReader([path], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)) as bag:
+            chosen = [connection for connection in bag.connections if connection.msgtype == _POINT_CLOUD2]
+            messages = (bag.deserialize(data, _POINT_CLOUD2) for _, _, data in bag.messages(connections=chosen))
+            parts = [unpack_points(message) for message in messages] if chosen else []
+            points = np.concatenate([np.column_stack([part[axis] for axis in "xyz"]) for part in parts])
+            columns: dict[str, Any] = {
+                name: np.concatenate([part[name] for part in parts])
+                for name in ("intensity", "frame", "line", "time")
+                if all(name in (part.dtype.names or ()) for part in parts)
+            }
+    except Exception as error:
+        # The library raises errors of file formats, compression, SQLite and the operating system.
+        raise CaptureError(f"{path} is no recording with messages PointCloud2, or damaged: {error}") from error
+    times = columns.pop("time", None)
+    step_mm = 1e3 * find_float_step(points)
+    return make_foreign_cloud(1e3 * points.astype(float), time_s=times, step_mm=step_mm, **columns)
 
 
 def bag_types(store: Any) -> MessageTypes:

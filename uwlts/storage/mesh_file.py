@@ -13,20 +13,25 @@ import numpy as np
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import open_regular, require_regular_file
+from uwlts.files.reading import log_warnings, open_regular, require_regular_file
 from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
-from uwlts.storage.number_tables import MM_PER_UNIT, Unit, check_unit
-from uwlts.storage.ply import encode_ply, open_ply, read_ply
+from uwlts.storage.number_tables import Unit, choose_scale, find_stated_unit
+from uwlts.storage.ply import encode_ply, read_comments, read_ply
 
 if TYPE_CHECKING:
     import trimesh
 
 MESH_FORMATS = (".stl", ".ply", ".glb")
-READ_FORMATS = (".ply", ".stl", ".obj")
+READ_FORMATS = (".ply", ".stl", ".obj", ".glb")
 """Endings of the meshes that can be read."""
 
+_Y_UP = (".glb", ".gltf")
+_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""Rotation from glTF's axes, whose y axis points up."""
+_LONGEST_START = 2**16
+"""Bytes in which comments are looked for."""
 _FARTHEST = 1e10
 """Largest coordinate in the file's unit: in mm the circumference of the Earth is 4e10; larger ones are damage."""
 _FARTHEST_SINGLE_MM = 16_000.0
@@ -125,21 +130,24 @@ def has_faces(path: Path) -> bool:
     return header.startswith(b"ply") and found is not None
 
 
-def load_triangles(path: Path) -> trimesh.Trimesh:
-    """Load the triangles of a mesh in any format of trimesh, with vertices (V, 3) and faces (F, 3) as in the file.
+def load_triangles(path: Path, *, unit: Unit | None = None) -> trimesh.Trimesh:
+    """Load the triangles of a mesh in any format of trimesh, in mm and with z up.
 
-    Raises CaptureError if the file is missing, damaged or without triangles, or vertices are not finite.
+    The unit is that which the format prescribes or a comment states, else ``unit``, by default mm. Raises CaptureError
+    if the file is missing, damaged or without triangles, vertices are not finite, or the unit is not ``unit``.
     """
     import trimesh
 
     require_regular_file(path, called="mesh")
     ending = path.suffix.lower()
-    source = open_ply(path, called="mesh") if ending == ".ply" else str(path)
-    try:
-        loaded: Any = trimesh.load(source, file_type=ending[1:], force="mesh", process=False)
-    except Exception as error:
-        # trimesh passes on all exceptions of its parsers.
-        raise CaptureError(f"{path} is not a complete mesh (such as .stl, .obj, .off or .ply): {error}") from error
+    if ending == ".ply":
+        loaded: Any = trimesh.Trimesh(*_ply_triangles(path), process=False)
+    else:
+        try:
+            loaded = trimesh.load(str(path), force="mesh", process=False, skip_materials=True)
+        except Exception as error:
+            # trimesh passes on all exceptions of its parsers.
+            raise CaptureError(f"{path} is not a complete mesh (such as .stl, .obj, .off or .ply): {error}") from error
     vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise CaptureError(f"{path} is not a complete mesh: expected vertices and triangles of three numbers each")
@@ -150,24 +158,57 @@ def load_triangles(path: Path) -> trimesh.Trimesh:
             f"{path} has {len(vertices)} vertices, and triangles of the vertices {faces.min()} to {faces.max()}: the "
             "file is damaged or incomplete"
         )
+    stated, doubts = _stated_unit(path, loaded.units)
+    log_warnings(path, doubts)
+    if (scale := choose_scale(stated, unit, path, CaptureError)) != 1 or ending in _Y_UP:
+        loaded.vertices = scale * vertices @ (_TO_Z_UP if ending in _Y_UP else np.eye(3)).T
     return loaded
 
 
+def _stated_unit(path: Path, known: str | None) -> tuple[str, list[str]]:
+    """Return the unit that a mesh's format or comments state, empty without, and doubts; ``known`` is trimesh's."""
+    match path.suffix.lower():
+        case ".glb" | ".gltf":
+            return "m", []
+        case ".ply":
+            return find_stated_unit(read_comments(path))
+    with open_regular(path, called="mesh") as file:
+        start = file.read(_LONGEST_START).decode("latin-1")
+    comments = [line for line in start.splitlines() if line.startswith("#")]
+    # Programs write such entries into the first 80 bytes of STL.
+    comments += re.split("[;,\0]", start[:80]) if path.suffix.lower() == ".stl" else []
+    return find_stated_unit([*comments, f"unit: {known}"])
+
+
+def _ply_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read the vertices (V, 3) and triangles (F, 3) of a PLY file; polygons become fans."""
+    vertices, faces = (read_ply(path, element, called="mesh")[0] for element in ("vertex", "face"))
+    if vertices is None or faces is None or not {"x", "y", "z"} <= {*(vertices.dtype.names or ())}:
+        raise CaptureError(f"{path} is not a complete mesh: expected vertices with x, y and z, and faces")
+    lists = [faces[name] for name in ("vertex_indices", "vertex_index") if name in (faces.dtype.names or ())]
+    polygons = lists[0] if lists else np.empty((0, 3))
+    sizes = {polygons.shape[1]} if polygons.ndim == 2 else {len(each) for each in polygons}
+    triangles = [np.empty((0, 3), np.int64)]
+    for size in sizes - {0, 1, 2}:
+        chosen = polygons if polygons.ndim == 2 else np.stack([each for each in polygons if len(each) == size])
+        triangles += [chosen[:, [0, corner, corner + 1]].astype(np.int64) for corner in range(1, size - 1)]
+    return np.column_stack([np.asarray(vertices[axis], float) for axis in "xyz"]), np.concatenate(triangles)
+
+
 def read_mesh(path: str | Path, *, unit: Unit | None = None) -> SurfaceMesh:
-    """Read a mesh from PLY, STL or OBJ in mm or ``unit``.
+    """Read a mesh from PLY, STL, OBJ or binary glTF, in mm and with z up (`load_triangles`).
 
     The standard uncertainties are those of a PLY file written by `SurfaceMesh.save`, otherwise 0. Normals that are not
     in the file are averages over the adjacent triangles.
 
-    Raises CaptureError if the file is missing, damaged or without triangles, or vertices are not finite.
+    Raises CaptureError like `load_triangles`.
     """
     path = Path(path)
-    loaded = load_triangles(path)
+    loaded = load_triangles(path, unit=unit)
     if path.suffix.lower() == ".stl":
         # STL repeats each vertex for every triangle.
         loaded.merge_vertices()
-    scale, faces = MM_PER_UNIT[check_unit(unit or "mm")], np.asarray(loaded.faces, np.int64)
-    vertices = scale * np.asarray(loaded.vertices, float)
+    vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64)
     known = read_ply(path, "vertex", called="mesh")[0] if path.suffix.lower() == ".ply" else None
     known = np.empty(len(vertices), []) if known is None else known
     names = known.dtype.names or ()
@@ -175,7 +216,7 @@ def read_mesh(path: str | Path, *, unit: Unit | None = None) -> SurfaceMesh:
     if {"nx", "ny", "nz"} <= set(names):
         normals = np.column_stack([known[name] for name in ("nx", "ny", "nz")]).astype(float)
     noise, shared = (
-        scale * known[name].astype(float) if name in names else np.zeros(len(vertices))
+        known[name].astype(float) if name in names else np.zeros(len(vertices))
         for name in ("uncertainty_noise", "uncertainty_shared")
     )
     return SurfaceMesh(vertices, normals, faces, noise, shared)
@@ -210,7 +251,7 @@ def _glb(mesh: SurfaceMesh) -> bytes:
     local = trimesh.Trimesh(1e-3 * mesh.vertices_mm - middle, mesh.faces, vertex_normals=mesh.normals, process=False)
     local.vertex_attributes["_uncertainty"] = mesh.std_mm.astype(np.float32)
     place = np.eye(4)
-    place[:3, 3] = middle
+    place[:3] = np.column_stack([_TO_Z_UP.T, _TO_Z_UP.T @ middle])
     scene = trimesh.Scene()
     scene.add_geometry(local, transform=place)
     content: Any = scene.export(file_type="glb", include_normals=True)

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
-from uwlts.errors import DescriptionError
+from uwlts.errors import DescriptionError, Error
 from uwlts.files.reading import read_bytes, shorten
 from uwlts.files.writing import hash_file
 from uwlts.storage.gocator_csv import is_gocator_csv, read_gocator_csv
@@ -56,7 +56,9 @@ _DECIMAL_COMMA = re.compile(rb"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?")
 _UNIT_IN_COMMENT = re.compile(
     r"\b(?:in|units?)\b[\s:=;,]*(?:the |are |is )?[\[(]?(m|cm|um|µm|in|inch(?:es)?|ft|feet|(?:centi)?met(?:re|er)s?)\b"
 )
-_STATED_UNIT = re.compile(r"\W*(?:length[\s_]*)?units?[\s:=;,]+[\[(\"']*([a-zµμ]+)\W*")
+_STATED_UNIT = re.compile(
+    r"\W*(?:(?:length|file|model|scene|linear|system)[\s_]*)?units?[\s:=;,]+[\[(\"']*([a-zµμ]+)\W*"
+)
 _NUMBER = re.compile(rb"[+-]?\d*(?:[.,](\d*))?")
 _FIRST, _FEWEST = 200, 10
 """Number of rows whose decimals are counted, and fewest rows that show them."""
@@ -92,11 +94,29 @@ class NumberTable:
         in_names = next(iter(found), "") or self.length_unit
         if self.length_unit not in ("", in_names):
             raise DescriptionError(f"{self.path} names columns in {in_names}, and states the unit {self.length_unit}")
-        if unit is not None and in_names and _LENGTHS[in_names] != MM_PER_UNIT[check_unit(unit)]:
-            raise DescriptionError(
-                f"{self.path} states {in_names}, but the unit {unit} was given: leave the unit out, or correct the file"
-            )
-        return _LENGTHS[in_names] if in_names else MM_PER_UNIT[check_unit(unit or "mm")]
+        return choose_scale(in_names, unit, self.path)
+
+
+def choose_scale(stated: str, unit: Unit | None, path: Path, error: type[Error] = DescriptionError) -> float:
+    """Return the unit of length that a file states in mm, else ``unit``, by default 1.
+
+    Raises ``error`` if both are given and differ.
+    """
+    if unit is not None and stated and _LENGTHS[stated] != MM_PER_UNIT[check_unit(unit)]:
+        raise error(f"{path} states {stated}, but the unit {unit} was given: leave the unit out, or correct the file")
+    return _LENGTHS[stated] if stated else MM_PER_UNIT[check_unit(unit or "mm")]
+
+
+def find_stated_unit(texts: Iterable[str]) -> tuple[str, list[str]]:
+    """Return the unit of length that comments state, as "unit: m", else an empty text and doubts about other words."""
+    texts = [*texts]
+    matches = (_STATED_UNIT.fullmatch(text.lower()) for text in texts)
+    lengths = {_plain_unit(match[1]) for match in matches if match} & _LENGTHS.keys()
+    if len(lengths) == 1:
+        return lengths.pop(), []
+    said = [text for text in texts if _UNIT_IN_COMMENT.search(text.lower())]
+    doubt = "a comment may state another unit than that of the coordinates"
+    return "", [f"{doubt}: {shorten(said[0], 100)}"] if said else []
 
 
 def check_unit(unit: Unit) -> Unit:
@@ -177,15 +197,11 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
         notes.append(
             f"lines before the names of columns are omitted ({len(block)}): {shorten(_text(block[0]), 60)} ..."
         )
-    texts = [*map(_text, [*block, *comments[:1000]])]
-    matches = (_STATED_UNIT.fullmatch(text.lower()) for text in texts)
-    lengths = {unit for match in matches if match and (unit := _plain_unit(match[1])) in _LENGTHS}
-    said = [text for text in texts if _UNIT_IN_COMMENT.search(text.lower())]
-    if said and not units.keys() & set("xyz") and len(lengths) != 1:
-        notes.append(f"a comment may state another unit than that of the coordinates: {shorten(said[0], 100)}")
+    stated, doubts = find_stated_unit(map(_text, [*block, *comments[:1000]]))
+    notes += doubts if not units.keys() & set("xyz") else []
     decimals = [_decimals(row) for row in zip(*(_cells(line, delimiter) for line in lines[:_FIRST]), strict=False)]
     steps = {name: 10.0**-count for name, count in zip(names, decimals, strict=False) if count is not None}
-    return NumberTable(path, columns, units, steps, notes, lengths.pop() if len(lengths) == 1 else "")
+    return NumberTable(path, columns, units, steps, notes, stated)
 
 
 def _parse(body: bytes, names: list[str], delimiter: bytes, comma: bool, path: Path) -> dict[str, np.ndarray]:

@@ -4,7 +4,6 @@ import os
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -41,14 +40,13 @@ class _Header:
     elements: dict[str, tuple[int, list[_Property]]]
     comments: list[str]
     size: int
-    is_ascii: bool
 
 
 def read_ply(path: Path, element: str, *, called: str) -> tuple[np.ndarray | None, list[str]]:
     """Read an element's table (N,) with the properties as fields, None without the element, and the comments.
 
-    Lists are fields of objects, without values. Numbers in binary files without lists are read from the disk on use.
-    The whole file is examined, also after the element.
+    A list has one number in each column (N, K), or is an array of each object if lengths differ. Numbers in binary
+    files without such objects are read from the disk on use. The whole file is examined, also after the element.
 
     Raises CaptureError if the file is missing, damaged or truncated.
     """
@@ -66,16 +64,9 @@ def read_ply(path: Path, element: str, *, called: str) -> tuple[np.ndarray | Non
     return found, header.comments
 
 
-def open_ply(path: Path, *, called: str) -> str | BytesIO:
-    """Return the path of a PLY file or, if its comments are not in ASCII, its content with these bytes replaced.
-
-    Raises CaptureError if the header is damaged, or the file is shorter than its header declares.
-    """
-    header = _read_header(path, called=called)
-    if header.is_ascii:
-        return str(path)
-    content = path.read_bytes()
-    return BytesIO(content[: header.size].translate(_IN_ASCII) + content[header.size :])
+def read_comments(path: Path) -> list[str]:
+    """Read the comments of a PLY file; CaptureError if its header is damaged."""
+    return _read_header(path, called="cloud").comments
 
 
 def encode_ply(
@@ -119,9 +110,9 @@ def _read_header(path: Path, *, called: str) -> _Header:
     count, properties = 0, []
     for line in text.translate(_IN_ASCII).decode("ascii").splitlines()[1:]:
         match line.split():
-            case ["comment", *_]:
-                comments.append(line.strip().removeprefix("comment").strip())
-            case ["obj_info", *_] | []:
+            case ["comment" | "obj_info" as kind, *_]:
+                comments.append(line.strip().removeprefix(kind).strip())
+            case []:
                 pass
             case ["format", name, "1.0"] if name in _ORDERS and not order:
                 order = name
@@ -153,7 +144,7 @@ def _read_header(path: Path, *, called: str) -> _Header:
             f"early end-of-file, its header declares at least {least:,} bytes of values, and the file has {size:,}",
         )
     used = len(text) + len(end) + len(newline)
-    return _Header(order == "ascii", _ORDERS[order], elements, comments, used, text.isascii())
+    return _Header(order == "ascii", _ORDERS[order], elements, comments, used)
 
 
 def _table_type(properties: Sequence[_Property], order: str) -> np.dtype:
@@ -165,22 +156,21 @@ def _parse_lines(lines: Sequence[bytes], properties: Sequence[_Property], count:
     if len(lines) < count and properties:
         raise _fault(path, f"early end-of-file, {len(lines):,} of {count:,} lines of an element are there")
     table = np.empty(count if properties else 0, _table_type(properties, "="))
-    columns: list[list[bytes]] = [[] for _ in properties]
+    columns: list[list[Any]] = [[] for _ in properties]
     for number, line in enumerate(lines if properties else ()):
         words, place = line.split(), 0
         for one, column in zip(properties, columns, strict=True):
             word = words[place] if place < len(words) else b""
-            if one.length is None:
-                column.append(word)
-                place += 1
-            else:
-                place += 1 + int(word) if word.isdigit() and len(word) < 10 else len(words) + 1
+            length = int(word) if word.isdigit() and len(word) < 10 else len(words)
+            column.append(word if one.length is None else words[place + 1 : place + 1 + length])
+            place += 1 if one.length is None else 1 + length
         if place != len(words):
             raise _fault(path, f"line {number + 1} of an element has {len(words)} values; its header declares others")
     for one, column in zip(properties, columns, strict=True):
-        if one.length is not None:
-            continue
         try:
+            if one.length is not None:
+                table[one.name] = _objects([np.array(each, float) for each in column])
+                continue
             values = np.array([float(word) for word in column])
         except ValueError as error:
             raise _fault(path, f"{one.name}: {error}") from error
@@ -208,11 +198,7 @@ def _parse_bytes(
         rows = content[:used].view(row)
         (listed,) = (one for one in properties if one.length)
         if (rows[f"{listed.name} length"] == row[listed.name].shape[0]).all():
-            table = np.empty(count, kind)
-            for one in properties:
-                if one is not listed:
-                    table[one.name] = rows[one.name]
-            return table, used
+            return rows[[one.name for one in properties]], used
     table, place, view = np.empty(count, kind), 0, content.data
     sizes = {code: np.dtype(code).itemsize for code in _NAMES}
     formats = {code: order + np.dtype(code).char for code in _NAMES}
@@ -227,8 +213,10 @@ def _parse_bytes(
                 elif not 0 <= value <= len(content):
                     raise _fault(path, f"a list {one.name} has the length {value}")
                 else:
-                    place += int(value) * sizes[one.kind]
-    except struct.error as error:
+                    end = place + int(value) * sizes[one.kind]
+                    table[one.name][number] = np.frombuffer(view[place:end], order + one.kind)
+                    place = end
+    except (struct.error, ValueError) as error:
         raise _fault(path, "early end-of-file within an element with lists") from error
     if place > len(content):
         raise _fault(path, "early end-of-file within an element with lists")
@@ -255,3 +243,11 @@ def _row_type(content: np.ndarray, properties: Sequence[_Property], order: str) 
         else:
             fields.append((one.name, order + one.kind))
     return np.dtype(fields)
+
+
+def _objects(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Return arrays of any lengths as an array (N,) of objects."""
+    found = np.empty(len(arrays), object)
+    for number, each in enumerate(arrays):
+        found[number] = each
+    return found

@@ -15,8 +15,9 @@ from uwlts.storage.cloud import PAIRS, PointCloud
 FRAME_ID = "base"
 """Frame of the points, if no other is given."""
 NANOSECONDS = 10**9  # of a second
-_DATATYPES = {"<i4": 5, "<f4": 7, "<f8": 8}
-"""Constants INT32, FLOAT32 and FLOAT64 of sensor_msgs/PointField."""
+_KINDS = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), start=1))
+"""Types of numbers by the constants of sensor_msgs/PointField."""
+_DATATYPES = {kind: constant for constant, kind in _KINDS.items()}
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def packed_layout(table: np.ndarray) -> dict[str, tuple[np.dtype, int]]:
 def point_cloud2(table: np.ndarray, types: MessageTypes, *, time_ns: int, frame_id: str) -> Any:
     """Return the message of packed rows (`pack_points`): one unordered row of points, all of them finite."""
     fields = [
-        types.point_field(name=name, offset=int(offset), datatype=_DATATYPES[kind.str], count=1)
+        types.point_field(name=name, offset=int(offset), datatype=_DATATYPES[kind.str[1:]], count=1)
         for name, (kind, offset) in packed_layout(table).items()
     ]
     stamp = types.time(sec=time_ns // NANOSECONDS, nanosec=time_ns % NANOSECONDS)
@@ -88,3 +89,18 @@ def point_cloud2(table: np.ndarray, types: MessageTypes, *, time_ns: int, frame_
         data=types.pack(table.tobytes()),
         is_dense=True,
     )
+
+
+def unpack_points(message: Any) -> np.ndarray:
+    """Return the points of a message as rows (N,) with its fields."""
+    order = ">" if message.is_bigendian else "<"
+    fields = [field for field in message.fields if field.count == 1]
+    layout: Any = {
+        "names": [field.name for field in fields],
+        "formats": [order + _KINDS[field.datatype] for field in fields],
+        "offsets": [field.offset for field in fields],
+        "itemsize": message.point_step,
+    }
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.row_step)
+    packed = np.ascontiguousarray(rows[:, : message.width * message.point_step])
+    return packed.view(np.dtype(layout)).ravel()

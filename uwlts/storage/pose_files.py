@@ -19,6 +19,8 @@ from uwlts.storage.ros_bags import read_bag_poses
 PoseFormat = str
 """matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg, angle-rad,
 abb, kuka, ur."""
+SAVED_FORMAT = "quaternion-xyzw"
+"""Format of `Trajectory.save`."""
 FARTHEST_MM = 1e7
 """Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
 
@@ -174,6 +176,15 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
             f"{path} has times up to {times.max():.9g}: expected s, or a unit in the name, such as 'time [ns]'"
         )
     return _trajectory(path, times, poses, covariance)
+
+
+def holds_trajectory(path: Path) -> bool:
+    """Return whether a table has times and rotations of poses, rather than the points of a cloud."""
+    columns = read_number_table(path, named=False).columns
+    others = [values for name, values in columns.items() if name not in ("time_s", "x", "y", "z")]
+    unit = len(others) == 4 and np.abs(np.square(others).sum(axis=0) - 1).max() < _ROUNDED
+    rotates = not columns.keys().isdisjoint(ROTATION_NAMES) or unit
+    return "time_s" in columns and bool(rotates or not {"x", "y", "z"} <= columns.keys())
 
 
 def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False) -> None:

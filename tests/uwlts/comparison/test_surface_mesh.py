@@ -165,7 +165,9 @@ def test_files_hold_the_mesh(tmp_path, monkeypatch):
     scene = trimesh.load("mesh.glb")
     (geometry,) = scene.geometry.values()
     placed = scene.to_geometry().vertices
-    np.testing.assert_allclose(1e3 * placed, vertices, atol=1e-4)
+    # glTF has y up: z of the cloud.
+    np.testing.assert_allclose(1e3 * placed @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]], vertices, atol=1e-4)
+    np.testing.assert_allclose(uwlts.read("mesh.glb").vertices_mm, vertices, atol=1e-4)
     assert len(geometry.vertex_attributes["_uncertainty"]) == len(vertices)
     with pytest.raises(OutputError, match=r"mesh.obj ends with none of"):
         app(["mesh", "scan.ply", "--out", "mesh.obj"], result_action="return_value")

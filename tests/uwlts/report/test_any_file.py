@@ -8,10 +8,11 @@ import pytest
 import trimesh
 
 import uwlts
-from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.errors import CaptureError, OutputError
 from uwlts.evaluation.evaluate import EvaluationRecord
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.nominal import nominal_calibration
+from uwlts.report.inventory import describe
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.mesh_file import SurfaceMesh
 
@@ -93,10 +94,10 @@ def test_a_saved_evaluation_is_read_as_its_record(tmp_path: Path):
 
 def test_an_unreadable_file_is_refused_with_the_readable_formats(tmp_path: Path):
     (tmp_path / "a.json").write_text('{"format": "uwlts-unknown", "version": 1}')
-    (tmp_path / "a.txt").write_text("words")
+    (tmp_path / "a.doc").write_text("words")
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.attrs["format"] = np.bytes_("another")
-    for name, found in (("a.json", "uwlts-unknown"), ("a.txt", ".txt"), ("a.h5", "another")):
+    for name, found in (("a.json", "uwlts-unknown"), ("a.doc", ".doc"), ("a.h5", "another")):
         with pytest.raises(
             CaptureError,
             match=f"{found}.*this reads captures and ground truth .* meshes .* evaluations .* trajectories",
@@ -105,8 +106,26 @@ def test_an_unreadable_file_is_refused_with_the_readable_formats(tmp_path: Path)
     with pytest.raises(CaptureError, match=r"missing\.h5"):
         uwlts.read(tmp_path / "missing.h5")
     (tmp_path / "a.csv").write_text("x,y\n1,2\n")
-    with pytest.raises(DescriptionError):
+    with pytest.raises(CaptureError, match="expected x, y and z"):
         uwlts.read(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("ending", [".csv", ".txt", ".asc", ".xyz", ".mcap", ".laz"])
+def test_the_commands_and_python_read_the_same_clouds(tmp_path: Path, ending: str):
+    path = tmp_path / f"a{ending}"
+    if ending in (".xyz", ".mcap", ".laz"):
+        cloud_of(7).save(path)
+    else:
+        path.write_text("x,y,z,time\n" + "".join(f"{n},0,1,{n}\n" for n in range(7)))
+    assert isinstance(uwlts.read(path), PointCloud) and describe(path).startswith("cloud of 7 points")
+
+
+@pytest.mark.parametrize("ending", [".csv", ".txt"])
+@pytest.mark.parametrize("names", ["time_s,x,y,z,qx,qy,qz,qw", "time_s,x,y,z,a,b,c,d"])
+def test_times_and_rotations_are_a_trajectory(tmp_path: Path, ending: str, names: str):
+    (tmp_path / f"a{ending}").write_text(f"{names}\n0,1,2,3,0,0,0,1\n1,1,2,3,0,0,0.6,0.8\n")
+    assert isinstance(uwlts.read(tmp_path / f"a{ending}"), Trajectory)
+    assert describe(tmp_path / f"a{ending}").startswith("Trajectory")
 
 
 def test_results_are_short_texts():

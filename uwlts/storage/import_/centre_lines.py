@@ -1,6 +1,5 @@
 """Files of centre lines of a 3D camera: tables (CSV), arrays (NPY), images (PNG, TIFF); one row per profile."""
 
-import csv
 import io
 from dataclasses import replace
 from pathlib import Path
@@ -8,12 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.reading import NPY_DAMAGE, read_bytes, read_text
+from uwlts.files.reading import NPY_DAMAGE, read_bytes
 from uwlts.model.sensor import Camera
 from uwlts.model.stripe import ROWS, Coordinates
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.folder_description import CentreLines
 from uwlts.storage.import_.matching import ImageRow
+from uwlts.storage.number_tables import read_number_table
 from uwlts.storage.numbering import unwrap_counts
 
 _MOST_BYTES = 2**28  # ten thousand profiles and more
@@ -36,19 +36,10 @@ def read_profiles(path: Path, lines: int) -> np.ndarray:
             if not isinstance(numbers, np.ndarray) or numbers.dtype.kind not in "iuf":
                 raise ImageError(f"{path} holds no numbers: expected an array of centre lines")
         case ".csv":
-            text = read_text(path, most_bytes=_MOST_BYTES, error=ImageError, called="table")
-            separator = ";" if ";" in text.partition("\n")[0] else ","
             try:
-                rows = [
-                    [float(cell) if cell.strip() else np.nan for cell in line.split(separator)]
-                    for line in text.splitlines()
-                    if line.strip()
-                ]
-                numbers = np.array(rows, float)
-            except ValueError as error:
-                raise ImageError(
-                    f"{path} is no table of centre lines: {error}; expected a row of {lines} numbers for each profile"
-                ) from error
+                numbers = np.column_stack([*read_number_table(path, named=False).columns.values()])
+            except DescriptionError as error:
+                raise ImageError(f"{error}; expected a row of {lines} numbers for each profile") from error
         case _:
             numbers = read_image(path)
             if numbers.ndim != 2:
@@ -102,21 +93,12 @@ def profile_rows(
 
 
 def _read_table(path: Path) -> list[dict[str, float]]:
-    text = read_text(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table of profiles")
-    reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
-    try:
-        columns = [name.strip() for name in reader.fieldnames or ()]
-    except csv.Error as error:
-        raise DescriptionError(f"{path} is no CSV table: {error}") from error
-    if not columns or not set(columns) <= set(_OF_PROFILES) or len(set(columns)) < len(columns):
+    columns = read_number_table(path, named=False).columns
+    if not columns.keys() <= set(_OF_PROFILES):
         raise DescriptionError(
             f"{path} has the columns {', '.join(columns)}; expected any of {', '.join(_OF_PROFILES)}"
         )
-    reader.fieldnames = columns
-    try:
-        table = [{name: float(cell) for name, cell in row.items()} for row in reader]
-    except (TypeError, ValueError, csv.Error) as error:
-        raise DescriptionError(f"{path}, line {reader.line_num}: expected a number in every column") from error
-    if not all(np.isfinite(list(row.values())).all() for row in table):
-        raise DescriptionError(f"{path} holds values that are not finite")
-    return table
+    rows = np.column_stack([*columns.values()])
+    if not np.isfinite(rows).all():
+        raise DescriptionError(f"{path} has cells that are empty or not finite")
+    return [dict(zip(columns, row, strict=True)) for row in rows.tolist()]
