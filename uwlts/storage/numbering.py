@@ -39,8 +39,8 @@ class Counted(NamedTuple):
 def count_names(names: Sequence[str]) -> Counted | None:
     """Return the increasing numbers of images in their names.
 
-    The names differ in one number, or in several of which one counts with the fewest gaps. None if no number counts, as
-    in names without digits and in times.
+    The names differ in one number, or in several; then the one with the fewest gaps counts. None if no number counts,
+    as in names without digits and in times.
 
     Raises DescriptionError for a mixture of naming, a number that occurs twice, or an order against the numbers.
     """
