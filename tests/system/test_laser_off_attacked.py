@@ -19,14 +19,13 @@ from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 import pytest
-from websockets.exceptions import InvalidStatus
 
 from tests.preloaded import Preloaded
 from tests.system.attacked_page import serve_page
-from tests.system.test_page_access import Browser, Place, asked, cookie, opened
+from tests.system.test_page_access import Browser, Place, asked, cookie
 from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
-from uwlts.desk.request_limits import HEAD_BYTES, HEAD_S
+from uwlts.desk.laser_listener import HEAD_BYTES, HEAD_S
 from uwlts.hardware.grbl import GrblStage
 
 OFF_S = 2.0
@@ -247,14 +246,14 @@ def test_a_long_header_line_is_refused_and_holds_up_no_press(operated):
             assert directly_s is not None and by_the_server_s is not None
             # The contents of the line's buffers are sent before the end of the connection arrives.
             assert line.sent < LONG_LINE_BYTES / 4
-    for port in (operated.page_port, operated.port):
+    for port, status in ((operated.page_port, b"400"), (operated.port, b"431")):
         with socket.create_connection(("127.0.0.1", port), timeout=20) as long:
             long.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Long: " + b"x" * HEAD_BYTES)
-            assert long.recv(100).startswith(b"HTTP/1.1 431 Request Header Fields Too Large\r\n")
+            assert long.recv(100).split()[1] == status
 
 
 def test_half_requests_end_and_lock_nobody_out(operated, half_requests):
-    held = [*half_requests(operated.page_port), *half_requests(operated.port)]
+    held = half_requests(operated.port)
     assert operated.press() == 204
     assert operated.dark_after_s() is not None
     light(operated.controller)
@@ -263,7 +262,7 @@ def test_half_requests_end_and_lock_nobody_out(operated, half_requests):
         print(f"page opened in {time.monotonic() - opened_s:.2f} s beside {len(held)} half requests")
         browser.click(browser.buttons()["Laser off"])
         assert operated.dark_after_s() is not None
-        assert sum(map(closed, held)) >= 2 * (HALF - 256)
+        assert sum(map(closed, held)) >= HALF - 256
     # A request that is sent slowly has the same time limit as one that stops.
     for _ in range(50):
         with suppress(OSError):
@@ -271,15 +270,3 @@ def test_half_requests_end_and_lock_nobody_out(operated, half_requests):
         time.sleep((HEAD_S + 1.0) / 50)
     assert within(20.0, lambda: all(map(closed, held)))
     assert asked(operated).status == 200
-
-
-def test_viewers_that_take_all_connections_leave_the_operator_his(operated):
-    with ExitStack() as viewers:
-        for _ in range(150):
-            with suppress(InvalidStatus):
-                viewers.enter_context(opened(operated))
-        assert asked(operated).status == 503
-        with Browser(operated, Cookie=operated.cookie) as browser:
-            browser.click(browser.buttons()["Laser off"])
-            assert operated.dark_after_s() is not None
-    assert within(20.0, lambda: asked(operated).status == 200)

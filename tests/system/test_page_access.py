@@ -242,6 +242,7 @@ def test_no_answer_can_be_framed_or_tells_the_address(page):
     assert [answer.status for answer in answers] == [200, 204, 204, 200, 200, 200, 403, 403, 303]
     for answer in answers:
         assert {name: answer.headers[name] for name in PROTECTION} == PROTECTION
+        assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
 
 
 def test_a_wrong_token_is_refused_and_the_right_one_does_not_lead_elsewhere(page):

@@ -26,9 +26,12 @@ _PROTECTION = (
     (b"x-content-type-options", b"nosniff"),
 )
 """Headers of every response: no other site can show the page in a frame, or learn its address."""
-
-_MOST_VIEWED = 100
-"""Each window of a viewer has one connection, and briefly some requests; a process may open 1024 files."""
+_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; object-src 'none'; base-uri 'self'; "
+    "form-action 'self'; frame-ancestors 'none'; connect-src 'self'"
+)
+"""Nothing is loaded from another site or sent to it. NiceGUI compiles its pages in the browser."""
 
 
 def is_local(host: str) -> bool:
@@ -133,21 +136,17 @@ class PageAccess:
 class GuardedApp:
     """An ASGI application behind the access rules, with protective headers in all responses.
 
-    It serves a limited number of viewers' requests and connections at once, and any number of the operator's.
+    ``laser_port`` is the port of the process that obeys Laser off, to which the page may send.
     """
 
-    def __init__(self, app: ASGIApp, access: PageAccess):
-        self._app, self._access, self._viewed = app, access, 0
+    def __init__(self, app: ASGIApp, access: PageAccess, *, laser_port: int | None = None):
+        self._app, self._access, self._laser_port = app, access, laser_port
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
         answer = self._access.answer(scope)
-        viewer = answer is None and not self._access.is_operator(Headers(scope=scope))
-        if viewer and self._viewed >= _MOST_VIEWED:
-            why = f"{_MOST_VIEWED} requests of viewers are being served: close other windows of this page"
-            answer, viewer = PlainTextResponse(f"{why}\n", http.HTTPStatus.SERVICE_UNAVAILABLE), False
         if answer is not None and scope["type"] == "websocket":
             # Closed before it is accepted: the browser sees status 403.
             await WebSocketClose()(scope, receive, send)
@@ -155,11 +154,14 @@ class GuardedApp:
 
         async def protected(message: Message) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] = [*message["headers"], *_PROTECTION]
+                given = [*message["headers"], *_PROTECTION]
+                # A report has a stricter policy of its own.
+                own = any(name == b"content-security-policy" for name, _ in given)
+                message["headers"] = given if own else [*given, (b"content-security-policy", policy.encode())]
             await send(message)
 
-        self._viewed += viewer
-        try:
-            await (answer or self._app)(scope, receive, protected)
-        finally:
-            self._viewed -= viewer
+        host = _HOST.fullmatch(Headers(scope=scope).get("Host", ""))
+        policy = _POLICY
+        if self._laser_port is not None and host is not None:
+            policy += f" http://{host[1]}:{self._laser_port}"
+        await (answer or self._app)(scope, receive, protected)

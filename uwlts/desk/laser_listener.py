@@ -18,8 +18,15 @@ from http import HTTPStatus
 from starlette.datastructures import Headers
 
 from uwlts.desk.access import PageAccess
-from uwlts.desk.request_limits import BACKLOG, HEAD_BYTES, PendingHeads
 
+HEAD_BYTES = 64 * 1024
+"""Longest head of a request. Browsers send some KB, including cookies of other programs on the machine."""
+HEAD_S = 5.0
+"""Longest duration of a request, even in a slow network."""
+BACKLOG = 64
+"""Connections accepted at once. Below the limit, so that the newest request is read before one is closed."""
+_MOST_REQUESTS = 256
+"""Requests at once; the oldest is closed, so that others cannot block the operator. A process may open 1024 files."""
 PRESS = re.compile(r"(off|escape)-\d{1,40}")
 """Name of a press, made by the page. It reaches the program on two paths, and is obeyed once."""
 MESSAGE_BYTES = 4096
@@ -44,7 +51,7 @@ class LaserListener:
         self._ended = False
         rules = json.loads(lending.recv(MESSAGE_BYTES))
         self.access, self.page_port = PageAccess(**rules["access"]), int(rules["page_port"])
-        self.heads = PendingHeads()
+        self.requests: dict[asyncio.Transport, asyncio.TimerHandle] = {}
 
     async def serve(self, listening: socket.socket) -> None:
         """Listen until the program ends; sockets alone do not show that, because a forked child may keep them open."""
@@ -116,11 +123,16 @@ class _Request(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         self._transport = transport
-        self._listener.heads.add(transport)
-        self._listener.heads.limit_time(transport)
+        requests = self._listener.requests
+        requests[transport] = asyncio.get_running_loop().call_later(HEAD_S, transport.abort)
+        if len(requests) > _MOST_REQUESTS:
+            oldest = next(iter(requests))
+            requests.pop(oldest).cancel()
+            oldest.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._listener.heads.remove(self._transport)
+        if (end := self._listener.requests.pop(self._transport, None)) is not None:
+            end.cancel()
 
     def data_received(self, data: bytes) -> None:
         if self._task is not None:

@@ -45,7 +45,7 @@ class LaserSwitch:
 
     def serve(self, access: PageAccess, listening: socket.socket, *, page_port: int) -> None:
         """Start the process with a socket, which it takes over; raises SetupError if it does not start."""
-        self._port = listening.getsockname()[1]
+        self.port = listening.getsockname()[1]
         self._lending, lending = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._presses, presses = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with listening, lending, presses:
@@ -119,7 +119,7 @@ class LaserSwitch:
 
     def show_button(self) -> None:
         """Add the button to a page; it precedes the page's scripts, and is displayed above everything else."""
-        ui.add_body_html(_BUTTON.read_text(encoding="utf-8").replace("LISTENER_PORT", str(self._port)))
+        ui.add_body_html(_BUTTON.read_text(encoding="utf-8").replace("LISTENER_PORT", str(self.port)))
         ui.on("laser_off", lambda event: self.press(event.args))
 
     def close(self) -> None:

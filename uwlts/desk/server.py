@@ -1,6 +1,5 @@
 """Server of the page in its own thread, at the requested port or the next free one."""
 
-import asyncio
 import errno
 import logging
 import socket
@@ -8,8 +7,8 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache, partial
-from typing import Any, Self, cast
+from functools import cache
+from typing import Any, Self
 
 import numpy as np
 import uvicorn
@@ -20,8 +19,8 @@ from starlette.responses import Response
 
 from uwlts.desk.access import GuardedApp, PageAccess, is_local
 from uwlts.desk.board_page import build_board
+from uwlts.desk.laser_listener import BACKLOG, HEAD_BYTES
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.request_limits import BACKLOG, HEAD_BYTES, LimitedHttp, PendingHeads
 from uwlts.desk.shown_state import Board
 from uwlts.desk.thinned_cloud import pack
 from uwlts.errors import Error, SetupError
@@ -29,6 +28,8 @@ from uwlts.errors import Error, SetupError
 _START_S, _END_S = 30.0, 5.0
 _PORTS = 100
 """Number of ports that are tried."""
+_MOST_CONNECTIONS = 300
+"""Connections at once; further requests are refused. A window has up to seven; a process may open 1024 files."""
 _LATEST = {"Cache-Control": "no-store"}
 _ALONE = threading.Lock()
 """Held by the page that is served."""
@@ -129,11 +130,10 @@ class DeskServer:
             nicegui.state.show = show
             self._errors = _FirstError()
             config = uvicorn.Config(
-                GuardedApp(self._app, self._access),
-                http=cast("type[asyncio.Protocol]", partial(LimitedHttp, PendingHeads())),
-                # Another event loop may accept more connections at once.
-                loop="asyncio",
+                GuardedApp(self._app, self._access, laser_port=None if switch is None else switch.port),
+                http="h11",
                 backlog=BACKLOG,
+                limit_concurrency=_MOST_CONNECTIONS,
                 h11_max_incomplete_event_size=HEAD_BYTES,
                 # Nothing is printed: a browser that disconnects during a response is not an error.
                 log_config=None,
