@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from uwlts.errors import ImageError
-from uwlts.storage.image_header import ImageHeader, png_damage, read_header, read_image_file
+from uwlts.storage.image_header import ImageHeader, read_header, read_image_file
 
 _STANDARD_ERROR = 2  # its file descriptor
 _DAMAGE = re.compile(rb"libpng error|Corrupt JPEG data|Premature end of JPEG|\[ERROR:")
@@ -55,13 +55,6 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
     declared = read_header(content, path)
     accept(declared)
     kind = declared.kind
-    if kind == "PNG" and (damage := png_damage(content)):
-        raise ImageError(f"{path} is a PNG file that is truncated or damaged ({damage}); copy it again")
-    if declared.least_bytes() > len(content):
-        raise ImageError(
-            f"{path} is a {kind} file that is truncated or damaged ({len(content)} bytes cannot hold "
-            f"{declared.width_px} x {declared.height_px} pixels); copy it again"
-        )
     try:
         with _capture_damage() as said:
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -71,10 +64,8 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
     if image is None or damage:
         found = f"{len(content)} bytes" + (f", its decoder says: {damage}" if damage else "")
         raise ImageError(f"{path} is a {kind} file that is truncated or damaged ({found}); copy it again")
-    with _capture_damage():
-        count = cv2.imcount(str(path)) if kind == "TIFF" else 1
-    if count > 1:
-        raise ImageError(f"{path} holds {count} pages; expected one image per file: split it")
+    if declared.several_pages:
+        raise ImageError(f"{path} holds several pages; expected one image per file: split it")
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"{path} holds values of {image.dtype}; expected whole numbers of 8 or 16 bit")
     if image.ndim == 3 and image.shape[2] not in (1, 3):
@@ -84,10 +75,10 @@ def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda dec
         )
     image = image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
     # OpenCV inverts such images of 8 bit only.
-    if declared.white_is_zero and image.dtype == np.uint16:
-        if declared.bits_per_pixel != 16:
+    if declared.inverted_bits and image.dtype == np.uint16:
+        if declared.inverted_bits != 16:
             raise ImageError(
-                f"{path} is a TIFF file of {declared.bits_per_pixel} bit in which zero is white; save it with zero as "
+                f"{path} is a TIFF file of {declared.inverted_bits} bit in which zero is white; save it with zero as "
                 "black (photometric interpretation BlackIsZero)"
             )
         image = np.invert(image)

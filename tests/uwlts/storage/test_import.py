@@ -560,7 +560,7 @@ def test_sixteen_bits_of_unknown_use(tmp_path: Path):
 
 def test_several_pages_and_floating_point(tmp_path: Path):
     assert cv2.imwritemulti(str(tmp_path / "pages.tif"), [stripe_image(), stripe_image()])
-    with pytest.raises(ImageError, match=r"pages.tif holds 2 pages"):
+    with pytest.raises(ImageError, match=r"pages.tif holds several pages"):
         read_image(tmp_path / "pages.tif")
     assert cv2.imwrite(str(tmp_path / "float.tif"), stripe_image().astype(np.float32))
     with pytest.raises(ImageError, match="holds values of float32"):
