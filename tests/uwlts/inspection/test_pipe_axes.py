@@ -18,7 +18,14 @@ from uwlts.storage.cloud import PointCloud
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0), "tilted": (1.0, 0.3, -0.2)}
 GATE, FALSE_ALARM = 4.5, 1e-4
-SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, *range(2, 10)))]
+DRAWS = [
+    *(pytest.param(axis, 1, id=f"{name}-1") for name, axis in AXES.items()),
+    *(
+        pytest.param(AXES[name], seed, id=f"{name}-{seed}", marks=pytest.mark.slow)
+        for name, seed in zip([*AXES] * 3, (0, *range(2, 13)), strict=True)
+    ),
+]
+"""Axis and seed: a pipe along each axis, and three more in slow tests."""
 DEPTHS_MM = 0.3, 0.6, 1.2, 2.0, 3.0
 """The shallowest is fifteen times the noise of a point; the deepest is within the 6 % of the radius that count."""
 BLEMISHES = FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION
@@ -48,8 +55,7 @@ def matched(pipe: ScannedPipe, found: Inspection, bumps: list[Bump]) -> list[Fea
     return own
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
+@pytest.mark.parametrize(("axis", "seed"), DRAWS)
 def test_all_pits_are_found_along_any_axis(axis: tuple[float, float, float], seed: int) -> None:
     """Pits all around the pipe; in some runs one of them is at the cut."""
     rng = np.random.default_rng([seed, 1])
@@ -69,8 +75,7 @@ def test_all_pits_are_found_along_any_axis(axis: tuple[float, float, float], see
     assert not any("is omitted" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
+@pytest.mark.parametrize(("axis", "seed"), DRAWS)
 def test_clean_pipes_have_no_findings_along_any_axis(axis: tuple[float, float, float], seed: int) -> None:
     rng = np.random.default_rng([seed, 2])
     arc = 2 * np.pi if seed % 2 else 0.8 * np.pi
