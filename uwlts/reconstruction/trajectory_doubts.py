@@ -1,6 +1,7 @@
 """Doubts about a trajectory at the images of a scan: units, clocks, outliers, standstill and direction."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwlts.model.trajectory import Trajectory, format_time
 
@@ -16,6 +17,8 @@ _OUTLIER, _LEAST_OUTLIER_MM = 30.0, 1.0
 """Least deviation of an outlier from its neighbours, in medians of all deviations, and in mm."""
 _STEPS_OF_OUTLIER = 5.0
 """The same in steps between poses (their 90th percentile), as a platform that starts to move deviates by half."""
+_STOPS, _LEAST_TURN, _LIKE = 13, np.radians(30), 0.2
+"""Places along the way at which course and turn are compared, least turn, and its largest relative difference."""
 _LEAST_ACROSS = 0.1
 """Least part of the motion across the laser sheet: scans along it have no points beside each other."""
 
@@ -50,7 +53,8 @@ def find_trajectory_doubts(trajectory: Trajectory, times_s: np.ndarray, sensor_p
             f"{100 * across.sum() / way.sum():.2g} % of the motion is across the laser sheet: check the order of "
             "quaternions and angles, and the mount"
         )
-    return [*doubts, *_find_outliers(known, places), *_find_standstill(trajectory, times_s)]
+    doubts += [*_find_outliers(known, places), *_find_standstill(trajectory, times_s)]
+    return [*doubts, *_find_opposite_turn(trajectory)]
 
 
 def _find_outliers(times: np.ndarray, places: np.ndarray) -> list[str]:
@@ -79,4 +83,24 @@ def _find_standstill(trajectory: Trajectory, times_s: np.ndarray) -> list[str]:
     return [
         f"{len(some)} of {len(times_s)} images, from {format_time(some[0])} to {format_time(some[-1])}, are at times "
         "at which the trajectory repeats the same pose: did it freeze?"
+    ]
+
+
+def _find_opposite_turn(trajectory: Trajectory) -> list[str]:
+    """Return a warning if the platform turns about the base's z axis as much as its course, in the other sense."""
+    way = np.append(0, np.cumsum(np.linalg.norm(np.diff(trajectory.poses[:, :2, 3], axis=0), axis=1)))
+    stops = np.searchsorted(way, np.linspace(0, way[-1], _STOPS))
+    if len(np.unique(stops)) < _STOPS:
+        return []
+    moves = np.diff(trajectory.poses[stops, :2, 3], axis=0)
+    course = float(np.diff(np.unwrap(np.arctan2(moves[:, 1], moves[:, 0]))[[0, -1]])[0])
+    turns = Rotation.from_matrix(trajectory.poses[stops, :3, :3])
+    # From the middle of the first move to that of the last.
+    about_z = (turns[1:] * turns[:-1].inv()).as_rotvec()[:, 2]
+    turned = float(about_z.sum() - (about_z[0] + about_z[-1]) / 2)
+    if abs(course) < _LEAST_TURN or abs(course + turned) > _LIKE * abs(course):
+        return []
+    return [
+        f"the course turns by {np.degrees(course):+.0f} deg about z, the platform by {np.degrees(turned):+.0f} deg: is "
+        "yaw a compass angle, or the frame mirrored?"
     ]

@@ -17,6 +17,7 @@ from uwlts.model.mount import BoardFound, Mount, SphereFound
 from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.trajectory import Trajectory, format_time
 from uwlts.pages.numbers import numbers_in
 from uwlts.report.any_file import read
 from uwlts.report.parameters import parameter_rows
@@ -85,6 +86,8 @@ def _lines_of(found: object) -> list[str]:
             return mount_lines(found)
         case PointCloud():
             return cloud_lines(found)
+        case Trajectory():
+            return trajectory_lines(found)
         case Acceptance() | SurfaceMesh():
             return found.lines()
         case _:
@@ -135,6 +138,25 @@ def cloud_lines(cloud: PointCloud) -> list[str]:
     if cloud.deviation_mm is not None and np.isfinite(cloud.deviation_mm).any():
         lines.append(f"deviation: standard deviation {np.nanstd(cloud.deviation_mm):.4f} mm")
     return lines + [f"{key}: {value}" for key, value in cloud.metadata.items()]
+
+
+def trajectory_lines(path: Trajectory) -> list[str]:
+    """Describe times, positions and the axes of the first and last pose of a trajectory."""
+    ends = [format_time(path.times_s[place]) for place in (0, -1)]
+    low, high = path.poses[:, :3, 3].min(axis=0), path.poses[:, :3, 3].max(axis=0)
+    lines = [f"trajectory of {len(path.times_s)} poses from {ends[0]} to {ends[1]}"]
+    lines += [f"{axis}: {a:.3f} to {b:.3f} mm" for axis, a, b in zip("XYZ", low, high, strict=True)]
+    for which, pose in (("first", path.poses[0]), ("last", path.poses[-1])):
+        axes = (f"{axis} along {_direction(pose[:3, k])}" for k, axis in enumerate("xyz"))
+        lines.append(f"axes of the platform in the {which} pose: {', '.join(axes)}")
+    return lines
+
+
+def _direction(vector: np.ndarray) -> str:
+    """Return a unit vector as the base's axis that is nearest, with the angle from it."""
+    nearest = int(np.argmax(np.abs(vector)))
+    angle = np.degrees(np.arccos(min(1.0, abs(vector[nearest]))))
+    return f"{'-' if vector[nearest] < 0 else '+'}{'XYZ'[nearest]}" + (f" ({angle:.0f} deg off)" if angle >= 1 else "")
 
 
 _MEDIA = {"air": "air", "fresh": "fresh water", "sea": "sea water", "custom": "the medium of its images"}

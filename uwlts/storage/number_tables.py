@@ -19,7 +19,7 @@ from uwlts.storage.gocator_csv import is_gocator_csv, read_gocator_csv
 
 Unit = Literal["mm", "m"]
 MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
-ROTATION_NAMES = ("qw", "qx", "qy", "qz", "rx", "ry", "rz", "roll", "pitch", "yaw", "angle")
+ROTATION_NAMES = ("qw", "qx", "qy", "qz", "rx", "ry", "rz", "roll", "pitch", "yaw", "angle", "heading")
 """Names of columns with rotations, as `read_number_table` returns them; it returns positions as x, y, z."""
 
 _MOST_BYTES = 512 * 2**20  # ten million rows
@@ -37,9 +37,18 @@ _SAME_UNITS |= {
 _SAME_UNITS |= {f"{name}s": unit for name, unit in _SAME_UNITS.items() if name in ("degree", "radian", "second")}
 _SAME_UNITS |= {"microns": "um", "micron": "um", "inches": "in", "inch": "in", "feet": "ft"}
 _UNITS = _LENGTHS | _ANGLES | _TIMES
-_UNITS_OF = {"time_s": _TIMES} | dict.fromkeys("xyz", _LENGTHS) | dict.fromkeys(ROTATION_NAMES[4:], _ANGLES)
+_DIRECTIONS = {"east": (1, 0, 0), "north": (0, 1, 0), "up": (0, 0, 1)}
+_DIRECTIONS |= {"west": (-1, 0, 0), "south": (0, -1, 0), "down": (0, 0, -1)}
+_HEIGHTS = {"height": "up", "altitude": "up", "elevation": "up", "depth": "down"}
+_UNITS_OF = (
+    {"time_s": _TIMES}
+    | dict.fromkeys(_DIRECTIONS, _LENGTHS)
+    | dict.fromkeys("xyz", _LENGTHS)
+    | dict.fromkeys(ROTATION_NAMES[4:], _ANGLES)
+)
 """Units of the columns whose units are converted or checked."""
-_SAME_NAMES = {name: name for name in ROTATION_NAMES} | {"heading": "yaw"}
+_SAME_NAMES = {name: name for name in ROTATION_NAMES} | {"azimuth": "heading", "bearing": "heading"} | _HEIGHTS
+_SAME_NAMES |= {f"{name}ing": name for name in ("east", "north", "west", "south")}
 _OF_NUMBERS = {"q0": "qw", "q1": "qx", "q2": "qy", "q3": "qz"}
 _TIME_NAMES = ("time", "t", "timestamp", "stamp", "time_s")
 _IN_BRACKETS = re.compile(r"(.*?)[\s_]*[\[(<](.*)[\])>]")
@@ -72,7 +81,8 @@ class NumberTable:
     """Columns (N,) by name, the units that their names state, and notes on uncertain readings.
 
     Times are in s. Other columns are in the unit that their name states. ``steps`` are those of their decimals.
-    ``length_unit`` is that which a line beside the table states, as "unit: m"; empty without.
+    ``length_unit`` is that which a line beside the table states, as "unit: m"; empty without. ``directions`` are those
+    of x, y and z if their names say it, such as east, north and up.
     """
 
     path: Path
@@ -81,6 +91,7 @@ class NumberTable:
     steps: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     length_unit: str = ""
+    directions: tuple[str, ...] = ()
 
     def mm_per_unit(self, axes: Iterable[str] = "xyz", *, unit: Unit | None = None) -> float:
         """Return the length unit of columns in mm, from their names or a line beside them, or ``unit``; by default 1.
@@ -185,6 +196,8 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
         names = ["x", "z"] if named and count == 2 else [str(number) for number in range(count)]
     if len(set(names)) < len(names):
         raise DescriptionError(f"{path} has the columns {', '.join(names)}: expected each name once")
+    names, directions = _name_axes(names, path)
+    units |= {axis: units.pop(name) for axis, name in zip("xyz", directions, strict=False) if name in units}
     columns = _parse(body, names, delimiter, comma, path)
     if lines[0].endswith(delimiter) and not (cells and cells[-1]) and np.isnan(columns[names[-1]]).all():
         del columns[names[-1]]
@@ -201,7 +214,7 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     notes += doubts if not units.keys() & set("xyz") else []
     decimals = [_decimals(row) for row in zip(*(_cells(line, delimiter) for line in lines[:_FIRST]), strict=False)]
     steps = {name: 10.0**-count for name, count in zip(names, decimals, strict=False) if count is not None}
-    return NumberTable(path, columns, units, steps, notes, stated)
+    return NumberTable(path, columns, units, steps, notes, stated, directions)
 
 
 def _parse(body: bytes, names: list[str], delimiter: bytes, comma: bool, path: Path) -> dict[str, np.ndarray]:
@@ -238,6 +251,19 @@ def _names_and_units(cells: list[str], path: Path) -> tuple[list[str], dict[str,
     if "qw" in names:
         names = [f"q{name[1]}" if name in ("rx", "ry", "rz") else name for name in names]
     return names, units
+
+
+def _name_axes(names: list[str], path: Path) -> tuple[list[str], tuple[str, ...]]:
+    """Return names with x, y and z in place of three directions, and these; raises DescriptionError if they mirror."""
+    found = tuple(name for name in names if name in _DIRECTIONS)
+    if len(found) != 3 or not np.linalg.det([_DIRECTIONS[name] for name in found]):
+        return names, ()
+    if np.linalg.det([_DIRECTIONS[name] for name in found]) < 0:
+        raise DescriptionError(
+            f"{path} has the axes {', '.join(found)}, a left-handed frame that mirrors all shapes: exchange the first "
+            "two, or change the sign of the last"
+        )
+    return [dict(zip(found, "xyz", strict=True)).get(name, name) for name in names], found
 
 
 def _is_unit_row(line: bytes) -> bool:

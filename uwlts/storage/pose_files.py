@@ -24,6 +24,7 @@ SAVED_FORMAT = "quaternion-xyzw"
 FARTHEST_MM = 1e7
 """Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
 
+_COMPASS = ("north", "east", "down")
 _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
 # Possessive, as backtracking in long runs of digits or blanks would take minutes.
@@ -242,9 +243,17 @@ def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tu
     times = columns.pop("time_s", None)
     if (numbers := columns.pop("pose", None)) is not None:
         log_warnings(path, _number_gaps(numbers, path))
+    units = table.units
+    if "heading" in columns:
+        if table.directions != _COMPASS:
+            raise DescriptionError(
+                f"{path} has a heading, clockwise from north, a yaw only for {', '.join(_COMPASS)} as x, y, z: "
+                "name positions so, or convert it (for east, north, up: yaw = 90 deg - heading) and name it yaw"
+            )
+        columns, units = ({("yaw" if n == "heading" else n): each for n, each in d.items()} for d in (columns, units))
     names = _order_names([*columns], pose_format, path)
     for name in names:
-        stated = table.units.get(name, "")
+        stated = units.get(name, "")
         if name in ROTATION_NAMES and stated and stated != pose_format.rpartition("-")[2]:
             raise DescriptionError(
                 f"{path} has {name} in {stated}, but the format {pose_format} was given: choose a format that ends "

@@ -97,3 +97,13 @@ def test_a_swapped_quaternion_that_leads_along_the_sheet_is_noticed():
     # The sensor's y axis, in the sheet, points along the motion.
     swapped = (Rotation.from_quat(turns) * Rotation.from_euler("Z", -90, degrees=True)).as_quat()
     assert "is across the laser sheet" in doubts_of(times, places, swapped)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_turn_against_the_course_is_noticed(seed):
+    angle = np.radians(np.linspace(0, 90, len(KNOWN_S)))
+    noise = np.random.default_rng(seed).normal(0, 2.0, (len(angle), 3))
+    places = 2000 * np.column_stack([np.sin(angle), 1 - np.cos(angle), 0 * angle]) + noise
+    for sign in (1, -1, 0):
+        turns = Rotation.from_euler("z", sign * angle[:, None]).as_quat()
+        assert ("is yaw a compass angle" in doubts_of(KNOWN_S, places, turns)) is (sign == -1)

@@ -125,7 +125,7 @@ def test_the_commands_and_python_read_the_same_clouds(tmp_path: Path, ending: st
 def test_times_and_rotations_are_a_trajectory(tmp_path: Path, ending: str, names: str):
     (tmp_path / f"a{ending}").write_text(f"{names}\n0,1,2,3,0,0,0,1\n1,1,2,3,0,0,0.6,0.8\n")
     assert isinstance(uwlts.read(tmp_path / f"a{ending}"), Trajectory)
-    assert describe(tmp_path / f"a{ending}").startswith("Trajectory")
+    assert describe(tmp_path / f"a{ending}").startswith("trajectory of 2 poses")
 
 
 def test_results_are_short_texts():

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import uwlts
+from uwlts.report.inventory import trajectory_lines
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.pose_files import read_poses
 
@@ -176,3 +177,50 @@ def test_numbers_of_poses_have_no_gaps(tmp_path: Path, caplog: pytest.LogCapture
     path.write_text("pose,x,y,z,rx,ry,rz\n" + "".join(f"{n},{n},0,0,0,0,0\n" for n in (1, 2, 2)))
     with pytest.raises(uwlts.Error, match="pose 2 follows pose 2"):
         read_poses(path, pose_format="rotvec-rad")
+
+
+def turning_left(path: Path, names: str, columns: str) -> Path:
+    """A quarter circle from course east to course north in columns e, n, u, d, yaw, heading (deg)."""
+    angle = np.radians(np.linspace(0, 90, 31))
+    known = {"e": np.sin(angle), "n": 1 - np.cos(angle), "u": 0 * angle - 10, "d": 0 * angle + 10, "0": 0 * angle}
+    known |= {"y": np.degrees(angle), "h": 90 - np.degrees(angle), "t": np.arange(31.0)}
+    table = np.column_stack([known[column] for column in columns])
+    np.savetxt(path, table, delimiter=",", header=names, comments="", fmt="%.9f")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("names", "columns", "first", "last"),
+    [
+        ("time_s,x_m,y_m,z_m,roll,pitch,yaw", "tenu00y", [1, 0, 0], [0, 1, 0]),
+        ("time_s,easting_m,northing_m,height_m,roll,pitch,yaw", "tenu00y", [1, 0, 0], [0, 1, 0]),
+        ("time_s,north [m],east [m],down [m],roll,pitch,heading_deg", "tned00h", [0, 1, 0], [1, 0, 0]),
+        ("time_s,North_m,East_m,Depth_m,roll,pitch,azimuth", "tned00h", [0, 1, 0], [1, 0, 0]),
+    ],
+)
+def test_headings_belong_to_north_east_down(tmp_path: Path, names, columns, first, last):
+    path = turning_left(tmp_path / "a.csv", names, columns)
+    found = uwlts.read(path, pose_format="euler-xyz-deg")
+    np.testing.assert_allclose(found.poses[[0, -1], :3, 0], [first, last], atol=1e-6)
+    assert np.ptp(found.poses[:, :2, 3], axis=0) == pytest.approx([1000, 1000])
+    assert f"pose: x along +{'XYZ'[first.index(1)]}, y along" in "".join(trajectory_lines(found))
+
+
+@pytest.mark.parametrize(
+    ("names", "columns", "words"),
+    [
+        ("time_s,x_m,y_m,z_m,roll,pitch,heading", "tenu00h", "clockwise from north"),
+        ("time_s,east_m,north_m,up_m,roll,pitch,heading", "tenu00h", "clockwise from north"),
+        ("time_s,northing,easting,height,roll,pitch,yaw", "tneu00y", "left-handed frame"),
+        ("time_s,east,north,depth,roll,pitch,yaw", "tend00y", "left-handed frame"),
+    ],
+)
+def test_compass_angles_and_mirrored_frames_are_refused(tmp_path: Path, names, columns, words):
+    with pytest.raises(uwlts.Error, match=words):
+        uwlts.read(turning_left(tmp_path / "a.csv", names, columns), pose_format="euler-xyz-deg")
+
+
+def test_a_mirrored_cloud_is_refused(tmp_path: Path):
+    np.savetxt(tmp_path / "a.txt", np.eye(3), header="Northing Easting Elevation")
+    with pytest.raises(uwlts.Error, match="north, east, up, a left-handed frame"):
+        read_cloud(tmp_path / "a.txt")
