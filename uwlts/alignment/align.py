@@ -76,6 +76,8 @@ class AlignedTrajectory(Brief):
     crossings : tuple of Crossing
     doubtful_s : tuple of (float, float)
         Times of both passes of ambiguous crossings, which were not used: several positions within the drift fit.
+    margins_s : (float, float)
+        How long the trajectory starts before the first point and ends after the last.
     cloud : PointCloud
         Cloud along the corrected path. Its uncertainty combines that of the corrected path with that of the
         calibrations of sensor and mount.
@@ -85,6 +87,7 @@ class AlignedTrajectory(Brief):
     correction: np.ndarray
     crossings: tuple[Crossing, ...]
     doubtful_s: tuple[tuple[float, float], ...]
+    margins_s: tuple[float, float]
     cloud: PointCloud
 
     def record(self) -> Table:
@@ -98,6 +101,7 @@ class AlignedTrajectory(Brief):
                 for each in self.crossings
             ],
             "doubtful_s": [list(each) for each in self.doubtful_s],
+            "margins_s": list(self.margins_s),
         }
 
     @check_arguments
@@ -111,7 +115,8 @@ class AlignedTrajectory(Brief):
         known = self.record()
         lines = [
             f"path corrected by up to {known['largest_shift_mm']:.3f} mm and {known['largest_turn_deg']:.4f} deg, "
-            f"{len(self.crossings)} crossings"
+            f"{len(self.crossings)} crossings",
+            "points from {:.3f} s after the start to {:.3f} s before the end of the trajectory".format(*self.margins_s),
         ]
         for each in self.crossings:
             first, second = each.times_s
@@ -248,6 +253,7 @@ def _make_result(
         correction,
         tuple(_make_crossing(estimate, pair) for pair in estimate.pairs),
         doubtful,
+        trajectory.margins_s(estimate.survey.moments_s),
         replace(cloud, points_mm=levers + platform + by_point[:, :3], uncertainty=known),
     )
 

@@ -18,6 +18,8 @@ from uwlts.model.calibration import is_rigid
 _ROUNDED = 1e-6  # deviation of poses and correlations that files with six digits have
 _LARGEST_DRIFT_PPM = 10_000.0
 """A hundred times the drift of the worst quartz; larger values indicate a wrong unit."""
+_CLOCKS_S = {18: "UTC and GNSS", 19: "GNSS and TAI", 37: "UTC and TAI"}
+"""Whole seconds between time scales since 2017 (IERS Bulletin C)."""
 _UNIX_S = 946_684_800.0, 4_102_444_800.0
 """Unix times from 2000 to 2100."""
 COVARIANCE_COLUMNS = {f"cov_{i}{j}": (i, j) for i in range(6) for j in range(i, 6)}
@@ -104,6 +106,10 @@ class Trajectory(Brief):
         turns = self._rotations(wanted).apply(self._rotations(wanted, 1))
         return np.hstack([self._positions(wanted, 1), turns])
 
+    def margins_s(self, times_s: np.ndarray) -> tuple[float, float]:
+        """Return how long the trajectory starts before and ends after times (M,), s."""
+        return float(times_s.min() - self.times_s[0]), float(self.times_s[-1] - times_s.max())
+
     def covariance_at(self, times_s: np.ndarray) -> np.ndarray | None:
         """Interpolate the covariances (M, 6, 6) linearly at times (M,); None if they are unknown."""
         if self.covariance is None:
@@ -120,12 +126,24 @@ class Trajectory(Brief):
             raise DescriptionError(
                 f"{outside} of {wanted.size} times, {format_time(wanted.min())} to {format_time(wanted.max())}, are "
                 f"outside the trajectory from {format_time(first)} to {format_time(last)}: check the offset of the "
-                "clocks"
+                f"clocks{_suggest_shift(first - wanted.min(), last - wanted.max())}"
             )
         poses = np.tile(np.eye(4), (len(wanted), 1, 1))
         poses[:, :3, :3] = self._rotations(wanted).as_matrix()
         poses[:, :3, 3] = self._positions(wanted)
         return poses
+
+
+def _suggest_shift(least_s: float, most_s: float) -> str:
+    """Return a difference of usual clocks within two limits as an ending of a message; empty without."""
+    hours = round((least_s + most_s) / 7200)
+    known = {sign * shift: name for shift, name in _CLOCKS_S.items() for sign in (1, -1)}
+    known |= {3600 * hours: "time zones"} if hours else {}
+    fitting = [shift for shift in known if least_s <= shift <= most_s]
+    if not fitting:
+        return ""
+    shift = min(fitting, key=abs)
+    return f". With `clock_offset_s` {shift}, as between {known[shift]}, all are inside"
 
 
 def format_time(time_s: float) -> str:

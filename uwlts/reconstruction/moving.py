@@ -49,6 +49,7 @@ class PlatformPoses:
     """(N, 6); velocity (mm/s) and angular velocity (rad/s) in the base frame; None without a
     trajectory."""
     doubts: tuple[str, ...] = ()  # warnings about the trajectory
+    margins_s: tuple[float, float] | None = None  # of the trajectory before and after the images
 
 
 def find_platform_poses(
@@ -92,7 +93,7 @@ def find_platform_poses(
     rates[:, :3] *= scale
     own = capture.header.T_platform_sensor if mount is None else mount.transform()
     doubts = find_trajectory_doubts(trajectory, times, poses[laser] if own is None else poses[laser] @ np.array(own))
-    return PlatformPoses(poses, covariance, capture.time_s, rates, tuple(doubts))
+    return PlatformPoses(poses, covariance, capture.time_s, rates, tuple(doubts), trajectory.margins_s(times))
 
 
 def add_platform_poses(capture: Capture, ride: PlatformPoses, mount: Mount | None) -> FrameTable:

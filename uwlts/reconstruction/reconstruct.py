@@ -150,6 +150,7 @@ def reconstruct(
             where = cloud.points_mm, cloud.frame, ride
             own = add_platform_uncertainty(own, *where, mount, mount_covariance=apart, correlation_s=pose_correlation_s)
         metadata = cloud.metadata | ({EDITED: "mount"} if mount is not None and mount.edited else {})
+        metadata |= {} if ride.margins_s is None else {"trajectory_margins_s": [*ride.margins_s]}
         known = {"uncertainty": own, "warnings": warnings, "metadata": metadata}
         return complete(cloud, **known, time_s=scan.time_s[cloud.frame])
 

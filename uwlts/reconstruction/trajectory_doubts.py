@@ -19,6 +19,8 @@ _STEPS_OF_OUTLIER = 5.0
 """The same in steps between poses (their 90th percentile), as a platform that starts to move deviates by half."""
 _STOPS, _LEAST_TURN, _LIKE = 13, np.radians(30), 0.2
 """Places along the way at which course and turn are compared, least turn, and its largest relative difference."""
+_LONGEST_STEP = 10.0
+"""Longest step between poses that is no gap, in medians of all steps."""
 _LEAST_ACROSS = 0.1
 """Least part of the motion across the laser sheet: scans along it have no points beside each other."""
 
@@ -54,7 +56,7 @@ def find_trajectory_doubts(trajectory: Trajectory, times_s: np.ndarray, sensor_p
             "quaternions and angles, and the mount"
         )
     doubts += [*_find_outliers(known, places), *_find_standstill(trajectory, times_s)]
-    return [*doubts, *_find_opposite_turn(trajectory)]
+    return [*doubts, *_find_opposite_turn(trajectory), *_find_gap(trajectory, times_s)]
 
 
 def _find_outliers(times: np.ndarray, places: np.ndarray) -> list[str]:
@@ -103,4 +105,18 @@ def _find_opposite_turn(trajectory: Trajectory) -> list[str]:
     return [
         f"the course turns by {np.degrees(course):+.0f} deg about z, the platform by {np.degrees(turned):+.0f} deg: is "
         "yaw a compass angle, or the frame mirrored?"
+    ]
+
+
+def _find_gap(trajectory: Trajectory, times_s: np.ndarray) -> list[str]:
+    """Return a warning about images in a gap of the trajectory in which it moves."""
+    steps = np.diff(trajectory.times_s)
+    moves = np.linalg.norm(np.diff(trajectory.poses[:, :3, 3], axis=0), axis=1)
+    gaps = (steps > _LONGEST_STEP * np.median(steps)) & (moves > np.median(moves))
+    within = gaps[np.clip(np.searchsorted(trajectory.times_s, times_s, side="right") - 1, 0, len(steps) - 1)]
+    if not within.any():
+        return []
+    return [
+        f"{np.count_nonzero(within)} of {len(times_s)} images are in gaps of the trajectory of up to "
+        f"{steps[gaps].max():.3g} s, whose poses are {np.median(steps):.3g} s apart otherwise"
     ]

@@ -384,7 +384,8 @@ def _names_columns(line: bytes, delimiter: bytes, count: int) -> bool:
     """Return whether a comment names columns: x and z, or an angle."""
     cells = _name_cells(line, delimiter, count)
     names = {_split_unit(cell)[0] for cell in cells}
-    return len(cells) == count and ({"x", "z"} <= names or "angle" in names)
+    known = {"x", "z"} <= names or "angle" in names or len(names & _DIRECTIONS.keys()) == 3
+    return len(cells) == count and known
 
 
 def _split_unit(cell: str) -> tuple[str, str | None]:

@@ -69,6 +69,9 @@ _FORMATS = (
     "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg, "
     "abb, kuka, ur (text of robot programs)"
 )
+_FEWEST_POSES, _ALTERNATING, _RETURNED, _LEAST_JUMP_MM, _REACH_MM = 10, 0.2, 0.3, 0.1, 300.0
+"""Two sources: least number of poses, share that jumps, largest distance after it relative to the jump, smallest jump,
+and lever of rotations. Of independent noise along one axis, 14 % jump, in a plane 6 %."""
 _NEAR_HALF_TURN = 3.0
 """Angles in rad reach pi, unless turns are small; the largest in deg is between 3 and pi by chance only."""
 _MOST_POSES = 1_000_000  # more than an hour at 200 poses a second
@@ -225,15 +228,34 @@ def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray, covariance: np
     """Return a trajectory without the repetitions of a pose at the same time."""
     same = np.zeros(len(times), bool)
     same[1:] = (np.diff(times) == 0) & (poses[1:] == poses[:-1]).all(axis=(1, 2))
-    warnings = []
+    warnings = _find_alternation(poses[~same])
     if count := int(np.count_nonzero(same)):
-        warnings = [f"{count} of {len(times)} poses repeat the previous one at the same time and are omitted"]
-        log_warnings(path, warnings)
+        warnings.append(f"{count} of {len(times)} poses repeat the previous one at the same time and are omitted")
+    log_warnings(path, warnings)
     try:
         known = None if covariance is None else covariance[~same]
         return Trajectory(times[~same], poses[~same], known, warnings=warnings)
     except DescriptionError as error:
         raise DescriptionError(f"{path}: {error}") from error
+
+
+def _find_alternation(poses: np.ndarray) -> list[str]:
+    """Return a warning if many poses (N, 4, 4) jump away from their neighbours and back, as those of two sources."""
+    if len(poses) < _FEWEST_POSES:
+        return []
+    axes = (poses[:, :3, 3] + _REACH_MM * poses[:, :3, axis] for axis in (0, 1))
+    places = np.concatenate([poses[:, :3, 3], *axes], axis=1)
+    steps, apart = (np.linalg.norm(places[lag:] - places[:-lag], axis=1) for lag in (1, 2))
+    away = np.minimum(steps[:-1], steps[1:])
+    jumps = (apart < _RETURNED * away) & (away > _LEAST_JUMP_MM)
+    if np.mean(jumps) < _ALTERNATING:
+        return []
+    turned = np.linalg.norm(np.diff(poses[:, :3, 0], axis=0), axis=1)[:-1][jumps]
+    moved = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[:-1][jumps]
+    return [
+        f"{100 * np.mean(jumps):.0f} % of the poses jump away and back, by {np.median(moved):.3g} mm and "
+        f"{np.degrees(np.median(turned)):.2g} deg: are two sources or frames in one track? Keep one of them"
+    ]
 
 
 def _poses(table: NumberTable, pose_format: PoseFormat, unit: Unit | None) -> tuple[np.ndarray, np.ndarray | None]:

@@ -192,7 +192,7 @@ def test_the_corrected_cloud_is_that_of_the_corrected_trajectory(loop, closed):
 
 def test_a_stored_trajectory_is_not_overwritten(closed, tmp_path):
     correction = np.zeros((len(closed.trajectory.times_s), 6))
-    aligned = AlignedTrajectory(closed.trajectory, correction, tuple(closed.crossings), (), closed.cloud)
+    aligned = AlignedTrajectory(closed.trajectory, correction, tuple(closed.crossings), (), (0.0, 0.0), closed.cloud)
     aligned.save(tmp_path / "corrected.csv")
     with pytest.raises(uwlts.Error, match="exists"):
         aligned.save(tmp_path / "corrected.csv")

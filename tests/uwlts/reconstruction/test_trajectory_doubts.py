@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from uwlts.errors import DescriptionError
 from uwlts.model.trajectory import Trajectory
 from uwlts.reconstruction.trajectory_doubts import find_trajectory_doubts
+from uwlts.storage.pose_files import read_trajectory
 
 IMAGES_S = np.linspace(0.5, 39.5, 30)
 KNOWN_S = np.linspace(-1, 41, 421)
@@ -107,3 +109,35 @@ def test_a_turn_against_the_course_is_noticed(seed):
     for sign in (1, -1, 0):
         turns = Rotation.from_euler("z", sign * angle[:, None]).as_quat()
         assert ("is yaw a compass angle" in doubts_of(KNOWN_S, places, turns)) is (sign == -1)
+
+
+def test_images_in_a_gap_are_noticed():
+    kept = KNOWN_S[(KNOWN_S < 10) | (KNOWN_S > 18)]
+    # Images are 1.3 s apart, seven of them in the 8 s.
+    assert "7 of 30 images are in gaps of the trajectory of up to 8" in doubts_of(*trajectory("steady", kept))
+
+
+@pytest.mark.parametrize(
+    ("shift", "names"), [(18, "UTC and GNSS"), (-37, "UTC and TAI"), (7200, "time zones"), (29, "")]
+)
+def test_the_clocks_of_time_scales_are_named(shift, names):
+    found = Trajectory(KNOWN_S + shift, np.tile(np.eye(4), (len(KNOWN_S), 1, 1)))
+    with pytest.raises(DescriptionError) as refused:
+        found.poses_at(IMAGES_S)
+    assert (f"With `clock_offset_s` {shift}, as between {names}" in str(refused.value)) is bool(names)
+    assert found.margins_s(IMAGES_S + shift) == pytest.approx((1.5, 1.5))
+
+
+@pytest.mark.parametrize("kind", ["steady", "accelerating", "noisy", "stop and go", "rotary", "curved"])
+@pytest.mark.parametrize("pattern", [(0, 1), (0, 0, 1), (0,)])
+@pytest.mark.parametrize("offset", ["place", "turn"])
+def test_two_sources_in_one_track_are_noticed(tmp_path, kind, pattern, offset):
+    times, places, quaternions = trajectory(kind)
+    other = np.resize(pattern, len(times)) == 1
+    if offset == "place":
+        places[other] += [0, 25.0, 0]
+    elif other.any():
+        quaternions[other] = (Rotation.from_quat(quaternions[other]) * Rotation.from_rotvec([0.1, 0, 0])).as_quat()
+    np.savetxt(tmp_path / "a.tum", np.column_stack([times, places / 1000, quaternions]), fmt="%.9f")
+    warnings = read_trajectory(tmp_path / "a.tum", pose_format="tum").warnings
+    assert ["two sources" in each for each in warnings] == [True] * (len(pattern) > 1)
