@@ -34,7 +34,7 @@ from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import is_cloud, read_cloud
+from uwlts.storage.cloud_files import is_cloud, load_cloud
 
 FORMAT, VERSION = "uwlts-acceptance", 2
 
@@ -311,7 +311,7 @@ def _judge_position(
 def _measure_cloud(file: Path, calibration: AnyCalibration | None) -> PointCloud:
     """Return the cloud in a file, or that of a capture."""
     if is_cloud(file):
-        return read_cloud(file)
+        return load_cloud(file)
     if calibration is None:
         raise DescriptionError(f"{file} is a capture: the plan must name the `calibration` that reconstructs it")
     with Capture(file) as capture:

@@ -95,10 +95,10 @@ def inspect(
     """Example: uwlts inspect pipe.cloud.h5 --wall-mm 9.5 --out pipe.json"""
     from uwlts.inspection.inspect import inspect_cloud
     from uwlts.report.plot import surface_limit_mm
-    from uwlts.storage.cloud_files import read_cloud
+    from uwlts.storage.cloud_files import load_cloud
 
-    measured = read_cloud(call.given.pop("cloud"), unit=unit)
-    options = call.given if datum is None else call.given | {"datum": read_cloud(datum, unit=unit)}
+    measured = load_cloud(call.given.pop("cloud"), unit=unit)
+    options = call.given if datum is None else call.given | {"datum": load_cloud(datum, unit=unit)}
     found = inspect_cloud(measured, kind, **options)
     show(found.lines())
     if coloured:

@@ -28,7 +28,7 @@ from uwlts.report.findings_order import judge_feature, load_order
 from uwlts.runtime.command_line import descriptions, option_type
 from uwlts.runtime.progress import ProgressListener
 from uwlts.runtime.workers import run_jobs
-from uwlts.storage.cloud_files import CLOUD_FORMATS, name_cloud, read_cloud, write_cloud
+from uwlts.storage.cloud_files import CLOUD_FORMATS, load_cloud, name_cloud, write_cloud
 
 _POLITE = 10
 """Reduction of the worker's priority in favour of a recording, as by ``nice``."""
@@ -128,7 +128,7 @@ def _inspect(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
 
     kind: Any = job.kind.partition(" ")[2]
     found: Inspection = uwlts.report.write_findings(kind=kind, out=job.path(".html"), **job.values)
-    cloud = replace(read_cloud(job.values["cloud"]), deviation_mm=found.deviation_mm)
+    cloud = replace(load_cloud(job.values["cloud"]), deviation_mm=found.deviation_mm)
     colours = deviation_colours(found.deviation_mm, surface_limit_mm(found.deviation_mm))
     write_cloud(job.path("-coloured.ply"), cloud, colours=colours)
     order = load_order(job.values.get("order"))

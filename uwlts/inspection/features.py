@@ -297,7 +297,8 @@ class Inspection(Brief, RecordFile):
     features : tuple of Feature
         The whole object first, then its parts.
     deviation_mm : (N,) float64
-        Distance of each point of the cloud from the undamaged surface, positive outwards; NaN for omitted points.
+        Distance of each point of the cloud, without repeated ones, from the undamaged surface, positive outwards; NaN
+        for omitted points.
     level_mm : (N,) float64
         Least significant depth of an indication of the smallest size at each point; NaN without a search.
     notes : tuple of str
@@ -310,8 +311,9 @@ class Inspection(Brief, RecordFile):
     level_mm: np.ndarray
     notes: tuple[str, ...] = ()
 
-    def count_steps(self, cloud: PointCloud) -> Inspection:
-        """Return the inspection with the steps of the cloud's stored coordinates in the uncertainties of lengths."""
+    def consider_cloud(self, cloud: PointCloud) -> Inspection:
+        """Return the inspection with the cloud's warnings as notes, and its steps in the uncertainties of lengths."""
+        self = replace(self, notes=(*self.notes, *cloud.warnings))
         if not (std := rounding_std_mm(cloud)):
             return self
         features = tuple(

@@ -362,7 +362,7 @@ def _make_inspection(
         deviation[own] = face.residuals_mm
     if cloud.uncertainty is None:
         notes = WITHOUT_UNCERTAINTY, *notes
-    return Inspection(kind, features, deviation, np.full(len(cloud), np.nan), tuple(notes)).count_steps(cloud)
+    return Inspection(kind, features, deviation, np.full(len(cloud), np.nan), tuple(notes)).consider_cloud(cloud)
 
 
 def _note_omission(face: _Face, place: np.ndarray, reason: str) -> str:

@@ -132,7 +132,7 @@ def inspect_pipe(
     level[chosen] = search.level_mm
     notes = *part.notes, *_note_limits(cloud, form, search), *of_size, *off, *of_sections, *on_welds, *of_blemishes
     found = Inspection("pipe", (*features, *of_welds, *blemishes), deviation, level, notes)
-    return found.count_steps(cloud)
+    return found.consider_cloud(cloud)
 
 
 def _check_size(diameter_mm: float, wall_mm: float | None) -> list[str]:

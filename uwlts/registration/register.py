@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError
+from uwlts.files.reading import log_warnings
 from uwlts.fitting.patches import PatchDistances, surface_patches
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
@@ -36,6 +37,7 @@ from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import PoseFormat, read_poses, write_poses
+from uwlts.storage.repeated_points import find_repeated
 
 _ROUNDS = 60  # largest number; 20 rounds narrow the search radius a hundredfold
 _REFITS = 12
@@ -298,6 +300,7 @@ def register(
             raise EvaluationError(f"`{name}` is {size:g}; expected {_SMALLEST:g} to {1 / _SMALLEST:g}")
     if (start_std_mm is None) != (start_std_deg is None):
         raise EvaluationError("the uncertainty of the initial poses needs both start_std_mm and start_std_deg")
+    scans = _omit_shared_points(scans, names)
     steps = len(scans) + _ROUNDS
     patches = []
     for number, (name, scan) in enumerate(zip(names, scans, strict=True)):
@@ -346,6 +349,25 @@ def register(
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
         cloud=merge_clouds(scans, names, joint, known),
     )
+
+
+def _omit_shared_points(scans: Sequence[PointCloud], names: Sequence[str]) -> list[PointCloud]:
+    """Return the scans without points that an earlier one contains, with a warning; EvaluationError if none is left."""
+    shared = find_repeated(np.vstack([scan.points_mm for scan in scans]))
+    result, ends = [], np.cumsum([len(scan) for scan in scans])
+    for repeated, scan, name in zip(np.split(shared, ends[:-1]), scans, names, strict=True):
+        if repeated.all():
+            raise EvaluationError(
+                f"all points of {name} are those of another scan. A copy is no evidence: leave it out"
+            )
+        if count := np.count_nonzero(repeated):
+            warning = (
+                f"{count} of {len(scan)} points are those of another scan and are omitted: they are no new evidence"
+            )
+            log_warnings(name, [warning])
+            scan = replace(scan.select(~repeated), warnings=[*scan.warnings, warning])
+        result.append(scan)
+    return result
 
 
 def _settle(

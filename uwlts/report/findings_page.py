@@ -55,7 +55,7 @@ from uwlts.report.measured_values import COLUMNS, MeasuredValues, read_measured
 from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.number_tables import Unit
 
 _BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
@@ -165,7 +165,7 @@ def write_findings(
     page, path = Path(out), Path(cloud)
     refuse_unsuitable_page(page, kind=FINDINGS, pdf=pdf, overwrite=overwrite)
     stated = load_order(order)
-    points = read_cloud(path, unit=unit)
+    points = load_cloud(path, unit=unit)
     by_hand = None if measured is None else read_measured(measured)
     sources = _sources(path, points, captures, calibration, certificate)
     checks = [_artefact_check(each, points) for each in verification]

@@ -37,6 +37,7 @@ from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_array, read_forma
 from uwlts.storage.normal_std import compute_normal_std
 from uwlts.storage.number_tables import Unit, choose_scale, find_stated_unit
 from uwlts.storage.ply import encode_ply, read_comments, read_ply
+from uwlts.storage.repeated_points import omit_repeated
 
 FORMAT = "uwlts-cloud"
 VERSION = 1  # of the file format
@@ -172,14 +173,16 @@ def read_cloud(path: str | os.PathLike[str], *, unit: Unit | None = None) -> Poi
 
 
 def load_cloud(cloud: PointCloud | str | os.PathLike[str], *, unit: Unit | None = None) -> PointCloud:
-    """Return a cloud to measure, unchanged or read from a file; raises the errors of `read_cloud`.
+    """Return a cloud to measure, as it is or read from a file; raises the errors of `read_cloud`.
 
-    Logs a warning if its file held no more of the uncertainty than the standard deviation along the normal.
+    Repeated points are omitted with a warning. Another one says if the file has no more of the uncertainty than the
+    standard deviation along the normal. Both are logged and added to the cloud's warnings.
     """
-    found = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud, unit=unit)
-    if found.normal_std_mm is not None and found.uncertainty is None:
-        log_warnings("cloud" if isinstance(cloud, PointCloud) else cloud, [_LEAN])
-    return found
+    found, warnings = omit_repeated(cloud if isinstance(cloud, PointCloud) else read_cloud(cloud, unit=unit))
+    if found.normal_std_mm is not None and found.uncertainty is None and _LEAN not in found.warnings:
+        warnings.append(_LEAN)
+    log_warnings("cloud" if isinstance(cloud, PointCloud) else cloud, warnings)
+    return replace(found, warnings=[*found.warnings, *warnings]) if warnings else found
 
 
 def read_thinned_cloud(

@@ -63,8 +63,8 @@ def test_steps_of_coordinates_widen_lengths_only() -> None:
     step = Feature(FeatureKind.STEP, "step", values, nothing, np.eye(3), nothing, np.arange(4))
     whole = Inspection("step", (step,), nothing, nothing)
     cloud = PointCloud(np.zeros((1, 3)), np.ones(1), np.zeros(1, int), np.zeros(1, int), metadata={STEP: 1.2})
-    (wider,) = whole.count_steps(cloud).features
+    (wider,) = whole.consider_cloud(cloud).features
     assert wider["height"].systematic == pytest.approx(1.2 / np.sqrt(12)) and wider["parallelism"] == values[1]
-    assert whole.count_steps(cloud).notes == (
+    assert whole.consider_cloud(cloud).notes == (
         "uncertainties contain 0.35 mm for the steps of the cloud's stored coordinates",
     )

@@ -277,7 +277,7 @@ def test_wrong_input_is_refused(pits):
         uwlts.register(scans[:2], reach_mm=-1)
     with pytest.raises(uwlts.Error, match="needs both start_std_mm"):
         uwlts.register(scans[:2], start_std_mm=1.0)
-    few = PointCloud(scans[0].points_mm[:50], *(np.zeros(50),) * 3)
+    few = PointCloud(scans[1].points_mm[:50], *(np.zeros(50),) * 3)
     with pytest.raises(uwlts.Error, match="scan 2: the cloud has 50 points"):
         uwlts.register([scans[0], few])
 
