@@ -140,12 +140,6 @@ JOBS: dict[str, str] = {
         f"uwlts export moving/vehicle.full.ply --out formats/vehicle{ending}"
         for ending in (".h5", ".xyz", ".laz", ".e57", ".mcap")
     ),
-    "report": """
-        copy inputs/scans/spheres.h5 report/spheres.h5
-        copy joint/calibration.json report/calibration.json
-        copy evaluate/spheres.json report/spheres.evaluation.json
-        copy evaluate/spheres.full.ply report/spheres.full.ply
-        uwlts report report --published thesis""",
     "info": """
         uwlts info joint/calibration.json
         uwlts info reconstruct/spheres.full.ply

@@ -46,7 +46,6 @@ from uwlts.model.library import library_folder, load_sensor, read_table, validat
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.acceptance_page import acceptance_page
 from uwlts.report.certificate import check_certificate, make_certificate
-from uwlts.report.gather import load_reference
 from uwlts.report.inventory import describe
 from uwlts.storage.calibration_file import load_calibration, read_calibration
 from uwlts.storage.capture import Capture
@@ -537,7 +536,6 @@ READERS = {
         Reader("screened", ".parquet", "bytes", _part, _read_part),
         Reader("results", ".json", "json", _results, CampaignResults.read_file),
         Reader("guided-plan", ".toml", "toml", _guided_plan, load_guided_plan),
-        Reader("reference", ".toml", "toml", _shipped("references/thesis.toml"), load_reference),
         Reader("published", ".toml", "toml", _shipped("references/thesis-tables.toml"), load_published),
     )
 }

@@ -52,7 +52,6 @@ SUBCOMMANDS = [
     "uwlts nominal",
     "uwlts reconstruct",
     "uwlts evaluate",
-    "uwlts report",
     "uwlts thesis",
 ]
 
@@ -242,7 +241,6 @@ def test_version(command, program: str):
         ("uwlts design --medium water", "SENSOR"),
         ("uwlts nominal thesis --out x.json", "--medium"),
         ("uwlts evaluate scan.ply", "--out"),
-        ("uwlts report", "--folder is missing"),
         ("uwlts thesis", "--folder is missing"),
         ("uwlts thesis campaign --trials many", "many"),
         ("twin simulate --out x.h5", "SCENE"),
@@ -305,7 +303,6 @@ PLACES = {
     "evaluate, cloud": ("uwlts evaluate {} --out x.json", {"scan.ply"}),
     "evaluate, artefact": ("uwlts evaluate scan.ply --artefact {} --out x.json", {"artefact.toml"}),
     "evaluate, truth": ("uwlts evaluate scan.ply --truth {} --out x.json", set()),
-    "report, published": ("uwlts report campaign --published {}", set()),
     "thesis, folder": ("uwlts thesis {}", set()),
     "thesis, published": ("uwlts thesis campaigns --published {}", set()),
     "reproduce, campaign": ("twin reproduce {} --campaigns 1 --out x", set()),
@@ -419,7 +416,6 @@ def test_damaged_residuals_are_refused_by_every_command(fails, folder: Path, tmp
     path = tmp_path / "calibration.json"
     for residuals in ({"camera": "good"}, {"camera": {"rms_px": "good"}}):
         path.write_text(json.dumps(content | {"residuals": residuals}), encoding="utf-8")
-        fails("uwlts", "report", tmp_path, says="calibration.json is not a valid calibration: residuals.camera")
         used = ("--calibration", path, "--out", tmp_path / "x.ply")
         fails("uwlts", "reconstruct", folder / "scan.h5", *used, says="residuals.camera")
 
@@ -579,17 +575,6 @@ def test_simulation_that_cannot_be(fails, folder: Path, monkeypatch, options: st
 def test_unknown_medium(fails, tmp_path: Path):
     fails("uwlts", "nominal", "thesis", "--medium", "milk", "--out", tmp_path / "x.json", says="milk")
     fails("uwlts", "design", "thesis", "--medium", "milk", says="knows the media air, water, not 'milk'")
-
-
-def test_reports_that_cannot_be(fails, folder: Path, tmp_path: Path):
-    fails("uwlts", "report", tmp_path / "missing", says="missing")
-    fails("uwlts", "report", folder / "scan.h5", says="scan.h5")
-    (tmp_path / "empty").mkdir()
-    fails("uwlts", "report", tmp_path / "empty", says="empty")
-    assert list((tmp_path / "empty").iterdir()) == []
-    fails("uwlts", "report", folder / "campaign", "--published", "no-reference", says="no-reference")
-    out = tmp_path / "missing" / "x.html"
-    fails("uwlts", "report", folder / "campaign", "--out", out, says="missing does not exist")
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,6 @@ def test_distortion_is_auto_or_each_coefficient_once(command, tmp_path, monkeypa
 
 
 FOLDERS = {
-    "uwlts report --pictures",
     "twin record --out",
     "twin dataset --out",
     "twin reproduce --out",
@@ -141,7 +140,7 @@ def test_what_is_described_as_written_counts_as_an_output():
         if program == "uwlts"
         and re.search(r"\bto write\b|^(Also w|W)rite |default: not written", argument.parameter.help)
     }
-    assert described >= {"out", "coloured", "aligned", "page", "poses_out", "pictures"}
+    assert described >= {"out", "coloured", "aligned", "page", "poses_out"}
     assert described <= OUTPUTS
 
 
@@ -187,7 +186,7 @@ def _written(line: str) -> list[str]:
         return []
     names = [str(path) for name in OUTPUTS if (path := given.get(name)) is not None and f"{path}" not in ("()", "")]
     kind = {"register": "registration", "findings_report": "findings"}.get(command.__name__, "")
-    pages = [Path(name) for name in names if name.endswith(".html") and command.__name__ != "report"]
+    pages = [Path(name) for name in names if name.endswith(".html")]
     beside = [str(json_beside(page, kind)) for page in pages]
     return names + beside + ([str(page.with_suffix(".pdf")) for page in pages] if given.get("pdf") else [])
 

@@ -72,7 +72,6 @@ def test_all_commands_with_outputs_are_covered():
         "uwlts nominal",
         "uwlts import",
         "uwlts export",
-        "uwlts report",
         "uwlts scan",
         "twin simulate",
         "twin record",

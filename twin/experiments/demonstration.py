@@ -1,14 +1,13 @@
-"""Demonstration of all commands: record a virtual campaign, calibrate, reconstruct, evaluate, report."""
+"""Demonstration: an experiment that compares the joint calibration with both methods of the thesis."""
 
-import json
-import shlex
-import time
 from pathlib import Path
 
-from twin.experiments.runner import AT_ONCE, CommandLine, Method, plan_lines, run_stages
-from twin.scene.campaign import list_takes, load_campaign
+from twin.experiments.experiment import run_experiment
+from twin.experiments.result import PAGE
+from twin.experiments.runner import Method
+from twin.scene.campaign import load_campaign
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 
-CAMPAIGN = "demo"
 _STEPS = ("step-near-water", "step-standoff-water", "step-far-water")
 _SPHERES = ("spheres-near", "spheres-standoff", "spheres-far")
 METHODS = (
@@ -35,41 +34,33 @@ METHODS = (
 """The joint calibration, and both methods of the thesis."""
 
 
-def demo(out: str | Path = "runs/demo") -> Path:
-    """Demonstrate the whole process: record a virtual campaign, calibrate, reconstruct, evaluate, report.
+def demo(out: str | Path = "runs/demo", *, progress: ProgressListener = ignore_progress) -> Path:
+    """Demonstrate the whole process as an experiment: render a campaign, calibrate, reconstruct, evaluate, compare.
 
     The campaign has realistic imperfections. It is calibrated jointly and by both methods of the thesis. The commands
-    are printed and run two at a time; each can also be typed by hand. The path of the report, OUT/report.html, is
-    returned.
+    that calibrate and measure are in OUT/commands.sh; each can also be typed by hand. An interrupted demonstration is
+    resumed. The path of the page, OUT/experiment.html, is returned.
 
     Parameters
     ----------
     out
         Folder for all results.
+    progress
+        As for `predict`.
 
     Returns
     -------
     pathlib.Path
-        The report, ``OUT/report.html``.
+        The page, ``OUT/experiment.html``.
 
     Raises
     ------
     CommandFailed
         A command failed; its output gives the reason.
-    SetupError
-        A worker process ended unexpectedly.
+    DescriptionError, OutputError, SetupError
+        As for `experiment`.
     """
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    begun = time.perf_counter()
-    name = shlex.quote(str(folder))
-    takes = {take.name: take for take in list_takes(load_campaign(CAMPAIGN), seed=0)}
-    made = folder / "report.html"
-    record = CommandLine("render", f"twin record {CAMPAIGN} --out {name} --overwrite", (), None)
-    seconds = run_stages([record, *plan_lines(folder, takes, METHODS, with_truth=True, coloured=True)], quiet=False)
-    (folder / "seconds.json").write_text(json.dumps(seconds, indent=2) + "\n", encoding="utf-8")
-    report = f"uwlts report {name} --published thesis --workers {AT_ONCE} --overwrite"
-    seconds |= run_stages([CommandLine("report", report, (), None)], quiet=False)
-    total = ", ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items())
-    print(f"done in {time.perf_counter() - begun:.1f} s ({total}); open {made}")
-    return made
+    how = {"name": "demo", "methods": METHODS, "with_truth": True, "every": 1, "workers": None}
+    result = run_experiment(load_campaign("demo"), Path(out), [0], progress=progress, **how)
+    print("\n".join(result.lines()))
+    return Path(out) / PAGE

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,10 @@ import tomli_w
 
 from twin.experiments.figures import describe_conditions, read_figures, read_flaws
 from twin.experiments.result import ExperimentResult
-from twin.experiments.runner import Method, evidence_of, inspected_as, is_evaluated, plan_lines, run_stages
+from twin.experiments.runner import COLOURED, Method, evidence_of, inspected_as, is_evaluated, plan_lines, run_stages
 from twin.recording.campaigns import make_folder, record_campaigns, require_at_least
 from twin.rendering_options import CPU, Variant
-from twin.scene.campaign import Campaign, CampaignRecording, Take, list_takes, load_campaign
+from twin.scene.campaign import Campaign, CampaignRecording, list_takes, load_campaign
 from twin.scene.stated_deviations import find_understated
 from uwlts.errors import DescriptionError, DescriptionWarning
 from uwlts.files.writing import write_atomically
@@ -47,7 +48,7 @@ def experiment(
 
     Each seed draws a campaign with its own imperfections and noise. The sensor's software calibrates it jointly,
     reconstructs and evaluates the scans, and states uncertainties. An interrupted experiment is resumed, and seeds can
-    be added. OUT/experiment.html and experiment.json are written.
+    be added. OUT/experiment.html and experiment.json are written, and commands.sh with all commands of the software.
 
     Parameters
     ----------
@@ -214,19 +215,22 @@ def run_experiment(
     *,
     name: str,
     with_truth: bool,
+    methods: Sequence[Method] = (),
     every: int,
     scheduler: str | None = None,
     progress: ProgressListener = ignore_progress,
     **options: Any,
 ) -> ExperimentResult:
-    """Record a campaign for each seed, calibrate it jointly, measure its scans, and write table and page.
+    """Record a campaign for each seed, calibrate it, measure its scans, and write table and page.
 
-    ``with_truth`` compares all scans with the ground truth, so that scans of any scene count; otherwise those of an
-    artefact, a pitted pipe or a weld. ``options`` are those of `record_campaigns`. Raises as `experiment`.
+    ``methods`` are the calibrations, whose scans count if the campaign has them; by default the joint one with all
+    recordings of targets and steps. ``with_truth`` compares all scans with the ground truth, so that scans of any scene
+    count; otherwise those of an artefact, a pitted pipe or a weld. ``options`` are those of `record_campaigns`. Raises
+    as `experiment`.
     """
     require_at_least(1, every=every, workers=options["workers"])
     require_at_least(0, seed=min(seeds))
-    method, scans = sort_recordings(campaign, every, all_scans=with_truth)
+    methods = methods or [choose_joint(campaign, every, all_scans=with_truth)]
     takes = [{take.name: take for take in list_takes(campaign, seed=seed, every=every)} for seed in seeds]
     understated = find_understated(campaign, [*takes[0].values()])
     for each in understated:
@@ -234,51 +238,52 @@ def run_experiment(
     folders = record_campaigns(
         campaign, folder, seeds=seeds, every=every, scheduler=scheduler, progress=progress, **options
     )
+    by_folder = dict(zip(folders, takes, strict=True))
+    methods = [replace(each, scans=[scan for scan in each.scans if scan in takes[0]]) for each in methods]
     lines = [
         line
-        for place, of_seed in zip(folders, takes, strict=True)
-        for line in plan_lines(place, of_seed, [method], with_truth=with_truth)
+        for place, of_seed in by_folder.items()
+        for line in plan_lines(place, of_seed, methods, with_truth=with_truth, coloured=place == folders[0])
     ]
+    with write_atomically(folder / "commands.sh", overwrite=True) as aside:
+        aside.write_text("".join(f"{line.text}\n" for line in lines), encoding="utf-8")
     run_stages(lines, scheduler=scheduler, progress=progress)
-    by_folder = dict(zip(folders, takes, strict=True))
-    rows = [row for place, of_seed in by_folder.items() for row in read_figures(place, of_seed, [method])]
-    detections, depths = read_flaws(by_folder, method)
-    table = FigureTable(rows=(*rows, *depths))
-    conditions = {scan: describe_conditions(take) for scan, take in scans.items()}
-    judged = {row.scan for row in rows}
+    rows = [row for place, of_seed in by_folder.items() for row in read_figures(place, of_seed, methods)]
+    detections, depths = read_flaws(by_folder, methods[0])
+    conditions = {row.scan: describe_conditions(takes[0][row.scan]) for row in rows}
     result = ExperimentResult(
         campaign=name,
         sensor=campaign.sensor,
         as_built=campaign.as_built,
         water=campaign.water,
         seeds=tuple(seeds),
-        table=table,
-        conditions={scan: text for scan, text in conditions.items() if scan in judged}
-        | {f"{each.flaw}s": each.checked for each in detections},
+        table=FigureTable(rows=(*rows, *depths)),
+        conditions=conditions | {f"{each.flaw}s": each.checked for each in detections},
         detections=detections,
         understated=understated,
     )
-    result.write(folder)
+    coloured = {scan: methods[0].result(folders[0], scan, COLOURED) for scan in methods[0].scans}
+    result.write(folder, {scan: path for scan, path in coloured.items() if path.is_file()})
     return result
 
 
-def sort_recordings(campaign: Campaign, every: int, *, all_scans: bool) -> tuple[Method, dict[str, Take]]:
-    """Return the joint calibration of a campaign, and its scans by name.
+def choose_joint(campaign: Campaign, every: int, *, all_scans: bool) -> Method:
+    """Return the joint calibration of a campaign and its scans.
 
     Raises DescriptionError if there is no recording of a target, or no scan.
     """
     evidence: dict[str, list[str]] = {"air": [], "water": [], "step": []}
-    scans: dict[str, Take] = {}
+    scans: list[str] = []
     for take in list_takes(campaign, seed=0, every=every):
         if (option := evidence_of(take)) is not None:
             evidence[option].append(take.name)
         elif all_scans or is_evaluated(take.scene) or inspected_as(take.scene) is not None:
-            scans[take.name] = take
+            scans.append(take.name)
     if not evidence["air"] and not evidence["water"]:
         raise DescriptionError(f"campaign {campaign.title!r} has no recording of a target for the calibration")
     if not scans:
         raise DescriptionError(f"campaign {campaign.title!r} has no scan of an artefact, a pitted pipe or a weld")
-    return Method(JOINT, evidence, tuple(scans)), scans
+    return Method(JOINT, evidence, scans)
 
 
 def _is_evidence(campaign: Campaign, recording: CampaignRecording) -> bool:

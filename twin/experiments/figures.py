@@ -39,11 +39,11 @@ def _read_evaluation(path: Path, take: Take) -> Iterator[dict[str, Any]]:
         stated = content.get("uncertainty", {})
         for name, value in (content["evaluation"] or {"figures_mm": {}})["figures_mm"].items():
             true, std = calibrated.get(name, (None, 0.0))
-            known = stated.get(name) if true is None else stated[name]
+            known = stated.get(name)
             expanded = None if known is None else math.hypot(known["expanded_mm"], std)
             yield {"figure": name, "true_mm": true, "measured_mm": (true or 0.0) + value, "expanded_mm": expanded}
     except (KeyError, TypeError) as error:
-        raise CaptureError(f"an evaluation of {take.name} has no uncertainty of {error}") from error
+        raise CaptureError(f"an evaluation of {take.name} is incomplete: {error}") from error
     if (truth := content.get("truth")) is not None:
         stated = truth.get("shift_expanded_mm") or (None,) * 3
         for axis, shift, expanded in zip(_AXES, truth["shift_mm"], stated, strict=True):

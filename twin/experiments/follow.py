@@ -1,16 +1,15 @@
 """Twin of a sensor from a scan: its description is fitted to the images, and the scan is rendered again."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 
+from twin.experiments.runner import run_program
 from twin.recording.render import simulate
 from twin.rendering_options import CPU, Variant
 from twin.scene.description import load_scene
-from uwlts.errors import CaptureError, CommandFailed, OutputError
+from uwlts.errors import CaptureError, OutputError
 from uwlts.files.writing import write_atomically
 from uwlts.model.sensor import Table
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -137,6 +136,5 @@ def _reconstructed_scene(header: CaptureHeader, mesh: str, reflectance: float) -
 
 
 def _run(command: str, *words: str) -> None:
-    """Run a command of the sensor's software as a separate program."""
-    if code := subprocess.run([sys.executable, "-m", "uwlts", command, *words, "--overwrite"], check=False).returncode:
-        raise CommandFailed(f"uwlts {command}", code)
+    """Run a command of the sensor's software as a separate program, which replaces its outputs."""
+    run_program("uwlts", command, *words, "--overwrite")

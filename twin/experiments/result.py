@@ -1,6 +1,7 @@
 """Result of an experiment: its table of figures, probabilities of detection, and page."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,24 @@ from twin.scene.stated_deviations import Understated
 from uwlts._version import __version__
 from uwlts.files.json_files import write_model
 from uwlts.model.brief import Brief, align_columns
-from uwlts.pages.toolkit import BLUE, figure_svg, new_figure, render_page, write_page
-from uwlts.storage.figure_table import FigureTable, format_errors
+from uwlts.pages.cloud_display import choose_points
+from uwlts.pages.toolkit import (
+    BLUE,
+    COLOURS,
+    FigureCollector,
+    figure_svg,
+    legend_below,
+    new_figure,
+    render_page,
+    write_page,
+)
+from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.figure_table import FigureErrors, FigureTable, format_errors
 
 RESULT = "experiment.json"
 PAGE = "experiment.html"
+_MOST_POINTS = 12_000
+"""Largest number of points in a cloud of the page, which take about 60 kB."""
 _DETECTION_HEAD = "flaw", "method", "width / mm", "found", "false", "a90 / mm", "a90/95", "limits"
 
 
@@ -64,7 +78,7 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
         """Return the result as lines of text."""
         lines = [
             f"sensor {self.sensor}, built as {self.as_built}; campaigns {self.campaign}: {len(self.seeds)}",
-            *format_errors(self.table.errors()),
+            *format_errors(self.errors()),
             self.verdict(),
             "U: expanded uncertainty (k = 2) by propagation; found: twice the rms error of the campaigns",
             *(f"understated: {each.text()}" for each in self.understated),
@@ -76,31 +90,51 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
             f"  {scan}: {text}" for scan, text in self.conditions.items()
         ]
 
+    def errors(self) -> tuple[FigureErrors, ...]:
+        """Return the errors of every figure of every scan; with several calibrations, those of each object together."""
+        return self.table.pooled_errors() if len(self._methods()) > 1 else self.table.errors()
+
+    def _methods(self) -> list[str]:
+        return list(dict.fromkeys(row.method for row in self.table.rows))
+
     def errors_figure(self) -> Figure:
         """Return a chart: bars for the stated uncertainties, and a dot for the error of every measurement."""
-        groups = self.table.errors()
+        methods, groups = self._methods(), self.errors()
+        places = [len(list(group)) for _, group in groupby(groups, lambda each: (each.scan, each.name))]
         figure, (axes,) = new_figure(8.0, 1.2 + 0.3 * len(groups))
         for place, each in enumerate(groups):
-            axes.barh(place, 2 * each.stated_mm, left=-each.stated_mm, height=0.6, color=BLUE, alpha=0.2)
-            axes.plot(each.errors_mm, [place] * len(each.errors_mm), "o", color=BLUE, markersize=4)
+            colour = COLOURS[methods.index(each.method) % len(COLOURS)]
+            axes.barh(place, 2 * each.stated_mm, left=-each.stated_mm, height=0.6, color=colour, alpha=0.2)
+            axes.plot(each.errors_mm, [place] * len(each.errors_mm), "o", color=colour, markersize=4, label=each.method)
         axes.axvline(0.0, color="black", linewidth=0.5)
-        axes.set_yticks(range(len(groups)), [f"{each.scan}, {each.name}" for each in groups])
+        firsts = np.cumsum([0, *places[:-1]]) if places else []
+        axes.set_yticks(firsts, [f"{groups[first].scan}, {groups[first].name}" for first in firsts])
         axes.invert_yaxis()
         axes.set_xlabel("measured minus true value, mm")
+        if len(methods) > 1:
+            legend_below(figure)
         return figure
 
-    def write(self, folder: Path) -> None:
-        """Write experiment.json and experiment.html into a folder; OutputError if that fails."""
-        write_model(folder / RESULT, self, file_format="twin-experiment", version=1, overwrite=True)
-        write_page(folder / PAGE, self._page(), overwrite=True)
+    def write(self, folder: Path, clouds: Mapping[str, Path] | None = None) -> None:
+        """Write experiment.json and experiment.html into a folder; OutputError if that fails.
 
-    def _page(self) -> str:
-        """Return a page with the uncertainties and errors, and the probabilities of detection."""
-        count = len(self.seeds)
+        ``clouds`` are files of clouds for the page, by name.
+        """
+        write_model(folder / RESULT, self, file_format="twin-experiment", version=1, overwrite=True)
+        write_page(folder / PAGE, self._page(clouds or {}), overwrite=True)
+
+    def _page(self, clouds: Mapping[str, Path]) -> str:
+        """Return a page with the uncertainties and errors, the probabilities of detection, and clouds."""
+        count, collected, shown = len(self.seeds), FigureCollector(), []
         water = [] if self.water is None else [("water", f"{self.water}")]
+        for name, path in clouds.items():
+            cloud = read_cloud(path)
+            points = choose_points(cloud.points_mm, "deviation", cloud.field_values("deviation"), most=_MOST_POINTS)
+            shown.append((name, collected.add_cloud(*points, still="")))
         return render_page(
             "twin.experiments",
             "page.html.j2",
+            interactive=collected,
             sensor=Path(self.sensor).stem,
             verdict=f"{self.verdict()}, in {count} rendered campaign{'s' if count > 1 else ''}.",
             introduction=[
@@ -112,13 +146,24 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
             ],
             understated=[each.text() for each in self.understated],
             figure=figure_svg(self.errors_figure()),
-            rows=[each.texts() for each in self.table.errors()],
+            rows=[each.texts() for each in self.errors()],
+            values=_mean_values(self.table),
+            clouds=shown,
             curves=_draw_curves(self.detections) if self.detections else None,
             detection_head=_DETECTION_HEAD,
             detections=[*map(_detection_row, self.detections)],
             validity=[*self.conditions.items()],
             version=__version__,
         )
+
+
+def _mean_values(table: FigureTable) -> list[tuple[str, ...]]:
+    """Return scan, calibration, figure and mean value of the figures without a true value."""
+    groups: dict[tuple[str, ...], list[float]] = {}
+    for row in table.rows:
+        if row.true_mm is None:
+            groups.setdefault((row.scan, row.method, row.figure), []).append(row.measured_mm)
+    return [(*key, f"{np.mean(values):.4f}") for key, values in groups.items()]
 
 
 def _detection_row(each: ProbabilityOfDetection) -> tuple[str, ...]:

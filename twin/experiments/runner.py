@@ -4,26 +4,32 @@ The twin shares no mathematics with the sensor's software, so an experiment cons
 type. Each one is skipped if its output is newer than its inputs: an interrupted experiment is resumed.
 """
 
+import io
+import runpy
 import shlex
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from twin.experiments.command_lines import run_apart, run_line
 from twin.scene.campaign import Take
 from twin.scene.description import Scene
 from twin.scene.forms import PittedPipe, Weld
 from uwlts.errors import CommandFailed, SetupError
+from uwlts.runtime.console import INTERRUPTED
 from uwlts.runtime.progress import ProgressListener, ignore_progress
-from uwlts.runtime.workers import Lost, Workers, open_workers
+from uwlts.runtime.workers import Lost, open_workers
 
 AT_ONCE = 2
 """Number of parallel commands of a stage: only rendering uses all processors by itself."""
 _STEP_IMAGES = 5
 """Fewer images of a step standard belong to a calibration; a scan has at least this many profiles."""
+
+COLOURED = "coloured.ply"
+"""End of the names of clouds with the colours of their deviations."""
 
 Inspected = Literal["flange", "pipe", "weld"]
 """Kind of object for `uwlts inspect`; a plane is the face of a flange."""
@@ -48,7 +54,7 @@ class Method:
         return folder / f"calibration{self.suffix}.json"
 
     def result(self, folder: Path, scan: str, kind: str) -> Path:
-        """Return a scan's file of a kind: cloud.h5, evaluation.json or inspection.json."""
+        """Return a scan's file of a kind: cloud.h5, evaluation.json, inspection.json or `COLOURED`."""
         return folder / f"{scan}{self.suffix}.{kind}"
 
 
@@ -95,13 +101,14 @@ def plan_lines(
 ) -> list[CommandLine]:
     """Return the command lines that calibrate, reconstruct and measure in a campaign's folder, by stage.
 
-    ``with_truth`` compares all clouds with the ground truth of their recordings, too; ``coloured`` also writes clouds
-    with the colours of their deviations.
+    ``with_truth`` compares all clouds with the ground truth of their recordings, too. With ``coloured``, those of the
+    first method are also written with the colours of their deviations.
     """
     lines = [_calibrate(folder, method) for method in methods]
     for method in methods:
         for scan in method.scans:
-            lines += _measure(folder, method, takes[scan], with_truth=with_truth, coloured=coloured)
+            shown = coloured and method is methods[0]
+            lines += _measure(folder, method, takes[scan], with_truth=with_truth, coloured=shown)
     return sorted(lines, key=lambda line: ("calibrate", "reconstruct", "evaluate").index(line.stage))
 
 
@@ -124,9 +131,9 @@ def _measure(folder: Path, method: Method, take: Take, *, with_truth: bool, colo
     if with_truth or is_evaluated(take.scene):
         made, words = method.result(folder, take.name, "evaluation.json"), ""
         if with_truth:
-            words = f" --truth {_quoted(capture.with_suffix('.truth.h5'))}"
-        if coloured:
-            words += f" --coloured {_quoted(folder / f'{take.name}{method.suffix}-coloured.ply')}"
+            words += f" --truth {_quoted(capture.with_suffix('.truth.h5'))}"
+        if with_truth and coloured:
+            words += f" --coloured {_quoted(method.result(folder, take.name, COLOURED))}"
         text = f"uwlts evaluate {_quoted(cloud)} --out {_quoted(made)}{words} --overwrite"
         yield CommandLine("evaluate", text, (cloud,), made)
     if (kind := inspected_as(take.scene)) is not None:
@@ -141,54 +148,63 @@ def _quoted(path: Path) -> str:
 
 
 def run_stages(
-    lines: Sequence[CommandLine],
-    *,
-    scheduler: str | None = None,
-    quiet: bool = True,
-    progress: ProgressListener = ignore_progress,
-) -> dict[str, float]:
-    """Run command lines by stage, those of a stage in parallel, and return the seconds of each stage.
+    lines: Sequence[CommandLine], *, scheduler: str | None = None, progress: ProgressListener = ignore_progress
+) -> None:
+    """Run command lines by stage, those of a stage in parallel; lines that are done are skipped.
 
-    Lines that are done are skipped. With ``scheduler``, the address of a Dask scheduler, its workers run them; they
-    need the same folder. Without ``quiet``, lines are printed as they start, and their output as they end.
+    With ``scheduler``, the address of a Dask scheduler, its workers run them; they need the same folder.
 
     Raises CommandFailed if one fails; its output, which has been printed, gives the reason. Raises SetupError if a
     worker ended unexpectedly, or the scheduler does not answer.
     """
-    seconds: dict[str, float] = {}
     done, total = 0, len(lines)
     with open_workers(workers=AT_ONCE, scheduler=scheduler) as workers:
-        run = partial(run_apart if scheduler else run_line, quiet=quiet)
         for stage in dict.fromkeys(line.stage for line in lines):
-            start = time.perf_counter()
             of_stage = [line for line in lines if line.stage == stage]
-            waiting = [line for line in of_stage if not line.is_done()]
+            waiting = [line.text for line in of_stage if not line.is_done()]
             done += len(of_stage) - len(waiting)
             progress(done, total, stage)
-            for _ in run_lines(workers, [line.text for line in waiting], run=run, quiet=quiet):
+            for line, ended in workers.map_unordered(run_apart if scheduler else run_line, waiting):
+                if isinstance(ended, Lost):
+                    raise SetupError(f"{line}: {ended.reason}")
+                code, output = ended
+                if code:
+                    print(output, end="", flush=True)
+                    raise CommandFailed(line, code)
                 done += 1
                 progress(done, total, stage)
-            seconds[stage] = round(time.perf_counter() - start, 2)
-    return seconds
 
 
-def run_lines(
-    workers: Workers, lines: Iterable[str], *, run: Callable[[str], tuple[int, str]], quiet: bool
-) -> Iterator[str]:
-    """Run independent command lines in parallel; yield each one when it has ended. Raises as `run_stages`."""
-    for line, ended in workers.map_unordered(run, lines if quiet else _announce(lines)):
-        if isinstance(ended, Lost):
-            raise SetupError(f"{line}: {ended.reason}")
-        code, output = ended
-        if code or not quiet:
-            print(output, end="", flush=True)
-        if code:
-            raise CommandFailed(line, code)
-        yield line
+def run_line(line: str) -> tuple[int, str]:
+    """Run a command as ``python -m`` does, and return its exit code and output with errors.
+
+    The command runs in this process: importing the shared modules takes most commands longer than their work.
+    """
+    program, *arguments = shlex.split(line)
+    output = io.StringIO()
+    sys.argv = [program, *arguments]
+    code = 0
+    with redirect_stdout(output), redirect_stderr(output):
+        try:
+            runpy.run_module(program, run_name="__main__", alter_sys=True)
+        except SystemExit as end:
+            code = int(end.code or 0)
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt
+    return code, output.getvalue()
 
 
-def _announce(lines: Iterable[str]) -> Iterator[str]:
-    """Yield the commands; print each one when it starts."""
-    for line in lines:
-        print(f"$ {line}", flush=True)
-        yield line
+def run_apart(line: str) -> tuple[int, str]:
+    """Run a command as a separate program, and return its exit code and output with errors.
+
+    Several threads of a process can do so at the same time.
+    """
+    words = [sys.executable, "-m", *shlex.split(line)]
+    done = subprocess.run(words, check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return done.returncode, done.stdout
+
+
+def run_program(*words: str) -> None:
+    """Run a program as ``python -m`` does, with its output on the terminal; CommandFailed if it fails."""
+    if code := subprocess.run([sys.executable, "-m", *words], check=False).returncode:
+        raise CommandFailed(" ".join(words[:2]), code)

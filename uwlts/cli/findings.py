@@ -1,4 +1,4 @@
-"""Commands that evaluate measured objects: changes, features and reports."""
+"""Commands that evaluate measured objects: changes, features and the thesis's campaigns."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -123,19 +123,6 @@ def findings_report(
     beside = [json_beside(out, "findings"), *([out.with_suffix(".pdf")] if call.given.get("pdf") else [])]
     show(found.lines())
     say(f"wrote {out}, {', '.join(each.name for each in beside)}")
-
-
-@command_from(app, uwlts.report, "write_campaign", job="Inspect")
-def report(call: Call) -> None:
-    """Print a table.
-
-    Example: uwlts report runs/demo --published thesis
-    """
-    from uwlts.report.campaign_tables import print_table
-
-    written = call()
-    print_table(written.rows())
-    say(f"wrote {written.page} and {written.summary}")
 
 
 @command_from(app, uwlts.thesis, "evaluate_thesis", job="Inspect")

@@ -306,18 +306,6 @@ def plain_text(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def webp_data_uri(picture: bytes) -> str:
-    """Return the bytes of a PNG as the address of a WebP, the smaller one of lossless and of quality 80."""
-    from PIL import Image
-
-    image, found = Image.open(io.BytesIO(picture)).convert("RGB"), []
-    for options in ({"lossless": True}, {"quality": 80}):
-        content = io.BytesIO()
-        image.save(content, "webp", method=6, **options)
-        found.append(content.getvalue())
-    return "data:image/webp;base64," + base64.b64encode(min(found, key=len)).decode("ascii")
-
-
 def png_data_uri(picture: Drawn | bytes, *, dpi: int = 100) -> str:
     """Return a matplotlib figure, or the bytes of a PNG, as an address that contains the whole picture."""
     data = picture if isinstance(picture, bytes) else figure_png(picture, dpi=dpi)

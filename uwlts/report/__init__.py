@@ -1,4 +1,4 @@
-"""Plots, tables and pages: reports of campaigns, certificates.
+"""Plots, tables and pages: certificates, findings, changes.
 
 The stub beside this file lists its functions. Each is imported when it is first used.
 """

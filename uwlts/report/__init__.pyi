@@ -1,7 +1,6 @@
 from . import plot as plot
 from .acceptance_page import write_acceptance as write_acceptance
 from .camera_page import write_camera as write_camera
-from .campaign_page import write_campaign as write_campaign
 from .certificate import check_certificate as check_certificate
 from .certificate_page import write_certificate as write_certificate
 from .change_page import write_change as write_change

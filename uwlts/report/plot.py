@@ -6,9 +6,9 @@ Every function draws into ``ax``, or into a new figure in the style of the pages
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import cycle, product
+from itertools import product
 from typing import Any, assert_never
 
 import numpy as np
@@ -22,7 +22,7 @@ from uwlts.errors import ImageError
 from uwlts.model.calibration import Calibration
 from uwlts.pages.cloud_figure import AZIMUTH_DEG, ELEVATION_DEG, STOPS, CloudField, colour_limit_mm, view_direction
 from uwlts.pages.numbers import entries_of, format_to_scale, number_list, split_name, unit_for, unit_of
-from uwlts.pages.toolkit import BLUE, COLOURS, INK, RED, make_figure, new_figure, plain_text, typeset_number
+from uwlts.pages.toolkit import BLUE, INK, RED, make_figure, new_figure, plain_text, typeset_number
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
@@ -377,64 +377,6 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: Residu
     if which.images:
         names = [plain_text(name) for name in which.images]
         ax.set_xticks(places, names, rotation=40, ha="right", rotation_mode="anchor", fontsize=7)
-    return ax
-
-
-@check_arguments
-def window_curves(
-    calibrations: Mapping[str, Calibration], ax: Axes | None = None, *, true_mm: float | None = None
-) -> Axes:
-    """Draw the step height error against the tried window distance, for all calibrations (by name) that contain it.
-
-    A diamond marks each estimate, and a dashed line the true distance, if given.
-
-    Raises
-    ------
-    NothingToDrawError
-        None of the calibrations contains it.
-    """
-    curves = {name: _window_curve(calibration) for name, calibration in calibrations.items()}
-    if all(curve is None for curve in curves.values()):
-        raise NothingToDrawError("none of the calibrations stores the error over the tried window distances")
-    ax = _axes(ax)
-    for colour, (name, curve) in zip(cycle(COLOURS), curves.items(), strict=False):
-        if curve is None:
-            continue
-        label, window = plain_text(name), calibrations[name].window
-        errors = number_list(calibrations[name].figures("window").get("errors_mm"))
-        rms = float(np.sqrt(np.mean(np.square(np.array(errors or [None], dtype=float)))))
-        if window is not None and np.isfinite(rms):
-            # The tried distances are too coarse to include the minimum.
-            curve = np.vstack([curve, (window.distance_mm, rms)])
-            curve = curve[np.argsort(curve[:, 0])]
-            ax.plot(*curve.T, color=colour, label=f"{label}: {window.distance_mm:.3f} mm, error {rms:.4f} mm")
-            ax.plot(window.distance_mm, rms, "D", color=colour, markersize=7)
-        else:
-            ax.plot(*curve.T, color=colour, label=label)
-    if true_mm is not None:
-        ax.axvline(true_mm, color=RED, linestyle="--", label=f"true {true_mm:.3f} mm")
-    ax.set(xlabel="window distance d / mm", ylabel="step height error (rms) / mm")
-    ax.legend(fontsize=8)
-    return ax
-
-
-def _window_curve(calibration: Calibration) -> np.ndarray | None:
-    """Return tried distances and errors (C, 2), NaN for missing ones; None if the calibration does not contain them."""
-    stored = calibration.figures("window").get("curve_mm")
-    rows = [number_list(row) for row in stored] if isinstance(stored, list) else []
-    if not rows or any(row is None or len(row) != 2 for row in rows):
-        return None
-    return np.array(rows, dtype=float)
-
-
-def seconds(seconds: Mapping[str, float], ax: Axes | None = None) -> Axes:
-    """Draw the time in s of each stage."""
-    ax = _axes(ax, 8.0, 0.8 + 0.3 * len(seconds))
-    bars = ax.barh([plain_text(name) for name in seconds], list(seconds.values()), color="#7fa6cc")
-    ax.bar_label(bars, [f"{value:.3g} s" for value in seconds.values()], padding=4)
-    ax.invert_yaxis()
-    ax.margins(x=0.1)
-    ax.set_xlabel("time / s")
     return ax
 
 

@@ -6,7 +6,8 @@ stated uncertainties.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,9 @@ from uwlts.runtime.optional_library import optional_library
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-_HEAD = "scan", "figure", "U / mm", "found", "within U"
+_HEAD = "scan", "calibration", "figure", "U / mm", "found", "within U"
+_NUMBER = re.compile(r" (sphere \d+|\d+-\d+|[XYZ])$")
+"""Sphere, pair of spheres or axis at the end of a figure's name."""
 
 
 class MeasuredFigure(BaseModel, frozen=True):
@@ -65,7 +68,7 @@ class FigureErrors(BaseModel, frozen=True):
     scan, method, name : str
         Recording, calibration and figure.
     expanded_mm : tuple of N float
-        Stated expanded uncertainty (k = 2) of every measurement.
+        Stated expanded uncertainty (k = 2) of every measurement; NaN if none is stated.
     errors_mm : tuple of N float
         Measured minus true value.
     """
@@ -92,9 +95,10 @@ class FigureErrors(BaseModel, frozen=True):
         return int(np.count_nonzero(np.abs(self.errors_mm) <= np.array(self.expanded_mm)))
 
     def texts(self) -> tuple[str, ...]:
-        """Return scan, figure, stated uncertainty, twice the rms error, and number of errors within the uncertainty."""
-        covered = f"{self.covered} of {len(self.errors_mm)}"
-        return self.scan, self.name, f"{self.stated_mm:.4f}", f"{self.found_mm:.4f}", covered
+        """Return scan, calibration, figure, stated uncertainty, twice the rms error, and number of errors within it."""
+        known = not np.isnan(self.stated_mm)
+        stated, covered = (f"{self.stated_mm:.4f}", f"{self.covered} of {len(self.errors_mm)}") if known else "--"
+        return self.scan, self.method, self.name, stated, f"{self.found_mm:.4f}", covered
 
 
 class FigureTable(Brief, BaseModel, frozen=True):
@@ -135,15 +139,21 @@ class FigureTable(Brief, BaseModel, frozen=True):
 
     def errors(self) -> tuple[FigureErrors, ...]:
         """Return the errors with a stated uncertainty, by scan, method and figure in the order of the rows."""
-        groups: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
-        for row in self.rows:
-            if row.error_mm is not None and row.expanded_mm is not None:
-                groups.setdefault((row.scan, row.method, row.figure), []).append((row.expanded_mm, row.error_mm))
-        return tuple(
-            FigureErrors(scan=scan, method=method, name=figure, expanded_mm=expanded, errors_mm=errors)
-            for (scan, method, figure), pairs in groups.items()
-            for expanded, errors in [tuple(zip(*pairs, strict=True))]
-        )
+        stated = [row for row in self.rows if row.expanded_mm is not None]
+        return _group_errors(stated, [(row.scan, row.method, row.figure) for row in stated])
+
+    def pooled_errors(self) -> tuple[FigureErrors, ...]:
+        """Return all errors by object and medium, figure and method: those of its scans, spheres or axes together.
+
+        A scan's name is OBJECT-PLACEMENT, and ends with "-air" if the object is in air.
+        """
+        keys = [
+            (row.scan.split("-")[0] + " in air" * row.scan.endswith("-air"), row.method, _NUMBER.sub("", row.figure))
+            for row in self.rows
+        ]
+        groups = _group_errors(self.rows, keys)
+        order = list(dict.fromkeys((each.scan, each.name) for each in groups))
+        return tuple(sorted(groups, key=lambda each: order.index((each.scan, each.name))))
 
     def covered_share(self) -> float:
         """Return the fraction of all errors within their stated uncertainty; NaN without any."""
@@ -156,6 +166,20 @@ class FigureTable(Brief, BaseModel, frozen=True):
         return format_errors(self.errors())
 
 
+def _group_errors(rows: Sequence[MeasuredFigure], keys: Sequence[tuple[str, str, str]]) -> tuple[FigureErrors, ...]:
+    """Group the errors of rows by their keys: scan, method and figure."""
+    groups: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for row, key in zip(rows, keys, strict=True):
+        if row.error_mm is not None:
+            stated = float("nan") if row.expanded_mm is None else row.expanded_mm
+            groups.setdefault(key, []).append((stated, row.error_mm))
+    return tuple(
+        FigureErrors(scan=scan, method=method, name=figure, expanded_mm=expanded, errors_mm=errors)
+        for (scan, method, figure), pairs in groups.items()
+        for expanded, errors in [tuple(zip(*pairs, strict=True))]
+    )
+
+
 def format_errors(groups: Iterable[FigureErrors]) -> list[str]:
     """Return errors as lines of text: stated uncertainty, twice the rms error, and the number within."""
-    return align_columns([_HEAD, *(each.texts() for each in groups)], right=(2, 3))
+    return align_columns([_HEAD, *(each.texts() for each in groups)], right=(3, 4))

@@ -34,7 +34,6 @@ from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.thesis.campaign_folder import campaign_folders
 from uwlts.thesis.evaluate_campaign import TRIALS, evaluate_campaign
-from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines, write_joint_comparison
 from uwlts.thesis.measurements import FORGOTTEN, POLYNOMIALS, PROPOSED
 from uwlts.thesis.monte_carlo import LEAST_TRIALS
 from uwlts.thesis.published_tables import (
@@ -67,7 +66,6 @@ def evaluate_thesis(
     published: str | Path = "thesis-tables",
     trials: int = TRIALS,
     workers: int | None = None,
-    joint: bool = False,
     again: bool = False,
     overwrite: bool = False,
     progress: ProgressListener = ignore_progress,
@@ -85,9 +83,6 @@ def evaluate_thesis(
         Trials of the Monte-Carlo propagation, at least 20, or 0 for none.
     workers : int, optional
         Number of scans measured in parallel. Default: number of processors.
-    joint : bool
-        Instead compare the joint calibration with the thesis's two methods, with campaigns in parallel and without
-        Monte Carlo; writes report.html and summary.json.
     again : bool
         Evaluate campaigns again that already have results.
     overwrite : bool
@@ -116,15 +111,10 @@ def evaluate_thesis(
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
     folder = Path(folder)
-    names = ("report.html", "summary.json") if joint else ("report.html", "summary.json", "tables.csv", "summary.md")
-    files = tuple(folder / name for name in names)
+    files = tuple(folder / name for name in ("report.html", "summary.json", "tables.csv", "summary.md"))
     tables, campaigns = load_published(published), campaign_folders(folder)
     for file in files:
         refuse_unsuitable(file, overwrite=overwrite)
-    if joint:
-        compared = compare_campaigns(campaigns, workers=workers, again=again, progress=progress)
-        summary = write_joint_comparison(folder, compared, overwrite=overwrite)
-        return ThesisReport(files, "\n".join(summary_lines(summary)))
     results = [
         evaluate_campaign(campaign, trials=trials, workers=workers, overwrite=again, progress=progress)
         for campaign in campaigns

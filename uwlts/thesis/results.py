@@ -1,4 +1,4 @@
-"""Results of campaigns in their folders: measurements, window study, budget, and the joint comparison."""
+"""Results of campaigns in their folders: measurements, window study and budget."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,6 @@ from uwlts.files.writing import write_atomically
 
 Points = list[tuple[float, float]]
 """Y and Z of points on a profile, mm."""
-
-JointMethod = Literal["joint_same_evidence", "joint_with_target_in_water", "joint_with_scans"]
-"""Joint calibrations by their evidence: that of the thesis's two methods, with a target in water, with scans too."""
-
-Method = Literal["one_refraction", "two_refractions"] | JointMethod
-"""Calibrations of the joint comparison."""
 
 
 class _Kept(BaseModel):
@@ -128,67 +122,3 @@ class CampaignResults(_Kept):
     line_profiles: dict[str, LineProfile]
     monte_carlo: list[SpacingInterval]
     trials: int
-
-
-@dataclass(frozen=True)
-class SphereErrors:
-    """Errors of a scan of spheres by calibration and figure, and standard uncertainties of the joint ones, mm.
-
-    In addition to the figures, there is the mean error of all points along X, Y and Z. Methods without a calibration
-    for the medium are missing.
-    """
-
-    placement: str
-    medium: str
-    errors_mm: dict[Method, dict[str, float]]
-    std_mm: dict[JointMethod, dict[str, float]]
-
-
-@dataclass(frozen=True)
-class PlaneScatter:
-    """Standard deviation of a plane about its fit, and its ratio to the speckle limit at its distance."""
-
-    placement: str
-    medium: str
-    std_mm: float
-    over_limit: float
-
-
-class JointResults(_Kept):
-    """Comparison of joint and sequential calibrations of one campaign: the file joint.json.
-
-    ``spheres`` and ``planes`` are scans that no calibration has used.
-    """
-
-    format: Literal["uwlts-joint-comparison"] = "uwlts-joint-comparison"
-    version: Literal[3] = 3
-    campaign: str
-    solve_s: dict[JointMethod, float]
-    spheres: list[SphereErrors]
-    planes: list[PlaneScatter]
-
-
-class MediumSummary(BaseModel):
-    """Errors of all scans in a medium by calibration, and coverage of the 95 % intervals."""
-
-    model_config = ConfigDict(frozen=True)
-
-    spacing_error_mm: dict[Method, list[float]]
-    diameter_error_mm: dict[Method, list[float]]
-    shift_mm: dict[Method, list[float]]
-    plane_std_over_speckle_limit: list[float]
-    coverage_95: dict[JointMethod, float]
-
-
-class JointSummary(MediumSummary):
-    """Summary of the comparison over all campaigns; fields outside the media are for water."""
-
-    solve_s: dict[JointMethod, list[float]]
-    campaigns: int
-    water: MediumSummary
-    air: MediumSummary
-
-    def media(self) -> dict[str, MediumSummary]:
-        """Return the summaries by medium, without media that have no scans."""
-        both = {"water": self.water, "air": self.air}
-        return {medium: part for medium, part in both.items() if any(part.spacing_error_mm.values())}

@@ -2,7 +2,6 @@
 
 import logging
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -110,13 +109,3 @@ def test_the_column_survives_copies_and_measuring_says_what_is_missing(tmp_path,
         caplog.clear()
         load_cloud(cloud)
         assert not caplog.records
-
-
-def test_a_campaign_uses_the_fuller_one_of_two_files(tmp_path: Path):
-    cloud = scan(lambda x, y: 300 + 0 * x)
-    for name in ("wall.cloud.h5", "wall.ply"):
-        write_cloud(tmp_path / name, cloud)
-    from uwlts.report.gather import gather_campaign
-
-    (found,) = gather_campaign(tmp_path).measurements
-    assert found.name == "wall" and found.cloud.uncertainty is not None
