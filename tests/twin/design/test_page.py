@@ -9,7 +9,6 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from matplotlib.tri import LinearTriInterpolator
 
 from twin.design.choice import StudyResults, find_pareto_front
 from twin.design.designs import (
@@ -22,17 +21,7 @@ from twin.design.designs import (
     select_design,
 )
 from twin.design.figures_of_merit import FIGURES, compute_figures
-from twin.design.report.charts import (
-    bars,
-    choose_pareto_axes,
-    contours,
-    curves,
-    map_places,
-    mesh_between,
-    parallel_chart,
-    pareto_chart,
-    sample,
-)
+from twin.design.report.charts import choose_pareto_axes, figures_chart, parallel_chart, pareto_chart, sample
 from twin.design.report.drawing import make_views
 from twin.design.report.study_page import page_text
 from twin.design.report.study_tables import (
@@ -316,46 +305,25 @@ def test_numbers_in_words():
 # --- charts -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_map_is_linear_between_designs_that_work(swept):
-    study, _, columns = swept
-    judged_designs = StudyResults(study, columns)
-    places = map_places(judged_designs, *study.variables)
-    assert places.tolist() == list(range(30))
-    mesh = mesh_between(judged_designs, places, *study.variables)
-    # A grid of 5 x 6 has 4 x 5 cells of two triangles each; those at a design that fails are left out.
-    assert len(mesh.triangles) == 40
-    fails = columns["failure"] != ""
-    assert mesh.mask.tolist() == fails[mesh.triangles].any(axis=1).tolist() and 0 < mesh.mask.sum() < 40
-    linear = columns["laser.baseline_mm"] + 2 * columns["laser.triangulation_angle_deg"]
-    inside = mesh.triangles[~mesh.mask][0]
-    x, y = mesh.x[inside].mean(), mesh.y[inside].mean()
-    # Rounding of numbers of some hundred.
-    assert float(LinearTriInterpolator(mesh, linear)(x, y)) == pytest.approx(x + 2 * y, rel=1e-9)
+def panel_of(figure, title: str) -> int:
+    """Number of the panel with a title."""
+    return [each.text for each in figure.layout.annotations].index(title)
 
 
-def test_a_map_draws_bounds_designs_and_failures(swept):
-    study, _, columns = swept
-    figure, caption = contours(StudyResults(study, columns), [], *study.variables)
-    panel = next(axes for axes in figure.axes if axes.get_title() == "line length in the middle (mm)")
-    dots, crosses = (next(line for line in panel.lines if line.get_marker() == kind) for kind in (".", "x"))
-    assert len(dots.get_xdata()) == (columns["failure"] == "").sum() > 5
-    assert len(crosses.get_xdata()) == (columns["failure"] != "").sum() > 0
-    assert "line length in the middle at least 160" in panel.get_legend_handles_labels()[1][0]
-    assert "Grey: a constraint is missed." in caption and "Crosses" in caption
-    assert panel.get_xlabel() == "laser baseline (mm)"
-
-
-def test_what_else_varies_is_shown_at_its_best(swept):
-    study, _, _ = swept
-    wider = small(choices={"lens": {"f/4": {"camera.f_number": 4.0}, "f/8": {"camera.f_number": 8.0}}})
-    _, columns = grid(wider)
-    found = StudyResults(wider, columns)
-    places = map_places(found, *study.variables)
-    sigma = np.where(columns["violation"] == 0, columns["sigma_z_rms_mm"], np.inf).reshape(30, 2).min(axis=1)
-    assert np.isfinite(sigma).sum() > 5 and len(places) == 30
-    shown = places[columns["violation"][places] == 0]
-    assert sorted(columns["sigma_z_rms_mm"][shown]) == sorted(sigma[np.isfinite(sigma)])
-    assert contours(found, [], *study.variables)[1].startswith("Lens also vary")
+def test_two_ranges_show_each_working_design_with_its_figure(swept):
+    study, designs, columns = swept
+    marked = marked_of(study, designs, columns)
+    figure, caption = figures_chart(StudyResults(study, columns), marked)
+    panel = panel_of(figure, "line length in the middle (mm)")
+    drawn = [trace for trace in figure.data if trace.xaxis == ("x" if panel == 0 else f"x{panel + 1}")]
+    works = columns["failure"] == ""
+    assert list(drawn[0].x) == round_for_json(columns["laser.baseline_mm"][works])
+    assert list(drawn[0].y) == round_for_json(columns["laser.triangulation_angle_deg"][works])
+    assert list(drawn[0].marker.color) == round_for_json(columns["line_mm"][works])
+    hollow = np.array(drawn[0].marker.symbol) == "circle-open"
+    assert hollow.tolist() == (columns["violation"][works] > 0).tolist() and 0 < hollow.sum() < works.sum()
+    assert [trace.text for trace in drawn[1:]] == [(f"<b>{one.label}</b>",) for one in marked]
+    assert figure.layout.xaxis.title.text == "laser baseline (mm)" and "Hollow" in caption
 
 
 def test_the_front_in_the_chart_is_that_of_the_designs_that_meet_the_constraints(swept):
@@ -388,23 +356,23 @@ def test_sampling_keeps_what_is_to_be_kept():
     assert chosen.sum() == 100 and chosen[kept].all() and not chosen[~candidates].any()
 
 
-def test_one_variable_gives_curves_and_none_gives_bars():
+def test_one_range_is_an_axis_and_none_gives_ranks():
     lens = {"f/4": {"camera.f_number": 4.0}, "f/8": {"camera.f_number": 8.0}}
     study = small(variables={"laser.power_mw": {"least": 1, "most": 20, "steps": 4}}, choices={"lens": lens}, follow=())
     _, columns = grid(study)
     base = point({"laser.power_mw": 7.0, "line_mm": 9.0})
-    panels = curves(StudyResults(study, columns), [base], "laser.power_mw")[0].axes
-    assert [line.get_label() for line in panels[0].lines][:2] == ["f/4", "f/8"]
-    assert panels[0].lines[0].get_xdata().tolist() == pytest.approx([1, 22 / 3, 41 / 3, 20])
-    lengths = next(axes for axes in panels if axes.get_title() == "line length in the middle (mm)")
-    (marked,) = (line for line in lengths.lines if line.get_label() == "base")
-    assert (list(marked.get_xdata()), list(marked.get_ydata())) == ([7.0], [9.0])
+    figure, caption = figures_chart(StudyResults(study, columns), [base])
+    assert sorted(set(figure.data[0].x)) == pytest.approx([1, 22 / 3, 41 / 3, 20], rel=1e-4)
+    panel = panel_of(figure, "line length in the middle (mm)")
+    axis = "x" if panel == 0 else f"x{panel + 1}"
+    (marked,) = (trace for trace in figure.data if trace.xaxis == axis and trace.text == ("<b>base</b>",))
+    assert (list(marked.x), list(marked.y)) == ([7.0], [9.0])
+    assert "Dashed: bounds." in caption and [shape.y0 for shape in figure.layout.shapes] == [160.0]
     study = small(variables={}, choices={"lens": lens})
     _, columns = grid(study)
-    axes = bars(StudyResults(study, columns))[0].axes[0]
+    first = figures_chart(StudyResults(study, columns), [])[0].data[0]
     best = columns["sigma_z_rms_mm"].argmin()
-    assert axes.get_yticklabels()[0].get_text() == list(lens)[best] and len(axes.patches) == 2
-    assert axes.patches[0].get_width() == columns["sigma_z_rms_mm"][best]
+    assert first.x[best] == 1.0 and list(first.y) == round_for_json(columns["sigma_z_rms_mm"])
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
@@ -496,15 +464,15 @@ def test_the_page_says_what_an_engineer_needs(swept, tmp_path):
     assert page.loads and all(link.startswith(("#", "data:image/png")) for link in page.loads)
     styles = raw.split("<script")[0]
     assert "default-src 'none'" in styles and "@import" not in styles and not re.findall(r"url\((?!#)", styles)
-    # Front and parallel axes; drawing, maps and two verifications.
-    assert len(page.figures) == 2 and styles.count("<svg") == 4
+    # Figures, front and parallel axes; drawing and two verifications.
+    assert len(page.figures) == 3 and styles.count("<svg") == 3
     assert len(raw) < 7e6
 
 
 def test_figures_hold_rounded_numbers_only(swept):
     study, designs, columns = swept
     page = Page(page_text(study, columns, marked=marked_of(study, designs, columns), agreements=[]))
-    shown = [trace for trace in page.figures[0]["data"] if trace.get("showlegend", True)]
+    shown = [trace for trace in page.figures[1]["data"] if trace.get("showlegend", True)]
     numbers = [value for trace in shown for value in (*trace["x"], *trace["y"])]
     assert len(numbers) == 2 * (columns["failure"] == "").sum()
     assert all(float(f"{value:.5g}") == value for value in numbers)
@@ -523,7 +491,7 @@ def test_labels_are_escaped():
     for tag in ("<script>", "<b>bold", "<u>", "<hr>", "<marks>", "<i>lens"):
         assert tag not in before.split("<body>")[1]
     assert "<b>bold</b>" in page.text() and "no <marks>" in page.text()
-    assert ["<b>&lt;u&gt;me&lt;/u&gt;</b>"] in [trace.get("text") for trace in page.figures[0]["data"]]
+    assert ["<b>&lt;u&gt;me&lt;/u&gt;</b>"] in [trace.get("text") for trace in page.figures[1]["data"]]
 
 
 def failing(study: Study) -> dict[str, np.ndarray]:
@@ -554,7 +522,7 @@ def test_a_page_where_nothing_meets_the_constraints():
     assert "No design meets all constraints." in page.text()
     assert "No design meets all constraints: the front is that of all working designs." in page.text()
     assert "misses its bound: at least 200 % is required" in page.text()
-    assert len(page.figures) == 1
+    assert len(page.figures) == 2
 
 
 @pytest.mark.parametrize("kind", ["grid", "scattered"])
@@ -566,20 +534,6 @@ def test_a_page_of_one_design(kind):
     marked = [HighlightedDesign("only", build_sensor(study, designs[place]), select_design(columns, place))]
     page = Page(page_text(study, one, marked=marked, agreements=[]))
     assert "1 evaluated" in page.text() and not page.open
-
-
-def test_designs_in_a_row_span_no_area():
-    study = small()
-    designs, _ = scattered(study, 40)
-    for slant in (0.0, 1e-9):
-        angles = [30.0 + slant * design.number for design in designs]
-        row = [
-            Design(design.number, design.values | {"laser.triangulation_angle_deg": angle})
-            for design, angle in zip(designs, angles, strict=True)
-        ]
-        page = Page(page_text(study, evaluate_designs(study, row), marked=[], agreements=[]))
-        assert not page.open
-    assert "are on a line in these two variables" in page.text()
 
 
 def test_a_chosen_design_that_cannot_be_drawn_is_said():

@@ -2,44 +2,30 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from html import escape
+from typing import Any
 
-import matplotlib
 import numpy as np
 import plotly.graph_objects as go
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
-from matplotlib.tri import Triangulation
+from plotly.subplots import make_subplots
 
 from twin.design.choice import StudyResults, find_pareto_front
 from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import CLASS_NAMES, RENDERED_SCATTERING_DEPTH
 from twin.design.report import study_tables as tables
-from twin.design.study import Variable
 from twin.design.verification import Agreement
-from uwlts.pages.toolkit import BLUE, COLOURS, FAINT, INK, RED, legend_below, new_figure
+from uwlts.pages.toolkit import BLUE, COLOURS, INK, RED, legend_below, new_figure
 
-Static = tuple[Figure, str]
 Interactive = tuple[go.Figure, str]
 """Figure for a page, and its caption."""
 
-_FRONT = COLOURS[2]
-"""Colour of the Pareto front."""
-_PALE = "#c3cad2"
-"""Colour of bars of designs that violate a constraint."""
-_LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
-"""Colours of the contour lines at the constraints' bounds."""
-_SYMBOLS = (("diamond", "D"), ("circle", "o"), ("star", "*"), ("square", "s"), ("cross", "P"))
-"""Symbols of highlighted designs, in plotly and in matplotlib."""
-_TEXT_HEIGHTS = ("top", "bottom", "middle")
-"""Heights of labels of highlighted designs, in turn; labels point to the middle of the chart."""
+_SYMBOLS = ("diamond", "circle", "star", "square", "cross")
+"""Symbols of highlighted designs."""
 _SHOWN = (
     "sigma_z_rms_mm",
     "sigma_z_mm",
@@ -56,39 +42,15 @@ _SHOWN = (
 """Figures shown in addition to objectives and constraints, the most informative first."""
 _MOST_PANELS = 9  # of a figure, so that it fits on a page
 _PANEL_COLUMNS = 3  # of a page's width
-_PANEL_INCHES = (4.0, 3.1)  # width and height
-_BAR_INCHES = 0.17  # height of a bar with its label
-# Limits: more points and lines make a page slow; more dots, curve points, bars and axes would overlap.
+# Limits: more points and lines make a page slow; more axes would overlap.
 MOST_POINTS = 20_000
 MOST_LINES = 5_000
-_MOST_DOTS = 2000
-_MOST_OF_CURVE = 500
-_MOST_BARS = 40
+_MOST_IN_PANEL = 2_000
 _MOST_DIMENSIONS = 12
-_FEW = 300
-"""Above this number, points are drawn smaller."""
 _IN_SVG = 2500
 """Above this number, points are drawn with WebGL, which is faster."""
-_LAYOUT = {"template": "none", "font": {"color": INK}, "paper_bgcolor": "white"}
 _WIDE_RANGE = 30.0
-"""Ratio of the largest to the smallest value above which a figure has a logarithmic axis."""
-_DASHED = "Dashed: bounds."
-_INTERVALS = 100
-"""Intervals of a curve with one best design each, if further variables are free."""
-_CELLS = 40
-"""Cells along each side of a map with one best design each, if further variables are free."""
-_FLAT = 1e-6
-"""Tolerance, relative to the ranges, for designs on a line, which do not span a map."""
-_LEVELS = 12  # contour levels that the eye still separates
-_WIDE = 15.0
-"""Ratio of a figure's values above which a map has logarithmic colours."""
-_MARGIN = 0.02
-"""Margin of the axes relative to the ranges."""
-_BESIDE = 1e-4
-"""Relative offset of a bound's contour into the violated side, because a discrete figure can equal the bound."""
-
-_plain_text = matplotlib.rc_context({"text.parse_math": False})
-"""Dollar signs in users' names are not formulas."""
+"""Ratio of the largest to the smallest value above which a figure has a logarithmic axis or colours."""
 _escaped = partial(escape, quote=False)
 """Escape text for plotly."""
 
@@ -99,216 +61,91 @@ def shown_figures(judged: StudyResults) -> list[str]:
     return [name for name in names if np.isfinite(judged.figure(name)[judged.works]).any()]
 
 
-# --- panels of static figures -----------------------------------------------------------------------------------------
+def figures_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> Interactive | None:
+    """Draw figures over the free ranges: over one, or by colour over two; over the rank if there are only choices.
 
-
-def _panels(names: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[Figure, list[tuple[Axes, str]]]:
-    """Make a Matplotlib figure with axes for the first figures of merit; their labels are the titles."""
-    names = names[:_MOST_PANELS]
-    columns = min(_PANEL_COLUMNS, len(names))
-    rows = -(-len(names) // columns)
-    figure, axes = new_figure(_PANEL_INCHES[0] * columns, height * rows, rows=rows, columns=columns)
-    for unused in axes[len(names) :]:
-        unused.remove()
-    for one, name in zip(axes, names, strict=False):
-        one.set_title(tables.label_of(name))
-    return figure, list(zip(axes, names, strict=False))
-
-
-def _mark(axes: Axes, marked: Sequence[HighlightedDesign], x: str, y: str) -> None:
-    """Draw highlighted designs as symbols, the chosen one in red."""
-    for number, one in enumerate(marked):
-        at, (colour, size) = (
-            (one.design.number_of(x), one.design.number_of(y)),
-            (RED, 10) if one is marked[-1] else (INK, 8),
-        )
-        if all(map(math.isfinite, at)):
-            style = {"color": colour, "markersize": size, "markeredgecolor": "white", "zorder": 6}
-            axes.plot(*at, _SYMBOLS[number % len(_SYMBOLS)][1], label=one.label, **style)
-
-
-def _draw_bounds(draw: Callable[..., object], judged: StudyResults, name: str) -> None:
-    for bounded, _, bound in judged.study.bounds():
-        if bounded == name:
-            draw(bound, color=RED, linewidth=1.2, linestyle="--")
-
-
-# --- curves and bars --------------------------------------------------------------------------------------------------
-
-
-@_plain_text
-def curves(judged: StudyResults, marked: Sequence[HighlightedDesign], x: str) -> Static:
-    """Draw figures over one variable: a curve for each combination of the other variables, or the best of all."""
-    others = [name for name in judged.study.free() if name != x]
-    groups: dict[str, list[int]] = {}
-    for place in np.flatnonzero(judged.works):
-        groups.setdefault(_combination(judged, others, int(place)), []).append(int(place))
-    caption = ""
-    if len(groups) > len(COLOURS):
-        groups = {"best": judged.best_first.tolist()}
-        varying = tables.join_words([tables.words_of(name) for name in others]).capitalize()
-        caption = f"{varying} also vary: each point is the best design of its interval. "
-    at, found = np.asarray(judged.columns[x], dtype=float), {}
-    for name, members in groups.items():
-        places = np.array(members)
-        if caption:
-            # Designs are sorted by merit: the first of each interval is the best.
-            share = normalise(judged.study.variables[x], at[places])
-            places = places[np.unique((share * (_INTERVALS - 1)).round(), return_index=True)[1]]
-        places = places[np.argsort(at[places], kind="stable")]
-        thinned = np.linspace(0, len(places) - 1, min(len(places), _MOST_OF_CURVE)).round().astype(int)
-        found[name] = places[np.unique(thinned)]
-    figure, panels = _panels(shown_figures(judged))
-    for axes, name in panels:
-        for colour, (group, places) in zip(COLOURS, found.items(), strict=False):
-            values, meets = (judged.columns[x][places], judged.figure(name)[places]), judged.feasible[places]
-            axes.plot(*values, color=colour, linewidth=1.3, label=group or "designs")
-            axes.scatter(*values, s=16, color=np.where(meets, colour, "white"), edgecolors=colour, zorder=3)
-        _draw_bounds(axes.axhline, judged, name)
-        _mark(axes, marked, x, name)
-        axes.set(xlabel=tables.label_of(x), xscale=judged.study.variables[x].scale)
-    legend_below(figure)
-    missed = "Hollow: a constraint is missed. " if (judged.works & ~judged.feasible).any() else ""
-    return figure, f"{caption}{missed}{_DASHED if judged.study.bounds() else ''}".strip()
-
-
-def _combination(judged: StudyResults, names: Sequence[str], place: int) -> str:
-    return ", ".join(tables.format_design_value(judged, name, place) for name in names)
-
-
-@_plain_text
-def bars(judged: StudyResults) -> Static:
-    """Draw the figures of all combinations of choices as bars, the best first."""
-    places = judged.best_first[:_MOST_BARS]
-    labels = [_combination(judged, list(judged.study.free()), place) for place in places]
-    figure, panels = _panels(shown_figures(judged), height=max(_PANEL_INCHES[1], _BAR_INCHES * len(places)))
-    for number, (axes, name) in enumerate(panels):
-        axes.barh(range(len(places)), judged.figure(name)[places], color=np.where(judged.feasible[places], BLUE, _PALE))
-        # Labels are long: only the left panels have them.
-        axes.set_yticks(range(len(places)), labels if number % _PANEL_COLUMNS == 0 else [""] * len(places))
-        axes.invert_yaxis()
-        _draw_bounds(axes.axvline, judged, name)
-    count = f"The best {len(places)} of {int(judged.works.sum()):,} designs." if len(places) == _MOST_BARS else ""
-    grey = " Grey: a constraint is missed." if not judged.feasible[places].all() else ""
-    return figure, f"{count}{grey} {_DASHED if judged.study.bounds() else ''}".strip()
-
-
-def normalise(variable: Variable, values: np.ndarray) -> np.ndarray:
-    """Normalise values to a variable's range (0 to 1), on its scale."""
-    values, (least, most) = np.asarray(values, dtype=float), variable.ends()
-    if variable.scale == "log":
-        return np.log(values / least) / math.log(most / least)
-    return (values - least) / (most - least)
-
-
-# --- maps over two variables ------------------------------------------------------------------------------------------
-
-
-def map_places(judged: StudyResults, x: str, y: str) -> np.ndarray:
-    """Return the indices of designs to show over two variables: all, or the best of each cell if more are free."""
-    if len(judged.study.free()) == 2:
-        return np.arange(len(judged))
-    cells = [np.rint(_CELLS * normalise(judged.study.variables[name], judged.columns[name])) for name in (x, y)]
-    order = np.concatenate([judged.best_first, np.flatnonzero(~judged.works)])
-    return order[np.unique(np.stack(cells)[:, order], axis=1, return_index=True)[1]]
-
-
-def mesh_between(judged: StudyResults, places: np.ndarray, x: str, y: str) -> Triangulation | None:
-    """Triangulate designs over two variables; triangles with a failed design are masked.
-
-    Return None if the designs are on a line.
+    Each point is a working design, hollow if it misses a constraint; None if no design works.
     """
-    shares = np.column_stack([normalise(judged.study.variables[name], judged.columns[name][places]) for name in (x, y)])
-    if np.linalg.matrix_rank(shares - shares.mean(axis=0), tol=_FLAT) < 2:
+    if not judged.works.any():
         return None
-    triangles = Triangulation(shares[:, 0], shares[:, 1]).triangles
-    at_x, at_y = (np.asarray(judged.columns[name][places], dtype=float) for name in (x, y))
-    return Triangulation(at_x, at_y, triangles, mask=~judged.works[places][triangles].all(axis=1))
+    study, names = judged.study, shown_figures(judged)[:_MOST_PANELS]
+    ranges = [name for name, variable in study.variables.items() if variable.values is None][:2]
+    front = judged.front(judged.of_interest)
+    places = np.flatnonzero(sample(judged.works, front, _MOST_IN_PANEL))
+    rows = -(-len(names) // _PANEL_COLUMNS)
+    titles = [_escaped(tables.label_of(name)) for name in names]
+    spacing: dict[str, Any] = {"horizontal_spacing": 0.12, "vertical_spacing": 0.3 / rows}
+    figure = make_subplots(rows, _PANEL_COLUMNS, subplot_titles=titles, **spacing)
+    for number, name in enumerate(names):
+        at: dict[str, Any] = {"row": number // _PANEL_COLUMNS + 1, "col": number % _PANEL_COLUMNS + 1}
+        _draw_panel(figure, judged, places, [*ranges, name], at)
+        for place, one in enumerate(marked) if ranges else ():
+            x, y = [*ranges, name][:2]
+            figure.add_trace(_mark(one, place, x, y, chosen=one is marked[-1]), **at)
+    figure.update_layout(template="plotly_white", height=120 + 280 * rows, showlegend=False)
+    count = int(judged.works.sum())
+    thin = f" {len(places):,} of {count:,} working designs are drawn." if len(places) < count else ""
+    dashed = " Dashed: bounds." if len(ranges) < 2 and study.bounds() else ""
+    return figure, f"Hollow: a constraint is missed.{dashed}{thin} Hover over a point for its design."
 
 
-@_plain_text
-def contours(judged: StudyResults, marked: Sequence[HighlightedDesign], x: str, y: str) -> Static | None:
-    """Draw maps of the figures over two variables; None if the designs are on a line."""
-    study, places = judged.study, map_places(judged, x, y)
-    mesh = mesh_between(judged, places, x, y)
-    if mesh is None or mesh.mask is None or mesh.mask.all():
-        return None
-    works = judged.works[places]
-
-    def over(name: str) -> np.ndarray:
-        return np.where(works, judged.figure(name)[places], np.nan)
-
-    # Violation of each bound relative to it; a discrete figure can equal the bound.
-    missed = [(sign * (over(name) - bound) / (abs(bound) or 1.0) - _BESIDE) for name, sign, bound in study.bounds()]
-    limits = list(zip(missed, itertools.cycle(_LIMITS), (tables.bound_text(*each) for each in study.bounds())))
-    fails = np.max(missed, axis=0, initial=-1.0)
-    beyond, misses = np.where(works, fails, 0.0), bool((fails[works] > 0).any())
-    dots = [
-        (np.flatnonzero(sample(chosen, np.zeros(len(places), bool), _MOST_DOTS)), style, size)
-        for chosen, style, size in ((works, ".", 1.5), (~works, "x", 3.0))
-    ]
-    variables = [study.variables[name] for name in (x, y)]
-    figure, panels = _panels(shown_figures(judged))
-    for number, (axes, name) in enumerate(panels):
-        _fill(axes, mesh, over(name), good=fails <= 0)
-        if misses:
-            axes.tricontourf(mesh, beyond, levels=[0.0, 1.01 * beyond.max()], colors="#e4e7eb", alpha=0.72)
-        for values, colour, label in limits if len(study.free()) == 2 else ():
-            if values[works].min() < 0 < values[works].max():
-                axes.tricontour(mesh, np.where(works, values, 0.0), levels=[0.0], colors=colour, linestyles="--")
-                axes.plot([], [], color=colour, linestyle="--", label=label)
-        for shown, style, size in dots:
-            axes.plot(mesh.x[shown], mesh.y[shown], style, color=INK, markersize=size, alpha=0.5, rasterized=True)
-        _mark(axes, marked, x, y)
-        axes.grid(visible=False)
-        axes.set(xlabel=tables.label_of(x), ylabel="" if number % _PANEL_COLUMNS else tables.label_of(y))
-        axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
-        # Margin for symbols at the border of the range.
-        xlim, ylim = ((float(v.value_at(-_MARGIN)), float(v.value_at(1 + _MARGIN))) for v in variables)
-        axes.set(xlim=xlim, ylim=ylim)
-    legend_below(figure)
-    others = [tables.words_of(name) for name in study.free() if name not in (x, y)]
-    ends = {name: variable.ends() for name, variable in zip((x, y), variables, strict=True)}
-    outside = [m.label for m in marked if not all(a <= m.design.number_of(n) <= b for n, (a, b) in ends.items())]
-    parts = (
-        f"{tables.join_words(others).capitalize()} also vary: each point is the design of its cell with the smallest "
-        f"constraint violation, then with the best {tables.words_of(study.objectives[0].figure)}."
-        if others
-        else "",
-        "Interpolated linearly between designs (dots).",
-        "Grey: a constraint is missed." if misses else "",
-        "Crosses: designs that cannot work; see the table of reasons." if not works.all() else "",
-        f"Outside the ranges: {tables.join_words(outside)}." if outside else "",
+def _draw_panel(
+    figure: go.Figure, judged: StudyResults, places: np.ndarray, names: Sequence[str], at: dict[str, Any]
+) -> None:
+    """Draw designs into a panel: the last one of the names is its figure, the others are free ranges."""
+    study, name = judged.study, names[-1]
+    found = judged.figure(name)[places]
+    marker = {"symbol": np.where(judged.feasible[places], "circle", "circle-open"), "color": BLUE}
+    shown = [judged.columns[each][places] for each in names[:2]]
+    if len(names) == 1:
+        rank = np.empty(len(judged))
+        rank[judged.best_first] = np.arange(1, len(judged.best_first) + 1)
+        shown = [rank[places], found]
+        figure.update_xaxes(title_text="rank", **at)
+    if len(names) == 3:
+        marker |= {"color": tables.round_for_json(found), "colorscale": "Viridis", "showscale": True}
+        marker["colorbar"] = _colour_bar(figure, **at)
+    figure.add_scatter(
+        x=tables.round_for_json(shown[0]),
+        y=tables.round_for_json(shown[-1]),
+        mode="markers",
+        marker=marker,
+        text=[_describe(judged, [name, *study.free()], int(place)) for place in places],
+        hovertemplate="%{text}<extra></extra>",
+        **at,
     )
-    return figure, " ".join(filter(None, parts))
+    axes = ((figure.update_xaxes, names[0]), (figure.update_yaxes, names[1])) if len(names) > 1 else ()
+    for update, each in axes:
+        if each in study.variables:
+            update(title_text=_escaped(tables.label_of(each)), type=study.variables[each].scale, **at)
+    for each, _, bound in study.bounds() if len(names) < 3 else ():
+        if each == name:
+            figure.add_hline(bound, line={"color": RED, "dash": "dash"}, **at)
 
 
-def _fill(axes: Axes, mesh: Triangulation, values: np.ndarray, *, good: np.ndarray) -> None:
-    """Draw a figure as filled contours, with a logarithmic scale for wide ranges."""
-    known = np.isfinite(values)
-    mesh = Triangulation(mesh.x, mesh.y, mesh.triangles, mask=~known[mesh.triangles].all(axis=1))
-    if mesh.mask is None or mesh.mask.all():
-        return
-    # The colour scale excludes a few extreme values.
-    best = values[good & known]
-    low, high = np.quantile(values[known], 0.02), np.quantile(best if len(best) > 10 else values[known], 0.98)
-    high = max(high, low + 1e-12 + 1e-9 * abs(low))
-    log = low > 0 and high > _WIDE * low
-    norm = LogNorm(low, high) if log else Normalize(low, high)
-    steps = np.geomspace(low, high, _LEVELS + 1) if log else MaxNLocator(_LEVELS).tick_values(low, high)
-    drawn = axes.tricontourf(mesh, np.where(known, values, low), levels=steps, norm=norm, extend="both")
-    ticks = np.geomspace(low, high, 5).tolist() if log else None
-    bar = axes.figure.colorbar(drawn, ax=axes, ticks=ticks)
-    if ticks:
-        bar.set_ticks(ticks, labels=[tables.number_text(tick, 2) for tick in ticks], minor=False)
-        bar.ax.minorticks_off()
+def _colour_bar(figure: go.Figure, *, row: int, col: int) -> dict[str, object]:
+    """Return the layout of the colour bar beside a panel."""
+    panel = next(figure.select_xaxes(row=row, col=col)), next(figure.select_yaxes(row=row, col=col))
+    across, along = (axis.domain for axis in panel)
+    return {"x": across[1], "y": sum(along) / 2, "len": along[1] - along[0], "thickness": 8, "xpad": 2}
 
 
-# --- rendering --------------------------------------------------------------------------------------------------------
+def _mark(one: HighlightedDesign, number: int, x: str, y: str, *, chosen: bool) -> go.Scatter:
+    """Return a highlighted design as a symbol, the chosen one in red."""
+    colour = RED if chosen else INK
+    return go.Scatter(
+        x=tables.round_for_json([one.design.number_of(x)]),
+        y=tables.round_for_json([one.design.number_of(y)]),
+        mode="markers",
+        showlegend=False,
+        marker={"symbol": _SYMBOLS[number % len(_SYMBOLS)], "size": 12, "color": colour},
+        text=[f"<b>{_escaped(one.label)}</b>"],
+        textposition="top left" if number % 2 else "top right",
+        hovertemplate="%{text}<extra></extra>",
+    )
 
 
-@_plain_text
-def verification_chart(found: Agreement) -> Static | None:
+def verification_chart(found: Agreement) -> tuple[Figure, str] | None:
     """Draw predicted and rendered scatter, and the systematic error, over Z."""
     if not found.z_mm:
         return None
@@ -323,9 +160,6 @@ def verification_chart(found: Agreement) -> Static | None:
     error.set(xlabel="Z from the stand-off (mm)", ylabel="systematic error (µm)")
     legend_below(figure)
     return figure, "Left: standard deviation of the points along Z. Right: their mean distance from the true plane."
-
-
-# --- the Pareto front -------------------------------------------------------------------------------------------------
 
 
 def choose_pareto_axes(judged: StudyResults) -> tuple[tuple[str, int], tuple[str, int]]:
@@ -355,86 +189,30 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
     front = find_pareto_front(np.where((judged.of_interest & known)[:, None], values, np.nan))
     shown = sample(known, front, MOST_POINTS)
     figure = go.Figure()
-    labels = [_escaped(tables.label_of(name)) for name in (x, y)]
 
-    def select_points(places: np.ndarray) -> dict[str, object]:
-        return {axis: tables.round_for_json(judged.figure(name)[places]) for axis, name in (("x", x), ("y", y))}
+    def add(name: str, places: np.ndarray, **style: object) -> None:
+        draw = go.Scattergl if len(places) > _IN_SVG else go.Scatter
+        across, along = (tables.round_for_json(judged.figure(each)[places]) for each in (x, y))
+        texts = [_describe(judged, [*judged.study.free(), x, y, "scattering_depth"], int(place)) for place in places]
+        about = {"text": texts, "hovertemplate": "%{text}<extra></extra>", "name": name}
+        figure.add_trace(draw(x=across, y=along, **about, **style))
 
     for name, chosen, colour in (
-        ("misses a constraint", shown & ~judged.feasible, "#b3bcc6"),
+        ("misses a constraint", shown & ~judged.feasible & ~front, "#b3bcc6"),
         ("meets all constraints", shown & judged.feasible & ~front, BLUE),
     ):
         if len(places := np.flatnonzero(chosen)):
-            trace = (go.Scattergl if len(places) > _IN_SVG else go.Scatter)(
-                **select_points(places),
-                name=name,
-                mode="markers",
-                marker={"color": colour, "size": 4 if shown.sum() > _FEW else 7, "opacity": 0.55},
-                customdata=judged.columns["design"][places].tolist(),
-                hovertemplate=f"design %{{customdata}}<br>{labels[0]}: %{{x}}<br>{labels[1]}: %{{y}}"
-                f"<extra>{name}</extra>",
-            )
-            figure.add_trace(trace)
+            add(name, places, mode="markers", marker={"color": colour, "opacity": 0.55})
     order = np.flatnonzero(front)[np.argsort(values[front, 0])]
-    names = list(dict.fromkeys([*judged.study.free(), x, y, "scattering_depth"]))
-    names = [name for name in names if name in judged.columns]
-    figure.add_scatter(
-        **select_points(order),
-        name=f"Pareto front ({len(order):,} of the designs)",
-        mode="lines+markers",
-        line={"color": _FRONT, "width": 2},
-        marker={"size": 6, "color": _FRONT},
-        text=[
-            "<br>".join(
-                [f"design {judged.columns['design'][place]}"]
-                + [
-                    _escaped(f"{tables.words_of(name)}: {tables.format_design_value(judged, name, place)}")
-                    for name in names
-                ]
-            )
-            for place in order
-        ],
-        hovertemplate="%{text}<extra></extra>",
-    )
-    axis = {"gridcolor": FAINT, "linecolor": INK, "ticks": "outside", "zeroline": False, "automargin": True}
-    axes = []
-    for name, label in zip((x, y), labels, strict=True):
+    add(f"Pareto front ({len(order):,} of the designs)", order, mode="lines+markers", line={"color": COLOURS[2]})
+    for number, one in enumerate(marked):
+        if all(math.isfinite(one.design.number_of(name)) for name in (x, y)):
+            figure.add_trace(_mark(one, number, x, y, chosen=one is marked[-1]).update(mode="markers+text"))
+    for axis, name in ((figure.update_xaxes, x), (figure.update_yaxes, y)):
         numbers = np.append(judged.figure(name)[known], [one.design.number_of(name) for one in marked])
         wide = 0 < np.nanmin(numbers) * _WIDE_RANGE < np.nanmax(numbers)
-        axes.append(
-            axis | {"title": {"text": label, "standoff": 12}} | ({"type": "log", "dtick": "D2"} if wide else {})
-        )
-    figure.update_layout(
-        _LAYOUT,
-        height=520,
-        margin={"l": 70, "r": 20, "t": 30, "b": 56},
-        font_size=13,
-        xaxis=axes[0],
-        yaxis=axes[1],
-        legend={"orientation": "h", "y": -0.16, "yanchor": "top", "x": 0, "itemsizing": "constant"},
-        hovermode="closest",
-        hoverlabel={"namelength": -1, "bgcolor": "white", "font": {"color": INK}},
-        separators=". ",
-        plot_bgcolor="white",
-    )
-    across = judged.figure(x)[known]
-    least, most = float(across.min()), float(across.max())
-    middle = math.sqrt(least * most) if axes[0].get("type") == "log" else 0.5 * (least + most)
-    for number, one in enumerate(marked):
-        place, colour = [one.design.number_of(name) for name in (x, y)], RED if one is marked[-1] else INK
-        if all(map(math.isfinite, place)):
-            figure.add_scatter(
-                x=tables.round_for_json(place[:1]),
-                y=tables.round_for_json(place[1:]),
-                mode="markers+text",
-                showlegend=False,
-                cliponaxis=False,
-                text=[f"<b>{_escaped(one.label)}</b>"],
-                textposition=f"{_TEXT_HEIGHTS[number % len(_TEXT_HEIGHTS)]} {'left' if place[0] > middle else 'right'}",
-                textfont={"color": colour, "size": 12.5},
-                marker={"symbol": _SYMBOLS[number % len(_SYMBOLS)][0], "size": 13, "color": colour},
-                hovertemplate=f"%{{text}}<br>{labels[0]}: %{{x}}<br>{labels[1]}: %{{y}}<extra></extra>",
-            )
+        axis(title_text=_escaped(tables.label_of(name)), type="log" if wide else "linear")
+    figure.update_layout(template="plotly_white", height=520, legend={"orientation": "h", "y": -0.16})
     better = " and ".join(
         f"{'less' if sign > 0 else 'more'} {tables.words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
     )
@@ -452,8 +230,17 @@ def pareto_chart(judged: StudyResults, marked: Sequence[HighlightedDesign]) -> I
     more = " Further objectives are not shown." if len(judged.study.objectives) > 2 else ""
     return (
         figure,
-        f"Better is {better}. No design is better in both than a design on the green line.{more}{none}{thin}{deep}",
+        f"Better is {better}. No design is better in both than a design on the line.{more}{none}{thin}{deep}",
     )
+
+
+def _describe(judged: StudyResults, names: Sequence[str], place: int) -> str:
+    """Return the number and values of a design as lines of text."""
+    lines = [f"design {judged.columns['design'][place]}"]
+    for name in dict.fromkeys(names):
+        if name in judged.columns:
+            lines.append(_escaped(f"{tables.words_of(name)}: {tables.format_design_value(judged, name, place)}"))
+    return "<br>".join(lines)
 
 
 def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
@@ -480,10 +267,6 @@ def parallel_chart(judged: StudyResults) -> Interactive | None:
         go.Parcoords(
             dimensions=[_dimension(judged, name, places) for name in names],
             labelangle=-12,
-            labelside="top",
-            labelfont={"size": 12},
-            tickfont={"size": 11},
-            rangefont={"size": 1, "color": "rgba(0,0,0,0)"},
             line={
                 "color": tables.round_for_json(colours),
                 "colorscale": "Viridis",
@@ -491,14 +274,11 @@ def parallel_chart(judged: StudyResults) -> Interactive | None:
                 "cmin": low,
                 "cmax": high if high > low else low + max(abs(low), 1e-9),
                 "reversescale": objective.goal == "maximise",
-                "colorbar": {
-                    "title": {"text": _escaped(tables.label_of(objective.figure)), "side": "right"},
-                    "thickness": 14,
-                },
+                "colorbar": {"title": {"text": _escaped(tables.label_of(objective.figure)), "side": "right"}},
             },
         )
     )
-    figure.update_layout(_LAYOUT, height=470, margin={"l": 80, "r": 40, "t": 110, "b": 30}, font_size=12)
+    figure.update_layout(height=470, margin_t=110)
     total = int(judged.feasible.sum())
     count = f"{len(places):,} of {total:,} designs" if len(places) < total else f"All {total:,} designs"
     return figure, f"{count} that meet all constraints. Drag along an axis to select designs by their values."

@@ -41,8 +41,8 @@ def page_text(
     Raises EvaluationError if the columns belong to another study.
     """
     judged, collected = StudyResults(study, columns), FigureCollector()
-    over_free_title, over_free = _over_what_is_free(judged, marked)
     nothing = "" if judged.works.any() else "None of the designs works: see the reasons below."
+    over_free = charts.figures_chart(judged, marked)
     pareto, parallel = charts.pareto_chart(judged, marked), charts.parallel_chart(judged)
     return render_page(
         "twin.design.report",
@@ -54,26 +54,22 @@ def page_text(
         label=marked[-1].label if marked else "",
         chosen=tables.tiles(study, marked[-1], marked[0] if len(marked) > 1 else None) if marked else None,
         drawing=_drawing(study, marked),
-        over_free=over_free,
-        over_free_title=over_free_title,
+        over_free=over_free and collected.add(*over_free),
         pareto=pareto and collected.add(*pareto),
         parallel=parallel and collected.add(*parallel),
         nothing=nothing if len(judged) else "No design has been evaluated.",
         number=tables.number_text,
         value=tables.value_text,
         verdicts=[
-            (found, tables.agreement_text(study, found), _show_static(charts.verification_chart(found)))
+            (found, tables.agreement_text(study, found), drawn and (figure_svg(drawn[0]), drawn[1]))
             for found in agreements
+            for drawn in [charts.verification_chart(found)]
         ],
         best=_best(judged),
         failures=tables.failure_counts(judged),
         misses=tables.miss_counts(judged),
         working=int(judged.works.sum()),
     )
-
-
-def _show_static(drawn: charts.Static | None) -> tuple[Markup, str] | None:
-    return drawn and (figure_svg(drawn[0]), drawn[1])
 
 
 def _drawing(study: Study, marked: Sequence[HighlightedDesign]) -> tuple[Markup | None, str]:
@@ -91,23 +87,6 @@ def _drawing(study: Study, marked: Sequence[HighlightedDesign]) -> tuple[Markup 
             other = drawing.make_views(base.sensor, study.medium_of(base.sensor))
     behind = f" Dashed grey behind, as far as it fits in: {base.label}." if other else ""
     return figure_svg(drawing.draw(*views, other)), _DRAWN + behind
-
-
-def _over_what_is_free(
-    judged: StudyResults, marked: Sequence[HighlightedDesign]
-) -> tuple[str, tuple[Markup, str] | None]:
-    """Return the title and the chart of figures over the free variables; no chart if no design works."""
-    ranges = [name for name, variable in judged.study.variables.items() if variable.values is None][:2]
-    title = f"Figures over {' and '.join(map(tables.words_of, ranges))}" if ranges else "Figures of the choices"
-    if not judged.works.any():
-        return title, None
-    match ranges:
-        case [x, y]:
-            return title, _show_static(charts.contours(judged, marked, x, y))
-        case [x]:
-            return title, _show_static(charts.curves(judged, marked, x))
-        case _:
-            return title, _show_static(charts.bars(judged))
 
 
 def _best(judged: StudyResults) -> tuple[list[str], list[list[str]]]:
