@@ -210,7 +210,7 @@ def pipeline() -> list[Row]:
 def reproduction() -> list[Row]:
     """Time per image of the thesis's campaign, its scans thinned: 3,000 images in half an hour are 600 ms."""
     from tests.bench.floors import stock_frame_seconds
-    from twin.recording.campaigns import record_campaigns
+    from twin.recording.campaigns import RecordingOptions, record_campaigns
     from twin.scene.campaign import load_campaign
 
     images = 0
@@ -221,7 +221,8 @@ def reproduction() -> list[Row]:
 
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        record_campaigns(load_campaign("thesis"), Path(folder), seeds=range(1), every=30, progress=count)
+        options = RecordingOptions(every=30)
+        record_campaigns(load_campaign("thesis"), Path(folder), seeds=range(1), options=options, progress=count)
         seconds = time.perf_counter() - start
     stock = Floor(STOCK_FRAME, 1e3 * stock_frame_seconds(), 1.0)
     name = f"the thesis's campaign, thinned to {images} images"

@@ -584,7 +584,7 @@ def test_unknown_medium(fails, tmp_path: Path):
         ("no-campaign.toml", "no description at no-campaign.toml"),
         ("--campaigns 0", "campaigns is 0; it must be at least 1"),
         ("--campaigns -3", "campaigns is -3"),
-        ("--first -1", "first is -1; a seed must not be negative"),
+        ("--first -1", "first is -1; it must be at least 0"),
         ("--every 0", "every is 0"),
         ("--workers 0", "workers is 0"),
         ("--spp 0", "spp is 0"),

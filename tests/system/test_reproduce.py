@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from twin import cli
-from twin.recording.campaigns import record as record_one, record_campaigns
+from twin.recording.campaigns import RecordingOptions, record as record_one, record_campaigns
 from twin.recording.record_scene import record_scene
 from twin.rendering_options import Options
 from twin.scene.campaign import list_takes, load_campaign
@@ -110,8 +110,9 @@ class Progress(list):
 
 def record(described: Path, folder: Path, *, name: str = "small", **how) -> Progress:
     seen = Progress()
-    how = {"seeds": range(1), "spp": 4, "workers": 2, "progress": seen} | how
-    record_campaigns(load_campaign(described / f"{name}.toml"), folder, **how)
+    seeds = how.pop("seeds", range(1))
+    options = RecordingOptions(**({"spp": 4, "workers": 2} | how))
+    record_campaigns(load_campaign(described / f"{name}.toml"), folder, seeds=seeds, options=options, progress=seen)
     return seen
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from twin.experiments.experiment import run_experiment
 from twin.experiments.reproduce import METHODS
-from twin.recording.campaigns import record_campaigns
+from twin.recording.campaigns import RecordingOptions, record_campaigns
 from twin.scene.campaign import Campaign, load_campaign
 from uwlts.errors import DescriptionWarning
 from uwlts.model.calibration import Calibration
@@ -65,7 +65,9 @@ def edition(tmp_path_factory: pytest.TempPathFactory) -> CampaignFolder:
     """The small campaign, rendered."""
     folder = tmp_path_factory.mktemp("thesis")
     described = load_campaign("thesis").model_dump(include={"title", "sensor", "as_built"}) | {"recordings": RECORDINGS}
-    (campaign,) = record_campaigns(Campaign.model_validate(described), folder, seeds=range(1), every=EVERY)
+    (campaign,) = record_campaigns(
+        Campaign.model_validate(described), folder, seeds=range(1), options=RecordingOptions(EVERY)
+    )
     return CampaignFolder(campaign)
 
 
@@ -145,9 +147,11 @@ def imperfect(tmp_path_factory: pytest.TempPathFactory) -> FigureTable:
     scans = {"scene": "spheres", "media": ["water"], "placements": places}
     plane = {"scene": "plane", "media": ["water"], "placements": ["standoff"]}
     campaign = Campaign.model_validate(described | {"recordings": [*RECORDINGS[:4], scans, plane]})
-    how = {"name": "imperfect", "methods": METHODS, "with_truth": True, "every": EVERY, "workers": None}
+    how = {"name": "imperfect", "methods": METHODS, "with_truth": True}
     with pytest.warns(DescriptionWarning, match="temperature"):
-        return run_experiment(campaign, tmp_path_factory.mktemp("imperfect"), range(1, 2), **how).table
+        return run_experiment(
+            campaign, tmp_path_factory.mktemp("imperfect"), range(1, 2), RecordingOptions(EVERY), **how
+        ).table
 
 
 def root_mean_square(values) -> float:

@@ -5,6 +5,7 @@ from pathlib import Path
 from twin.experiments.experiment import run_experiment
 from twin.experiments.result import PAGE
 from twin.experiments.runner import Method
+from twin.recording.campaigns import RecordingOptions
 from twin.scene.campaign import load_campaign
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 
@@ -60,7 +61,7 @@ def demo(out: str | Path = "runs/demo", *, progress: ProgressListener = ignore_p
     DescriptionError, OutputError, SetupError
         As for `experiment`.
     """
-    how = {"name": "demo", "methods": METHODS, "with_truth": True, "every": 1, "workers": None}
-    result = run_experiment(load_campaign("demo"), Path(out), [0], progress=progress, **how)
+    how = {"name": "demo", "methods": METHODS, "with_truth": True, "progress": progress}
+    result = run_experiment(load_campaign("demo"), Path(out), [0], RecordingOptions(), **how)
     print("\n".join(result.lines()))
     return Path(out) / PAGE

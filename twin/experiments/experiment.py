@@ -11,7 +11,7 @@ import tomli_w
 from twin.experiments.figures import describe_conditions, read_figures, read_flaws
 from twin.experiments.result import ExperimentResult
 from twin.experiments.runner import COLOURED, Method, evidence_of, inspected_as, is_evaluated, plan_lines, run_stages
-from twin.recording.campaigns import make_folder, record_campaigns, require_at_least
+from twin.recording.campaigns import RecordingOptions, make_folder, record_campaigns, require_at_least
 from twin.rendering_options import CPU, Variant
 from twin.scene.campaign import Campaign, CampaignRecording, list_takes, load_campaign
 from twin.scene.stated_deviations import find_understated
@@ -105,6 +105,7 @@ def experiment(
     if not seeds or not scenes:
         missing = "seeds" if scenes else "scenes"
         raise DescriptionError(f"{missing} is empty; an experiment needs at least one of them")
+    options = RecordingOptions(every, spp, variant, workers, scheduler, overwrite)
     described = load_campaign(campaign)
     folder = Path(
         out or Path("runs") / f"experiment-{sensor.name if isinstance(sensor, Sensor) else Path(sensor).stem}"
@@ -119,10 +120,7 @@ def experiment(
     changes |= {} if imperfections is None else {"imperfections": imperfections}
     changes |= {} if water is None else {"water": water}
     described = validate_description(Campaign, described.model_dump() | changes, str(campaign))
-    options = {"every": every, "spp": spp, "workers": workers, "scheduler": scheduler, "variant": variant}
-    return run_experiment(
-        described, folder, seeds, name=str(campaign), with_truth=True, overwrite=overwrite, progress=progress, **options
-    )
+    return run_experiment(described, folder, seeds, options, name=str(campaign), with_truth=True, progress=progress)
 
 
 def predict(
@@ -142,10 +140,8 @@ def predict(
 ) -> ExperimentResult:
     """Predict the uncertainty of a sensor's measurements, and compare it with the errors in rendered campaigns.
 
-    Every campaign has its own imperfections and noise. The sensor's software calibrates jointly, measures and
-    states an uncertainty, which is compared with the errors. Pits, dents and undercuts of drawn depths give their
-    probability of detection (MIL-HDBK-1823A). An interrupted run is resumed, and campaigns are added if the number is
-    increased. OUT/experiment.html and experiment.json are written.
+    An `experiment` with the scans of a campaign. Pits, dents and undercuts of drawn depths give their probability of
+    detection (MIL-HDBK-1823A).
 
     Parameters
     ----------
@@ -180,23 +176,17 @@ def predict(
 
     Raises
     ------
-    DescriptionError
-        An argument is out of its range, or the campaign has no calibration or no scan with a known truth.
-    DesignError, OutputError, SetupError
-        As `record_campaigns`.
-    CommandFailed
-        The sensor's software failed; its output gives the reason.
-    CaptureError
-        A result cannot be read.
+    DescriptionError, DesignError, OutputError, SetupError, CommandFailed, CaptureError
+        As for `experiment`, or the campaign has no scan with a known truth.
 
     Warns
     -----
     DescriptionWarning
-        The campaign deviates by more than the sensor's table ``[uncertainty]`` states. The warning comes before
-        anything is rendered, and is repeated in the result.
+        As for `experiment`.
     """
-    require_at_least(1, campaigns=campaigns, every=every, workers=workers)
+    require_at_least(1, campaigns=campaigns)
     require_at_least(0, first=first)
+    options = RecordingOptions(every, spp, variant, workers, overwrite=overwrite)
     described = load_campaign(campaign)
     changes: dict[str, Any] = {} if water is None else {"water": water}
     if sensor is not None:
@@ -204,40 +194,34 @@ def predict(
     described = validate_description(Campaign, described.model_dump() | changes, str(campaign))
     folder = Path(out or Path("runs") / f"predict-{Path(described.sensor).stem}")
     seeds = range(first, first + campaigns)
-    options = {"every": every, "spp": spp, "workers": workers, "variant": variant, "overwrite": overwrite}
-    return run_experiment(described, folder, seeds, name=str(campaign), with_truth=False, progress=progress, **options)
+    return run_experiment(described, folder, seeds, options, name=str(campaign), with_truth=False, progress=progress)
 
 
 def run_experiment(
     campaign: Campaign,
     folder: Path,
     seeds: Sequence[int],
+    options: RecordingOptions,
     *,
     name: str,
     with_truth: bool,
     methods: Sequence[Method] = (),
-    every: int,
-    scheduler: str | None = None,
     progress: ProgressListener = ignore_progress,
-    **options: Any,
 ) -> ExperimentResult:
     """Record a campaign for each seed, calibrate it, measure its scans, and write table and page.
 
     ``methods`` are the calibrations, whose scans count if the campaign has them; by default the joint one with all
     recordings of targets and steps. ``with_truth`` compares all scans with the ground truth, so that scans of any scene
-    count; otherwise those of an artefact, a pitted pipe or a weld. ``options`` are those of `record_campaigns`. Raises
-    as `experiment`.
+    count; otherwise those of an artefact, a pitted pipe or a weld. Raises as `experiment`.
     """
-    require_at_least(1, every=every, workers=options["workers"])
+    every = options.every
     require_at_least(0, seed=min(seeds))
     methods = methods or [choose_joint(campaign, every, all_scans=with_truth)]
     takes = [{take.name: take for take in list_takes(campaign, seed=seed, every=every)} for seed in seeds]
     understated = find_understated(campaign, [*takes[0].values()])
     for each in understated:
         warnings.warn(each.text(), DescriptionWarning, stacklevel=3)
-    folders = record_campaigns(
-        campaign, folder, seeds=seeds, every=every, scheduler=scheduler, progress=progress, **options
-    )
+    folders = record_campaigns(campaign, folder, seeds=seeds, options=options, progress=progress)
     by_folder = dict(zip(folders, takes, strict=True))
     methods = [replace(each, scans=[scan for scan in each.scans if scan in takes[0]]) for each in methods]
     lines = [
@@ -247,7 +231,7 @@ def run_experiment(
     ]
     with write_atomically(folder / "commands.sh", overwrite=True) as aside:
         aside.write_text("".join(f"{line.text}\n" for line in lines), encoding="utf-8")
-    run_stages(lines, scheduler=scheduler, progress=progress)
+    run_stages(lines, scheduler=options.scheduler, progress=progress)
     rows = [row for place, of_seed in by_folder.items() for row in read_figures(place, of_seed, methods)]
     detections, depths = read_flaws(by_folder, methods[0])
     conditions = {row.scan: describe_conditions(takes[0][row.scan]) for row in rows}

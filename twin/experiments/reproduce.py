@@ -11,7 +11,7 @@ from pathlib import Path
 from twin.experiments.experiment import run_experiment
 from twin.experiments.result import PAGE
 from twin.experiments.runner import Method, run_program
-from twin.recording.campaigns import record_campaigns, require_at_least
+from twin.recording.campaigns import RecordingOptions, record_campaigns, require_at_least
 from twin.rendering_options import CPU, Variant
 from twin.scene.campaign import load_campaign
 from uwlts.errors import DescriptionError
@@ -99,9 +99,9 @@ def reproduce(
     CommandFailed
         The evaluation failed; its output gives the reason.
     """
-    require_at_least(1, campaigns=campaigns, every=every, workers=workers)
-    if first < 0:
-        raise DescriptionError(f"first is {first}; a seed must not be negative")
+    options = RecordingOptions(every, spp, variant, workers, overwrite=overwrite)
+    require_at_least(1, campaigns=campaigns)
+    require_at_least(0, first=first)
     if trials != 0 and trials < _LEAST_TRIALS:
         raise DescriptionError(
             f"trials is {trials}; expected at least {_LEAST_TRIALS}, or 0 for no Monte-Carlo propagation"
@@ -109,23 +109,12 @@ def reproduce(
     campaign = campaign or ("joint" if joint else "thesis")
     folder = Path(out or Path("runs") / Path(campaign).stem)
     described = load_campaign(campaign)
+    seeds = range(first, first + campaigns)
     if joint:
-        options = {"every": every, "spp": spp, "workers": workers, "variant": variant, "overwrite": overwrite}
-        seeds, about = range(first, first + campaigns), {"name": str(campaign), "methods": METHODS, "with_truth": True}
-        result = run_experiment(described, folder, seeds, progress=progress, **about, **options)
-        print("\n".join(result.lines()))
+        how = {"name": str(campaign), "methods": METHODS, "with_truth": True, "progress": progress}
+        print("\n".join(run_experiment(described, folder, seeds, options, **how).lines()))
         return folder / PAGE
-    record_campaigns(
-        described,
-        folder,
-        seeds=range(first, first + campaigns),
-        every=every,
-        spp=spp,
-        variant=variant,
-        workers=workers,
-        overwrite=overwrite,
-        progress=progress,
-    )
+    record_campaigns(described, folder, seeds=seeds, options=options, progress=progress)
     # The sensor's software runs as a separate program, which shares no mathematics with the twin.
     command = ["uwlts", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
     command += ["--again"] if overwrite else []

@@ -21,6 +21,24 @@ from uwlts.storage.truth import truth_path
 PLAN = "plan.json"
 
 
+@dataclass(frozen=True)
+class RecordingOptions:
+    """Options of campaigns' recordings, as those of `record`; DescriptionError if one is out of its range.
+
+    ``scheduler`` is the address of a Dask scheduler whose workers render, instead of processes on this machine.
+    """
+
+    every: int = 1
+    spp: int = 16
+    variant: str = CPU
+    workers: int | None = None
+    scheduler: str | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        require_at_least(1, every=self.every, workers=self.workers)
+
+
 def record(
     campaign: str | Path,
     *,
@@ -67,13 +85,13 @@ def record(
     DescriptionError, DesignError, OutputError, SetupError
         As `record_campaigns`, or an argument is out of its range.
     """
-    require_at_least(1, every=every, workers=workers)
+    options = RecordingOptions(every=every, spp=spp, variant=variant, workers=workers, overwrite=overwrite)
     require_at_least(0, seed=seed)
     described, folder = load_campaign(campaign), Path(out)
     flaws = Flaws.parse(*effects)
-    jobs = _jobs(described, folder, seed=seed, every=every, spp=spp, variant=variant, flaws=flaws)
-    plan = _plan(described, every=every, spp=spp, variant=variant) | {"seed": seed, "effects": flaws.names()}
-    _record_all(jobs, folder, plan, recorded="*.h5*", workers=workers, overwrite=overwrite, progress=progress)
+    jobs = _jobs(described, folder, options, seed=seed, flaws=flaws)
+    plan = _plan(described, options) | {"seed": seed, "effects": flaws.names()}
+    _record_all(jobs, folder, plan, options, recorded="*.h5*", progress=progress)
     return folder
 
 
@@ -107,20 +125,14 @@ def record_campaigns(
     folder: Path,
     *,
     seeds: Sequence[int],
-    every: int = 1,
-    spp: int = 16,
-    variant: str = CPU,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    overwrite: bool = False,
+    options: RecordingOptions,
     progress: ProgressListener = ignore_progress,
 ) -> list[Path]:
     """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; return these folders.
 
     Each seed draws its own sensor and noise. ``every`` takes only every n-th profile of the scans; calibrations keep
     all images. Complete recordings are kept and interrupted ones resumed, unless ``overwrite`` removes those of these
-    seeds. ``progress(done, total)`` counts images. With ``scheduler``, the address of a Dask scheduler, its workers
-    render, and progress is that of whole recordings.
+    seeds. ``progress(done, total)`` counts images; with a scheduler, those of whole recordings.
 
     Raises DescriptionError if the folder contains a campaign with other settings or a description is wrong; DesignError
     if the sensor cannot measure a scene; OutputError if a file cannot be written; SetupError if a rendering process was
@@ -130,45 +142,40 @@ def record_campaigns(
     jobs = [
         job
         for seed, place in zip(seeds, folders, strict=True)
-        for job in _jobs(campaign, place, seed=seed, every=every, spp=spp, variant=variant, flaws=Flaws())
+        for job in _jobs(campaign, place, options, seed=seed, flaws=Flaws())
     ]
-    plan = _plan(campaign, every=every, spp=spp, variant=variant)
-    run = {"workers": workers, "scheduler": scheduler, "overwrite": overwrite, "progress": progress}
-    _record_all(jobs, folder, plan, recorded="campaign-*/*.h5*", **run)
+    _record_all(jobs, folder, _plan(campaign, options), options, recorded="campaign-*/*.h5*", progress=progress)
     return folders
 
 
-def _jobs(
-    campaign: Campaign, place: Path, *, seed: int, every: int, spp: int, variant: str, flaws: Flaws
-) -> list[_Job]:
+def _jobs(campaign: Campaign, place: Path, options: RecordingOptions, *, seed: int, flaws: Flaws) -> list[_Job]:
     return [
-        _Job(take, place / f"{take.name}.h5", Options(spp=spp, seed=take.seed, flaws=flaws), variant)
-        for take in list_takes(campaign, seed=seed, every=every)
+        _Job(take, place / f"{take.name}.h5", Options(spp=options.spp, seed=take.seed, flaws=flaws), options.variant)
+        for take in list_takes(campaign, seed=seed, every=options.every)
     ]
 
 
-def _plan(campaign: Campaign, *, every: int, spp: int, variant: str) -> dict[str, JsonValue]:
-    return {"campaign": campaign.model_dump(mode="json"), "every": every, "spp": spp, "variant": variant}
+def _plan(campaign: Campaign, options: RecordingOptions) -> dict[str, JsonValue]:
+    described = campaign.model_dump(mode="json")
+    return {"campaign": described, "every": options.every, "spp": options.spp, "variant": options.variant}
 
 
 def _record_all(
     jobs: list[_Job],
     folder: Path,
     plan: dict[str, JsonValue],
+    options: RecordingOptions,
     *,
     recorded: str,
-    workers: int | None,
-    overwrite: bool,
     progress: ProgressListener,
-    scheduler: str | None = None,
 ) -> None:
     """Render incomplete recordings into a folder that follows a plan; ``recorded`` is the pattern of its captures."""
     make_folder(folder)
     files = {file for job in jobs for file in job.files}
-    keep_to_plan(folder, plan, files, recorded=recorded, called="recordings", overwrite=overwrite)
+    keep_to_plan(folder, plan, files, recorded=recorded, called="recordings", overwrite=options.overwrite)
     for place in {job.path.parent for job in jobs}:
         place.mkdir(exist_ok=True)
-    if overwrite:
+    if options.overwrite:
         # Remove all files first: after an interruption, old recordings must not pass for new ones.
         for path in (path for job in jobs for path in job.files):
             path.unlink(missing_ok=True)
@@ -178,10 +185,10 @@ def _record_all(
     total = sum(job.images for job in jobs)
     counted = count(total - sum(job.images for job in waiting))
     progress(next(counted), total)
-    if scheduler is None:
-        run_jobs(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
+    if options.scheduler is None:
+        run_jobs(_record, waiting, workers=options.workers, on_message=lambda _: progress(next(counted), total))
         return
-    with open_workers(scheduler=scheduler) as cluster:
+    with open_workers(scheduler=options.scheduler) as cluster:
         for job, lost in cluster.map_unordered(_record, waiting):
             if lost is not None:
                 raise SetupError(f"{job.path}: {lost.reason}")
