@@ -16,6 +16,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import erf
 
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError
+from uwlts.files.reading import log_warnings
 from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.any_calibration import calibration_digest
@@ -135,6 +136,8 @@ def fit_radiometry(
                 f"{scan.path.name} has poses of a platform or of a target; the slope of the surface is found from the "
                 "steps of a stage: give a scan by a stage"
             )
+        if (response := scan.header.provenance.get("response")) is not None:
+            log_warnings(scan.path.name, [f"the response of its images is {response}; what follows needs it"])
         stripes = fill_gaps(find_stripes(scan, options=stripe, progress=progress))
         light = stripe_light(scan.header, known, stripes, scan.stage_mm)
         images = measure_stripes(scan, stripes, light.usable, progress)

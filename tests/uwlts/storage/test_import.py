@@ -681,3 +681,19 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert run(cli.app) == 0
     printed = capsys.readouterr()
     assert "with 3 laser and 0 lamp images" in printed.out and "warning: 1 images of the folder" in printed.err
+
+
+def test_a_formula_leaves_lamp_images_grey(tmp_path: Path):
+    colours = np.dstack([lamp_image(1), lamp_image(2), np.maximum(lamp_image(3), stripe_image())])
+    given = without("laser", laser="*.png", lamp="*.png", channel="red - max(green, blue)")
+    folder = folder_of(tmp_path, {"a1.png": colours, "a2.png": colours[::-1]}, given)
+    import_images(folder, tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        assert np.array_equal(capture.image(0), cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY)) and not capture.laser_on[0]
+        assert "not known" in capture.header.provenance["response"]
+
+
+def test_inverted_grey_values_are_named(tmp_path: Path):
+    folder = folder_of(tmp_path, {f"l{n}.png": 255 - stripe_image(20.0 + n, seed=n) for n in range(3)})
+    (warning,) = import_images(folder, tmp_path / "a.h5").warnings
+    assert "are their grey values inverted?" in warning

@@ -47,6 +47,7 @@ _SIZE_ADVICE = {
 """Advice on an image of another size than the sensor's, by whether it is the first, and whether it is rotated."""
 
 _MOST_EXAMINED = 4  # images of each light in which a mosaic is looked for
+_INVERTED = 3.0  # largest dark deviation from the median of a laser image, relative to the bright one
 _MANY_LINES = 0.5  # fraction of the profile lines with clipped pixels: the stripe itself rather than reflections
 
 
@@ -57,8 +58,8 @@ class _Content:
     ``saturation_dn`` is that of the files; ``target``: the description has a target. ``black`` has the names of the
     dark images and ``seen`` the number of all, by whether the laser was on. ``with_stripe`` counts the images with a
     stripe, ``sideways`` those with a stripe across the expected direction, ``clipped`` the laser images with clipped
-    pixels on most lines. ``mosaics`` has the names of the raw Bayer images among the first of each light, and
-    ``repeats`` the laser images that are equal to the one before.
+    pixels on most lines. ``mosaics`` has the names of the raw Bayer images among the first of each light,
+    ``repeats`` the laser images that are equal to the one before; ``inverted`` counts those with a dark stripe.
     """
 
     stripe_along: str
@@ -71,6 +72,7 @@ class _Content:
     clipped: int = 0
     mosaics: list[str] = field(default_factory=list)
     repeats: list[str] = field(default_factory=list)
+    inverted: int = 0
     _last: np.ndarray | None = None
 
     def add_image(self, image: np.ndarray, clipped: np.ndarray, *, laser_on: bool, name: str) -> None:
@@ -88,6 +90,8 @@ class _Content:
         if self.seen[laser_on] - len(self.black[laser_on]) <= _MOST_EXAMINED and is_mosaic(image):
             self.mosaics.append(name)
         if laser_on:
+            low, middle, high = np.percentile(image, (0.1, 50, 99.9))
+            self.inverted += bool(middle - low > _INVERTED * (high - middle))
             self.clipped += bool(clipped.any(axis=1 if self.stripe_along == "height" else 0).mean() > _MANY_LINES)
             if self._last is not None and np.array_equal(image, self._last):
                 self.repeats.append(name)
@@ -133,6 +137,8 @@ class _Content:
                 f"{self.repeats[0]}: the camera or a copy repeated an image, so that positions may be wrong"
             )
         lasers = self.seen[True]
+        if 2 * self.inverted > lasers and not self.target:
+            warnings.append("the laser images have dark features on a bright ground: are their grey values inverted?")
         if self.clipped:
             warnings.append(
                 f"{self.clipped} of {lasers} laser images are saturated on more than {100 * _MANY_LINES:g} % of their "
@@ -312,7 +318,7 @@ class _Reader:
         raw = read_image(self._folder / name, accept=partial(self._require_size, name))
         if self.dtype not in (np.void, raw.dtype):
             raise ImageError(f"{name} contains {raw.dtype}, the images before it contain {self.dtype}")
-        channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
+        channel = given.channel if laser_on else given.channel_of_lamp(raw)
         # A header does not state the bits, and the grey values of an exported capture fit in it.
         bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
         self.dtype = raw.dtype
@@ -348,6 +354,9 @@ def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, 
     remarks |= {
         key: getattr(given, key) for key in ("bayer", "channel", "lamp_channel", "intrinsics") if getattr(given, key)
     }
+    name = frames[0].file.lower() if frames else ""
+    if bits == 8 and (given.channel or name.endswith((".jpg", ".jpeg"))):
+        remarks["response"] = "not known: 8-bit photographs are usually not proportional to light"
     if zero_dn:
         background = any(row.background is not None for row in frames)
         name, done = ("background", "subtracted from the laser images, ") if background else ("laser_images", "")

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from uwlts.errors import DescriptionError
@@ -21,7 +22,7 @@ from uwlts.model.library import (
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
 from uwlts.storage.capture import NO_STAGE, CaptureHeader
 from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
-from uwlts.storage.import_.grey_values import Channel
+from uwlts.storage.import_.grey_values import Channel, is_formula
 from uwlts.storage.import_.mosaic import BayerPattern
 from uwlts.targets import parse_target
 
@@ -120,6 +121,12 @@ class ImportDescription(Description):
         if self.centre_lines is not None and (self.background or self.channel is not None):
             raise ValueError("centre lines have neither background nor channel: leave these out; lamp_channel may stay")
         return self
+
+    def channel_of_lamp(self, image: np.ndarray) -> str | None:
+        """Return the channel of lamp images such as ``image``; by default grey if that of the laser is a formula."""
+        if self.lamp_channel is not None:
+            return self.lamp_channel
+        return "grey" if is_formula(self.channel, image) and image.ndim == 3 else self.channel
 
 
 def read_description(path: Path) -> ImportDescription:
