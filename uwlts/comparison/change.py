@@ -19,6 +19,7 @@ from uwlts.comparison.change_reference import (
     read_reference,
     require_enough,
     require_same_unit,
+    stated_variance,
 )
 from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.comparison.ideal_shapes import IdealShape, place_shape
@@ -79,6 +80,10 @@ class SurfaceChange(Brief):
         Registration that moved the cloud; None without.
     reference : str
         Description of the reference.
+    warnings : tuple of str
+        Doubts about the clouds, such as unknown uncertainties that the level does not contain.
+    stated_std_mm : (float or None, float or None)
+        Stated standard uncertainties of systematic errors of the cloud and of the reference, which the level contains.
     """
 
     points_mm: np.ndarray
@@ -91,6 +96,8 @@ class SurfaceChange(Brief):
     deep_mm: float
     registration: Registration | None
     reference: str
+    warnings: tuple[str, ...] = ()
+    stated_std_mm: tuple[float | None, float | None] = (None, None)
 
     @property
     def compared(self) -> np.ndarray:
@@ -140,6 +147,9 @@ class SurfaceChange(Brief):
         found = self.registration
         return {
             "reference": self.reference,
+            "warnings": list(self.warnings),
+            "cloud_std_mm": self.stated_std_mm[0],
+            "reference_std_mm": self.stated_std_mm[1],
             "places": len(self.distance_mm),
             "compared": len(distance),
             "compared_area_mm2": float(area.sum()),
@@ -189,7 +199,10 @@ class SurfaceChange(Brief):
                 f"registration              moved by {shift:.3f} mm and {turn:.4f} deg, rms {found.rms_mm:.4f} mm"
             )
             lines += [f"  undetermined, not moved: {name}" for name in found.open_directions]
-        return lines
+        for name, std in zip(("cloud", "reference"), self.stated_std_mm, strict=True):
+            if std is not None:
+                lines.append(f"systematic errors         {std:.4g} mm standard uncertainty stated for the {name}")
+        return [*lines, *(f"warning: {each}" for each in self.warnings)]
 
 
 def compare_clouds(
@@ -203,6 +216,8 @@ def compare_clouds(
     same_water: bool = False,
     reference_unit: Unit | None = None,
     cloud_unit: Unit | None = None,
+    cloud_std_mm: float | None = None,
+    reference_std_mm: float | None = None,
 ) -> SurfaceChange:
     """Find where a surface differs from an earlier cloud, a mesh or an ideal shape by more than the uncertainty.
 
@@ -240,6 +255,11 @@ def compare_clouds(
         Unit of the reference, mm or m, if its file does not state it; by default mm.
     cloud_unit
         The same of the cloud.
+    cloud_std_mm
+        Standard uncertainty of distances by systematic errors of the cloud's scanner, for a cloud without uncertainty.
+        It is common to all points, so that averaging does not reduce it.
+    reference_std_mm
+        The same of the reference, if it is a cloud.
 
     Returns
     -------
@@ -267,6 +287,9 @@ def compare_clouds(
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
     disc = disc_mm or choose_disc_diameter(require_enough(new.points_mm, "cloud"), new.frame)
     surface = read_reference(reference, unit=reference_unit, disc_mm=disc)
+    exact = not isinstance(surface, ReferencePoints) or surface.meshed or surface.uncertainty is not None
+    own, own_warnings = stated_variance(cloud_std_mm, known=new.uncertainty is not None, of="cloud")
+    other, other_warnings = stated_variance(reference_std_mm, known=exact, of="reference")
     fixed = None if datums is None else read_datums(datums)
     if isinstance(surface, ReferencePoints):
         require_same_unit(new.points_mm, require_enough(surface.points_mm, "reference"))
@@ -285,8 +308,10 @@ def compare_clouds(
     if found is not None:
         variance = variance + found.std_along(sides.places, sides.normals) ** 2
     # Rounding errors of neighbouring points are equal where a surface is parallel to an axis, and do not average out.
-    stored = surface.rounding_std_mm if isinstance(surface, ReferencePoints) else 0.0
-    variance = variance + rounding_std_mm(new) ** 2 + stored**2
+    stored, read = 0.0, ()
+    if isinstance(surface, ReferencePoints):
+        stored, read = surface.rounding_std_mm, surface.warnings
+    variance = variance + rounding_std_mm(new) ** 2 + stored**2 + own + other
     if not np.isfinite(sides.distance_mm).any():
         raise EvaluationError(
             f"the cloud and the reference do not overlap within {deep:g} mm. Check that both have the same frame and "
@@ -304,6 +329,8 @@ def compare_clouds(
         deep,
         sides.moved,
         sides.reference,
+        tuple(dict.fromkeys([*new.warnings, *read, *own_warnings, *other_warnings])),
+        (cloud_std_mm, reference_std_mm),
     )
 
 

@@ -41,6 +41,7 @@ class ReferencePoints:
     uncertainty: PointUncertainty | None = None
     frame: np.ndarray | None = None
     rounding_std_mm: float = 0.0
+    warnings: tuple[str, ...] = ()
 
     @property
     def meshed(self) -> bool:
@@ -95,8 +96,7 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
         if path.suffix.lower() == ".toml":
             reference = read_shape(path)
         elif path.suffix.lower() == ".h5" or (is_readable_cloud(path) and not has_faces(path)):
-            cloud = load_cloud(path, unit=unit)
-            return ReferencePoints(cloud.points_mm, None, cloud.uncertainty, cloud.frame, rounding_std_mm(cloud))
+            return _points_of(load_cloud(path, unit=unit), 1.0)
         else:
             mesh = load_triangles(path, unit=unit)
             return sample_mesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), disc_mm=disc_mm)
@@ -104,8 +104,33 @@ def read_reference(reference: Reference, *, unit: Unit | None, disc_mm: float) -
         return reference
     if scale != 1.0 and reference.uncertainty is not None:
         raise EvaluationError("the unit is m, but clouds with uncertainty are always in mm; omit the unit")
-    rounding = scale * rounding_std_mm(reference)
-    return ReferencePoints(scale * reference.points_mm, None, reference.uncertainty, reference.frame, rounding)
+    return _points_of(load_cloud(reference), scale)
+
+
+def _points_of(cloud: PointCloud, scale: float) -> ReferencePoints:
+    points, rounding = scale * cloud.points_mm, scale * rounding_std_mm(cloud)
+    return ReferencePoints(points, None, cloud.uncertainty, cloud.frame, rounding, tuple(cloud.warnings))
+
+
+def stated_variance(std_mm: float | None, *, known: bool, of: str) -> tuple[float, list[str]]:
+    """Return the variance of a stated systematic error of a surface, and a warning if its uncertainty is not known.
+
+    ``known`` states whether the surface contains its uncertainty; ``of`` is "cloud" or "reference".
+
+    Raises EvaluationError if the standard deviation is negative or not finite, or would count twice.
+    """
+    name = f"{of}_std_mm"
+    if std_mm is None:
+        text = (
+            f"no uncertainty of the {of} is known: the level of detection contains its scatter only, not the errors of "
+            f"the scanner's calibration. State their standard uncertainty ({name})"
+        )
+        return 0.0, [] if known else [text]
+    if not 0 <= std_mm < np.inf:
+        raise EvaluationError(f"`{name}` is {std_mm:g}; expected a standard uncertainty in mm, at least 0")
+    if known:
+        raise EvaluationError(f"the {of} contains its uncertainty, or has none, as a mesh: omit `{name}`")
+    return std_mm**2, []
 
 
 def sample_mesh(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> ReferencePoints:

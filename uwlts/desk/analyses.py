@@ -160,7 +160,7 @@ def _compare(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
         )
         for number, each in enumerate(change.regions(), start=1)
     )
-    return AnalysisOutcome(tuple(change.lines()), findings)
+    return AnalysisOutcome(tuple(change.lines()), findings, change.warnings)
 
 
 def _register(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
@@ -204,7 +204,13 @@ ANALYSES: Mapping[str, Analysis] = MappingProxyType(
         },
         "compare": Analysis(
             _compare,
-            ((uwlts, "compare_clouds", ("cloud", "reference", "register", "same_water")),),
+            (
+                (
+                    uwlts,
+                    "compare_clouds",
+                    ("cloud", "reference", "register", "same_water", "cloud_std_mm", "reference_std_mm"),
+                ),
+            ),
             "-change",
             (".html", ".json", "-coloured.ply"),
         ),

@@ -489,3 +489,40 @@ def test_areas_of_places_add_up_to_the_surface():
     area = _estimate_areas(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])).reshape(x.shape)
     np.testing.assert_allclose(area[2:-2, 2:-2], np.pi * 16 / 12.5)
     np.testing.assert_array_equal(_estimate_areas(np.zeros((1, 3))), [0.0])
+
+
+def test_unknown_uncertainties_are_warned_of_on_all_outputs_and_can_be_stated(tmp_path):
+    """The systematic errors of a scanner, 0.05 mm over the plate, are significant unless they are stated."""
+    rng, clouds = np.random.default_rng(3), []
+    for error_mm in (0.0, 0.05):
+        x, y = rng.uniform(0, 60, (2, 4000))
+        clouds.append(np.column_stack([x, y, 300 + error_mm * x / 60 + rng.normal(0, 0.02, 4000)]))
+    files = [tmp_path / "a.xyz", tmp_path / "b.xyz"]
+    for path, points in zip(files, clouds, strict=True):
+        np.savetxt(path, points)
+    scatter = uwlts.compare_clouds(*files)
+    assert np.mean(scatter.significant) > 0.3
+    assert [each[: each.index(" is known")] for each in scatter.warnings] == [
+        "no uncertainty of the cloud",
+        "no uncertainty of the reference",
+    ]
+    uwlts.report.write_change(tmp_path / "a.html", scatter)
+    recorded, page = json.loads((tmp_path / "a.json").read_text()), (tmp_path / "a.html").read_text()
+    for warning in scatter.warnings:
+        assert f"warning: {warning}" in scatter.lines() and warning in recorded["warnings"]
+        assert warning.replace("'", "&#39;") in page
+    stated = uwlts.compare_clouds(*files, cloud_std_mm=0.03, reference_std_mm=0.04)
+    # The variances of independent errors add up.
+    assert stated.level_mm == pytest.approx(np.hypot(scatter.level_mm, 1.96 * 0.05), rel=1e-6)
+    assert not stated.warnings and not stated.significant.any()
+    assert stated.record()["cloud_std_mm"] == 0.03 and stated.record()["reference_std_mm"] == 0.04
+    known = scanned(rng)
+    assert uwlts.compare_clouds(known, "plane", deep_mm=20.0).warnings == ()
+    for options, reason in (
+        ({"cloud_std_mm": 0.1}, "the cloud contains its uncertainty"),
+        ({"reference_std_mm": 0.1}, "the reference contains its uncertainty"),
+    ):
+        with pytest.raises(EvaluationError, match=reason):
+            uwlts.compare_clouds(known, "plane", deep_mm=20.0, **options)
+    with pytest.raises(EvaluationError, match="`cloud_std_mm` is -1"):
+        uwlts.compare_clouds(files[0], "plane", cloud_std_mm=-1)
