@@ -95,7 +95,7 @@ def test_verify_judges_a_known_object_by_both_uncertainties_and_a_limit(folder: 
 
     plain = verify()
     assert (plain.returncode, plain.stdout.splitlines()[-2]) == (0, "pass")
-    assert "not shown: a reversed stage direction" in plain.stdout
+    assert "such as a reversed stage" in plain.stdout
     evaluated = json.loads((folder / "spheres.json").read_text(encoding="utf-8"))
     # The spacing's line: error and expanded uncertainty are those of `uwlts evaluate`; the certificate has its own.
     line = next(text for text in plain.stdout.splitlines() if "sphere spacing" in text)

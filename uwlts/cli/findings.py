@@ -42,7 +42,8 @@ def evaluate(
     evaluation.save(out, overwrite=overwrite)
     if coloured:
         write_coloured(coloured, evaluation.cloud, colour_limit_mm, overwrite=overwrite)
-    wrote(evaluation_lines(evaluation.record()), [], out)
+    doubts = [] if evaluation.artefact is None else evaluation.artefact.doubts()
+    wrote(evaluation_lines(evaluation.record()), doubts, out)
 
 
 @command_from(app, uwlts, "compare_clouds", job="Inspect")

@@ -15,6 +15,10 @@ from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereS
 TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
 """Direction from a surface to the sensor in the object coordinate system."""
 
+MOST_STRANGE = 0.3
+"""Largest fraction of points that do not belong to an artefact without a warning. Chosen by hand: above edges and
+stands, and below one half, that of two scans in one."""
+
 
 class Quantity(StrEnum):
     """Kind of a figure; PE, RE and SSE are the probing, range and sphere spacing errors of VDI/VDE 2634."""
@@ -153,7 +157,8 @@ class ArtefactEvaluation(ABC):
     """Figures of an artefact and the numbers of its points.
 
     ``points_rejected`` counts the outliers on the artefact (`fit_robustly`). Points that do not belong to the artefact
-    are not counted. ``deviation_mm`` (N,) is the signed deviation of each used point of the cloud, NaN for all others.
+    are the rest of the cloud (`strange_share`). ``deviation_mm`` (N,) is the signed deviation of each used point of the
+    cloud, NaN for all others.
     """
 
     kind: ClassVar[str]
@@ -167,6 +172,20 @@ class ArtefactEvaluation(ABC):
     def rejected_share(self) -> float:
         """Fraction of the artefact's points that were rejected."""
         return self.points_rejected / (self.points_used + self.points_rejected)
+
+    @property
+    def strange_share(self) -> float:
+        """Fraction of the cloud's points that do not belong to the artefact."""
+        return 1 - (self.points_used + self.points_rejected) / len(self.deviation_mm)
+
+    def doubts(self) -> list[str]:
+        """Return a warning if many of the points do not belong to the artefact."""
+        if self.strange_share <= MOST_STRANGE:
+            return []
+        return [
+            f"{100 * self.strange_share:.0f} % of the points do not belong to the artefact ({self.kind}): remove other "
+            "surfaces, or check whether all images are of one scan"
+        ]
 
     @property
     def within_vdi_outliers(self) -> bool:

@@ -113,6 +113,8 @@ def reconstruct(
         until, doubts = describe_verification(file, calibration)
     else:
         until, doubts = None, []
+    if until is not None and index is not None:
+        until, doubts = None, [*doubts, f"the verification does not apply: it had no `index` of {index:g}"]
 
     def complete(cloud: PointCloud, **changes: Any) -> PointCloud:
         metadata = changes.pop("metadata", cloud.metadata) | ({} if until is None else {VERIFIED: until})

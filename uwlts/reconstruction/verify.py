@@ -78,7 +78,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Verification:
-    """Results for all calibrated quantities of an artefact, and errors that the artefact cannot reveal.
+    """Results for all calibrated quantities of an artefact, the share of other points, and errors that it cannot show.
 
     ``capture`` is its name, and ``calibration`` the digest of the calibration.
     """
@@ -170,7 +170,9 @@ def verify(
     )
     if not verdicts:
         raise EvaluationError(f"the artefact '{artefact.kind}' has no calibrated size; add one to its description")
-    return Verification(verdicts, not_shown, scan.path.name, calibration_digest(calibration))
+    share = f"{100 * evaluation.strange_share:.1f} % of the points do not belong to the artefact"
+    remarks = (*(evaluation.doubts() or [share]), *not_shown)
+    return Verification(verdicts, remarks, scan.path.name, calibration_digest(calibration))
 
 
 _ACROSS = 0.1
@@ -186,6 +188,7 @@ def find_undetectable_errors(kind: str, stage_mm: np.ndarray, direction: Vector)
     if len(np.unique(stage_mm)) < 2 or np.hypot(y, z) > _ACROSS * abs(x):
         return ()
     return (
-        "not shown: a reversed stage direction. It produces a mirror image, in which the sizes of an artefact "
-        f"({kind}) are the same. Check once with the cloud of an object with lettering",
+        f"not shown by the sizes of an artefact ({kind}): what mirrors the cloud, such as a reversed stage, files in "
+        "reverse order, or mirrored images; and single images that were exchanged. Check once with an object with "
+        "lettering",
     )

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.acceptance.accept import Acceptance
 from uwlts.errors import CaptureError
 from uwlts.evaluation.evaluate import EvaluationRecord, TruthComparisons
+from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parse_toml, read_text
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import BoardFound, Mount, SphereFound
@@ -29,9 +31,26 @@ from uwlts.storage.mesh_file import SurfaceMesh
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.truth import FORMAT as TRUTH, Truth, TruthHeader, TruthStatus, read_truth
 
+_DESCRIPTIONS = (
+    ("plan of an acceptance test", {"volume_mm", "mpe"}, "uwlts accept"),
+    ("campaign", {"recordings"}, "twin predict --campaign, twin experiment --campaign"),
+    ("data set", {"vary"}, "twin dataset"),
+    ("design study", {"variables", "title"}, "twin sweep"),
+    ("design study", {"choices", "title"}, "twin sweep"),
+    ("scene", {"objects"}, "twin simulate"),
+    ("scene", {"motion"}, "twin simulate"),
+    ("plan of a scan", {"title", "stage", "sensor"}, "uwlts scan"),
+    ("description of a folder of images", {"stage", "sensor"}, "uwlts import"),
+    ("description of a mount's calibration", {"profiles", "poses"}, "uwlts mount"),
+    ("order of a report", {"datum"}, "uwlts findings-report --order"),
+    ("order of a report", {"client"}, "uwlts findings-report --order"),
+    ("order of a report", {"limits"}, "uwlts findings-report --order"),
+)
+"""Kinds of descriptions, keys by which they are recognised in this order, and the command that uses them."""
+
 
 def describe(path: str | Path, *, unit: Unit | None = None, schema: str | Path | None = None) -> str:
-    """Describe a file that `read` reads, a digital calibration certificate, or a sensor description (by name or path).
+    """Describe a file that `read` reads, a digital calibration certificate, a sensor (by name or path), or a plan.
 
     Parameters
     ----------
@@ -58,7 +77,7 @@ def describe(path: str | Path, *, unit: Unit | None = None, schema: str | Path |
     name, path = str(path), Path(path)
     endings = [each for each in path.suffixes if each != ".part"]
     if not endings or endings[-1] == ".toml":
-        lines = sensor_lines(load_sensor(name))
+        lines = _other_description(path) or sensor_lines(load_sensor(name))
     elif endings[-1] == ".xml":
         lines = digital_certificate_lines(path, schema)
     elif endings[-2:] == [".truth", ".h5"] or (endings[-1] == ".h5" and read_format(path) == TRUTH):
@@ -69,6 +88,24 @@ def describe(path: str | Path, *, unit: Unit | None = None, schema: str | Path |
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise CaptureError(f"{path} is damaged: a value is missing or not a number ({error})") from error
     return "\n".join(lines)
+
+
+def _other_description(path: Path) -> list[str]:
+    """Return what a description other than a sensor's is, by its keys; empty for a sensor or none of them."""
+    if path.suffix != ".toml" or not is_regular_file(path):
+        return []
+    with suppress(ValueError):
+        return _kind_of(parse_toml(read_text(path, most_bytes=MOST_TOML_BYTES, called="description")))
+    return []
+
+
+def _kind_of(table: Mapping[str, JsonValue]) -> list[str]:
+    """Return what a description is by its keys; empty if they are not known."""
+    found = next((each for each in _DESCRIPTIONS if table.keys() >= each[1]), None)
+    if found is None:
+        return []
+    title = table.get("title") or table.get("name")
+    return [found[0] + (f": {title}" if title else ""), f"with {', '.join(table)}", f"used by {found[2]}"]
 
 
 def _lines_of(found: object) -> list[str]:
@@ -324,7 +361,9 @@ def evaluation_lines(record: EvaluationRecord) -> list[str]:
             known = record.uncertainty.get(name)
             expanded = " mm" if known is None else f" ± {known.expanded_mm:.4f} mm (k = 2)"
             lines.append(f"  {name}: {value:+.4f}{expanded}")
-        lines.append(f"  points: {evaluation.points_used} used, {evaluation.points_rejected} rejected")
+        used, rejected, total = evaluation.points_used, evaluation.points_rejected, evaluation.points_total
+        strange = f"{total - used - rejected} ({100 * (1 - (used + rejected) / max(total, 1)):.1f} %) on no artefact"
+        lines.append(f"  points: {used} used, {rejected} rejected, {strange}")
     if truth := record.truth:
         for name, part in (("against truth", truth), ("the same after a best-fit motion", truth.after_best_fit)):
             if part is not None:

@@ -39,3 +39,19 @@ def test_other_files_are_refused_with_what_is_read(tmp_path: Path, name: str, te
     (tmp_path / name).write_text(text)
     with pytest.raises(CaptureError, match=r"this reads captures"):
         describe(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        ('title = "a"\nvolume_mm = [1, 1, 1]\n[mpe]\n', "plan of an acceptance test: a"),
+        ('base = "demo"\ntitle = "b"\nrecordings = []\n', "campaign: b"),
+        ('title = "c"\n[variables]\n', "design study: c"),
+        ('client = "d"\n[datum]\n', "order of a report"),
+        ('title = "e"\nsensor = "thesis"\nmedium = "air"\n[stage]\n', "plan of a scan: e"),
+        ('base = "thesis"\nname = "f"\n', "sensor 'f'"),
+    ],
+)
+def test_info_names_the_kind_of_a_description(tmp_path: Path, content: str, kind: str):
+    (tmp_path / "a.toml").write_text(content)
+    assert describe(tmp_path / "a.toml").startswith(kind)
