@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-import subprocess
-import sys
+import shlex
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -22,14 +21,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from twin.backend.llvm import preserve_threads
 from twin.design.designs import HighlightedDesign
 from twin.design.figures_of_merit import compute_figures, predict_scatter
 from twin.design.sensor_arrays import extract_parameters
 from twin.design.study import Study
 from twin.design.verification_scenes import PlannedRecording, plan_recordings
-from twin.recording.campaigns import make_folder, require_at_least
-from twin.rendering_options import CPU, Options, use_variant
+from twin.experiments.runner import run_apart
+from twin.recording.campaigns import make_folder, record_on_one_thread, require_at_least
+from twin.rendering_options import CPU, Options
 from uwlts import errors
 from uwlts.errors import Error
 from uwlts.files.writing import write_atomically
@@ -155,31 +154,22 @@ def _record(
     folder: Path, variant: str, job: tuple[PlannedRecording, Options], report: Callable[[object], None]
 ) -> None:
     """Render a recording to its file with one thread; several recordings are rendered at the same time."""
-    use_variant(variant)
-    import drjit as dr
-
-    from twin.recording.record_scene import record_scene
-
     recording, options = job
-    with preserve_threads():
-        dr.set_thread_count(1)
-        try:
-            path = _capture(folder, recording)
-            record_scene(recording.scene, recording.sensor, path, options=options, overwrite=True)
-        except Error as error:
-            raise type(error)(f"{recording.scene.title}: {error}") from error
+    try:
+        record_on_one_thread(recording.scene, recording.sensor, _capture(folder, recording), variant, options=options)
+    except Error as error:
+        raise type(error)(f"{recording.scene.title}: {error}") from error
 
 
 def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:
     """Run a command of the sensor software; raise its message as ``fails_as`` if it fails."""
-    line = [sys.executable, "-m", "uwlts", command, *arguments, "--overwrite"]
-    done = subprocess.run(line, check=False, capture_output=True, text=True)
-    if done.returncode == 0:
+    code, output = run_apart(shlex.join(["uwlts", command, *arguments, "--overwrite"]))
+    if code == 0:
         return
-    said = done.stderr.strip().splitlines() or ["no message"]
-    if done.returncode == _USER_ERROR:
-        raise fails_as(said[-1].removeprefix("error: "))
-    raise errors.SetupError(f"uwlts {command} has ended unexpectedly (exit code {done.returncode}): {said[-1]}")
+    last = (output.strip().splitlines() or ["no message"])[-1]
+    if code == _USER_ERROR:
+        raise fails_as(last.removeprefix("error: "))
+    raise errors.SetupError(f"uwlts {command} has ended unexpectedly (exit code {code}): {last}")
 
 
 def _evaluate_points(points: np.ndarray, stage_mm: np.ndarray) -> VerifiedMeasurements:

@@ -5,14 +5,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
+from typing import Any
 
 from pydantic import JsonValue
 
+from twin.backend.llvm import preserve_threads
 from twin.rendering_options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, list_takes, load_campaign
+from twin.scene.description import Scene
 from uwlts.errors import CaptureError, DescriptionError, Error, OutputError, SetupError
 from uwlts.files.json_files import describe_other_plan, read_json
 from uwlts.files.writing import write_atomically
+from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import open_workers, run_jobs
 from uwlts.storage.capture import part_path
@@ -244,24 +248,23 @@ def keep_to_plan(
 
 def _record(job: _Job, report: Callable[[None], None] = lambda _: None) -> None:
     """Render a recording; call ``report`` after every image."""
-    use_variant(job.variant)
+    take = job.take
+    how: dict[str, Any] = {"as_built": take.built, "options": job.options}
+    # An incomplete recording either has a part to resume, or lacks its truth and is rendered again.
+    how |= {"resume": part_path(job.path).exists(), "progress": lambda done, total, stage="": report(None)}
+    try:
+        record_on_one_thread(take.scene, take.sensor, job.path, job.variant, **how)
+    except Error as error:
+        raise type(error)(f"{job.path}: {error}") from error
+
+
+def record_on_one_thread(scene: Scene, sensor: Sensor, path: Path, variant: str, **how: Any) -> None:
+    """Record a scene as `record_scene` does, with one thread: several processes render at the same time."""
+    use_variant(variant)
     import drjit as dr
 
     from twin.recording.record_scene import record_scene
 
-    dr.set_thread_count(1)
-    take = job.take
-    try:
-        record_scene(
-            take.scene,
-            take.sensor,
-            job.path,
-            as_built=take.built,
-            options=job.options,
-            overwrite=True,
-            # An incomplete recording either has a part to resume, or lacks its truth and is rendered again.
-            resume=part_path(job.path).exists(),
-            progress=lambda done, total, stage="": report(None),
-        )
-    except Error as error:
-        raise type(error)(f"{job.path}: {error}") from error
+    with preserve_threads():
+        dr.set_thread_count(1)
+        record_scene(scene, sensor, path, overwrite=True, **how)

@@ -1,4 +1,4 @@
-"""Text for numbers and their names: lengths to a micrometre, no negative zero, a dash for missing values."""
+"""Text for numbers and their names: no negative zero, a dash for missing values."""
 
 import math
 import re
@@ -16,22 +16,6 @@ def format_fixed(value: float | None, decimals: int = 3, *, signed: bool = False
         return MISSING
     text = f"{value:{'+' if signed else ''}.{decimals}f}"
     return text if float(text) else text.lstrip("+-")
-
-
-def format_length(value_mm: float | None, *, signed: bool = False) -> str:
-    """Format a length with its unit: below 1 mm in µm with one decimal (below 1 µm with two), else in mm with three."""
-    if value_mm is None or not math.isfinite(value_mm):
-        return MISSING
-    if abs(value_mm) < 1:
-        return f"{format_fixed(1e3 * value_mm, 1 if abs(value_mm) >= 1e-3 else 2, signed=signed)} µm"
-    return f"{format_fixed(value_mm, signed=signed)} mm"
-
-
-def format_number(value: float) -> str:
-    """Format a number with four significant digits, or an integer with all digits."""
-    if float(value).is_integer() and abs(value) < 1e9:
-        return f"{value:.0f}"
-    return f"{value:.4g}"
 
 
 def format_to_scale(value: float, scale: float, *, digits: int = 3) -> str:

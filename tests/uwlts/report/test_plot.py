@@ -18,7 +18,7 @@ from matplotlib.colors import to_hex
 from uwlts.model.library import load_sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.pages.cloud_display import choose_points
-from uwlts.pages.numbers import format_fixed, format_length, format_to_scale
+from uwlts.pages.numbers import format_fixed, format_to_scale
 from uwlts.pages.toolkit import figure_png, figure_svg
 from uwlts.report import plot
 from uwlts.report.pictures import StripeView, stripe_picture
@@ -222,9 +222,6 @@ def test_fixed_numbers_are_near_and_have_no_negative_zero(value, decimals, signe
     assert (text[0] in "+-") == (float(text) < 0 or (signed and float(text) > 0))
 
 
-def test_lengths_choose_their_unit():
-    assert format_length(0.0123456) == "12.3 µm" and format_length(-0.00002, signed=True) == "-0.02 µm"
-    assert (
-        format_length(1.5, signed=True) == "+1.500 mm" and format_length(None) == "-" and format_fixed(math.nan) == "-"
-    )
+def test_numbers_have_the_decimals_of_their_scale():
     assert format_to_scale(0.123456, 1.58) == "0.12" and format_to_scale(7.0, 0.0) == "7.000"
+    assert format_fixed(math.nan) == "-"
