@@ -40,7 +40,7 @@ settling_s = 0.05
 def spheres(cloud, stops: np.ndarray | None = None) -> tuple[str, np.ndarray]:
     """Return the figures of a cloud of spheres as text, with shifts along X from ``stops``, and its centres (2, 3)."""
     result = uwlts.evaluate(cloud)
-    centres = np.array([sphere.centre_mm for sphere in result.artefact.spheres])
+    centres = np.array([sphere["centre_mm"] for sphere in result.evaluation.spheres])
     text = f"spacing {1e3 * result.sphere_spacing.value_mm:+6.1f} um, std {1e3 * result.std.value_mm:5.1f} um"
     if stops is not None:
         text += f", centres {1e3 * float((centres - stops)[:, 0].mean()):+6.1f} um along the stage"

@@ -106,7 +106,7 @@ def test_calibrated_sensor_beats_the_thesis(campaign: tuple[Path, CalibrationRes
         placement=placement,
         motion=PROFILES,
     )
-    figures = measured(path, result.calibration).artefact.figures_mm
+    figures = measured(path, result.calibration).evaluation.figures_mm
     assert abs(figures["SSE"]) <= 0.11
     # Speckle leaves the profile fit 0.022 to 0.025 mm on spheres (docs/results/stripe-methods.md); half of it and
     # twice of it.

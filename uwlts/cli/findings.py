@@ -40,10 +40,10 @@ def evaluate(
 
     evaluation = call()
     evaluation.save(out, overwrite=overwrite)
-    if coloured:
+    if coloured and evaluation.cloud is not None:
         write_coloured(coloured, evaluation.cloud, colour_limit_mm, overwrite=overwrite)
-    doubts = [] if evaluation.artefact is None else evaluation.artefact.doubts()
-    wrote(evaluation_lines(evaluation.record()), doubts, out)
+    doubts = [] if evaluation.evaluation is None else evaluation.evaluation.doubts()
+    wrote(evaluation_lines(evaluation), doubts, out)
 
 
 @command_from(app, uwlts, "compare_clouds", job="Inspect")

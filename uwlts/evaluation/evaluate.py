@@ -1,18 +1,18 @@
 """Evaluation of point clouds against calibrated artefacts and ground truth, and evaluation files (JSON)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, ValidationError, model_serializer
+from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
 from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError, describe_problems
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
-from uwlts.evaluation.figures import ArtefactEvaluation, Figure, FigureKey, Quantity, figure_keys
-from uwlts.evaluation.truth_comparison import TruthComparison, compare_with_truth
+from uwlts.evaluation.figures import Figure, FigureKey, FigureUncertainty, Quantity, doubt_points, figure_keys
+from uwlts.evaluation.truth_comparison import Count, StoredResult, TruthComparison, compare_with_truth
 from uwlts.files.json_files import EDITED, read_model, write_model
 from uwlts.fitting.least_squares import fit_rigid_transform
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
@@ -27,15 +27,9 @@ TOLERANCE_MM = 0.010
 """Tolerance for points from perfect images and true parameters (tests/system/test_campaign.py)."""
 FORMAT = "uwlts-evaluation"
 VERSION = 1  # of the file format
-Count = Annotated[int, Field(ge=0)]
 
 
-class _Stored(BaseModel):
-    # Keep results of specific artefacts and fields of newer versions.
-    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
-
-
-class ArtefactFigures(_Stored):
+class ArtefactFigures(StoredResult):
     """Figures of an artefact by name, mm, the numbers of points, and results of the specific artefact."""
 
     kind: str
@@ -45,6 +39,15 @@ class ArtefactFigures(_Stored):
     points_rejected: Count
     within_vdi_outliers: bool
 
+    @property
+    def strange_share(self) -> float:
+        """Fraction of the cloud's points that do not belong to the artefact."""
+        return 1 - (self.points_used + self.points_rejected) / max(self.points_total, 1)
+
+    def doubts(self) -> list[str]:
+        """Return a warning if many of the points do not belong to the artefact."""
+        return doubt_points(self.kind, self.strange_share)
+
     @model_serializer(mode="wrap")
     def _verdict_last(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         content = plain(self)
@@ -52,48 +55,35 @@ class ArtefactFigures(_Stored):
         return content
 
 
-class TruthFigures(_Stored):
-    """Statistics of signed distances from the true surface, mm; see `TruthComparison`."""
+class Evaluation(Brief, StoredResult):
+    """Result of `evaluate`, and content of its file.
 
-    matched: Count
-    tolerance_mm: float
-    mean_mm: float
-    std_mm: float
-    rms_mm: float
-    p95_mm: float
-    p99_mm: float
-    largest_mm: float
-    share_within_tolerance: Annotated[float, Field(ge=0, le=1)]
-    false_points: Count
-    missed: Count
-
-
-class TruthComparisons(TruthFigures):
-    """Statistics of the points as measured, and after the best-fit rigid motion to the truth.
-
-    ``shift_mm`` is the mean error of the points along X, Y and Z, ``shift_expanded_mm`` its stated uncertainty (k = 2).
+    Attributes
+    ----------
+    source : str
+        Name of the cloud.
+    capture, sensor, medium : str or None
+        Names of the cloud's capture, sensor and medium.
+    medium_index : float or None
+        Refractive index of the medium.
+    artefact : Artefact or None
+        Artefact with its calibrated values; None without an artefact.
+    calibration : str or None
+        Digest of the cloud's calibration.
+    evaluation : ArtefactFigures or None
+        Measurement of the artefact; None without an artefact.
+    truth : TruthComparison or None
+        Comparison of the points as measured, and after the best-fit rigid motion to the truth; None without a truth.
+    uncertainty : dict of str to FigureUncertainty
+        Uncertainties of the artefact's figures by name, if the cloud has them.
+    edited : bool
+        True if the file, or one that the cloud comes from, was edited by hand.
+    cloud : PointCloud or None
+        The evaluated cloud with the deviation of each point from the artefact's fit. Without an artefact, deviations
+        are from the true surface after a best fit. None in an evaluation that was read from a file.
     """
 
-    after_best_fit: TruthFigures | None = None
-    shift_mm: tuple[float, float, float] | None = None
-    shift_expanded_mm: tuple[float, float, float] | None = None
-
-
-class StoredUncertainty(_Stored):
-    """Standard uncertainties of a figure, mm, and their combined expanded uncertainty (k = 2)."""
-
-    random_mm: float
-    systematic_mm: float
-    expanded_mm: float
-
-
-class EvaluationRecord(_Stored):
-    """Content of an evaluation file; ``calibration`` is the digest of the cloud's calibration.
-
-    ``edited`` is set if the file, or one that the cloud comes from, was edited by hand.
-    """
-
-    cloud: str
+    source: str = Field(alias="cloud")
     capture: str | None = None
     sensor: str | None = None
     medium: str | None = None
@@ -101,45 +91,27 @@ class EvaluationRecord(_Stored):
     artefact: Artefact | None = None
     calibration: str | None = None
     evaluation: ArtefactFigures | None = None
-    truth: TruthComparisons | None = None
-    uncertainty: dict[str, StoredUncertainty] = {}
+    truth: TruthComparison | None = None
+    uncertainty: dict[str, FigureUncertainty] = {}
     edited: bool = False
-
-    def figure_keys(self) -> dict[str, FigureKey]:
-        """Return the keys of the artefact's figures by name; empty if the file names no artefact."""
-        return {} if self.artefact is None else {key.name: key for key in figure_keys(self.artefact)}
+    cloud: PointCloud | None = Field(default=None, alias="evaluated_cloud", exclude=True)
 
     @model_serializer(mode="wrap")
     def _as_given(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Omit missing keys, since clouds of other programs have no metadata."""
-        return {key: value for key, value in plain(self).items() if key in self.model_fields_set}
+        given = self.model_fields_set - {"source"}
+        return {"cloud": self.source} | {key: value for key, value in plain(self).items() if key in given}
 
+    def figure_keys(self) -> dict[str, FigureKey]:
+        """Return the keys of the artefact's figures by name; empty without an artefact."""
+        return {} if self.artefact is None else {key.name: key for key in figure_keys(self.artefact)}
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Evaluation(Brief):
-    """Result of `evaluate`.
-
-    Attributes
-    ----------
-    source : str
-        Name of the cloud.
-    cloud : PointCloud
-        The evaluated cloud with the deviation of each point from the artefact's fit. Without an artefact, deviations
-        are from the true surface after a best fit.
-    artefact : ArtefactEvaluation or None
-        Measurement of the artefact; None without an artefact.
-    figures : tuple of Figure
-        Figures of the artefact, with uncertainties if the cloud has them.
-    truth, truth_after_best_fit : TruthComparison or None
-        Comparison of the points as measured, and after the best-fit rigid motion to the truth; None without a truth.
-    """
-
-    source: str
-    cloud: PointCloud
-    artefact: ArtefactEvaluation | None
-    figures: tuple[Figure, ...]
-    truth: TruthComparison | None
-    truth_after_best_fit: TruthComparison | None
+    @property
+    def figures(self) -> tuple[Figure, ...]:
+        """Figures of the artefact, with uncertainties if the cloud has them."""
+        values = {} if self.evaluation is None else self.evaluation.figures_mm
+        keys = self.figure_keys().items()
+        return tuple(Figure(key, values[name], self.uncertainty.get(name)) for name, key in keys if name in values)
 
     def all_of(self, quantity: Quantity) -> tuple[Figure, ...]:
         """Return all figures of a quantity; EvaluationError if there is none."""
@@ -184,34 +156,10 @@ class Evaluation(Brief):
         """Largest standard deviation about a fitted surface."""
         return self.all_of(Quantity.STD)[0]
 
-    def record(self) -> EvaluationRecord:
-        """Return the content of the evaluation file; EvaluationError if the cloud's metadata is not valid."""
-        found = self.artefact
-        content: dict[str, Any] = {"cloud": self.source, **self.cloud.metadata}
-        if EDITED in content:
-            # The cloud names the part; the record has a mark, which the seal protects.
-            content[EDITED] = bool(content[EDITED])
-        content |= {"artefact": found and found.artefact, "evaluation": found and found.as_dict(), "truth": None}
-        if self.truth is not None and self.truth_after_best_fit is not None:
-            content["truth"] = self.truth.as_dict() | {"after_best_fit": self.truth_after_best_fit.as_dict()}
-            content["truth"]["shift_mm"] = self.truth.shift_mm.tolist()
-            if self.cloud.uncertainty is not None:
-                content["truth"]["shift_expanded_mm"] = (2 * shift_std_mm(self.cloud, self.truth.matched)).tolist()
-        if found is not None:
-            known = {figure.key.name: figure.uncertainty for figure in self.figures if figure.uncertainty is not None}
-            parts = ("random_mm", "systematic_mm", "expanded_mm")
-            content["uncertainty"] = {name: {part: getattr(u, part) for part in parts} for name, u in known.items()}
-        try:
-            return EvaluationRecord.model_validate(content)
-        except ValidationError as error:
-            raise EvaluationError(
-                f"the metadata of the cloud {self.source} is not valid: {describe_problems(error)}"
-            ) from error
-
     @check_arguments
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the evaluation as indented JSON, atomically; OutputError if writing fails."""
-        write_model(path, self.record(), file_format=FORMAT, version=VERSION, overwrite=overwrite)
+        write_model(path, self, file_format=FORMAT, version=VERSION, overwrite=overwrite)
 
 
 def compare_cloud_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
@@ -320,22 +268,34 @@ def evaluate(
         compared = compare_cloud_with_truth(cloud, truth)
         # A calibrated sensor's frame has its own origin and axes. After the best-fit motion, errors of form and size
         # remain.
-        measured = cloud.points_mm[compared.matched]
-        motion = fit_rigid_transform(measured, measured - compared.error_mm[compared.matched])
+        measured = cloud.points_mm[compared.is_matched]
+        motion = fit_rigid_transform(measured, measured - compared.error_mm[compared.is_matched])
         moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
         fitted = compare_cloud_with_truth(replace(cloud, points_mm=moved), truth)
     found = None if artefact is None else evaluate_cloud(cloud, artefact)
-    figures: tuple[Figure, ...] = ()
     deviation = np.full(len(cloud), np.nan) if fitted is None else fitted.distance_mm
-    if found is not None:
-        known = figure_uncertainties(cloud, found)
-        figures = tuple(replace(figure, uncertainty=known.get(figure.key.name)) for figure in found.figures)
-        deviation = found.deviation_mm
+    if compared is not None:
+        stated = None if cloud.uncertainty is None else tuple((2 * shift_std_mm(cloud, compared.is_matched)).tolist())
+        shift = tuple(np.mean(compared.error_mm[compared.is_matched], axis=0).tolist())
+        compared = compared.model_copy(
+            update={"after_best_fit": fitted, "shift_mm": shift, "shift_expanded_mm": stated}
+        )
     name = source or str(cloud.metadata.get("capture", ""))
-    return Evaluation(name, replace(cloud, deviation_mm=deviation), found, figures, compared, fitted)
+    content: dict[str, Any] = {"cloud": name, **cloud.metadata, "artefact": None, "evaluation": None, "truth": compared}
+    if EDITED in content:
+        # The cloud names the part; the evaluation has a mark, which the seal protects.
+        content[EDITED] = bool(content[EDITED])
+    if found is not None:
+        deviation = found.deviation_mm
+        content |= {"artefact": found.artefact, "evaluation": found.as_dict()}
+        content["uncertainty"] = figure_uncertainties(cloud, found)
+    try:
+        return Evaluation.model_validate(content | {"evaluated_cloud": replace(cloud, deviation_mm=deviation)})
+    except ValidationError as error:
+        raise EvaluationError(f"the metadata of the cloud {name} is not valid: {describe_problems(error)}") from error
 
 
-def read_evaluation(path: str | Path) -> EvaluationRecord:
+def read_evaluation(path: str | Path) -> Evaluation:
     """Read an evaluation file; CaptureError if it is missing, newer, damaged, or of another format."""
     advice = "; evaluate the cloud again"
-    return read_model(path, EvaluationRecord, file_format=FORMAT, version=VERSION, called="evaluation", advice=advice)
+    return read_model(path, Evaluation, file_format=FORMAT, version=VERSION, called="evaluation", advice=advice)

@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import Any, ClassVar, Literal, assert_never, get_args
 
 import numpy as np
+import pydantic
 
 from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
@@ -76,13 +77,14 @@ class FigureKey:
         return self.quantity in (Quantity.SPACING_ERROR_KNOWN_RADIUS, Quantity.PROFILE_HEIGHT_ERROR)
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class FigureUncertainty:
     """Standard uncertainties of a figure, mm: by noise of stripe and positions, and by calibration and stage."""
 
     random_mm: float
     systematic_mm: float
 
+    @pydantic.computed_field
     @property
     def expanded_mm(self) -> float:
         """Expanded uncertainty, mm, with the coverage factor 2."""
@@ -157,7 +159,7 @@ class ArtefactEvaluation(ABC):
     """Figures of an artefact and the numbers of its points.
 
     ``points_rejected`` counts the outliers on the artefact (`fit_robustly`). Points that do not belong to the artefact
-    are the rest of the cloud (`strange_share`). ``deviation_mm`` (N,) is the signed deviation of each used point of the
+    are the rest of the cloud. ``deviation_mm`` (N,) is the signed deviation of each used point of the
     cloud, NaN for all others.
     """
 
@@ -174,18 +176,18 @@ class ArtefactEvaluation(ABC):
         return self.points_rejected / (self.points_used + self.points_rejected)
 
     @property
+    def points_total(self) -> int:
+        """Number of points of the cloud."""
+        return len(self.deviation_mm)
+
+    @property
     def strange_share(self) -> float:
         """Fraction of the cloud's points that do not belong to the artefact."""
-        return 1 - (self.points_used + self.points_rejected) / len(self.deviation_mm)
+        return 1 - (self.points_used + self.points_rejected) / self.points_total
 
     def doubts(self) -> list[str]:
         """Return a warning if many of the points do not belong to the artefact."""
-        if self.strange_share <= MOST_STRANGE:
-            return []
-        return [
-            f"{100 * self.strange_share:.0f} % of the points do not belong to the artefact ({self.kind}): remove other "
-            "surfaces, or check whether all images are of one scan"
-        ]
+        return doubt_points(self.kind, self.strange_share)
 
     @property
     def within_vdi_outliers(self) -> bool:
@@ -216,11 +218,21 @@ class ArtefactEvaluation(ABC):
         return {
             "kind": self.kind,
             "figures_mm": self.figures_mm,
-            "points_total": len(self.deviation_mm),
+            "points_total": self.points_total,
             **{name: _plain(getattr(self, name)) for name in own},
             "rejected_share": self.rejected_share,
             "within_vdi_outliers": self.within_vdi_outliers,
         }
+
+
+def doubt_points(kind: str, strange_share: float) -> list[str]:
+    """Return a warning if many of the points do not belong to the artefact of a kind."""
+    if strange_share <= MOST_STRANGE:
+        return []
+    return [
+        f"{100 * strange_share:.0f} % of the points do not belong to the artefact ({kind}): remove other surfaces, "
+        "or check whether all images are of one scan"
+    ]
 
 
 def spread_mm(residuals_mm: np.ndarray) -> float:

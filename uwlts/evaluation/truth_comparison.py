@@ -1,45 +1,60 @@
 """Point-by-point comparison of measured points with ground truth."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from uwlts.errors import EvaluationError
 from uwlts.storage.truth import TruthStatus
 
+Count = Annotated[int, Field(ge=0)]
+_NO_POINTS = np.zeros(0)
 
-@dataclass(frozen=True, eq=False)
-class TruthComparison:
-    """Errors, completeness and false points of a cloud."""
 
-    matched: np.ndarray  # (N,) bool; points whose frame and line have a true stripe; all others are false points
-    error_mm: np.ndarray  # (N, 3); measured minus true point; NaN if not matched
-    distance_mm: np.ndarray  # (N,); component of the error along the true normal; NaN if not matched
+class StoredResult(BaseModel):
+    """Base of results that are files or parts of files; fields that are not in the file do not count as differences."""
+
+    # Keep results of specific artefacts and fields of newer versions.
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False, arbitrary_types_allowed=True)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether the contents of two files are equal."""
+        return isinstance(other, StoredResult) and self.model_dump() == other.model_dump()
+
+
+class TruthComparison(StoredResult):
+    """Errors, completeness and false points of a cloud.
+
+    Statistics are of the signed distances of matched points; percentiles and maximum are of their absolute values.
+    ``false_points`` have no true stripe, and ``missed`` counts true stripes (a line of a frame) without a point.
+    ``shift_mm`` is the mean error of the points along X, Y and Z, ``shift_expanded_mm`` its stated uncertainty (k = 2).
+    The arrays are not in files. ``is_matched`` (N,) marks points whose frame and line have a true stripe. ``error_mm``
+    (N, 3) is the measured minus the true point, NaN if not matched. ``distance_mm`` (N,) is its component along the
+    true normal.
+    """
+
+    matched: Count
     tolerance_mm: float
-    # Statistics of the distances of matched points.
     mean_mm: float
     std_mm: float
     rms_mm: float
-    # Percentiles and maximum of their absolute values.
     p95_mm: float
     p99_mm: float
     largest_mm: float
-    share_within_tolerance: float  # fraction of the matched points with an absolute distance of at most `tolerance_mm`
-    # Number of points without a true stripe, and of true stripes (a line of a frame) without a point.
-    false_points: int
-    missed: int
+    share_within_tolerance: Annotated[float, Field(ge=0, le=1)]
+    false_points: Count
+    missed: Count
+    after_best_fit: "TruthComparison | None" = None
+    shift_mm: tuple[float, float, float] | None = None
+    shift_expanded_mm: tuple[float, float, float] | None = None
+    is_matched: np.ndarray = Field(default=_NO_POINTS, exclude=True)
+    error_mm: np.ndarray = Field(default=_NO_POINTS, exclude=True)
+    distance_mm: np.ndarray = Field(default=_NO_POINTS, exclude=True)
 
-    @property
-    def shift_mm(self) -> np.ndarray:
-        """Mean error (3,) of the matched points."""
-        return np.mean(self.error_mm[self.matched], axis=0)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the statistics and the number of matched points as JSON."""
-        arrays = ("matched", "error_mm", "distance_mm")
-        statistics = {name: value for name, value in vars(self).items() if name not in arrays}
-        return {"matched": int(np.count_nonzero(self.matched)), **statistics}
+    @model_serializer(mode="wrap")
+    def _without_missing(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in plain(self).items() if value is not None}
 
 
 def compare_with_truth(
@@ -96,7 +111,8 @@ def compare_with_truth(
     found[at] = True
     p95, p99 = np.percentile(size, [95, 99])
     return TruthComparison(
-        matched=matched,
+        matched=int(np.count_nonzero(matched)),
+        is_matched=matched,
         error_mm=error,
         distance_mm=distance,
         tolerance_mm=float(tolerance_mm),

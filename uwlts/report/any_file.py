@@ -4,7 +4,7 @@ from pathlib import Path
 
 from uwlts.acceptance.accept import FORMAT as ACCEPTANCE, Acceptance, read_acceptance
 from uwlts.errors import CaptureError
-from uwlts.evaluation.evaluate import FORMAT as EVALUATION, EvaluationRecord, read_evaluation
+from uwlts.evaluation.evaluate import FORMAT as EVALUATION, Evaluation, read_evaluation
 from uwlts.files.json_files import read_json
 from uwlts.files.reading import require_regular_file
 from uwlts.model.any_calibration import AnyCalibration
@@ -31,7 +31,7 @@ _READABLE = (
 
 def read(
     path: str | Path, *, pose_format: PoseFormat = SAVED_FORMAT, pose_unit: Unit | None = None, unit: Unit | None = None
-) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | EvaluationRecord | Acceptance | Trajectory:
+) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | Evaluation | Acceptance | Trajectory:
     """Read a file of the program, whose content determines the type of the result.
 
     The result is an opened capture, a cloud, a mesh, ground truth, a calibration, a mount, the record of an evaluation,
@@ -52,7 +52,7 @@ def read(
 
     Returns
     -------
-    Capture, PointCloud, SurfaceMesh, Truth, Mount, EvaluationRecord, Acceptance, Trajectory or a calibration
+    Capture, PointCloud, SurfaceMesh, Truth, Mount, Evaluation, Acceptance, Trajectory or a calibration
         An opened capture must be closed, or used in a ``with`` statement.
 
     Raises

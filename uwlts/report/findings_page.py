@@ -245,7 +245,7 @@ def _artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, list[_Che
         known, key = record.uncertainty.get(name), keys.get(name)
         calibrated = None if key is None or key.calibrated is None else key.calibrated.value_mm
         rows.append(_CheckedFigure(name, calibrated, measured, None if known is None else known.expanded_mm))
-    return f"{record.evaluation.kind}, {record.cloud}{', edited' if record.edited else ''}", rows
+    return f"{record.evaluation.kind}, {record.source}{', edited' if record.edited else ''}", rows
 
 
 def _check_rows(figures: Sequence[_CheckedFigure]) -> list[tuple[str, ...]]:

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.acceptance.accept import Acceptance
 from uwlts.errors import CaptureError
-from uwlts.evaluation.evaluate import EvaluationRecord, TruthComparisons
+from uwlts.evaluation.evaluate import Evaluation
+from uwlts.evaluation.truth_comparison import TruthComparison
 from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parse_toml, read_text
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
@@ -117,7 +118,7 @@ def _lines_of(found: object) -> list[str]:
             return calibration_lines(found)
         case PolynomialCalibration():
             return polynomial_lines(found)
-        case EvaluationRecord():
+        case Evaluation():
             return evaluation_lines(found)
         case Mount():
             return mount_lines(found)
@@ -353,16 +354,16 @@ def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
     )
 
 
-def evaluation_lines(record: EvaluationRecord) -> list[str]:
+def evaluation_lines(record: Evaluation) -> list[str]:
     """Describe the figures of an evaluation."""
-    lines = [f"evaluation of {record.cloud}"]
+    lines = [f"evaluation of {record.source}"]
     if evaluation := record.evaluation:
         for name, value in evaluation.figures_mm.items():
             known = record.uncertainty.get(name)
             expanded = " mm" if known is None else f" ± {known.expanded_mm:.4f} mm (k = 2)"
             lines.append(f"  {name}: {value:+.4f}{expanded}")
         used, rejected, total = evaluation.points_used, evaluation.points_rejected, evaluation.points_total
-        strange = f"{total - used - rejected} ({100 * (1 - (used + rejected) / max(total, 1)):.1f} %) on no artefact"
+        strange = f"{total - used - rejected} ({100 * evaluation.strange_share:.1f} %) on no artefact"
         lines.append(f"  points: {used} used, {rejected} rejected, {strange}")
     if truth := record.truth:
         for name, part in (("against truth", truth), ("the same after a best-fit motion", truth.after_best_fit)):
@@ -378,7 +379,7 @@ def evaluation_lines(record: EvaluationRecord) -> list[str]:
     return lines
 
 
-def _shift_texts(truth: TruthComparisons) -> list[str]:
+def _shift_texts(truth: TruthComparison) -> list[str]:
     """Return the mean errors of all points along X, Y and Z with uncertainty, as text; empty if not in the file."""
     shift = truth.shift_mm or ()
     stated = truth.shift_expanded_mm or (None,) * len(shift)

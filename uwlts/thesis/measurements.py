@@ -166,7 +166,7 @@ def measure_scan(
                     continue
                 figures = _figures(evaluation) | {"line length": _line_length(cloud)}
                 found.append(Measurement(*about, figures_mm=figures, points=len(cloud)))
-                if scan.thing in _SHOWN and processing == OURS:
+                if evaluation.cloud is not None and scan.thing in _SHOWN and processing == OURS:
                     name = f"{scan.path.stem}-{method.replace(' ', '-')}.ply"
                     write_cloud(clouds / name, evaluation.cloud, overwrite=True)
     return found
@@ -179,13 +179,13 @@ def _figures(evaluation: Evaluation) -> dict[str, float]:
     of 4 to 6 standard deviations of more than ten thousand points are otherwise impossible. The full ranges are added.
     """
     figures = {figure.key.name: figure.value_mm for figure in evaluation.figures}
-    deviation_mm = evaluation.cloud.deviation_mm
+    deviation_mm = None if evaluation.cloud is None else evaluation.cloud.deviation_mm
     for name in ("PE", "RE"):
         if name in figures and deviation_mm is not None:
             figures[f"{name} of all points"] = figures[name]
             figures[name] = _range_within(deviation_mm)
-    if (fitted := evaluation.truth_after_best_fit) is not None:
-        spread = fitted.std_mm
+    if (truth := evaluation.truth) is not None and truth.after_best_fit is not None:
+        spread = truth.after_best_fit.std_mm
         figures |= {"std to the true surface": spread} | ({} if evaluation.artefact else {"STD": spread})
     return figures
 

@@ -493,7 +493,7 @@ def test_points_are_compared_with_their_own_truth():
     np.testing.assert_allclose(result.distance_mm, [0, 0.6, 0.08, 0, np.nan], atol=1e-12)
     np.testing.assert_allclose(result.error_mm[:4], offsets[:4], atol=1e-12)
     assert np.isnan(result.error_mm[4]).all()
-    np.testing.assert_array_equal(result.matched, [True, True, True, True, False])
+    np.testing.assert_array_equal(result.is_matched, [True, True, True, True, False])
     # By hand: distances 0, 0.6, 0.08, 0.
     assert result.mean_mm == pytest.approx(0.17)
     assert result.rms_mm == pytest.approx(np.sqrt(0.3664 / 4))
@@ -503,7 +503,7 @@ def test_points_are_compared_with_their_own_truth():
     assert result.share_within_tolerance == 0.75
     # Seven stripes are visible; three of them have points, one of these has two.
     assert (result.false_points, result.missed) == (1, 4)
-    assert json.loads(json.dumps(result.as_dict(), allow_nan=False))["matched"] == 4
+    assert json.loads(result.model_dump_json())["matched"] == 4
 
 
 @pytest.mark.parametrize(

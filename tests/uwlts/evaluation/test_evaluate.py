@@ -8,7 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.evaluate import EvaluationRecord, TruthFigures, evaluate
+from uwlts.evaluation.evaluate import Evaluation, evaluate
+from uwlts.evaluation.truth_comparison import TruthComparison
 from uwlts.model.library import load_sensor
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.truth import Truth, TruthHeader, scene_digest, write_truth
@@ -91,9 +92,9 @@ def test_the_truth_of_every_second_image_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("index", [float("inf"), float("nan")])
 def test_a_stored_evaluation_has_finite_values(index: float) -> None:
-    EvaluationRecord(cloud="a.ply", medium_index=1.33)
+    Evaluation(cloud="a.ply", medium_index=1.33)
     with pytest.raises(ValidationError, match="finite number"):
-        EvaluationRecord(cloud="a.ply", medium_index=index)
+        Evaluation(cloud="a.ply", medium_index=index)
 
 
 @pytest.mark.parametrize(
@@ -102,6 +103,6 @@ def test_a_stored_evaluation_has_finite_values(index: float) -> None:
 def test_stored_fractions_and_counts_are_possible(tmp_path: Path, name: str, value: float) -> None:
     found = evaluate(a_cloud(METADATA), truth=truth_file(tmp_path / "a.truth.h5", scene=SCENE)).truth
     assert found is not None
-    TruthFigures.model_validate(found.as_dict())
+    assert TruthComparison.model_validate(found.model_dump()) == found
     with pytest.raises(ValidationError, match=name):
-        TruthFigures.model_validate(found.as_dict() | {name: value})
+        TruthComparison.model_validate(found.model_dump() | {name: value})

@@ -35,6 +35,6 @@ def test_the_share_of_points_on_no_artefact_is_judged(share, doubted):
     artefact = {"kind": "spheres", "diameters_mm": [50.0, 50.0], "spacings_mm": [100.0]}
     found = uwlts.evaluate(cloud, artefact)
     # A few points of the spheres are outliers or mixed.
-    assert found.artefact.strange_share == pytest.approx(share, abs=0.01)
-    assert bool(found.artefact.doubts()) is doubted
-    assert f"({100 * found.artefact.strange_share:.1f} %) on no artefact" in "".join(evaluation_lines(found.record()))
+    assert found.evaluation.strange_share == pytest.approx(share, abs=0.01)
+    assert bool(found.evaluation.doubts()) is doubted
+    assert f"({100 * found.evaluation.strange_share:.1f} %) on no artefact" in "".join(evaluation_lines(found))

@@ -12,9 +12,8 @@ from twin.design.sweep import SweepResult
 from uwlts.comparison.change import ChangedRegion
 from uwlts.errors import ArgumentError, SetupError
 from uwlts.evaluation.evaluate import Evaluation
-from uwlts.evaluation.figures import Figure, FigureUncertainty, figure_keys
+from uwlts.evaluation.figures import FigureUncertainty
 from uwlts.inspection.features import Feature, FeatureKind, Inspection, plain_value
-from uwlts.model.artefacts import StepStandard
 from uwlts.model.joint_estimate import JointEstimate, NominalSheet
 from uwlts.model.parameter_keys import LensParameter, WindowParameter
 from uwlts.reconstruction.verify import Verdict
@@ -26,10 +25,17 @@ def cloud_of(count: int, **columns) -> PointCloud:
     return PointCloud(points, np.ones(count), np.full(count, -1), np.arange(count), **columns)
 
 
+def evaluation_of(figures_mm: dict[str, float], **uncertainty: FigureUncertainty) -> Evaluation:
+    counts = dict.fromkeys(("points_total", "points_used", "points_rejected"), 2)
+    figures = {"kind": "step", "figures_mm": figures_mm, "within_vdi_outliers": True, **counts}
+    step = {"kind": "step", "height_mm": 23.17, "height_uncertainty_mm": 0.002}
+    content = {"cloud": "step", "artefact": step, "evaluation": figures, "uncertainty": uncertainty}
+    return Evaluation.model_validate(content)
+
+
 def test_figures_of_an_evaluation():
-    height, std, _ = figure_keys(StepStandard(height_mm=23.17, height_uncertainty_mm=0.002))
-    figures = (Figure(height, -0.03, FigureUncertainty(0.003, 0.004)), Figure(std, 0.02))
-    frame = uwlts.report.to_frame(Evaluation("step", cloud_of(2), None, figures, None, None))
+    figures_mm = {"height error": -0.03, "STD": 0.02}
+    frame = uwlts.report.to_frame(evaluation_of(figures_mm, **{"height error": FigureUncertainty(0.003, 0.004)}))
     assert list(frame["quantity"]) == ["height error", "STD"] and list(frame["name"]) == ["height error", "STD"]
     np.testing.assert_allclose(frame["value_mm"], [-0.03, 0.02])
     np.testing.assert_allclose(frame["measured_mm"], [23.14, 0.02])
@@ -41,10 +47,9 @@ def test_figures_of_an_evaluation():
 
 
 def test_columns_do_not_depend_on_what_is_known():
-    key = figure_keys(StepStandard(height_mm=23.17))[1]
     known, unknown = (
-        uwlts.report.to_frame(Evaluation("", cloud_of(1), None, (Figure(key, 0.02, each),), None, None))
-        for each in (FigureUncertainty(0.1, 0.2), None)
+        uwlts.report.to_frame(evaluation_of({"STD": 0.02}, **each))
+        for each in ({"STD": FigureUncertainty(0.1, 0.2)}, {})
     )
     assert list(known.columns) == list(unknown.columns)
     assert unknown["uncertainty_random_mm"].dtype == np.float64
