@@ -126,6 +126,8 @@ class SurfaceChange(Brief):
 
     def _region(self, own: np.ndarray) -> ChangedRegion:
         distance, area, points = self.distance_mm[own], self.area_mm2[own], self.points_mm[own]
+        # Scattered points without neighbours have no area.
+        area = area if area.any() else np.ones_like(area)
         centre = np.average(points, axis=0, weights=area)
         extent = np.ptp((points - centre) @ np.linalg.svd(points - centre, full_matrices=False)[2][0])
         return ChangedRegion(

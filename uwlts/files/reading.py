@@ -18,6 +18,7 @@ from io import BufferedReader
 from pathlib import Path
 from tokenize import TokenError
 from typing import TYPE_CHECKING, Any, TypeVar
+from zipfile import BadZipFile
 
 from uwlts.errors import CaptureError, Error, make_printable
 
@@ -115,7 +116,7 @@ def log_warnings(path: str | os.PathLike[str], warnings: Iterable[str]) -> None:
         _LOG.warning("%s", make_printable(f"warning: {path}: {warning}"))
 
 
-NPY_DAMAGE = (ValueError, EOFError, OSError, SyntaxError, TokenError, MemoryError, OverflowError)
+NPY_DAMAGE = (ValueError, EOFError, OSError, SyntaxError, TokenError, MemoryError, OverflowError, BadZipFile)
 """Exceptions of NumPy for a damaged NPY file, depending on the kind of damage."""
 
 

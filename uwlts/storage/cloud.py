@@ -45,6 +45,8 @@ WATER = "water"
 """Prefix of error names for a medium's index, which may drift between scans."""
 _BLOCK = 8192
 """Points whose covariances are summed together: their parts fit in the processor's cache."""
+FARTHEST_SINGLE_MM = 16_000.0
+"""Beyond this distance 32-bit numbers are coarser than a micrometre."""
 FEW_ZEROS = 3
 """Largest number of measured points at exactly 0 0 0."""
 _SAMPLE = 2000

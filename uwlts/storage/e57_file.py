@@ -11,7 +11,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import require_regular_file
-from uwlts.storage.cloud import FEW_ZEROS, PointCloud, find_float_step, make_foreign_cloud
+from uwlts.storage.cloud import FARTHEST_SINGLE_MM, FEW_ZEROS, PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.las_file import describe_units, load_library, shorten_error
 from uwlts.storage.number_tables import Unit
 
@@ -36,8 +36,8 @@ def write_e57(
 ) -> None:
     """Write points as one scan.
 
-    Coordinates and real numbers have 32 bits, times 64. A time is the sum of ``acquisitionStart``, the whole second
-    before all of them, and a positive ``timeStamp``.
+    Real numbers have 32 bits, coordinates farther than 16 m from the origin and times 64. A time is the sum of
+    ``acquisitionStart``, the whole second before all of them, and a positive ``timeStamp``.
 
     ``columns`` and ``further`` hold columns (N,) by their names: those of the standard, and others that are stored as
     ``uwlts:NAME``. ``to`` is the final name of the file.
@@ -47,16 +47,18 @@ def write_e57(
     pye57 = load_library("pye57", "E57")
     lib = pye57.libe57
     # Rounded first, so that the bounds in the file apply to the numbers in the file.
-    coordinates = (1e-3 * points_mm).astype(np.float32).astype(np.float64).T
+    single = np.abs(points_mm).max() <= FARTHEST_SINGLE_MM
+    coordinates = (1e-3 * points_mm).astype(np.float32 if single else np.float64).astype(np.float64).T
     fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), coordinates, strict=True)) | columns
     fields |= {f"{PREFIX}:{label}": values for label, values in (further or {}).items()}
     start = 0.0 if time_s is None else float(np.floor(time_s.min()))
     if time_s is not None:
         fields["timeStamp"] = time_s - start
     fields = {label: np.ascontiguousarray(values) for label, values in fields.items()}
+    file: Any = None
     try:
         # The library's own scan writer supports neither times nor extensions.
-        with pye57.E57(str(path), mode="w") as file:
+        with (file := pye57.E57(str(path), mode="w")):
             image = file.image_file
             if further:
                 image.extensionsAdd(PREFIX, EXTENSION)
@@ -89,7 +91,7 @@ def write_e57(
                 low, high = values.min(), values.max()
                 if values.dtype.kind in "iu":
                     node = lib.IntegerNode(image, int(low), int(low), int(high))
-                elif label == "timeStamp":
+                elif label == "timeStamp" or (label.startswith("cartesian") and not single):
                     node = lib.FloatNode(image, float(low), lib.E57_DOUBLE, float(low), float(high))
                 else:
                     node = lib.FloatNode(image, float(low), lib.E57_SINGLE, float(low), float(high))
@@ -102,7 +104,11 @@ def write_e57(
             writer.write(len(points_mm))
             writer.close()
     except lib.E57Exception as error:
-        raise OutputError(f"cannot write {to}: {shorten_error(error)}") from error
+        # The library closes its file again when it is deleted.
+        if file is not None:
+            file.close = lambda: None
+        full = " (is the disk full?)" if "ErrorWriteFailed" in str(error) else ""
+        raise OutputError(f"cannot write {to}: {shorten_error(error).partition(' ****')[0]}{full}") from error
 
 
 def _limits(named: Sequence[tuple[str, np.ndarray]], kind: type[int] | type[float]) -> dict[str, int | float]:

@@ -13,7 +13,7 @@ import numpy as np
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import require_regular_file
 from uwlts.runtime.optional_library import optional_library
-from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
+from uwlts.storage.cloud import FARTHEST_SINGLE_MM, PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.point_cloud2 import (
     FRAME_ID,
@@ -35,11 +35,16 @@ def mcap_content(cloud: PointCloud) -> bytes:
     Points have the fields x, y, z (m) and intensity as 32-bit floating point numbers, which viewers expect; frame and
     line as 32-bit integers; time (s, 64 bits) if known; and the covariance in mm2 (`covariance_columns`).
 
-    Raises OutputError if a time is negative: messages cannot be earlier than the clock's zero; SetupError if a library
-    is not installed.
+    Raises OutputError if a point is farther than 16 m from the origin, or a time is negative: messages cannot be
+    earlier than the clock's zero; SetupError if a library is not installed.
     """
     if cloud.time_s is not None and cloud.time_s.min() < 0:
         raise OutputError(f"a point has the time {cloud.time_s.min():g} s: messages have no time before 0")
+    if (farthest := float(np.abs(cloud.points_mm).max())) > FARTHEST_SINGLE_MM:
+        raise OutputError(
+            f"the cloud reaches {farthest:.6g} mm from the origin, where the 32-bit numbers of MCAP are coarser than a "
+            "micrometre: write HDF5, PLY, E57 or LAZ, or move the cloud"
+        )
     mcap, typesys = _library("mcap.writer"), _library("rosbags.typesys")
     store: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     types = bag_types(store)

@@ -17,6 +17,7 @@ from uwlts.files.reading import log_warnings, open_regular, require_regular_file
 from uwlts.files.writing import write_atomically
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.storage.cloud import FARTHEST_SINGLE_MM
 from uwlts.storage.number_tables import Unit, choose_scale, find_stated_unit
 from uwlts.storage.ply import encode_ply, read_comments, read_ply
 
@@ -34,8 +35,6 @@ _LONGEST_START = 2**16
 """Bytes in which comments are looked for."""
 _FARTHEST = 1e10
 """Largest coordinate in the file's unit: in mm the circumference of the Earth is 4e10; larger ones are damage."""
-_FARTHEST_SINGLE_MM = 16_000.0
-"""Beyond this distance 32-bit numbers are coarser than a micrometre."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -234,7 +233,7 @@ def _stl(mesh: SurfaceMesh) -> bytes:
     import trimesh
 
     farthest = float(np.abs(mesh.vertices_mm).max())
-    if farthest > _FARTHEST_SINGLE_MM:
+    if farthest > FARTHEST_SINGLE_MM:
         raise OutputError(
             f"the mesh reaches {farthest:.6g} mm from the origin, where the numbers of STL are coarser than a "
             "micrometre: write PLY or glTF"

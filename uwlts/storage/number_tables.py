@@ -186,7 +186,7 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     if delimiter == b" " and b"  " in body:
         body = re.sub(rb" {2,}", b" ", body)
     comma = comma or (delimiter != b"," and b"," in body)
-    if header is None and delimiter == b"," and any(re.search(rb"(^|,) *-?0\d", line) for line in lines[:50]):
+    if header is None and delimiter == b"," and _seems_decimal(lines[:_FIRST]):
         raise DescriptionError(
             f"{path} has cells such as '00' between commas: commas seem to be both decimal and separators. "
             "Export it with another separator"
@@ -303,6 +303,17 @@ def _decode_wide(content: bytes, path: Path) -> bytes:
         return content.decode(kind).encode() if kind else content.removeprefix(b"\xef\xbb\xbf")
     except UnicodeDecodeError as error:
         raise DescriptionError(f"{path} is no table of numbers: it is no complete text in UTF-16") from error
+
+
+def _seems_decimal(lines: list[bytes]) -> bool:
+    """Return whether commas between cells seem to be decimal too: cells such as 00, or decimals in every second."""
+    if any(re.search(rb"(^|,) *-?0\d", line) for line in lines):
+        return True
+    decimals = [[*map(bytes.strip, line.split(b",")[1::2])] for line in lines if line.count(b",") % 2]
+    plain = all(cell.isdigit() for row in decimals for cell in row)
+    lengths = [{*map(len, column)} for column in zip(*decimals, strict=False)]
+    # Cells of one length in three columns.
+    return plain and _FEWEST <= len(decimals) == len(lines) and len(lengths) > 2 and max(map(len, lengths)) == 1
 
 
 def _without_count(lines: list[bytes]) -> tuple[list[bytes], int | None]:

@@ -1,5 +1,6 @@
 """Reading of any file of the program with one function, and saving of results."""
 
+import struct
 from pathlib import Path
 
 import h5py
@@ -153,3 +154,25 @@ def test_a_nominal_calibration_reports_its_medium(tmp_path):
         assert uwlts.read(tmp_path / f"{name}.json") == calibration
     # Without a name, files are as before, so that the digests in older clouds stay valid.
     assert "medium_name" not in nominal_calibration(sensor).model_dump_json()
+
+
+def test_a_ply_with_two_lists_on_a_face_is_a_mesh(tmp_path: Path):
+    mesh = tetrahedron()
+    header = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "element face 4\nproperty list uchar int vertex_indices\nproperty list uchar float other\nend_header\n"
+    rows = [" ".join(map(str, row)) for row in mesh.vertices_mm.tolist()]
+    faces = mesh.faces.tolist()
+    rows += [f"3 {' '.join(map(str, face))} {n} {'0.5 ' * n}" for n, face in enumerate(faces)]
+    (tmp_path / "a.ply").write_text(header + "\n".join(rows) + "\n")
+    content = header.replace("ascii", "binary_little_endian").encode() + mesh.vertices_mm.astype("<f4").tobytes()
+    for n, face in enumerate(faces):
+        content += struct.pack(f"<B3iB{n}f", 3, *face, n, *[0.5] * n)
+    (tmp_path / "b.ply").write_bytes(content)
+    for name in ("a.ply", "b.ply"):
+        assert uwlts.read(tmp_path / name).area_mm2() == pytest.approx(mesh.area_mm2())
+
+
+def test_a_missing_texture_is_silent(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd missing.png\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n")
+    assert uwlts.read(tmp_path / "a.obj").area_mm2() == pytest.approx(0.5) and not caplog.records

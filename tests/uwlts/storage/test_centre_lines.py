@@ -213,3 +213,10 @@ def test_an_interrupted_recording_keeps_its_centre_lines_and_goes_on(tmp_path: P
             assert np.array_equal(
                 one.read_observation(k).centre_px, other.read_observation(k).centre_px, equal_nan=True
             )
+
+
+def test_an_array_that_begins_like_an_archive_is_refused(tmp_path: Path):
+    folder = described(tmp_path / "f", "map.npy")
+    (folder / "map.npy").write_bytes(b"PK\x03\x04" + bytes(100))
+    with pytest.raises(ImageError, match="is no NPY array"):
+        uwlts.import_images(folder, tmp_path / "a.h5")

@@ -156,3 +156,21 @@ def test_times_before_zero_are_refused(cloud, tmp_path):
     with pytest.raises(uwlts.Error, match="no time before 0"):
         write_cloud(tmp_path / "a.mcap", early)
     assert not list(tmp_path.iterdir())
+
+
+def test_far_clouds_keep_their_micrometres(cloud, tmp_path):
+    far = replace(cloud, points_mm=cloud.points_mm + [5e6, 0, 0], uncertainty=None)
+    write_cloud(tmp_path / "a.e57", far)
+    # 64 bits at 5 km.
+    np.testing.assert_allclose(uwlts.read(tmp_path / "a.e57").points_mm, far.points_mm, atol=2e-9)
+    with pytest.raises(uwlts.Error, match="coarser than a micrometre"):
+        write_cloud(tmp_path / "a.mcap", far)
+
+
+def test_mcap_gives_points_times_and_images_back(cloud, tmp_path):
+    write_cloud(tmp_path / "a.mcap", cloud)
+    again = uwlts.read(tmp_path / "a.mcap")
+    # 32 bits at 0.3 m.
+    np.testing.assert_allclose(again.points_mm, cloud.points_mm, atol=2e-5)
+    for name in ("frame", "line", "time_s"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(cloud, name))

@@ -224,3 +224,14 @@ def test_a_mirrored_cloud_is_refused(tmp_path: Path):
     np.savetxt(tmp_path / "a.txt", np.eye(3), header="Northing Easting Elevation")
     with pytest.raises(uwlts.Error, match="north, east, up, a left-handed frame"):
         read_cloud(tmp_path / "a.txt")
+
+
+def test_decimal_commas_between_commas_are_refused(tmp_path: Path):
+    points = np.random.default_rng(2).uniform(-20, 20, (40, 3))
+    for digits in (1, 3):
+        rows = [",".join(f"{value:.{digits}f}".replace(".", ",") for value in row) for row in points]
+        (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+        with pytest.raises(uwlts.Error, match="commas seem to be both decimal and separators"):
+            read_cloud(tmp_path / "a.csv")
+    np.savetxt(tmp_path / "a.csv", np.rint(100 * np.tile(points, 2)), fmt="%d", delimiter=",")
+    assert len(read_cloud(tmp_path / "a.csv")) == 40
