@@ -615,7 +615,7 @@ def test_who_looks_closer_sees_all_points_there(desk, page):
     low, high = np.array(got.value.url.partition("box=")[2].split(","), float).reshape(2, 3)
     # Again, because Playwright waits without limit for the body of an answer to a page.
     again = page.request.get(got.value.url, timeout=SLOW_MS)
-    sent = np.frombuffer(again.body(), "<f4").reshape(-1, 6)
+    sent = np.frombuffer(again.body(), "<f4").reshape(-1, 7)
     inside = np.all((points >= low) & (points <= high), axis=1)
     assert 0 < len(sent) == np.count_nonzero(inside) < len(points) / 4
     kept(page, "closer")

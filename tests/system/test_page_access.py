@@ -336,7 +336,7 @@ def test_the_latest_image_and_the_cloud_are_fetched_anew(page):
     page.board.cloud.add(np.array([[1.0, 2.0, 3.0], [1001.0, 2.0, 3.5]]), intensity=np.array([7.0, 8.0]))
     cloud = asked(page, "/cloud")
     origin = np.array([float(x) for x in cloud.headers["x-origin"].split(",")])
-    table = np.frombuffer(cloud.body, "<f4").reshape(-1, 6)
+    table = np.frombuffer(cloud.body, "<f4").reshape(-1, 7)
     np.testing.assert_allclose(table[:, :3] + origin, [[1, 2, 3], [1001, 2, 3.5]], atol=1e-4)
     assert table[:, 3].tolist() == [7, 8] and np.isnan(table[:, 4:]).all()
     assert cloud.headers["cache-control"] == "no-store"

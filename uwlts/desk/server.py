@@ -215,7 +215,7 @@ class DeskServer:
 
 
 def _cloud_answer(table: np.ndarray) -> Response:
-    """Return points (N, 6) as a response to the browser."""
+    """Return points (N, 7) as a response to the browser."""
     origin, data = pack(table)
     headers = _LATEST | {"X-Origin": ",".join(map(str, origin.tolist()))}
     return Response(data, 200, headers, "application/octet-stream")

@@ -6,13 +6,13 @@ import numpy as np
 
 from uwlts.pages.cloud_figure import CloudField
 
-FIELDS: tuple[CloudField, ...] = ("intensity", "deviation", "uncertainty")
-"""Fields for colouring points besides depth: in grey values, mm and mm."""
+FIELDS: tuple[CloudField, ...] = ("intensity", "deviation", "random", "common")
+"""Fields for colouring points besides depth: in grey values, then mm."""
 _COLUMNS = 3 + len(FIELDS)  # coordinates first
 
 
 def point_table(points_mm: np.ndarray, **fields: np.ndarray | None) -> np.ndarray:
-    """Return points (N, 6): coordinates in mm, then fields (N,) by the names in `FIELDS`, NaN if unknown."""
+    """Return points (N, 7): coordinates in mm, then fields (N,) by the names in `FIELDS`, NaN if unknown."""
     table = np.full((len(points_mm), _COLUMNS), np.nan)
     table[:, :3] = points_mm
     for column, name in enumerate(FIELDS, 3):
@@ -22,7 +22,7 @@ def point_table(points_mm: np.ndarray, **fields: np.ndarray | None) -> np.ndarra
 
 
 def pack(table: np.ndarray) -> tuple[np.ndarray, bytes]:
-    """Return an origin (3,) in mm, and points (N, 6) relative to it with fields as float32, for the browser."""
+    """Return an origin (3,) in mm, and points (N, 7) relative to it with fields as float32, for the browser."""
     origin = np.round(np.median(table[:, :3], axis=0)) if len(table) else np.zeros(3)
     return origin, (table - np.append(origin, np.zeros(len(FIELDS)))).astype("<f4").tobytes()
 
@@ -70,6 +70,6 @@ class ThinnedCloud:
             self.version += 1
 
     def points(self) -> np.ndarray:
-        """Return the kept points (N, 6): coordinates in mm, then the fields."""
+        """Return the kept points (N, 7): coordinates in mm, then the fields."""
         with self._lock:
             return self._table[: self._count].copy()

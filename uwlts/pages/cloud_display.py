@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.pages.cloud_figure import LIMIT_STD, CloudField, CloudPoints, colour_limit_mm
+from uwlts.pages.cloud_figure import LIMIT_STD, PARTS, CloudField, CloudPoints, colour_limit_mm
 from uwlts.pages.numbers import unit_for
 from uwlts.pages.toolkit import FigureCollector, render_page, write_page
 
@@ -46,6 +46,7 @@ def choose_points(
         caption += f" The colours end at {LIMIT_STD:g} standard deviations, ±{limit:.3g} {unit}."
     if np.isnan(shown := factor * values[chosen]).any():
         caption += " Dark points were not evaluated: outliers, near an edge, or beside the artefact." if limit else ""
+    caption += f" {PARTS[field]}" if field in PARTS else ""
     return CloudPoints(points_mm[chosen], field, shown, unit, limit), f"{caption} {axes}"
 
 

@@ -13,8 +13,15 @@ from typing import Literal
 
 import numpy as np
 
-CloudField = Literal["deviation", "depth", "intensity", "uncertainty"]
-"""Quantities of points that colours show: Z for "depth"."""
+CloudField = Literal["deviation", "depth", "intensity", "random", "common"]
+"""Quantities of points that colours show: Z for "depth"; the last two are parts of the standard uncertainty."""
+PARTS: dict[CloudField, str] = {
+    "random": "Random standard uncertainty along the surface normal, by noise and by errors of single images: a length "
+    "contains that of its ends.",
+    "common": "Standard uncertainty along the surface normal by errors that all points share: a length contains only "
+    "their difference between its ends.",
+}
+"""Captions of the parts of the uncertainty."""
 
 VIEW = Path(__file__).with_name("cloud_view.js")
 """Component of Vue that draws a cloud; the desk uses it, too."""

@@ -4,7 +4,7 @@
 // from /cloud/detail when the view is at rest. A page gives its own points (`source`), in the same form.
 import { OrbitControls, THREE } from "nicegui-scene";
 
-const COLUMNS = 6;
+const COLUMNS = 7;
 const REST_MS = 300;
 // Turbo (Mikhailov 2019), polynomials of degree 5 for red, green, blue.
 const TURBO = [
@@ -182,7 +182,7 @@ export default {
       box.expandByScalar((2 * size) / Math.sqrt(seen) + 1e-3);
       return [...box.min.toArray(), ...box.max.toArray()];
     },
-    column() { return { depth: 2, intensity: 3, deviation: 4, uncertainty: 5 }[this.field] ?? 2; },
+    column() { return { depth: 2, intensity: 3, deviation: 4, random: 5, common: 6 }[this.field] ?? 2; },
     // Turbo without its darkest end, which is invisible on a dark background.
     shade(share) { return this.stops ? between(this.stops, limited(share)) : turbo(0.05 + 0.95 * limited(share)); },
     colour() {

@@ -97,7 +97,7 @@ def _point_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
     for name in ("frame", "line"):
         if not ((known := getattr(cloud, name)) == NO_INDEX).all():
             columns[name] = known
-    columns |= {name: getattr(cloud, name) for name in ("time_s", "deviation_mm", "normal_std_mm")}
+    columns |= {name: getattr(cloud, name) for name in ("time_s", "deviation_mm", "random_std_mm", "common_std_mm")}
     if cloud.uncertainty is not None:
         columns |= dict(zip(_axis_names("std_mm"), cloud.uncertainty.std_mm().T, strict=True))
     return {name: values for name, values in columns.items() if values is not None}

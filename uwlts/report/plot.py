@@ -80,8 +80,8 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: CloudField = "dev
         Three-dimensional axes.
     colour
         Quantity shown by colour: "deviation" from the fitted or true surface, limited to two standard deviations;
-        "depth" Z; "intensity", the brightness of the stripe; or "uncertainty", the standard uncertainty of the
-        position.
+        "depth" Z; "intensity", the brightness of the stripe; or "random" or "common", the standard
+        uncertainty along the surface normal by noise, or by errors that all points share.
     """
     if ax is None:
         # The axes are square, as wide as the space beside the colour bar, and clipped by the figure vertically.
@@ -147,9 +147,9 @@ def _select_values(cloud: PointCloud, colour: CloudField) -> tuple[np.ndarray | 
             return values, "Z / mm", {"cmap": "viridis"}
         case "intensity":
             return values, "brightness / grey levels", {"cmap": "cividis"}
-        case "uncertainty":
+        case "random" | "common":
             unit, factor = unit_for(float(np.median(values)))
-            return factor * values, f"standard uncertainty / {unit}", {"cmap": "viridis"}
+            return factor * values, f"{colour} standard uncertainty / {unit}", {"cmap": "viridis"}
         case _:
             assert_never(colour)
 

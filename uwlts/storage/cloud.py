@@ -37,7 +37,7 @@ NO_INDEX = -1
 PER_POINT = ("points_mm", "intensity", "frame", "line")
 """Columns of every cloud."""
 KINDS = dict(zip(PER_POINT, (np.float64, np.float32, np.int32, np.int32), strict=True)) | {"deviation_mm": np.float32}
-KINDS |= {"time_s": np.float64, "normal_std_mm": np.float32}
+KINDS |= {"time_s": np.float64, "random_std_mm": np.float32, "common_std_mm": np.float32}
 """Types of all columns."""
 OPTIONAL = tuple(KINDS)[len(PER_POINT) :]
 """Columns that clouds may lack."""
@@ -96,6 +96,10 @@ class PointUncertainty:
         position = self.position_mm[None]
         return position if self.poses_mm is None else np.concatenate([position, self.poses_mm])
 
+    def independent_mm2(self) -> np.ndarray:
+        """Return the covariance (N, 6) of each point due to noise and to errors of its image's position and pose."""
+        return self.random_mm2 + _pairs_of(self.image_errors_mm())
+
     def systematic_mm2(self) -> np.ndarray:
         """Return the covariance (N, 6) of each point due to calibration and stage."""
         return _pairs_of(self.patterns_mm)
@@ -105,8 +109,7 @@ class PointUncertainty:
         result = np.empty((len(self.random_mm2), 3, 3), self.random_mm2.dtype)
         for start in range(0, len(result), _BLOCK):
             some = self[start : start + _BLOCK]
-            pairs = _pairs_of(some.image_errors_mm()) + (some.random_mm2 + some.systematic_mm2())
-            result[start : start + _BLOCK] = expand_covariances(pairs)
+            result[start : start + _BLOCK] = expand_covariances(some.independent_mm2() + some.systematic_mm2())
         return result
 
     def std_mm(self) -> np.ndarray:
@@ -172,8 +175,9 @@ class PointCloud(Brief):
         The same for stripe centres by the name of their `RayStatus`.
     warnings : list of str
         Evidence that the calibration is not that of the sensor; and omissions and doubts of the reader of a file.
-    normal_std_mm : (N,) float32 or None
-        Standard deviation along the surface normal, of clouds whose file holds no more of the uncertainty.
+    random_std_mm, common_std_mm : (N,) float32 or None
+        Standard deviations along the surface normal, of clouds whose file holds no more of the uncertainty: by noise
+        and errors of single images, and by errors of the calibration that all points share.
 
     Raises
     ------
@@ -193,9 +197,12 @@ class PointCloud(Brief):
     lines_by_status: dict[str, int] = field(default_factory=dict)
     rays_by_status: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
-    normal_std_mm: np.ndarray | None = None
+    random_std_mm: np.ndarray | None = None
+    common_std_mm: np.ndarray | None = None
     writer: ClassVar[Callable[..., None]]
     """Function that writes clouds; `uwlts.storage.cloud_files`, which knows the formats, sets it."""
+    normal_std: ClassVar[Callable[..., tuple[np.ndarray | None, np.ndarray | None]]]
+    """Function that returns the parts along the surface normal; `uwlts.storage.normal_std`, which finds it, sets it."""
 
     def __post_init__(self) -> None:
         for name, kind in KINDS.items():
@@ -257,9 +264,9 @@ class PointCloud(Brief):
         Parameters
         ----------
         colour
-            Quantity shown by colour: "depth" Z; "intensity", the brightness of the stripe; "uncertainty", the standard
-            uncertainty of the position; or "deviation" from the fitted or true surface, limited to two standard
-            deviations.
+            Quantity shown by colour: "depth" Z; "intensity", the brightness of the stripe; "random" or "common", the
+            standard uncertainty along the surface normal by noise, or by errors that all points share; or "deviation"
+            from the fitted or true surface, limited to two standard deviations.
         """
         # Templates are only needed here.
         from uwlts.pages.cloud_display import display_points, show
@@ -269,7 +276,7 @@ class PointCloud(Brief):
     def field_values(self, field: CloudField) -> np.ndarray | None:
         """Return a quantity (N,) that colours can show, NaN where unknown, in mm or grey values; None if unknown.
 
-        For "uncertainty" it is the norm of the coordinates' standard uncertainties, or else `normal_std_mm`.
+        "random" and "common" are standard deviations along the surface normal (`PointCloud.random_std_mm`).
         """
         match field:
             case "depth":
@@ -278,10 +285,9 @@ class PointCloud(Brief):
                 return self.intensity.astype(np.float64)
             case "deviation":
                 return None if self.deviation_mm is None else self.deviation_mm.astype(np.float64)
-            case "uncertainty" if self.uncertainty is not None:
-                return np.linalg.norm(self.uncertainty.std_mm().astype(np.float64), axis=1)
-            case "uncertainty":
-                return None if self.normal_std_mm is None else self.normal_std_mm.astype(np.float64)
+            case "random" | "common":
+                std = self.normal_std(self)[0 if field == "random" else 1]
+                return None if std is None else std.astype(np.float64)
             case _:
                 assert_never(field)
 

@@ -55,7 +55,7 @@ PLY_COLOURS = ("red", "green", "blue")
 FULL = ".full.ply"
 """Ending of PLY files with the whole uncertainty."""
 _LEAN = (
-    "it holds the standard deviation of each point along the surface normal, and no errors that points share: results "
+    "it holds the standard deviations of each point along the surface normal, and no errors that points share: results "
     f"have no uncertainty. Use the cloud in HDF5 (NAME.h5) or in PLY with the whole uncertainty (NAME{FULL})"
 )
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
@@ -76,10 +76,10 @@ def write_cloud(
     - ``.h5``: mm, with all attributes. The datasets have the names in `PointCloud` and `PointUncertainty`, plus
       systematic_mm2 (N, 6).
     - ``.ply``: mm, for other programs, binary and little-endian. The vertex properties are x, y, z (double) and
-      intensity (float). If known, there are deviation, normal_std (float), time (double, s), frame and line (int).
-      normal_std is the standard deviation along the surface normal. The metadata is JSON in numbered comments that
-      every reader accepts.
-    - ``.full.ply``: the same with the whole uncertainty in place of normal_std (`PointUncertainty`). The covariances
+      intensity (float). If known, there are deviation, random_std, common_std (float), time (double, s), frame and line
+      (int). The two are standard deviations along the surface normal (`PointCloud`). The metadata is JSON in comments
+      that every reader accepts.
+    - ``.full.ply``: the same with the whole uncertainty in place of both (`PointUncertainty`). The covariances
       are random_xx to random_zz and systematic_xx to systematic_zz in mm2. Shared errors in mm are position_x to
       position_z, pattern0_x, pattern0_y and so on, and optionally pose0_x to pose5_z.
     - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan if unknown) of every point, with all
@@ -87,10 +87,11 @@ def write_cloud(
     - ``.laz``, ``.las``: LAS 1.4, point format 6, or 7 with colours, metres in steps of 1e-7 m. The standard intensity
       is rounded to integers (0 if unknown) and ``amplitude`` holds its value; the standard ``gps_time`` is the time in
       s if known. Extra fields are ``frame``, ``line``, ``deviation_mm``, and the covariance ``cov_xx_mm2`` to
-      ``cov_zz_mm2``.
+      ``cov_zz_mm2``, and ``random_std_mm`` and ``common_std_mm``.
     - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the image as
       column and the line as row if both are known and below 65536; ``timeStamp`` in 64 bits since ``acquisitionStart``
-      if times are known; the covariance as an extension, ``uwlts:cov_xx_mm2`` to ``uwlts:cov_zz_mm2``.
+      if times are known; the covariance as an extension, ``uwlts:cov_xx_mm2`` to ``uwlts:cov_zz_mm2``,
+      and ``uwlts:random_std_mm`` and ``uwlts:common_std_mm``.
     - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, one for each image if the points' times are known
       (`uwlts.storage.mcap_clouds`).
 
@@ -117,11 +118,11 @@ def write_cloud(
     if colours is not None:
         columns |= dict(zip(PLY_COLOURS, colours.T, strict=True))
     full = not is_lean(path)
-    std = None if full else compute_normal_std(cloud)
+    random, common = (None, None) if full and cloud.uncertainty is not None else compute_normal_std(cloud)
     # MeshLab shows a property named "intensity" as grey, in place of the colours.
     brightness = "intensity" if colours is None else "scalar_intensity"
     columns |= {brightness: cloud.intensity, "deviation": cloud.deviation_mm, "time": cloud.time_s}
-    columns |= {"normal_std": cloud.normal_std_mm if std is None else std}
+    columns |= {"random_std": random, "common_std": common}
     for name, indices in (("frame", cloud.frame), ("line", cloud.line)):
         columns[name] = None if (indices == NO_INDEX).all() else indices
     columns = {name: values for name, values in columns.items() if values is not None}
@@ -179,7 +180,7 @@ def load_cloud(cloud: PointCloud | str | os.PathLike[str], *, unit: Unit | None 
     standard deviation along the normal. Both are logged and added to the cloud's warnings.
     """
     found, warnings = omit_repeated(cloud if isinstance(cloud, PointCloud) else read_cloud(cloud, unit=unit))
-    if found.normal_std_mm is not None and found.uncertainty is None and _LEAN not in found.warnings:
+    if found.random_std_mm is not None and found.uncertainty is None and _LEAN not in found.warnings:
         warnings.append(_LEAN)
     log_warnings("cloud" if isinstance(cloud, PointCloud) else cloud, warnings)
     return replace(found, warnings=[*found.warnings, *warnings]) if warnings else found
@@ -309,7 +310,7 @@ def name_cloud(path: str | os.PathLike[str]) -> str:
 
 
 def is_lean(path: str | os.PathLike[str]) -> bool:
-    """Return whether `write_cloud` writes no more of the uncertainty than the standard deviation along the normal."""
+    """Return whether `write_cloud` writes no more of the uncertainty than standard deviations along the normal."""
     name = str(path).lower()
     return name.endswith(".ply") and not name.endswith(FULL)
 
@@ -447,6 +448,10 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         if parts and known.keys() >= set(_pose_names(parts)):
             poses = np.stack([column(name, np.nan) for name in _pose_names(parts)]).reshape(parts, 3, -1)
             uncertainty = replace(uncertainty, poses_mm=np.ascontiguousarray(np.moveaxis(poses, 1, 2)))
+
+    def lean(name: str) -> np.ndarray | None:
+        return column(name, np.nan) if name in known and uncertainty is None else None
+
     deviation = column("deviation", np.nan)
     metadata, uncertainty = _without_shared(_metadata(comments), uncertainty)
     cloud = PointCloud(
@@ -457,7 +462,8 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         deviation_mm=None if np.isnan(deviation).all() else deviation,
         uncertainty=uncertainty,
         time_s=column("time", np.nan, np.float64) if "time" in known else None,
-        normal_std_mm=column("normal_std", np.nan) if "normal_std" in known and uncertainty is None else None,
+        random_std_mm=lean("random_std"),
+        common_std_mm=lean("common_std"),
         metadata=metadata,
         warnings=warnings,
     )

@@ -14,6 +14,7 @@ from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
 from uwlts.storage.mcap_clouds import mcap_content, read_bag_cloud
+from uwlts.storage.normal_std import compute_normal_std
 from uwlts.storage.number_tables import Unit, read_number_table
 from uwlts.storage.point_cloud2 import covariance_columns
 
@@ -103,12 +104,18 @@ def _write_las(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> 
     fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
     if cloud.deviation_mm is not None:
         fields["deviation_mm"] = cloud.deviation_mm
-    fields |= covariance_columns(cloud)
+    fields |= _uncertainty_columns(cloud)
     compressed = path.suffix.lower() == ".laz"
     content = encode_las(
         cloud.points_mm, cloud.intensity, fields, time_s=cloud.time_s, colours=colours, compressed=compressed
     )
     aside.write_bytes(content)
+
+
+def _uncertainty_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
+    """Return the known columns (N,) of the covariance, and of the random and common part along the surface normal."""
+    parts = zip(("random_std_mm", "common_std_mm"), compute_normal_std(cloud), strict=True)
+    return covariance_columns(cloud) | {name: values for name, values in parts if values is not None}
 
 
 def _write_mcap(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> None:
@@ -127,7 +134,7 @@ def _write_e57(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> 
         columns |= dict(zip(COLOURS, colours.T, strict=True))
     if all(numbers.min() >= 0 and numbers.max() < 2**16 for numbers in (cloud.frame, cloud.line)):
         columns |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
-    further = covariance_columns(cloud)
+    further = _uncertainty_columns(cloud)
     write_e57(aside, cloud.points_mm, columns, to=path, time_s=cloud.time_s, further=further)
 
 

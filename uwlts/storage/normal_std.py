@@ -1,8 +1,8 @@
-"""Standard deviation of each point along the surface normal, for files that hold no more of the uncertainty."""
+"""Random and common standard deviation of each point along the surface normal, to show and for lean files."""
 
 import numpy as np
 
-from uwlts.storage.cloud import NO_INDEX, PointCloud, PointUncertainty
+from uwlts.storage.cloud import NO_INDEX, PointCloud, PointUncertainty, project_variance
 
 _STEPS_STD = 20.0
 """Ratio of the distance between the points that give a direction and their noise: 0.07 rad of error, whose cosine
@@ -11,25 +11,32 @@ _SAMPLED = 2000
 """Number of points for the median distance between neighbours."""
 
 
-def compute_normal_std(cloud: PointCloud) -> np.ndarray | None:
-    """Return the total standard deviation (N,) in mm along the surface normal; None if the uncertainty is unknown.
+def compute_normal_std(cloud: PointCloud) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return the random and the common standard deviation (N,) in mm along the surface normal; None if unknown.
+
+    The random one is by noise and by errors of single images, the common one by errors that all points share. Those
+    stored with a cloud are returned if it contains no more.
 
     The normal is that of the directions to a point on the same image line in another image, and to another point of the
-    same image. Of both sides the nearer point is used, which is on the same side of an edge. A point without such
-    neighbours has the largest standard deviation of all directions.
+    same image. Of both sides the nearer point is used, which is on the same side of an edge. For a point without such
+    neighbours, the direction of its largest standard deviation is used.
     """
     known = cloud.uncertainty
     if known is None:
-        return None
-    covariance = known.covariance_mm2().astype(np.float64)
+        return cloud.random_std_mm, cloud.common_std_mm
     normals = np.cross(_directions(cloud, known, "frame"), _directions(cloud, known, "line"))
     length = np.linalg.norm(normals, axis=1)
-    found = length > 0
-    variance = np.empty(len(cloud))
-    units = normals[found] / length[found, None]
-    variance[found] = np.einsum("ni,nij,nj->n", units, covariance[found], units)
-    variance[~found] = np.linalg.eigvalsh(covariance[~found])[:, -1]
-    return np.sqrt(np.maximum(variance, 0)).astype(np.float32)
+    lost = length == 0
+    normals = normals / np.where(lost, 1.0, length)[:, None]
+    normals[lost] = np.linalg.eigh(known[lost].covariance_mm2().astype(np.float64))[1][:, :, -1]
+    random, common = (
+        np.sqrt(np.maximum(project_variance(pairs, normals), 0)).astype(np.float32)
+        for pairs in (known.independent_mm2(), known.systematic_mm2())
+    )
+    return random, common
+
+
+PointCloud.normal_std = staticmethod(compute_normal_std)
 
 
 def _directions(cloud: PointCloud, known: PointUncertainty, along: str) -> np.ndarray:

@@ -60,13 +60,13 @@ def test_the_selection_does_not_depend_on_the_pieces(at_most: int, sizes: list[i
 @given(at_most=st.integers(1, 50), sizes=PIECES)
 def test_fields_stay_with_their_points(at_most: int, sizes: list[int]):
     kept = filled(at_most, sizes).points()
-    assert FIELDS == ("intensity", "deviation", "uncertainty")
+    assert FIELDS == ("intensity", "deviation", "random", "common")
     np.testing.assert_array_equal(kept[:, 3], 2 * kept[:, 0])
     ends = np.cumsum(sizes)
     piece = np.searchsorted(ends, kept[:, 0], side="right")
     unknown = np.array([sizes[k] % 2 == 1 for k in piece], dtype=bool)
     np.testing.assert_array_equal(kept[:, 4], np.where(unknown, np.nan, kept[:, 0] + 0.5))
-    assert np.isnan(kept[:, 5]).all()
+    assert np.isnan(kept[:, 5:]).all()
 
 
 @given(at_most=st.integers(1, 50), sizes=PIECES, far=st.sampled_from([0.0, 1e6, -3e7]))
@@ -74,15 +74,15 @@ def test_packed_points_are_unpacked_unchanged(at_most: int, sizes: list[int], fa
     cloud, total = ThinnedCloud(at_most), 0
     for size in sizes:
         piece = points(total, size) + [far, 0, -far]
-        cloud.add(piece, uncertainty=np.full(size, 0.125))
+        cloud.add(piece, random=np.full(size, 0.125))
         total += size
     origin, data = pack(cloud.points())
-    kept, table = cloud.points(), np.frombuffer(data, "<f4").reshape(-1, 6)
+    kept, table = cloud.points(), np.frombuffer(data, "<f4").reshape(-1, 7)
     assert origin.shape == (3,) and (origin == np.round(origin)).all()
     assert len(table) == len(kept)
     # Relative to the origin coordinates are small, so that a float32 keeps them to some um for distant clouds, too.
     np.testing.assert_allclose(table[:, :3] + origin, kept[:, :3], rtol=0, atol=2e-4)
-    assert (table[:, 5] == 0.125).all() and np.isnan(table[:, 3:5]).all()
+    assert (table[:, 5] == 0.125).all() and np.isnan(table[:, [3, 4, 6]]).all()
     if len(kept):
         np.testing.assert_allclose(origin, np.median(kept[:, :3], axis=0), atol=0.5)
 

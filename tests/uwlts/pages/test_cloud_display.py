@@ -24,11 +24,11 @@ def ramp(count: int = COUNT) -> PointCloud:
     x, y = rng.uniform(-50, 50, (2, count))
     along = (x + 50) / 100
     points, none = np.column_stack([x, y, 300 + 40 * along]), np.full(count, -1)
-    return PointCloud(points, 200 * along, none, none, normal_std_mm=0.01 + 0.02 * along)
+    return PointCloud(points, 200 * along, none, none, common_std_mm=0.01 + 0.02 * along)
 
 
 def test_several_views_draw_in_frames_of_one_page_without_the_network(tmp_path: Path, chromium):
-    cloud, fields = ramp(), ("depth", "uncertainty", "intensity")
+    cloud, fields = ramp(), ("depth", "common", "intensity")
     displays = [display_points(cloud.points_mm, field, cloud.field_values(field)) for field in fields]
     frames = "".join(each._repr_html_() for each in displays)
     assert frames.count('sandbox="allow-scripts"') == len(fields)
@@ -77,11 +77,11 @@ def test_a_script_writes_a_page_and_opens_it(tmp_path: Path, installed: bool):
 
 def test_large_clouds_are_sampled_and_unknown_values_stay_unknown():
     points = np.random.default_rng(5).normal(size=(MOST_SHOWN + 100, 3))
-    chosen, caption = choose_points(points, "uncertainty", None, most=MOST_SHOWN)
+    chosen, caption = choose_points(points, "random", None, most=MOST_SHOWN)
     assert len(chosen.points_mm) == MOST_SHOWN and chosen.values is not None and np.isnan(chosen.values).all()
     assert caption.startswith("200,000 of 200,100 points, drawn at random.")
 
 
 def test_another_colour_is_refused():
-    with pytest.raises(ArgumentError, match="`colour` is 'red'.*'depth', 'intensity' or 'uncertainty'"):
+    with pytest.raises(ArgumentError, match="`colour` is 'red'.*'depth', 'intensity', 'random' or 'common'"):
         ramp(3).show("red")  # pyright: ignore[reportArgumentType]

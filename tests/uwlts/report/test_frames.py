@@ -117,7 +117,7 @@ def test_points_of_a_cloud():
     ]
     np.testing.assert_array_equal(frame[["x_mm", "y_mm", "z_mm"]], [[0, 1, 2], [3, 4, 5]])
     np.testing.assert_allclose(frame[["std_x_mm", "std_y_mm", "std_z_mm"]], [[1, 2, 3]] * 2)
-    assert "normal_std_mm" in uwlts.report.to_frame(cloud_of(2, normal_std_mm=np.ones(2)))
+    assert "common_std_mm" in uwlts.report.to_frame(cloud_of(2, common_std_mm=np.ones(2)))
 
 
 def test_designs_of_a_sweep_and_lists_of_records(tmp_path: Path):

@@ -130,14 +130,14 @@ def test_the_cloud_picture_shows_both_signs_on_their_sides():
     assert red[:, 1].mean() > blue[:, 1].mean() + 200
 
 
-@pytest.mark.parametrize("colour", ["deviation", "depth", "intensity", "uncertainty"])
+@pytest.mark.parametrize("colour", ["deviation", "depth", "intensity", "random", "common"])
 def test_clouds_are_coloured_by_any_known_attribute(colour):
     nothing = np.zeros(3, int)
     cloud = PointCloud(np.eye(3), np.array([10.0, 20.0, 30.0]), nothing, nothing)
     ax = plot.cloud(cloud, colour=colour)
     (drawn,) = ax.collections
     # Without deviations or uncertainties all points have one colour.
-    assert (drawn.get_array() is None) == (colour in ("deviation", "uncertainty"))
+    assert (drawn.get_array() is None) == (colour in ("deviation", "random", "common"))
     if colour == "intensity":
         assert sorted(drawn.get_array()) == [10, 20, 30]
 
