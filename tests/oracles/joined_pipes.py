@@ -121,6 +121,11 @@ class Weld:
     part: Part
 
 
+_LOW, _HIGH = np.sqrt(1 - 0.1), np.sqrt(1 - 0.5)
+TOES = float(_LOW + 0.1 * (_LOW - _HIGH) / (0.5 - 0.1))
+"""Distance of the toes of a parabola divided by its width: lines through 10 and 50 % of its height end beyond its foot."""
+
+
 def weld(rng: np.random.Generator) -> Weld:
     """A girth or seam weld of a pipe: 6 to 12 point spacings wide, 1 to 4 % of the radius high."""
     radius = float(rng.uniform(60, 160))
@@ -142,7 +147,7 @@ def weld(rng: np.random.Generator) -> Weld:
             return np.abs(at - along - bead.lean_mm * np.cos(around)) < width
         return np.abs(radius * np.angle(np.exp(1j * (around - angle)))) < width
 
-    truth = Truth(values={"height": height, "width": width}, covers=covers)
+    truth = Truth(values={"height": height, "width": TOES * width}, covers=covers)
     return Weld(bead, Part(points_mm=pipe.points_mm, frame=pipe.frame, line=pipe.line, truths=(truth,)))
 
 

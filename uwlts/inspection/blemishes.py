@@ -28,6 +28,7 @@ from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication
 from uwlts.inspection.features import BIAS_STD, COVERAGE, COVERAGE_FACTOR, SEED, FeatureKind, FeatureValue, plain_value
+from uwlts.inspection.noisy_extremes import BIAS_FACTOR
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +46,8 @@ class BlemishRule:
     """Exponents p of simulated bells (1 - t^2)^p, from a paraboloid with a sharp edge to a bell with a flat edge."""
     bandwidth: float = 0.35
     """Radius of the local quadratic, in radii of the blemish: it lowers the depth of a bell by 0.3 %."""
+    narrow: float = 1.4
+    """Radius of the local quadratic in rough ground, in radii of the smallest indication: two dozen points."""
     points: int = 150
     """Most points in a local quadratic, whose radius is reduced to this: its noise is a sixth of one point's."""
     ring: float = 0.6  # width of the surroundings, in radii of the blemish
@@ -58,6 +61,10 @@ class BlemishRule:
     paraboloid. It gives the radius of the deepest hollow of a blemish of any outline."""
     compact: float = 0.45
     """Least radius of the deepest hollow, in half the largest extent, of a blemish that is simulated as a bell."""
+    off_bell: float = 0.1
+    """Largest root mean square of depths beside those of a bell, divided by the depth, of a blemish that is simulated
+    as a bell: cosine, paraboloid and normal distribution have less than 0.05. Chosen on seeds 0 to 9 of
+    docs/studies/inspection_verdicts.py."""
     single: float = 0.75
     """Radius of the deepest hollow, in radii of the blemish, from which the blemish is this hollow."""
     beyond: float = 1.5
@@ -133,10 +140,9 @@ def measure_blemish(
     Raises EvaluationError if too few points around the indication determine the undamaged surface, and
     NotSignificantError if its depth, length or width is not significant.
     """
-    field, sign = _Field.about(surface, search, indication), float(np.sign(indication.height_mm))
-    # The deepest hollow of a gouge or an area of corrosion is far smaller than these.
-    local = field.hollow_radius(sign * surface.heights[field.near], indication.noise_mm)
-    field = _Field.about(surface, search, indication, local_mm=local)
+    sign = float(np.sign(indication.height_mm))
+    field, local, wide_depth = _choose_field(surface, search, indication)
+    is_bell = wide_depth is None
     heights = sign * surface.heights[field.near]
     depths = field.depths(heights)
     deepest, between = field.find_deepest(heights)
@@ -154,22 +160,30 @@ def measure_blemish(
     seen[0] += between
     # Errors of simulated blemishes of this size, measured at these points: noise, sampling and smoothing. One of
     # another outline than a bell is its own model.
-    wrong, is_bell = [], local >= 0.5 * _RULE.compact * float(np.max(seen[1:3]))
+    bells = [_Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, p) for p in _RULE.exponents]
+    wrong: list[np.ndarray] = []
     own_heights = field.seen @ np.where(field.region, depths, 0.0)
     for move in moves:
         if not is_bell:
             wrong.append(field.measure(own_heights + move, edge) - seen)
             continue
-        bell = _Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, rng)
+        bell = bells[rng.integers(len(bells))]
         shift = rng.uniform(-0.5, 0.5, 2) * search.smallest_mm
         wrong.append(field.measure(field.observe(bell, shift) + move, edge) - bell.figures(edge))
     low, bias, high = np.quantile(wrong, [0.5 - 0.5 * COVERAGE, 0.5, 0.5 + 0.5 * COVERAGE], axis=0)
     random = 0.5 * (high - low) / COVERAGE_FACTOR
+    # Uncertainty by the footprints' size and, without a known form, by a second correction of the smoothing and by the
+    # width of its quadratics.
+    again: list[dict[str, Any]] = [{"share": 1 - field.footprint_std}] + [{"steps": 2}] * (not is_bell)
+    resolved = np.array([field.figures(field.depths(heights, **each), edge, deepest) - seen for each in again])
+    resolved[:, 0] += between
+    if wide_depth is not None:
+        resolved = np.vstack([resolved, [wide_depth - seen[0], 0, 0, 0, 0]])
+        # This model has the noise already, whose bias increases in proportion to its standard deviation.
+        smoothed = field.measure(own_heights, edge) - seen
+        bias = smoothed + BIAS_FACTOR * (bias - smoothed)
     plain = np.maximum(seen - bias, 0)
-    # Uncertainty by the footprints' size.
-    resolved = field.figures(field.depths(heights, share=1 - field.footprint_std), edge, deepest) - seen
-    resolved[0] += between
-    without_bias = np.hypot(random, resolved)
+    without_bias = np.hypot(random, np.linalg.norm(resolved, axis=0))
     random = np.hypot(without_bias, BIAS_STD * bias)
 
     def changed(pattern: np.ndarray) -> np.ndarray:
@@ -224,6 +238,34 @@ def measure_blemish(
     )
 
 
+def _choose_field(
+    surface: UnrolledSurface, search: BlemishSearch, indication: Indication
+) -> tuple[_Field, float, float | None]:
+    """Return the field of an indication, the radius of its deepest hollow, and None for the form of a bell.
+
+    The deepest hollow of a gouge or an area of corrosion is far smaller than these. Rough ground has narrow quadratics;
+    the depth by those of its size is returned.
+    """
+    field = _Field.about(surface, search, indication)
+    heights = float(np.sign(indication.height_mm)) * surface.heights[field.near]
+    local = field.hollow_radius(heights, indication.noise_mm)
+    field = _Field.about(surface, search, indication, local_mm=local)
+    depths, noise = field.depths(heights), field.noise_of_means(indication.noise_mm)
+    deepest, between = field.find_deepest(heights)
+    depth = float(depths[deepest]) + between
+    edge = max(SEARCH_RULE.edge_share * depth, SEARCH_RULE.edge_std * float(np.median(noise[field.region])))
+    seen = field.figures(depths, edge, deepest)
+    if local < 0.5 * _RULE.compact * float(np.max(seen[1:3])):
+        return field, local, depth
+    bells = [_Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, p) for p in _RULE.exponents]
+    off = min(field.mean_square(depths - bell.depths_at(field.grid)) for bell in bells)
+    # A correction increases the variance of the noise, by up to four.
+    if off < (_RULE.off_bell * depth) ** 2 + 4 * field.mean_square(noise):
+        return field, local, None
+    narrow = _RULE.narrow * search.smallest_mm / _RULE.bandwidth
+    return _Field.about(surface, search, indication, local_mm=narrow), local, depth
+
+
 @dataclass(frozen=True, eq=False)
 class _Bell:
     """Blemish of depth (1 - t^2)^p and elliptic outline, with half axes (2,) about a middle (2,), mm."""
@@ -234,14 +276,11 @@ class _Bell:
     exponent: int
 
     @classmethod
-    def resembling(
-        cls, seen: np.ndarray, edge: float, middle: np.ndarray, radius: float, rng: np.random.Generator
-    ) -> _Bell:
+    def resembling(cls, seen: np.ndarray, edge: float, middle: np.ndarray, radius: float, exponent: int) -> _Bell:
         """Return a bell with the measured depth, length and width at an edge.
 
         The half axes equal the radius if the measured sizes are zero.
         """
-        exponent = int(rng.choice(_RULE.exponents))
         rim = float(np.sqrt(1 - min(edge / seen[0], 0.99) ** (1 / exponent)))
         half = np.where(seen[1:3] > 0, 0.5 * seen[1:3] / rim, radius)
         return cls(middle, half, float(seen[0]), exponent)
@@ -368,8 +407,7 @@ class _Field:
         smooth = self.depths(heights, steps=0)
         top = int(np.argmax(np.where(self.region, smooth, -np.inf)))
         away = np.hypot(*(self.grid - self.grid[top]).T)
-        std = noise_mm * np.sqrt(np.asarray(self.smooth.power(2).sum(axis=1)).ravel())
-        below = smooth < 0.5 * smooth[top] - SEARCH_RULE.edge_std * std
+        below = smooth < 0.5 * smooth[top] - SEARCH_RULE.edge_std * self.noise_of_means(noise_mm)
         half = float(np.min(away, where=below, initial=float(away.max())))
         return half / _RULE.half_depth
 
@@ -394,6 +432,14 @@ class _Field:
         if np.count_nonzero(own) < SEARCH_RULE.points_in_smallest:
             return f"not sized: {np.count_nonzero(own)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
         return None
+
+    def noise_of_means(self, noise_mm: float) -> np.ndarray:
+        """Return the standard deviations (G,) of the smooth surface by the noise of independent points."""
+        return noise_mm * np.sqrt(np.asarray(self.smooth.power(2).sum(axis=1)).ravel())
+
+    def mean_square(self, depths: np.ndarray) -> float:
+        """Return the mean square of depths (G,) in the region."""
+        return float(np.mean(np.square(depths[self.region])))
 
     def measure(self, heights: np.ndarray, edge: float) -> np.ndarray:
         """Return the figures for point heights (n,), at their own deepest place."""

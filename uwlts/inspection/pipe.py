@@ -279,6 +279,9 @@ def _blemish_features(
             notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
             return False
         except EvaluationError as error:
+            if any(np.isin(points, whole.own.points).all() and indication is not whole.own for whole, _ in large):
+                notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
+                return False
             add_unsized(points, indication.height_mm, 0.0, str(error))
             return False
         measured.append((blemish, middle, indication.false_alarm))

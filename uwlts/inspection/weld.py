@@ -71,6 +71,8 @@ class WeldRule:
     fewest_beside: int = 50  # fewest points of each plate, and of an estimate of the local scatter
     groove_outside: float = 0.35  # width of the search for an undercut outside the toe, in bead widths
     groove_inside: float = 0.05  # width of this search inside the toe, in bead widths
+    exponents: tuple[int, ...] = (1, 2)
+    """Exponents p of simulated beads (1 - t^2)^p, from a parabola with sharp toes to a bell with flat ones."""
     whole_height: float = 0.7
     """Fraction of the median height below which a section belongs to the bead's ends and is left out."""
     significant: float = 4.0  # least height of a bead, in standard deviations of the plates' points
@@ -358,8 +360,12 @@ def measure_bead(bead: Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, .
         values_of(_evaluate_figures(bead, bead.raw_mm, whole, toes, share=1 - bead.footprint_std)),
     ]
     resolved = np.nan_to_num(np.array(resolution) - seen)
-    fixed = np.sqrt((BIAS_STD * bias) ** 2 + np.sum(resolved**2, axis=0))
-    plain = np.where(extremes, np.maximum(seen - bias, 0), seen)
+    # Where points are far apart, smoothing widens the bead: the middle of the errors on beads of known forms is
+    # subtracted, and their largest distance from it belongs to the uncertainty, as the form is unknown.
+    of_forms = _simulate_forms(bead, seen, whole, toes)
+    form, spread = 0.5 * (of_forms.max(axis=0) + of_forms.min(axis=0)), 0.5 * np.ptp(of_forms, axis=0)
+    fixed = np.sqrt((BIAS_STD * bias) ** 2 + (BIAS_STD * form) ** 2 + spread**2 + np.sum(resolved**2, axis=0))
+    plain = np.where(extremes, np.maximum(seen - bias - form, 0), seen - form)
     common = errors.by_patterns(
         lambda pattern: values_of(_evaluate_figures(bead, bead.raw_mm + pattern, whole, toes)) - seen
     )
@@ -431,6 +437,29 @@ def _evaluate_figures(
     offset = abs(middle[1] - middle[0])
     values = np.array([float(np.mean(tops)), np.nan, width, *means, np.nan, *angles, offset])
     return _Figures(values, crest, (grooves[0], grooves[1]))
+
+
+def _simulate_forms(bead: Bead, seen: np.ndarray, whole: np.ndarray, toes: np.ndarray) -> np.ndarray:
+    """Return the errors (E, 9) of values at beads H (1 - t^2)^p of the seen height H and width, for several p."""
+    height, width = seen[_NAMES.index("height")], seen[_NAMES.index("width")]
+    errors = np.zeros((len(_RULE.exponents), len(_NAMES)))
+    if not (height > 0 and width > 0):
+        return errors
+    grid = bead.profiles.across_mm - float(np.nanmean(toes))
+    for error, exponent in zip(errors, _RULE.exponents, strict=True):
+        low, high = (np.sqrt(1 - share ** (1 / exponent)) for share in (_RULE.flank_low, _RULE.flank_high))
+        steep = (_RULE.flank_high - _RULE.flank_low) / (low - high)
+        half = 0.5 * width / (low + _RULE.flank_low / steep)
+        profile = height * np.maximum(1 - np.square(grid / half), 0) ** exponent
+        found = _evaluate_figures(
+            bead, bead.profiles.seen @ np.tile(profile, bead.profiles.sections), whole, toes
+        ).values
+        angle = 180 - float(np.degrees(np.arctan(steep * height / half)))
+        for names, true in ((_NAMES[:2], height), (_NAMES[2:3], width), (_NAMES[6:8], angle)):
+            for name in names:
+                at = _NAMES.index(name)
+                error[at] = found[at if at != 1 else 0] - true
+    return np.nan_to_num(errors)
 
 
 def _find_undercuts(bead: Bead, profiles: np.ndarray, toes: np.ndarray, side: int) -> np.ndarray:

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 import uwlts
+from tests.oracles.joined_pipes import TOES
 from tests.oracles.pipes import Bump, WeldBead, scan_pipe
 from uwlts.inspection.features import FeatureKind
 from uwlts.inspection.pipe_welds import _find_ridges
 from uwlts.storage.cloud import PointCloud
 
 GATE, RADIUS_MM = 4.5, 80.0
+BEAD_GATE = 3.0
+"""Largest error of sizes of beads, in standard uncertainties: most of them is the unknown form, of limited effect."""
 CASES = [
     pytest.param(kind, seed, marks=[pytest.mark.slow] if seed > 31 else [])
     for kind in ("girth", "seam")
@@ -36,11 +39,10 @@ def test_a_weld_of_a_pipe_is_a_weld(kind: str, seed: int) -> None:
     found = uwlts.inspect_pipe(PointCloud(pipe.points_mm, np.ones(len(pipe.points_mm)), pipe.frame, pipe.line))
     (weld,) = found.select(FeatureKind.WELD)
     assert weld.name == f"{kind} weld 1"
-    # The largest height of a profile is above the mean crest by its noise; lines are 1.4 mm apart.
-    assert weld["height"].value == pytest.approx(height, abs=GATE * weld["height"].uncertainty + 0.01 * height)
-    assert weld["height"].uncertainty < 0.05 * height
-    # The line through a parabola's flank ends 1 % beyond its foot, and lines 1.4 mm apart see both ends.
-    assert weld["width"].value == pytest.approx(1.01 * width, abs=1.4 / np.sqrt(12) * 2)
+    for name, truth, largest in (("height", height, 0.05), ("width", TOES * width, 0.1)):
+        value = weld[name]
+        assert value.value == pytest.approx(truth, abs=BEAD_GATE * value.uncertainty), value
+        assert value.uncertainty < largest * truth
     place, around = pipe.own_places(weld.place_mm)
     if kind == "girth":
         assert place[0] == pytest.approx(along + bead.lean_mm * np.cos(around[0]), abs=1.0)
