@@ -85,15 +85,11 @@ class LargeBlemish:
         return [each for each in self.search.indications if not np.isin(self.chosen[each.points], taken).any()]
 
     def is_rough(self, share: float) -> bool:
-        """Return whether the ground of a hollow is rough: hollows and raised parts cover a share of it."""
+        """Return whether the ground of a hollow is rough: hollows cover a share of it, or parts of it are raised."""
         parts = [each for each in self.search.indications if not self.is_form(each)]
         inside = [each for each in parts if np.isin(self.chosen[each.points], self.own.points).mean() > 0.5]
-        return sum(len(each.points) for each in inside) > share * len(self.own.points)
-
-    def is_raised(self, indication: Indication) -> bool:
-        """Return whether an indication is a raised part of a hollow that stays below the undamaged surface."""
-        beneath = float(np.median(self.height_mm[indication.points]))
-        return indication.height_mm * self.own.height_mm < 0 < beneath * (beneath + indication.height_mm)
+        covered = sum(len(each.points) for each in inside) / len(self.own.points)
+        return covered > share or any(each.height_mm * self.own.height_mm < 0 for each in inside)
 
     def is_form(self, indication: Indication) -> bool:
         """Return whether an indication of the window belongs to the form of the large one.

@@ -302,13 +302,13 @@ def _blemish_features(
     taken = np.zeros(len(chosen), bool)
     for whole, middle in large:
         parts = whole.parts_beside(search.indications)
-        formed = [abs(part.height_mm) for part in parts if whole.is_form(part) or whole.is_raised(part)]
+        formed = [abs(part.height_mm) for part in parts if whole.is_form(part)]
         if formed:
             reason = f"{len(formed)} departures of up to {max(formed):.2g} mm from a smooth surface belong to its form"
             notes.append(_note_large(cloud, chosen[whole.own.points], whole.own.height_mm, reason))
         for part in parts:
             points = whole.chosen[part.points]
-            if not (taken[points].any() or whole.is_form(part) or whole.is_raised(part)):
+            if not taken[points].any() and not whole.is_form(part):
                 taken[points] = measure(part, points, middle, partial(whole.measure, part, errors, **sizes))
         for each in whole.search.unresolved:
             if (point := whole.chosen[each.point]) in whole.own.points:

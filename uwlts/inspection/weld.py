@@ -404,8 +404,17 @@ def _mask_beside_bead(bead: Bead, profiles: np.ndarray) -> np.ndarray:
 
 
 def _find_tops(bead: Bead, profiles: np.ndarray) -> np.ndarray:
-    """Return the largest height (S,) of each profile between the toes; -inf if it is unknown."""
-    return np.max(_mask_beside_bead(bead, profiles), axis=1)
+    """Return the largest height (S,) of each profile between the toes; -inf if it is unknown.
+
+    A parabola through the highest place and its neighbours gives the height between places.
+    """
+    inside = _mask_beside_bead(bead, profiles)
+    peak = np.clip(np.argmax(inside, axis=1), 1, inside.shape[1] - 2)
+    before, top, after = (inside[np.arange(len(inside)), peak + step] for step in (-1, 0, 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bend, tilt = before + after - 2 * top, after - before
+        more = np.where(np.isfinite(bend) & (bend < 0) & (np.abs(tilt) <= -bend), -np.square(tilt) / (8 * bend), 0.0)
+    return np.max(inside, axis=1) + more
 
 
 def _find_toes(bead: Bead, profiles: np.ndarray, whole: np.ndarray) -> np.ndarray:
@@ -445,15 +454,15 @@ def _simulate_forms(bead: Bead, seen: np.ndarray, whole: np.ndarray, toes: np.nd
     errors = np.zeros((len(_RULE.exponents), len(_NAMES)))
     if not (height > 0 and width > 0):
         return errors
-    grid = bead.profiles.across_mm - float(np.nanmean(toes))
+    middle = np.full((bead.profiles.sections, 1), float(np.nanmean(toes)))
+    middle[whole, 0] = np.where(np.isfinite(toes).all(axis=1), toes.mean(axis=1), middle[whole, 0])
+    away = bead.profiles.across_mm - middle
     for error, exponent in zip(errors, _RULE.exponents, strict=True):
         low, high = (np.sqrt(1 - share ** (1 / exponent)) for share in (_RULE.flank_low, _RULE.flank_high))
         steep = (_RULE.flank_high - _RULE.flank_low) / (low - high)
         half = 0.5 * width / (low + _RULE.flank_low / steep)
-        profile = height * np.maximum(1 - np.square(grid / half), 0) ** exponent
-        found = _evaluate_figures(
-            bead, bead.profiles.seen @ np.tile(profile, bead.profiles.sections), whole, toes
-        ).values
+        raw = bead.profiles.seen @ (height * np.maximum(1 - np.square(away / half), 0) ** exponent).ravel()
+        found = _evaluate_figures(bead, raw, whole, toes).values
         angle = 180 - float(np.degrees(np.arctan(steep * height / half)))
         for names, true in ((_NAMES[:2], height), (_NAMES[2:3], width), (_NAMES[6:8], angle)):
             for name in names:
