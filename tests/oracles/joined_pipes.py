@@ -123,7 +123,7 @@ class Weld:
 
 _LOW, _HIGH = np.sqrt(1 - 0.1), np.sqrt(1 - 0.5)
 TOES = float(_LOW + 0.1 * (_LOW - _HIGH) / (0.5 - 0.1))
-"""Distance of the toes of a parabola divided by its width: lines through 10 and 50 % of its height end beyond its foot."""
+"""Distance of the toes of a parabola divided by its width: lines through 10 and 50 % of its height end beyond it."""
 
 
 def weld(rng: np.random.Generator) -> Weld:
