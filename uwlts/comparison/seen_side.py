@@ -21,7 +21,7 @@ as the part is thick must cover more than this fraction of a face to be mistaken
 def orient_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return faces (F, 3) whose normals agree across edges, in each connected part with most of its area unchanged.
 
-    Parts that have only one side, such as a Moebius strip, are unchanged.
+    Parts that have only one side, such as a Moebius strip, are unchanged. Normals of a closed mesh point outwards.
     """
     joined = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces]
     edges, face = joined[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), np.repeat(np.arange(len(faces)), 3)
@@ -41,6 +41,9 @@ def orient_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     turn = kept[part[many:]] > kept[part[:many]]
     result = faces.copy()
     result[turn] = faces[turn][:, ::-1]
+    corners = vertices[result] - vertices[faces].mean(axis=(0, 1))
+    if (count == 2).all() and np.linalg.det(corners).sum() < 0:
+        return result[:, ::-1]
     return result
 
 
