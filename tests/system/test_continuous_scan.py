@@ -112,9 +112,12 @@ def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_
         assert "measured" in said[-1]
         error_s = (capture.stage_mm - true_places(capture, hill)) / capture.speed_mm_per_s
         scatter_s = float(said[-1].split("scatter by ")[1].split(" ms")[0]) * 1e-3
-        # 0.2 ms; on a busy machine five standard errors of a pass's position from its reports, at least four.
-        allowed_s = max(2e-4, 5 * scatter_s / np.sqrt(4))
-        assert np.abs(error_s).max() < allowed_s
+        # 0.2 ms; on a busy machine five standard errors of a pass's position from its reports, at least four. Between
+        # frames that are missing, the surface is interpolated; the hill's flanks are 12 mm wide.
+        there = capture.speed_mm_per_s > 0
+        gaps_s = [np.diff(np.sort(capture.time_s[way])).max() for way in (there, ~there)]
+        allowed_s = max(2e-4, 5 * scatter_s / np.sqrt(4), 0.2 * (max(gaps_s) - 3 * STEP_MM / SPEED))
+        assert np.abs(error_s).max() < allowed_s, f"{len(capture)} frames, gaps {gaps_s} s, {said[-1]}"
 
 
 @pytest.mark.slow
