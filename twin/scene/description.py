@@ -41,7 +41,7 @@ def replace_values(described: Kind, **changes: object) -> Kind:
     )
 
 
-class Sphere(SceneObject):
+class Ball(SceneObject):
     """A sphere centred at its own origin."""
 
     kind: Literal["sphere"]
@@ -211,7 +211,7 @@ class TargetPlate(PrintedPlate):
 
 
 AnyObject = Annotated[
-    Sphere | Plate | Block | Pipe | Mesh | CirclePlate | TargetPlate | AnyForm, Field(discriminator="kind")
+    Ball | Plate | Block | Pipe | Mesh | CirclePlate | TargetPlate | AnyForm, Field(discriminator="kind")
 ]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
-from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Plate, Scene, Sphere, TargetPlate
+from twin.scene.description import AnyObject, Ball, Block, CirclePlate, Mesh, Pipe, Plate, Scene, TargetPlate
 from twin.scene.finish import albedo_parts, body_spread, finish_bsdf, register_textures, view_along_normal
 from twin.scene.forms.triangles import bowed_plate, rounded_box
 from twin.scene.scene_object import FreeForm
@@ -208,7 +208,7 @@ def _by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
 def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
     """Return the shape of an object at its pose (4, 4) in the scene."""
     match thing:
-        case Sphere():
+        case Ball():
             matrix = pose.copy()
             if thing.texture is None:
                 matrix[:3, :3] = np.eye(3)  # Mitsuba mistakes rounding errors of a rotated sphere for shear
@@ -332,7 +332,7 @@ def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
         case Plate():
             half = np.array([thing.width_mm, thing.height_mm]) / 2
             yield MirrorFace(pose @ _FACING_SENSOR, half, thing.mirror_share())
-        case Sphere() | Pipe() | Mesh() | CirclePlate() | TargetPlate() | FreeForm():
+        case Ball() | Pipe() | Mesh() | CirclePlate() | TargetPlate() | FreeForm():
             raise NotImplementedError(f"a {thing.kind} has no flat face that could be a mirror")
         case _:
             assert_never(thing)

@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import ui
 
 from uwlts.desk.cloud_view import CloudView
-from uwlts.desk.shown_state import KEPT_LINES, Board, LaserState, Line, Picture
+from uwlts.desk.shown_state import KEPT_LINES, Board, LaserState, Picture, ShownLine
 from uwlts.desk.thinned_cloud import FIELDS
 
 _REFRESH_S = 0.2  # five times a second looks immediate
@@ -126,7 +126,7 @@ def _progress_text(board: Board) -> str:
     return text if place is None else f"{text} · stage at {place:.3f} mm"
 
 
-def _line_text(line: Line) -> str:
+def _line_text(line: ShownLine) -> str:
     kind = "" if line.kind == "note" else f"{line.kind}: "
     return f"{time.strftime('%H:%M:%S', time.localtime(line.time_s))}  {kind}{line.text}"
 

@@ -71,7 +71,7 @@ def _encode(picture: np.ndarray, suffix: str) -> bytes:
 
 
 @dataclass(frozen=True)
-class Line:
+class ShownLine:
     """A line of the page's log."""
 
     number: int
@@ -119,16 +119,16 @@ class Board:
     profile: FrameProfile | None = None
 
     def __post_init__(self) -> None:
-        self._lines: deque[Line] = deque(maxlen=KEPT_LINES)
+        self._lines: deque[ShownLine] = deque(maxlen=KEPT_LINES)
         self._lock, self._began_s = threading.Lock(), 0.0
 
     def say(self, text: str, kind: Kind = "note") -> None:
         """Add a line to the log."""
         with self._lock:
             number = self._lines[-1].number + 1 if self._lines else 0
-            self._lines.append(Line(number, time.time(), kind, text))
+            self._lines.append(ShownLine(number, time.time(), kind, text))
 
-    def lines(self, after: int = -1) -> list[Line]:
+    def lines(self, after: int = -1) -> list[ShownLine]:
         """Return the log's lines with higher numbers."""
         with self._lock:
             return [line for line in self._lines if line.number > after]

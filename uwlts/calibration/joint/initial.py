@@ -15,9 +15,9 @@ from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
 from uwlts.calibration.joint.residuals import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import (
     LEAST_SHARE,
-    Cylinder,
-    Plane,
-    Spheres,
+    ScannedPipe,
+    ScannedPlane,
+    ScannedSpheres,
     Surface,
     SurfaceScanEvidence,
     perpendicular_directions,
@@ -398,7 +398,7 @@ def _fit_surface(
             diameters = np.array([sphere.diameter_mm for sphere in spheres.spheres])
             off = np.abs(np.linalg.norm(points[used][:, None] - centres, axis=2) - diameters / 2)
             nominal, spacings = np.array(artefact.diameters_mm), np.array(artefact.spacings_mm)
-            surface = Spheres(
+            surface = ScannedSpheres(
                 diameters_mm=nominal,
                 diameter_std_mm=np.full(len(nominal), std(artefact.diameter_uncertainty_mm)),
                 spacings_mm=spacings,
@@ -409,12 +409,14 @@ def _fit_surface(
         case PlaneStandard():
             plane = evaluate_plane(points, artefact)
             normal = np.array(plane.normal)
-            surface = Plane(in_camera(plane.point_mm), rotation @ normal, perpendicular_directions(normal) @ rotation.T)
+            surface = ScannedPlane(
+                in_camera(plane.point_mm), rotation @ normal, perpendicular_directions(normal) @ rotation.T
+            )
             return np.isfinite(plane.deviation_mm), surface, np.zeros(3)
         case PipeStandard():
             pipe = evaluate_pipe(points, artefact)
             axis = np.array(pipe.axis)
-            surface = Cylinder(
+            surface = ScannedPipe(
                 point_mm=in_camera(pipe.point_mm),
                 axis=rotation @ axis,
                 across=perpendicular_directions(axis) @ rotation.T,

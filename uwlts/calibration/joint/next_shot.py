@@ -18,7 +18,7 @@ from uwlts.calibration.joint.observability import (
 )
 from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
-from uwlts.calibration.joint.scanned_surfaces import SLOPES, Spheres, SurfaceScanEvidence
+from uwlts.calibration.joint.scanned_surfaces import SLOPES, ScannedSpheres, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, require_joint
 from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, eliminate_others, rank_candidates
 from uwlts.model.calibration import Calibration, rigid_transform
@@ -224,7 +224,7 @@ def _simulate_spheres(known: StoredEstimate, depth_mm: float, uncertainty: Uncer
         across=known.across(),
         beside_mm=np.zeros((3, sum(counts))),
         common_px=np.full(sum(counts), _ON_SPHERES_PX),
-        surface=Spheres(np.full(SPHERES, SPHERE_MM), unknown, apart, unknown[1:], sphere),
+        surface=ScannedSpheres(np.full(SPHERES, SPHERE_MM), unknown, apart, unknown[1:], sphere),
         frame=np.repeat(np.repeat(np.arange(_SPHERE_IMAGES), SPHERES), counts),
         stage_mm=positions,
         direction=frame[:3, 0],

@@ -8,7 +8,7 @@ from pydantic import JsonValue
 from uwlts.calibration.joint.estimate import Estimate
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly
 from uwlts.calibration.joint.policy import solve_consistently
-from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
+from uwlts.calibration.joint.scanned_surfaces import ScannedPlane, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import build_calibration
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
@@ -63,7 +63,9 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
         "warnings": [*warnings],
     }
     calibration = build_calibration(result, problem.evidence, sensor, list(gathered.media.values()), provenance)
-    scans = [e for e in problem.evidence if isinstance(e, SurfaceScanEvidence) and not isinstance(e.surface, Plane)]
+    scans = [
+        e for e in problem.evidence if isinstance(e, SurfaceScanEvidence) and not isinstance(e.surface, ScannedPlane)
+    ]
     if scans:
         direction = scans[0].stage_direction(problem.parameters, result.values)[0]
         stage = KnownStage(

@@ -65,7 +65,7 @@ class Surface(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class Spheres(Surface):
+class ScannedSpheres(Surface):
     """S spheres. Local parameters: centres in mm, then deviations of the diameters from ``diameters_mm`` (S,).
 
     ``spacings_mm`` (S - 1,) are the distances of consecutive centres. Standard uncertainties are infinite for unknown
@@ -125,7 +125,7 @@ class Spheres(Surface):
 
 
 @dataclass(frozen=True, eq=False)
-class Plane(Surface):
+class ScannedPlane(Surface):
     """Plane near the one through ``point_mm`` (3,) with the unit ``normal`` (3,).
 
     Local parameters: two slopes of its normal towards the unit vectors ``across`` (2, 3), and its distance in mm from
@@ -149,7 +149,7 @@ class Plane(Surface):
 
 
 @dataclass(frozen=True, eq=False)
-class Cylinder(Surface):
+class ScannedPipe(Surface):
     """Cylinder near the one with the unit ``axis`` (3,) through ``point_mm`` (3,), seen from outside or inside.
 
     Local parameters: two shifts of its axis in mm at the point and two slopes, along the unit vectors ``across`` (2,
@@ -187,7 +187,7 @@ class Cylinder(Surface):
         return Distances(distance - 0.5 * (self.diameter_mm + local[4]), outward, by_local)
 
 
-SCANNED = (Spheres.kind, Plane.kind, Cylinder.kind)
+SCANNED = (ScannedSpheres.kind, ScannedPlane.kind, ScannedPipe.kind)
 """Names of residuals on these surfaces."""
 SLOPES = (StageParameter.SLOPE_1, StageParameter.SLOPE_2)
 """Slopes of the stage's direction relative to the described one, towards two perpendicular directions."""

@@ -19,7 +19,7 @@ from uwlts.calibration.joint.initial import build_all_scan_evidence, build_scan_
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.residuals import STEP, Residuals
-from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Spheres
+from uwlts.calibration.joint.scanned_surfaces import SLOPES, ScannedPipe, ScannedPlane, ScannedSpheres
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.fitting.schur_least_squares import LocalPrior
@@ -95,14 +95,14 @@ def true_own(kind, evidence):
     points = np.array([body.point for body in KINDS[kind][0]]) @ frame[:3, :3].T + frame[:3, 3]
     body = KINDS[kind][0][0]
     match surface:
-        case Spheres():
+        case ScannedSpheres():
             local = np.append(points.ravel(), np.zeros(surface.count))
-        case Plane():
+        case ScannedPlane():
             normal = frame[:3, :3] @ body.axis
             normal /= surface.normal @ normal
             distance = normal @ (points[0] - surface.point_mm) / np.linalg.norm(normal)
             local = np.append(surface.across @ normal, distance)
-        case Cylinder():
+        case ScannedPipe():
             axis = frame[:3, :3] @ body.axis
             axis /= surface.axis @ axis
             away = points[0] - surface.point_mm
@@ -220,7 +220,7 @@ def test_round_spheres_tell_the_stage_and_the_water(known):
         # The stated uncertainty includes errors common to a sphere's points, so it is far above that of 0.02 px noise.
         assert std[name] < 3e-3, name
     assert np.abs(result.local[0][6:8]).max() < (0.01 if known else 0.1)
-    assert result.noise[Spheres.kind].besides > 10
+    assert result.noise[ScannedSpheres.kind].besides > 10
 
 
 def test_a_known_spacing_is_a_length_in_water():
@@ -296,7 +296,7 @@ def test_all_kinds_together_with_a_target_in_water(thesis):
     camera = SENSOR.camera
     true = {"f": camera.focal_length_px(), "window_distance": camera.window.distance_mm, "index of water": WATER}
     assert max(abs(values[key] - true[key.text]) / std[key] for key in map(parse_parameter, true)) < 4.5
-    for kind in (Spheres.kind, Plane.kind, Cylinder.kind):
+    for kind in (ScannedSpheres.kind, ScannedPlane.kind, ScannedPipe.kind):
         assert found.noise[kind].sigma_px == pytest.approx(0.1, rel=0.1)
     frame = result.calibration.object_transform()
     moved, stage = stage_direction(SENSOR), result.calibration.stages[0]
