@@ -31,7 +31,6 @@ MEANING = {
         "--home": "Home the stage first",
         "--host": "Address of the page",
         "--index": "[Rr]efractive index",
-        "--joint": "joint|all parameters together",
         "--kind": "Kind of the object",
         "--medium": "One of the sensor's media",
         "--out": "to write|New folder",
@@ -45,7 +44,6 @@ MEANING = {
         "--pose-format": "euler-ZYX-deg",
         "--pose-unit": "Unit of the .*positions",
         "--poses": "[Pp]ose",
-        "--published": "[Pp]ublished",
         "--resume": "[Cc]ontinue an (earlier|interrupted)",
         "--section-mm": "section",
         "--sensor": "sensor description",
@@ -60,7 +58,6 @@ MEANING = {
         "--wall-mm": "wall",
         "--false-alarm": "Probability of any finding",
         "--largest-ovality": "ovality",
-        "--workers": "Number of .*(parallel|processes)",
     },
     "twin": {
         "--as-built": "sensor to render",
