@@ -30,8 +30,8 @@ from .reconstruction.reconstruct import reconstruct as reconstruct
 from .reconstruction.verify import verify as verify
 from .registration.register import register as register
 from .report import plot as plot
-from .report.any_file import read as read
-from .report.inventory import describe as describe
+from .report.file_description import describe as describe
+from .report.reading import read as read
 from .storage.capture import Capture as Capture
 from .storage.cloud import PointCloud as PointCloud
 from .storage.export_ import export as export

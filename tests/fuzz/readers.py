@@ -46,7 +46,7 @@ from uwlts.model.library import library_folder, load_sensor, read_table, validat
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.acceptance_page import acceptance_page
 from uwlts.report.certificate import check_certificate, make_certificate
-from uwlts.report.inventory import describe
+from uwlts.report.file_description import describe
 from uwlts.storage.calibration_file import load_calibration, read_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud

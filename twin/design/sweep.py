@@ -26,7 +26,7 @@ from twin.recording.campaigns import PLAN, require_at_least
 from twin.rendering_options import CPU, Variant
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import write_atomically
-from uwlts.model.brief import Brief
+from uwlts.model.short_text import Brief
 from uwlts.pages.toolkit import write_page
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import open_workers

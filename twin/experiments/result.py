@@ -13,7 +13,7 @@ from twin.experiments.detection import ProbabilityOfDetection
 from twin.scene.stated_deviations import Understated
 from uwlts._version import __version__
 from uwlts.files.json_files import write_model
-from uwlts.model.brief import Brief, align_columns
+from uwlts.model.short_text import Brief, align_columns
 from uwlts.pages.cloud_display import choose_points
 from uwlts.pages.toolkit import (
     BLUE,

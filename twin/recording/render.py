@@ -17,9 +17,9 @@ from twin.scene.campaign import AnySensor, choose_sensors
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import require_ending
-from uwlts.model.brief import Brief
 from uwlts.model.library import validate_description
 from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.short_text import Brief
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import CAPTURES
 from uwlts.storage.truth import Truth

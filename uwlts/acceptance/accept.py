@@ -28,7 +28,7 @@ from uwlts.files.reading import is_regular_file
 from uwlts.files.writing import hash_file
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.artefacts import PlaneStandard
-from uwlts.model.brief import Brief
+from uwlts.model.short_text import Brief
 from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration

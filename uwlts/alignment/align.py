@@ -25,8 +25,8 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError
 from uwlts.files.json_files import write_record
 from uwlts.fitting.least_squares import noise_factor
-from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.model.short_text import Brief
 from uwlts.model.trajectory import Trajectory, convert_to_platform_clock
 from uwlts.reconstruction.path_uncertainty import correct_path_uncertainty
 from uwlts.runtime.progress import ProgressListener, ignore_progress

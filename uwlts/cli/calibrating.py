@@ -41,7 +41,7 @@ def calibrate(
     from uwlts.calibration.camera.lens import require_coefficients
     from uwlts.calibration.joint.next_shot import advice_lines
     from uwlts.optics.window import require_index
-    from uwlts.report.inventory import calibration_lines
+    from uwlts.report.file_description import calibration_lines
 
     recorded = {}
     if live is not None:
@@ -103,7 +103,7 @@ def mount(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts mount profiles poses.csv --pose-format quaternion-wxyz --radius-mm 19.05 --out mount.json"""
-    from uwlts.report.inventory import mount_lines
+    from uwlts.report.file_description import mount_lines
 
     found = call()
     found.save(out, overwrite=overwrite)
@@ -133,7 +133,7 @@ def refresh(
 @command_from(app, uwlts, "calibrate_polynomials", job="Calibrate", shortcuts=STRIPE)
 def polynomials(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) -> None:
     """Example: uwlts polynomials --captures target-water.h5 --out polynomials.json"""
-    from uwlts.report.inventory import polynomial_lines
+    from uwlts.report.file_description import polynomial_lines
 
     found = call()
     found.calibration.save(out, overwrite=overwrite)

@@ -36,7 +36,7 @@ def evaluate(
 ) -> None:
     """Example: uwlts evaluate spheres.cloud.h5 --truth spheres.truth.h5 --out spheres.evaluation.json"""
     from uwlts.pages.cloud_figure import colour_limit_mm
-    from uwlts.report.inventory import evaluation_lines
+    from uwlts.report.file_description import evaluation_lines
 
     evaluation = call()
     evaluation.save(out, overwrite=overwrite)

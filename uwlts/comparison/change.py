@@ -27,8 +27,8 @@ from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, average_locally
 from uwlts.comparison.seen_side import select_seen_side
 from uwlts.errors import EvaluationError
 from uwlts.fitting.point_spacing import choose_disc_diameter, number_cubes
-from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.model.short_text import Brief
 from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface
 from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances, rounding_std_mm
 from uwlts.storage.cloud_files import load_cloud

@@ -36,7 +36,7 @@ from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, record_scan
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
-from uwlts.report.inventory import calibration_lines
+from uwlts.report.file_description import calibration_lines
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, Frame, drawable_image, part_path
 from uwlts.stripe import Stripe

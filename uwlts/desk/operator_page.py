@@ -29,7 +29,7 @@ from uwlts.errors import DescriptionError, Error
 from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
 from uwlts.model.library import validate_description
-from uwlts.report.inventory import describe
+from uwlts.report.file_description import describe
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_thinned_cloud

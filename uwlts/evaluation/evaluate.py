@@ -16,8 +16,8 @@ from uwlts.evaluation.truth_comparison import Count, StoredResult, TruthComparis
 from uwlts.files.json_files import EDITED, read_model, write_model
 from uwlts.fitting.least_squares import fit_rigid_transform
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
-from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.model.short_text import Brief
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.number_tables import Unit

@@ -9,8 +9,8 @@ from enum import StrEnum
 import numpy as np
 
 from uwlts.files.json_files import RecordFile
-from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.model.short_text import Brief
 from uwlts.storage.cloud import PointCloud, rounding_std_mm
 
 COVERAGE = 0.95

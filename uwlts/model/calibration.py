@@ -17,10 +17,10 @@ from pydantic import (
 from uwlts.argument_types import check_arguments
 from uwlts.errors import describe_problems
 from uwlts.files.json_files import write_model
-from uwlts.model.brief import Brief
 from uwlts.model.joint_estimate import JointEstimate, Origin
 from uwlts.model.parameter_keys import SheetParameter
 from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Table, UnitVector, Vector, Window
+from uwlts.model.short_text import Brief
 
 FORMAT, VERSION = "uwlts-calibration", 1
 

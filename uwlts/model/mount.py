@@ -8,9 +8,9 @@ from pydantic import Field, model_validator
 
 from uwlts.argument_types import check_arguments
 from uwlts.files.json_files import write_model
-from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Description, NotNegative, Positive, Rows, Vector
+from uwlts.model.short_text import Brief
 
 FORMAT, VERSION = "uwlts-mount", 1
 

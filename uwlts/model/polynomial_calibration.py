@@ -10,9 +10,9 @@ from pydantic import Field, model_validator
 from uwlts.argument_types import check_arguments
 from uwlts.files.json_files import add_seal
 from uwlts.files.writing import require_ending, write_atomically
-from uwlts.model.brief import Brief
 from uwlts.model.calibration import Residuals
 from uwlts.model.sensor import Description, Medium, Positive, Rows, Table
+from uwlts.model.short_text import Brief
 
 FORMAT, VERSION = "uwlts-polynomials", 1
 Pair = tuple[float, float]

@@ -14,8 +14,8 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError
 from uwlts.files.json_files import json_text, read_json
 from uwlts.files.writing import require_ending, write_atomically
-from uwlts.model.brief import Brief
 from uwlts.model.sensor import Sensor, Table
+from uwlts.model.short_text import Brief
 
 FORMAT, VERSION = "uwlts-radiometry", 1
 SIGNIFICANT = 3.0

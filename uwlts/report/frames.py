@@ -14,8 +14,8 @@ from uwlts.argument_types import union_members
 from uwlts.errors import ArgumentError
 from uwlts.evaluation.evaluate import Evaluation
 from uwlts.inspection.features import Inspection
-from uwlts.model.brief import Brief
 from uwlts.model.calibration import Calibration
+from uwlts.model.short_text import Brief
 from uwlts.report.parameters import parameter_rows
 from uwlts.runtime.optional_library import optional_library
 from uwlts.storage.cloud import NO_INDEX, PointCloud

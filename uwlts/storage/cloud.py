@@ -11,8 +11,8 @@ import numpy as np
 from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_plain
-from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.model.short_text import Brief
 from uwlts.pages.cloud_figure import CloudField
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

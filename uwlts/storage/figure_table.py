@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
-from uwlts.model.brief import Brief, align_columns
+from uwlts.model.short_text import Brief, align_columns
 from uwlts.runtime.optional_library import optional_library
 
 if TYPE_CHECKING:

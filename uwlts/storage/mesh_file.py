@@ -15,8 +15,8 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import log_warnings, open_regular, require_regular_file
 from uwlts.files.writing import write_atomically
-from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
+from uwlts.model.short_text import Brief
 from uwlts.storage.cloud import FARTHEST_SINGLE_MM
 from uwlts.storage.number_tables import Unit, choose_scale, find_stated_unit
 from uwlts.storage.ply import encode_ply, read_comments, read_ply

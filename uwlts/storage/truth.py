@@ -12,8 +12,8 @@ import numpy as np
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import write_atomically
-from uwlts.model.brief import Brief
 from uwlts.model.sensor import Description, Medium, Sensor, Table
+from uwlts.model.short_text import Brief
 from uwlts.storage.hdf5_file import DAMAGE, read_array, read_label, write_label
 
 FORMAT = "uwlts-truth"

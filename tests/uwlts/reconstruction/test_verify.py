@@ -5,7 +5,7 @@ import pytest
 
 import uwlts
 from uwlts.reconstruction.verify import find_undetectable_errors
-from uwlts.report.inventory import evaluation_lines
+from uwlts.report.file_description import evaluation_lines
 from uwlts.storage.cloud import PointCloud
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import uwlts
-from uwlts.report.inventory import trajectory_lines
+from uwlts.report.file_description import trajectory_lines
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.pose_files import read_poses
 

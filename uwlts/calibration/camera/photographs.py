@@ -22,8 +22,8 @@ from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
 from uwlts.files.reading import is_regular_file
 from uwlts.files.writing import write_atomically
-from uwlts.model.brief import Brief
 from uwlts.model.library import read_table
+from uwlts.model.short_text import Brief
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import DESCRIPTION_NAME, check_channel, extract_channel, image_files

@@ -26,11 +26,11 @@ from uwlts.calibration.joint.stored_estimate import (
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, sources_of
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.model.any_calibration import calibration_digest
-from uwlts.model.brief import Brief
 from uwlts.model.calibration import Calibration, KnownStage
 from uwlts.model.joint_estimate import CoveredRegion, JointEstimate, Origin
 from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Medium
+from uwlts.model.short_text import Brief
 from uwlts.optics.fitness import check_fits
 from uwlts.optics.window import require_index
 from uwlts.runtime.progress import ProgressListener, ignore_progress

@@ -1,7 +1,7 @@
 """Artefacts that a profiler on a platform may observe: detection in a profile, and distances from them.
 
-Each artefact is one class. Its start values are in `start`, its stored form in `uwlts.model.mount`. The values of an
-artefact form an array; its parameters are steps from these values.
+Each artefact is one class. Its start values are in `start_values`, its stored form in `uwlts.model.mount`. The values
+of an artefact form an array; its parameters are steps from these values.
 """
 
 from abc import ABC, abstractmethod

@@ -20,7 +20,7 @@ from uwlts.calibration.mount.restricted_likelihood import (
     settle,
     settle_agreeing,
 )
-from uwlts.calibration.mount.start import NoFit, start
+from uwlts.calibration.mount.start_values import NoFit, start
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose

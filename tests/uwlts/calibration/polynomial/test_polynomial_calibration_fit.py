@@ -27,7 +27,7 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_by_polynomials
 from uwlts.optics.window import RayStatus
 from uwlts.reconstruction.reconstruct import reconstruct
-from uwlts.report.inventory import describe
+from uwlts.report.file_description import describe
 from uwlts.runtime.console import run
 from uwlts.storage.calibration_file import load_calibration, read_polynomials
 from uwlts.storage.capture import Capture, CaptureHeader, Frame

@@ -14,7 +14,7 @@ from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, CalibrationResult, Evidence, solve
 from uwlts.model.placement import laser_pose
-from uwlts.report.inventory import calibration_lines
+from uwlts.report.file_description import calibration_lines
 
 BARE = altered(built_sensor(), {"camera": {"window": {"mounted": False}}})
 POSITIONS = np.arange(12) * 20.0

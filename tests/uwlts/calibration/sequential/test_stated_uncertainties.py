@@ -7,7 +7,7 @@ import pytest
 
 from uwlts.calibration.sequential.sequential_calibration import _uncertainty_warnings
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.report.inventory import calibration_lines
+from uwlts.report.file_description import calibration_lines
 
 
 def warnings_for(sensor, *, normal_deg, focal_share):

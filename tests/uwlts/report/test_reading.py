@@ -13,7 +13,7 @@ from uwlts.errors import CaptureError, OutputError
 from uwlts.evaluation.evaluate import Evaluation
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.report.inventory import describe
+from uwlts.report.file_description import describe
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.mesh_file import SurfaceMesh
 

@@ -8,7 +8,7 @@ import trimesh
 from uwlts.errors import CaptureError
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal
-from uwlts.report.inventory import calibration_lines, describe
+from uwlts.report.file_description import calibration_lines, describe
 
 
 @pytest.mark.parametrize(
