@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from tests.virtual_sensors import altered, camera_axes, laser_origin
-from twin.scene.description import AnyObject, Block, Pipe, Plate, Scene, Sphere
+from twin.scene.description import AnyObject, Ball, Block, Pipe, Plate, Scene
 from twin.scene.finish import finish_bsdf
 from uwlts.model.sensor import Medium, Sensor
 
@@ -212,7 +212,7 @@ def _shape(thing: AnyObject, pose: np.ndarray, sensor: Sensor, medium: Medium) -
     bsdf = finish_bsdf(thing, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength)
     at, scaled = mi.ScalarTransform4f(pose), mi.ScalarTransform4f().scale
     match thing:
-        case Sphere():
+        case Ball():
             return {"type": "sphere", "to_world": at @ scaled(thing.diameter_mm / 2), "bsdf": bsdf}
         case Block():
             return {"type": "cube", "to_world": at @ scaled([side / 2 for side in thing.size_mm]), "bsdf": bsdf}

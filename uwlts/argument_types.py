@@ -47,7 +47,7 @@ def protect_inputs(arguments: Mapping[str, object]) -> Iterator[None]:
     named = [name for key in arguments.keys() - _WRITTEN for name in _file_names(arguments[key])]
     token = _inputs.set((*_inputs.get(), *filter(os.path.isfile, named)))
     try:
-        for key in _WRITTEN.intersection(arguments):
+        for key in OUTPUTS.intersection(arguments):
             for name in _file_names(arguments[key]):
                 refuse_input(name)
         yield
