@@ -183,12 +183,12 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
 
 
 def holds_trajectory(path: Path) -> bool:
-    """Return whether a table has times and rotations of poses, rather than the points of a cloud."""
+    """Return whether a table has times and rotations of poses, or quaternions, rather than the points of a cloud."""
     columns = read_number_table(path, named=False).columns
     others = [values for name, values in columns.items() if name not in ("time_s", "x", "y", "z")]
     unit = len(others) == 4 and np.abs(np.square(others).sum(axis=0) - 1).max() < _ROUNDED
-    rotates = not columns.keys().isdisjoint(ROTATION_NAMES) or unit
-    return "time_s" in columns and bool(rotates or not {"x", "y", "z"} <= columns.keys())
+    rotates = unit or not columns.keys().isdisjoint(ROTATION_NAMES) or not {"x", "y", "z"} <= columns.keys()
+    return {"qx", "qy", "qz", "qw"} <= columns.keys() or ("time_s" in columns and bool(rotates))
 
 
 def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import uwlts
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
 from uwlts.calibration.joint.observability import SheetRegion, list_regions, project_sheet_points, read_region_estimate
@@ -106,7 +107,7 @@ def test_a_file_that_is_no_certificate_is_refused(path, tmp_path):
 
 def test_the_calibration_itself_is_never_replaced(path):
     with pytest.raises(OutputError, match="is an input"):
-        write_certificate(path, out=path.with_suffix(".html"), overwrite=True)
+        uwlts.report.write_certificate(path, out=path.with_suffix(".html"), overwrite=True)
 
 
 def test_it_says_where_it_holds(calibration, content, thesis):

@@ -139,7 +139,7 @@ def test_a_killed_process_leaves_no_unfinished_files(tmp_path: Path):
 
     with pytest.raises(KeyboardInterrupt):
         run_jobs(partial(write_and_hold_on, tmp_path), range(2), workers=2, on_message=interrupted)
-    assert ".lock" in seen[0] and ".txt" in seen[0]
+    assert ".txt" in seen[0]
     assert list(tmp_path.iterdir()) == []
 
 
