@@ -621,6 +621,15 @@ def test_theses_that_cannot_be(fails, tmp_path: Path):
     fails("uwlts", "thesis", tmp_path / "runs", "--trials", "-1", says="trials is -1")
     fails("uwlts", "thesis", tmp_path / "runs", "--workers", "0", says="workers is 0; it must be at least 1")
     fails("uwlts", "thesis", tmp_path / "runs", "--published", "thesis", says="known are thesis-tables")
+    (tmp_path / "foreign.toml").write_text('title = "No tables"\n', encoding="utf-8")
+    fails(
+        "uwlts",
+        "thesis",
+        tmp_path / "runs",
+        "--published",
+        tmp_path / "foreign.toml",
+        says="contains no published tables",
+    )
     (tmp_path / "runs" / "report.html").write_text("precious", encoding="utf-8")
     fails("uwlts", "thesis", tmp_path / "runs", says="report.html exists already")
     assert (tmp_path / "runs" / "report.html").read_text(encoding="utf-8") == "precious"

@@ -173,7 +173,7 @@ def test_images_with_a_hole(says, scan_images, tmp_path: Path, suffix: str):
     victim.write_bytes(content)
     says(
         f"import {folder} --out {tmp_path / 'x.h5'}",
-        "laser1.*damaged .*(its decoder says: |a checksum does not fit |its header cannot be read).*; copy it again",
+        "laser1.*damaged .*(its decoder says: .*|a checksum does not fit .*); copy it again",
     )
 
 

@@ -62,7 +62,7 @@ def _read_text(path: Path, unit: Unit | None) -> PointCloud:
         raise CaptureError(str(error)) from error
     used = next((names for names in ("xyz", "012") if set(names) <= columns.keys()), None)
     if used is None:
-        raise CaptureError(f"{path} has the columns {', '.join(columns)}; expected x, y and z in mm")
+        raise CaptureError(f"{path} has the columns {table.titles}; expected x, y and z in mm")
     points = np.column_stack([columns[name] for name in used])
     if used == "012" and len(columns) > 3 and len(points) > 2 and (np.diff(points[:, 0]) == 1).all():
         raise CaptureError(f"{path} counts its rows in the first column: name the columns, such as n x y z")

@@ -61,7 +61,7 @@ def read_header(content: bytes, path: str | Path) -> ImageHeader:
         raise ImageError(f"{path}: {error}") from error
     except Exception as error:  # Pillow raises exceptions of many types for damaged files.
         raise ImageError(
-            f"{path} is a {kind} file that is truncated or damaged ({len(content)} bytes, its header cannot be read); "
+            f"{path} is a {kind} file that is truncated or damaged ({len(content)} bytes, its decoder says: {error}); "
             "copy it again"
         ) from error
     if found.width_px * found.height_px > MOST_PIXELS:

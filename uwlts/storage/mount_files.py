@@ -278,9 +278,7 @@ def _points_of(table: NumberTable, unit: Unit | None) -> np.ndarray:
     """Return the points (N, 2) or (N, 3) of a table in mm."""
     columns = table.columns
     if not {"x", "z"} <= columns.keys():
-        raise DescriptionError(
-            f"{table.path} has the columns {', '.join(columns)}; expected x and z, and y for 3D points"
-        )
+        raise DescriptionError(f"{table.path} has the columns {table.titles}; expected x and z, and y for 3D points")
     return np.column_stack([columns[name] for name in "xyz" if name in columns]) * table.mm_per_unit(unit=unit)
 
 

@@ -82,7 +82,7 @@ class NumberTable:
 
     Times are in s. Other columns are in the unit that their name states. ``steps`` are those of their decimals.
     ``length_unit`` is that which a line beside the table states, as "unit: m"; empty without. ``directions`` are those
-    of x, y and z if their names say it, such as east, north and up.
+    of x, y and z if their names say it, such as east, north and up. ``titles`` are the names in the file, for messages.
     """
 
     path: Path
@@ -92,6 +92,7 @@ class NumberTable:
     notes: list[str] = field(default_factory=list)
     length_unit: str = ""
     directions: tuple[str, ...] = ()
+    titles: str = ""
 
     def mm_per_unit(self, axes: Iterable[str] = "xyz", *, unit: Unit | None = None) -> float:
         """Return the length unit of columns in mm, from their names or a line beside them, or ``unit``; by default 1.
@@ -214,7 +215,7 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     notes += doubts if not units.keys() & set("xyz") else []
     decimals = [_decimals(row) for row in zip(*(_cells(line, delimiter) for line in lines[:_FIRST]), strict=False)]
     steps = {name: 10.0**-count for name, count in zip(names, decimals, strict=False) if count is not None}
-    return NumberTable(path, columns, units, steps, notes, stated, directions)
+    return NumberTable(path, columns, units, steps, notes, stated, directions, ", ".join(cells or names))
 
 
 def _parse(body: bytes, names: list[str], delimiter: bytes, comma: bool, path: Path) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from tests.uwlts.pipe_views import OVALITY_MM, RADIUS_MM, oval, pitted, plain, p
 from uwlts.cli import app
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_pipe
-from uwlts.fitting.patches import distances_between, surface_patches
+from uwlts.fitting.patches import distances_between, find_disc_radius, surface_patches
 from uwlts.model.artefacts import PipeStandard
 from uwlts.registration.joint_registration import FEWEST_OF_PAIR, JointRegistration, PairEvidence
 from uwlts.registration.register import _open_movements, _overlap, _pair_fit
@@ -294,8 +294,11 @@ def test_degenerate_clouds_have_an_error():
         known = PointUncertainty(variances.astype(np.float32), np.zeros_like(patterns[0]), patterns)
         return PointCloud(places, *np.zeros((3, len(places))), uncertainty=known)
 
+    repeated = np.repeat(points[:300], 10, axis=0)
     with pytest.raises(EvaluationError, match="spacing of the points is too large"):
-        uwlts.register([cloud(np.repeat(points[:300], 10, axis=0), 0.01), cloud(points, 0.01)])
+        uwlts.register([cloud(repeated, 0.01), cloud(points, 0.01)])
+    with pytest.raises(EvaluationError, match="omit repeated points"):
+        find_disc_radius(repeated)
     with pytest.raises(EvaluationError, match="differ by too many orders of magnitude"):
         uwlts.register([cloud(points, 1e6), cloud(points + rng.normal(0, 0.01, points.shape), 0.01)])
     shifted = np.tile(np.eye(4), (2, 1, 1))

@@ -93,11 +93,9 @@ def profile_rows(
 
 
 def _read_table(path: Path) -> list[dict[str, float]]:
-    columns = read_number_table(path, named=False).columns
-    if not columns.keys() <= set(_OF_PROFILES):
-        raise DescriptionError(
-            f"{path} has the columns {', '.join(columns)}; expected any of {', '.join(_OF_PROFILES)}"
-        )
+    table = read_number_table(path, named=False)
+    if not (columns := table.columns).keys() <= set(_OF_PROFILES):
+        raise DescriptionError(f"{path} has the columns {table.titles}; expected any of {', '.join(_OF_PROFILES)}")
     rows = np.column_stack([*columns.values()])
     if not np.isfinite(rows).all():
         raise DescriptionError(f"{path} has cells that are empty or not finite")

@@ -346,7 +346,7 @@ def test_wrong_profiles_are_refused_in_words(tmp_path, rng):
     with pytest.raises(CalibrationError, match="of 6 profiles show the sphere"):
         uwlts.calibrate_mount([p[:5] for p in campaign.profiles], campaign.poses)
     (tmp_path / "a.csv").write_text("x,depth\n1,2\n")
-    with pytest.raises(DescriptionError, match="columns x, down; expected x and z"):
+    with pytest.raises(DescriptionError, match="columns x, depth; expected x and z"):
         read_profiles(tmp_path)
     with pytest.raises(DescriptionError, match="no column 'pose'"):
         read_profiles(tmp_path / "a.csv")
