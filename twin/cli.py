@@ -59,7 +59,7 @@ def follow(call: Call) -> None:
 @command_from(app, twin, "demo", job="Simulate")
 def demo(call: Call) -> None:
     """Example: twin demo"""
-    _run_others(call)
+    say(f"wrote {_run_others(call)}")
 
 
 def _run_others(call: Call) -> Any:

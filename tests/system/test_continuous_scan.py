@@ -105,7 +105,7 @@ def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_
     for _ in range(3):
         hill.states.clear()
         seen = uwlts.scan(plan(tmp_path, hill, moving), out, home=True, overwrite=True, report=said.append)
-        # A busy machine makes fewer frames. Where many in a row are missing, the scan is repeated.
+        # A busy machine makes fewer frames. If many in a row are missing, the scan is repeated.
         with Capture(out) as capture:
             gaps_s = np.diff(np.sort(capture.time_s[capture.speed_mm_per_s > 0]))
         if gaps_s.max() < 5 * STEP_MM / SPEED:

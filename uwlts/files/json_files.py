@@ -52,7 +52,7 @@ def read_json(path: str | Path, *, called: str, check_seal: bool = True) -> dict
     """Read the object in a file; raises CaptureError if it is missing, not JSON, or truncated.
 
     ``called`` names the expected content in messages. Numbers are finite and keys are unique (`uwlts.files.reading`).
-    The object contains the seal, if there is one; a warning says if it does not match.
+    The object contains the seal, if there is one, and ``edited`` if it does not match, which a warning says.
     """
     text = read_text(path, most_bytes=MOST_JSON_BYTES, called=called)
     try:
@@ -65,6 +65,7 @@ def read_json(path: str | Path, *, called: str, check_seal: bool = True) -> dict
         raise CaptureError(f"{path} is JSON but not {add_article(called)}: expected an object with named entries")
     if check_seal and SEAL in content and content[SEAL] != compute_seal(content):
         log_warnings(path, [f"it was edited after it was written: its content does not match its seal ({SEAL})"])
+        content[EDITED] = True
     return content
 
 
@@ -93,14 +94,14 @@ def model_from_json(
     advice: str = "",
 ) -> AnyModel:
     """Convert the result of `read_json` to a model; raises CaptureError like `read_model`."""
-    content, edited = dict(content), content.get(SEAL) != compute_seal(content)
+    content = dict(content)
     if content.pop("format", None) != file_format:
         raise CaptureError(f'{path} is JSON but not {add_article(called)}: expected "format": "{file_format}"')
     if (found := content.pop("version", None)) != version:
         raise CaptureError(f"{path} has version {found}; this program reads {version}")
-    if edited:
-        if SEAL not in content:
-            log_warnings(path, [f"it has no seal ({SEAL}), and is treated as a file that was edited"])
+    if SEAL not in content:
+        log_warnings(path, [f"it has no seal ({SEAL}), and is treated as a file that was edited"])
+    if content.pop(EDITED, False) or SEAL not in content:
         if EDITED in model.model_fields:
             content[EDITED] = True
         elif isinstance(provenance := content.get("provenance"), dict):

@@ -92,13 +92,15 @@ class Plane(Flat):
         normals, corners = normals[length > 0] / length[length > 0, None], corners[length > 0, 0]
         levels = np.einsum("pi,pi->p", normals, corners)
         best = int(np.argmax((np.abs(thinned @ normals.T - levels) < _NEAR * size).sum(axis=0)))
-        inside = np.abs(points @ normals[best] - levels[best]) < _NEAR * size
-        plane = None
-        for _ in range(_REFINEMENTS):
+
+        def refine(inside: np.ndarray) -> tuple[Self, np.ndarray]:
             plane = fit_robustly(cls.fit, points[inside], towards=towards).fit
             distance = plane.distances_mm(points)
-            inside = np.abs(distance) < off * max(robust_std(distance[inside]), 1e-9)
-        assert plane is not None
+            return plane, np.abs(distance) < off * max(robust_std(distance[inside]), 1e-9)
+
+        plane, inside = refine(np.abs(points @ normals[best] - levels[best]) < _NEAR * size)
+        for _ in range(_REFINEMENTS - 1):
+            plane, inside = refine(inside)
         return plane, inside
 
 
