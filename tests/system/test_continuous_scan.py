@@ -85,7 +85,8 @@ def true_places(capture: Capture, hill: Hill) -> np.ndarray:
     places = np.array([state.position_mm for state in hill.states])
     # Times of the capture start at its beginning, on the host's clock. The camera's clock was compared with it.
     offsets = times[:, None] - capture.time_s
-    candidates = np.sort(offsets.ravel())
+    # The first frame is one of the exposures.
+    candidates = np.sort(offsets[:, 0])
     off = np.array([np.abs(offsets - by).min(axis=0).max() for by in candidates])
     fitting = candidates[off < 1e-6]
     assert len(fitting)
@@ -101,17 +102,11 @@ def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_
         return continuous._Clock(clock.offset_s + 0.02, clock.encoder)
 
     monkeypatch.setattr(continuous, "_compare_clocks", compared)
-    moving, out = f"speed_mm_per_s = {SPEED}", tmp_path / "a.h5"
-    for _ in range(3):
-        hill.states.clear()
-        seen = uwlts.scan(plan(tmp_path, hill, moving), out, home=True, overwrite=True, report=said.append)
-        # A busy machine makes fewer frames. If many in a row are missing, the scan is repeated.
-        with Capture(out) as capture:
-            gaps_s = np.diff(np.sort(capture.time_s[capture.speed_mm_per_s > 0]))
-        if gaps_s.max() < 5 * STEP_MM / SPEED:
-            break
+    moving = f"speed_mm_per_s = {SPEED}"
+    seen = uwlts.scan(plan(tmp_path, hill, moving), tmp_path / "a.h5", home=True, report=said.append)
     assert not hill.controller.state().laser_on
-    with Capture(out) as capture:
+    with Capture(tmp_path / "a.h5") as capture:
+        # A busy machine makes fewer frames.
         assert capture.moving and 20 < len(capture) <= 2 * COUNT + 4 and seen.found > 0.95 * seen.lines
         assert np.allclose(np.abs(capture.speed_mm_per_s), SPEED, rtol=0.01)
         assert {1.0, -1.0} == set(np.sign(capture.speed_mm_per_s)) and len(capture.stage_reports) > 10
@@ -120,7 +115,7 @@ def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_
         scatter_s = float(said[-1].split("scatter by ")[1].split(" ms")[0]) * 1e-3
         # 0.2 ms; on a busy machine five standard errors of a pass's position from its reports, at least four.
         allowed_s = max(2e-4, 5 * scatter_s / np.sqrt(4))
-        assert np.abs(error_s).max() < allowed_s, f"{len(capture)} frames, gaps up to {gaps_s.max()} s, {said[-1]}"
+        assert np.abs(error_s).max() < allowed_s
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ from uwlts.runtime.progress import ProgressListener
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.numbering import unwrap_counts
-from uwlts.stripe import find_stripe
+from uwlts.stripe import find_stripe, warm_up
 
 _SPARE_MM, _SPARE_S = 1.0, 0.3
 """Travel at constant speed before and after the stored frames: a distance, and in addition a time."""
@@ -132,6 +132,7 @@ def record_continuously(
     dtype = np.dtype(np.uint16 if camera.info.bits > 8 and not lines else np.uint8)
     settings = {"exposure_ms": exposure_ms, "gain_db": plan.gain_db, "bits": sensor.detector.bits}
     camera.stop()
+    warm_up()  # before the laser is on: the first image would hold up the frames after it
     stage.move_to(passes[0][0], feed_mm_per_min=plan.stage.feed_mm_per_min)
     camera.configure(**settings, trigger="software")
     camera.start(faults="skip")

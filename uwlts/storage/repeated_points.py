@@ -46,10 +46,8 @@ def omit_repeated(cloud: PointCloud) -> tuple[PointCloud, list[str]]:
     repeated = find_repeated(cloud.points_mm)
     if not repeated.any():
         return cloud, []
-    text = (
-        f"{np.count_nonzero(repeated)} of {len(cloud)} points repeat others and are omitted: they are no new evidence"
-    )
-    return cloud.select(~repeated), [text]
+    some = f"{np.count_nonzero(repeated)} of {len(cloud)} points"
+    return cloud.select(~repeated), [f"{some} repeat others and are omitted: they are no new evidence"]
 
 
 def find_repeated(points_mm: np.ndarray) -> np.ndarray:
