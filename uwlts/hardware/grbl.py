@@ -357,7 +357,8 @@ class GrblStage:
         advice = {
             "Hold": "feed hold: its button was pressed, or there was noise on the line or on A1; home or unlock",
             "Door": "the safety door is open: close it, then home or unlock",
-            "Alarm": "locked by an alarm: home",
+            # The greeting after a restart is taken for the answer to a reset that was sent at the same moment.
+            "Alarm": "locked by an alarm, or because it restarted by itself: home",
             "Sleep": "asleep: home",
             "Check": "in check mode, without movements: send $C",
             "Jog": "jogging",

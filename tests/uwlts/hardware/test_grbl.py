@@ -585,6 +585,16 @@ def test_a_fault_while_moving_is_named_and_the_laser_is_off(real, sweeping, faul
         assert controller.state().position_mm == 20.0
 
 
+def test_a_restart_at_the_moment_of_a_reset_is_named(controller, stage, monkeypatch):
+    """A light ends by a reset; the greeting after a restart just before it looks like the answer."""
+    stage.laser(True, at_most_s=5.0)
+    end = stage._line.end
+    monkeypatch.setattr(stage._line, "end", lambda: (controller.inject("restart"), end()))
+    with pytest.raises(HardwareError, match=r"restarted by itself: home"):
+        stage.laser(False)
+    assert not controller.state().laser_on
+
+
 def test_a_movement_that_ends_short_by_more_than_a_step_is_named(controller, stage):
     controller.inject("stop-short", 1)
     assert stage.move_to(10.0, feed_mm_per_min=900.0) == pytest.approx(10.0 - STEP_MM, abs=1e-9)
