@@ -4,7 +4,7 @@
 stage hardware. `record` renders a campaign of captures. `dataset` renders a data set with labels, and `load_dataset`
 reads it. `sweep` searches the best design of a sensor, and `experiment` calibrates a sensor,
 measures scenes and compares the results with the truth; `predict` does so for all figures of a campaign.
-`follow` fits the description of a sensor to a scan. `demo` runs the whole chain of commands, and `reproduce` the
+`demo` runs the whole chain of commands, and `reproduce` the
 evaluation of the thesis. The stub file lists all names. Each name is imported at its first use, because libLLVM must be
 selected before Mitsuba is imported.
 """

@@ -5,7 +5,6 @@ from .design.sweep import SweepResult as SweepResult, sweep as sweep
 from .devices.serve import ServedTwin as ServedTwin, serve as serve
 from .experiments.demonstration import demo as demo
 from .experiments.experiment import experiment as experiment, predict as predict
-from .experiments.follow import follow as follow
 from .experiments.reproduce import reproduce as reproduce
 from .experiments.result import ExperimentResult as ExperimentResult
 from .recording.campaigns import record as record

@@ -50,12 +50,6 @@ def reproduce(call: Call) -> None:
     _run_others(call)
 
 
-@command_from(app, twin, "follow", job="Simulate")
-def follow(call: Call) -> None:
-    """Example: twin follow wall.h5 --calibration calibration.json --out runs/follow"""
-    say(f"wrote {_run_others(call)}")
-
-
 @command_from(app, twin, "demo", job="Simulate")
 def demo(call: Call) -> None:
     """Example: twin demo"""

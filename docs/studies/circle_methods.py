@@ -32,7 +32,10 @@ def circles_table() -> str:
         image = studio.image(next(scene.motion.shots()), 0)
         truth, middles = _true_images(sensor, scene.objects[0], stage)
         apart = np.linalg.norm(middles - truth, axis=1)
-        methods = {"thesis's processing": ellipses_of_contours(image), "uwlts.targets": find_circles(image).centres}
+        methods = {
+            "thesis's processing": ellipses_of_contours(image),
+            "uwlts.targets": next(find_circles(image)).centres,
+        }
         errors = {method: _errors(centres, truth) for method, centres in methods.items()}
         both = np.isfinite(np.stack(list(errors.values()))).all(axis=(0, 2))
         for method, error in errors.items():

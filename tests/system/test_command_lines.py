@@ -104,7 +104,6 @@ FOLDERS = {
     "twin reproduce --out",
     "twin predict --out",
     "twin demo --out",
-    "twin follow --out",
     "twin sweep --out",
 }
 """Outputs that are folders, whose names need no ending."""

@@ -146,24 +146,10 @@ def radiometry(
         a_file(".toml", beside=".json"),
         Parameter(help="Description of the sensor to write (TOML), with all estimates as JSON beside it."),
     ],
-    page: Annotated[
-        Path | None,
-        a_file(".html"),
-        Parameter(help="Page to write that shows both captures; needs --compared-with and --earlier-capture."),
-    ] = None,
-    earlier_capture: Annotated[Path | None, Parameter(help="Capture of the earlier result, for the page.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts radiometry wall.h5 --calibration calibration.json --out followed.toml"""
-    from uwlts.errors import DescriptionError
-
-    earlier = call.given.get("compared_with")
-    if page and not (earlier and earlier_capture):
-        raise DescriptionError("`page` compares two captures: give `compared_with` and `earlier_capture`, too")
     found = call()
     found.save(out, overwrite=overwrite)
-    if page and earlier and earlier_capture:
-        given = {"earlier_capture": earlier_capture, "overwrite": overwrite}
-        uwlts.report.write_radiometry(page, found, call.given["capture"], **given)
     show(found.lines())
-    say(f"wrote {out} and {out.with_suffix('.json').name}" + (f", {page}" if page else ""))
+    say(f"wrote {out} and {out.with_suffix('.json').name}")

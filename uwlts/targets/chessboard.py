@@ -86,7 +86,7 @@ class ChessboardTarget(Target):
                 f"found no chessboard of {self.columns} x {self.rows} inner corners"
                 + "".join(f"; {reason}" for reason in reasons)
                 + "; columns and rows count inner corners, not squares; of a board partly in view, two adjacent sides "
-                "must be in view"
+                "must be in view, and a board with cut outer squares can be placed in more than one way"
             )
         pixels = _from_top_left(grey, part).reshape(-1, 2)
         seen = np.isfinite(pixels[:, 0])

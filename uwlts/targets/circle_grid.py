@@ -1,6 +1,6 @@
 """Circle grids without marks: rectangular ones, and asymmetric ones whose rows are shifted by half their spacing."""
 
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -9,6 +9,9 @@ from uwlts.errors import TargetError
 from uwlts.model.sensor import Positive
 from uwlts.targets.circles import collect_circles, disc
 from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
+
+if TYPE_CHECKING:
+    from uwlts.targets.detection import Lattice
 
 _FEWEST = 0.75
 """Least fraction of the circles that must be found: dirt hides single ones; with fewer, the grid is another one."""
@@ -75,7 +78,10 @@ class CircleGridTarget(Target):
         # Imported late: a description does not need the detector.
         from uwlts.targets.detection import detect_lattice
 
-        lattice = detect_lattice(image)
+        return detect_lattice(image, self._read_lattice)
+
+    def _read_lattice(self, lattice: "Lattice") -> TargetView:
+        """Return the view of the target in a lattice of circles."""
         numbers = lattice.indices
         if self.asymmetric:
             # Nearest neighbours are along the diagonals of rows and columns.

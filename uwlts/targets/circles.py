@@ -1,5 +1,6 @@
 """The circle target: a lattice of circles, numbered from three circles with a dot."""
 
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
@@ -10,7 +11,7 @@ from uwlts.model.sensor import Positive
 from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
 
 if TYPE_CHECKING:
-    from uwlts.targets.detection import Ellipses
+    from uwlts.targets.detection import Ellipses, Lattice
 
 Place = tuple[int, int]
 
@@ -102,9 +103,15 @@ class CircleTarget(Target):
 
     def detect(self, image: np.ndarray) -> TargetView:
         # Imported late: a description does not need the detector.
-        from uwlts.targets.detection import detect_lattice, measure_marks
+        from uwlts.targets.detection import detect_lattice
 
-        lattice = detect_lattice(image)
+        return detect_lattice(image, partial(self._read_lattice, image))
+
+    def _read_lattice(self, image: np.ndarray, lattice: "Lattice") -> TargetView:
+        """Return the view of the target in a lattice of circles of an image (H, W)."""
+        # Imported late: a description does not need the detector.
+        from uwlts.targets.detection import measure_marks
+
         circles, numbers = lattice.circles, lattice.indices
         strength = measure_marks(image, circles, mark_over_circle=self.marker_diameter_mm / self.diameter_mm)
         origin, turn = _orientation(numbers, strength - np.median(strength), self, lattice.found)

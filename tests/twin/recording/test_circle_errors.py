@@ -72,7 +72,7 @@ def lattice_mm(scene: Scene) -> np.ndarray:
 
 def found_px(image: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Return the circles (rows, columns, 2) of an image nearest to their expected positions."""
-    circles = find_circles(image).centres
+    circles = next(find_circles(image)).centres
     assert len(circles) == ROWS * COLUMNS
     distance = np.linalg.norm(expected[:, :, None] - circles, axis=-1)
     # A spacing is 20 px at least.
@@ -138,11 +138,11 @@ def test_detection_errors_have_their_size_in_the_image(small, medium):
     """Through the window in water, too, where everything seems nearer."""
     scene = lamp_scene(medium, detection_std_px=0.6, errors_seed=3)
     studio, perfect = studio_of(small, scene), studio_of(small, lamp_scene(medium))
-    still = find_circles(perfect.image(LAMP, 0)).centres
+    still = next(find_circles(perfect.image(LAMP, 0))).centres
     assert len(still) == ROWS * COLUMNS
     offsets = []
     for index in range(IMAGES):
-        circles = find_circles(studio.image(LAMP, index)).centres
+        circles = next(find_circles(studio.image(LAMP, index))).centres
         distance = np.linalg.norm(still[:, None] - circles, axis=-1)
         offsets.append(circles[distance.argmin(axis=1)] - still)
     offsets = np.array(offsets)

@@ -119,3 +119,24 @@ def test_photographs_of_an_asymmetric_grid_give_the_camera(tmp_path):
     for name, true in {"f": FOCAL, "cx": CENTRE[0], "cy": CENTRE[1]}.items():
         # Twelve draws in 10,000 exceed four standard uncertainties of few images.
         assert abs(values[name] - true) < 4 * std[name] < 2.0, name
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_grid_is_found_among_more_specks_than_it_has_circles(seed):
+    """Specks of 1 to 3 px radius, bright and dark, outnumber the circles by four to eight."""
+    rng = np.random.default_rng(seed)
+    place = pose((15.0, 20.0, float(rng.uniform(0.0, 360.0))), (0.0, 0.0, 400.0))
+    place[:3, 3] -= place[:3, :3] @ [40.0, 25.0, 0.0]
+    image = photograph(RECTANGULAR.points_mm[:, :2], 6.0, place, bright=bool(seed % 2))
+    corners = project_points(RECTANGULAR.plate_mm, RAYS, place, start=np.tile(CENTRE, (4, 1)))
+    plate = cv2.fillConvexPoly(np.zeros_like(image), np.rint(corners).astype(np.int32), 1)
+    near = cv2.dilate(plate, np.ones((25, 25))) > 0
+    ground = np.full(image.shape, 110.0, np.float32)
+    for place_px in rng.uniform(5, [SIZE[0] - 5, SIZE[1] - 5], (int(rng.uniform(300, 600)), 2)):
+        level = 110.0 + float(rng.choice([-1, 1]) * rng.uniform(25, 60))
+        cv2.circle(ground, place_px.astype(int), int(rng.integers(1, 4)), level, -1)
+    scene = np.where(near, image, cv2.GaussianBlur(ground, (0, 0), 0.8) + rng.normal(0.0, 1.0, image.shape))
+    view = RECTANGULAR.detect(np.clip(scene, 0, 255).astype(np.uint8))
+    assert len(view.pixels) >= 52
+    alone = RECTANGULAR.detect(image)
+    assert [index for index in view.indices.tolist() if index not in alone.indices.tolist()] == []

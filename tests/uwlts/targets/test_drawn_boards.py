@@ -70,3 +70,33 @@ def test_boards_are_found_through_a_wide_lens(coefficients):
     view = board.detect(image)
     assert len(view.pixels) == 135
     assert away(view, place, rays).max() < 0.4
+
+
+@pytest.mark.parametrize(
+    ("described", "more", "rim", "turns", "at"),
+    [
+        ((6, 8), (1, 1, 1, 1), 0.246, (5.4, -29.0, 163.9), (22.9, -40.5, 272.7)),
+        ((5, 6), (0, 1, 0, 1), 0.292, (14.2, -12.7, 162.0), (48.8, -35.4, 203.3)),
+    ],
+    ids=str,
+)
+def test_a_cut_board_partly_in_view_is_right_or_ambiguous(described, more, rim, turns, at):
+    """Corners of its cut squares are not described; a board a quarter turn off, or shifted by a square, would fit."""
+    columns, rows = described[0] + more[0] + more[2], described[1] + more[1] + more[3]
+    left, top, right, bottom = (rim if each else 1.0 for each in more)
+    levels = chessboard(columns, rows, 20.0, rims=(left, top, right, bottom))
+    place = pose(turns, at)
+    place[:3, 3] -= place[:3, :3] @ [10.0 * (columns - 1), 10.0 * (rows - 1), 0.0]
+    image = draw(levels, RAYS, place, size=SIZE, rng=np.random.default_rng(7), samples=2)
+    board = ChessboardTarget(columns=described[0], rows=described[1], square_mm=20.0)
+    try:
+        view = board.detect(image)
+    except TargetError as error:
+        assert "more than one way" in str(error)
+        return
+    first, last = 20.0 * np.array(more[:2]), 20.0 * (np.array(described) - 1)
+    errors = []
+    for points in (view.points_mm[:, :2], last - view.points_mm[:, :2]):
+        true = project_points(points + first, RAYS, place, start=view.pixels)
+        errors.append(np.linalg.norm(view.pixels - true, axis=1).max())
+    assert min(errors) < 0.4

@@ -106,22 +106,33 @@ def _measure_unevenness(board: np.ndarray) -> float | None:
 def has_more_corners(grey: np.ndarray, board: np.ndarray) -> bool:
     """Return True if a pattern continues beyond the sides of a board (rows, columns, 2).
 
-    Squares at the rim that are cut do not count, if the opposite side shows which corners are meant: beyond it there
-    are such squares too, or whole ones and no more.
+    Squares at the rim that are cut do not count, if all sides in view show which corners are meant: beyond each of
+    them there are such squares too, or whole ones and no more.
     """
     usual = np.median(_compare_squares(grey, board)[1][np.isfinite(board[..., 0])])
-    continues, whole = np.zeros(4, bool), np.zeros(4, bool)
+    continues, ends = np.zeros(4, bool), np.zeros(4, bool)
     for turn in range(4):
         turned = np.rot90(board, turn)
-        next_row = 2.0 * turned[:1] - turned[1:2]
+        next_row = _extrapolate_row(turned[:3])[None]
         inside = np.all((next_row > 0) & (next_row < np.array(grey.shape[::-1]) - 1), axis=2)[0]
         further = _compare_squares(grey, np.concatenate([next_row, turned]))[1][0]
         continues[turn] = inside.sum() > 2 and (further[inside] > usual / 2).mean() > 0.5
         if continues[turn] and _are_whole(grey, next_row[0], turned[0]):
             return True
-        whole[turn] = _are_whole(grey, turned[0], turned[1])
-    opposite = np.roll(continues, 2) | np.roll(whole, 2)
-    return bool((continues & ~opposite).any())
+        ends[turn] = inside.mean() > 0.5 and not continues[turn] and not _are_whole(grey, turned[0], turned[1])
+    return bool(continues.any() and ends.any())
+
+
+def _extrapolate_row(rows: np.ndarray) -> np.ndarray:
+    """Return the places (K, 2) before two or three rows of corners (R, K, 2) at even distances in perspective.
+
+    Let r be the ratio of the last two distances along a line in perspective. By the cross ratio of evenly spaced
+    points, the ratio of the next distance to the last one is (1 + r) / (3 - r).
+    """
+    steps = np.linalg.norm(np.diff(rows, axis=0), axis=2)
+    known = np.isfinite(steps).all(axis=0)
+    ratio = float(np.median(steps[0, known] / steps[1, known])) if len(steps) > 1 and known.any() else 1.0
+    return rows[0] + (1.0 + ratio) / (3.0 - ratio) * (rows[0] - rows[1])
 
 
 def _are_whole(grey: np.ndarray, corners: np.ndarray, before: np.ndarray) -> bool:

@@ -219,30 +219,28 @@ def _complete_board(piece: np.ndarray, columns: int, rows: int, grey: np.ndarray
         if turned.size:
             board = _place_piece(_crop_to_board(turned, columns, rows, grey), columns, rows, grey.shape)
             boards += [] if board is None else [board]
+    # A piece that fits in both orientations may have further corners in one of them.
+    boards = [board for board in boards if not has_more_corners(grey, board)] or boards
     counts = [count_corners(board) for board in boards]
-    if len(boards) == 2 and counts[0] == counts[1]:
-        if columns == rows and counts[0] == rows**2:
-            return boards[0]
-        # A piece that fits in both orientations has its place only if it has further corners in one of them.
-        boards = [board for board in boards if not has_more_corners(grey, board)]
-        return boards[0] if len(boards) == 1 else None
+    whole = counts.count(rows * columns)
+    if len(boards) == 2 and (whole == 0 or (whole == 2 and rows != columns)):
+        return None
     return boards[int(np.argmax(counts))] if boards else None
 
 
 def _crop_to_board(piece: np.ndarray, columns: int, rows: int, grey: np.ndarray) -> np.ndarray:
     """Return the part of a piece (J, I, 2), at most as large as the board, with most corners.
 
-    Of equal parts, it is the one beyond which there are only squares cut by the board's rim.
+    Parts beyond which there are only squares cut by the board's rim come first.
     """
     there = np.isfinite(piece[..., 0])
     height, width = (min(size, most) for size, most in zip(there.shape, (rows, columns), strict=True))
     starts = product(range(there.shape[0] - height + 1), range(there.shape[1] - width + 1))
     parts = [_trim(piece[top : top + height, left : left + width]) for top, left in starts]
-    counts = [count_corners(part) for part in parts]
-    fullest = [part for part, count in zip(parts, counts, strict=True) if count == max(counts)]
-    if len(fullest) == 1:
-        return fullest[0]
-    return next((part for part in fullest if min(part.shape) > 1 and not has_more_corners(grey, part)), fullest[0])
+    parts.sort(key=count_corners, reverse=True)
+    if len(parts) == 1:
+        return parts[0]
+    return next((part for part in parts if min(part.shape) > 1 and not has_more_corners(grey, part)), parts[0])
 
 
 def _place_piece(piece: np.ndarray, columns: int, rows: int, shape: tuple[int, ...]) -> np.ndarray | None:

@@ -390,20 +390,21 @@ def _sample_bilinear(grey, u, v):
 
 
 def find_circles(image):
-    """Find the images of circles of one polarity and similar size, bright on dark or dark on bright.
+    """Yield families of images of circles of one polarity, bright on dark or dark on bright; the likeliest first.
 
     Blobs are found as by G. S. de Matos (UFSC 2017, section 4.5: median filter, background-corrected threshold, hole
     filling, removal of border and small particles, ellipse fit). Ellipse and centre are fitted to the grey levels.
 
     The image is (H, W) of uint8 or uint16; ImageError for others. Centres are centroids of the covered area, in px (u,
-    v). The result may be empty.
+    v). The first family may be empty; the others are similar in size.
     """
     grey = check_grey(image)
     # An image without noise has rounding errors of half a grey level.
     noise = max(estimate_noise(grey), 0.5)
-    ellipses = fit_ellipses(grey, find_blobs(grey, noise), noise)
-    centres, agree = find_centroids(grey, ellipses)
-    return replace(ellipses, centres=centres)[agree]
+    for blobs in find_blobs(grey, noise):
+        ellipses = fit_ellipses(grey, blobs, noise)
+        centres, agree = find_centroids(grey, ellipses)
+        yield replace(ellipses, centres=centres)[agree]
 
 
 def measure_marks(image, circles, *, mark_over_circle):

@@ -119,20 +119,30 @@ class Lattice:
     found: int  # number of circles found in the image, with or without a place
 
 
-def detect_lattice(image):
+def detect_lattice(image, read=lambda lattice: lattice):
     """Find the circles of a regular rectangular array without marks and number them.
 
-    Returns the largest connected part of a lattice in an image (H, W) of uint8 or uint16. ImageError for other images;
-    TargetError if fewer than four circles form a lattice.
+    ``read`` turns the largest connected part of a lattice into a result, or raises `TargetError`: then the lattice of
+    the next family of circles is tried. Returns the first result.
+
+    ``image`` is (H, W) of uint8 or uint16; ImageError for others. If no family has a result, the TargetError is that
+    of the largest lattice.
     """
-    circles = find_circles(image)
-    indices, labelled = label_lattice(circles.centres, circles.shapes)
-    if labelled.sum() < LATTICE_RULE.fewest_labelled:
-        raise TargetError(
-            f"found {len(circles)} circles, {labelled.sum()} of them in a lattice; expected at least "
-            f"{LATTICE_RULE.fewest_labelled}: check that the target is in view, sharp and evenly lit"
-        )
-    return Lattice(circles[labelled], indices[labelled], len(circles))
+    most, reason = -1, TargetError("")
+    for circles in find_circles(image):
+        indices, labelled = label_lattice(circles.centres, circles.shapes)
+        count = int(labelled.sum())
+        try:
+            if count < LATTICE_RULE.fewest_labelled:
+                raise TargetError(
+                    f"found {len(circles)} circles, {count} of them in a lattice; expected at least "
+                    f"{LATTICE_RULE.fewest_labelled}: check that the target is in view, sharp and evenly lit"
+                )
+            return read(Lattice(circles[labelled], indices[labelled], len(circles)))
+        except TargetError as error:
+            if count > most:
+                most, reason = count, error
+    raise reason
 
 
 def label_lattice(centres, shapes):
