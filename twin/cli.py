@@ -47,7 +47,7 @@ def dataset(call: Call) -> None:
 @command_from(app, twin, "reproduce", job="Simulate")
 def reproduce(call: Call) -> None:
     """Example: twin reproduce --campaigns 1 --every 10 --out runs/quick"""
-    _run_others(call)
+    say(f"wrote {_run_others(call)}")
 
 
 @command_from(app, twin, "demo", job="Simulate")

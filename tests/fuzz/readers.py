@@ -28,6 +28,7 @@ from tests.uwlts.stripe.test_learned import centroid_model
 from twin.datasets.data_set import load_description as load_data_set
 from twin.design.screening import encode_part, read_parts
 from twin.design.study import load_study
+from twin.experiments.published import load_published
 from twin.scene.campaign import load_campaign
 from twin.scene.description import Mesh, load_scene
 from twin.scene.finish import read_grey
@@ -52,6 +53,7 @@ from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.data_set import load_dataset
 from uwlts.storage.data_set_shards import Sample, ShardReader, open_shard
+from uwlts.storage.figure_table import FigureTable, MeasuredFigure, read_figures
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, set_intrinsics
 from uwlts.storage.import_.centre_lines import read_profiles as read_centre_lines
@@ -63,8 +65,6 @@ from uwlts.storage.pose_files import read_poses, read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
 from uwlts.storage.verification_file import describe_verification
 from uwlts.stripe.learned import read_model_of_lines
-from uwlts.thesis.published_tables import load_published
-from uwlts.thesis.results import CampaignResults, LineProfile, Measurement, SpacingInterval, WindowChoice, WindowProfile
 
 
 @dataclass(frozen=True)
@@ -337,19 +337,9 @@ def _read_part(path: Path) -> None:
         read_parts(Path(folder))
 
 
-def _results(path: Path) -> None:
-    measured = Measurement("spheres", "near", "water", "proposed", "ours", {"SSE": 0.01, "STD": 0.02}, 4000)
-    CampaignResults(
-        measurements=[measured],
-        window={"all": WindowChoice("all", 47.3, 0.02)},
-        window_profiles=[WindowProfile(47.3, [(1.0, 2.0), (1.5, 2.5)])],
-        two_refractions_distance_mm=47.3,
-        polynomials={},
-        budget={"index": 0.01},
-        line_profiles={"near": LineProfile(180.0, [(1.0, 2.0)])},
-        monte_carlo=[SpacingInterval("near", 0.01, 0.02, (-0.03, 0.05), True)],
-        trials=100,
-    ).keep(path)
+def _figures(path: Path) -> None:
+    rows = {"campaign": "campaign-0", "scan": "spheres", "method": "joint", "figure": "SSE"}
+    FigureTable(rows=(MeasuredFigure(**rows, true_mm=99.18, measured_mm=99.2, expanded_mm=0.03),)).save(path)
 
 
 def _guided_plan(path: Path) -> None:
@@ -534,7 +524,7 @@ READERS = {
         ),
         Reader("datums", ".toml", "toml", _text("[[datum]]\ncentre_mm = [1, 2, 3]\nradius_mm = 5\n"), read_datums),
         Reader("screened", ".parquet", "bytes", _part, _read_part),
-        Reader("results", ".json", "json", _results, CampaignResults.read_file),
+        Reader("figures", ".json", "json", _figures, read_figures),
         Reader("guided-plan", ".toml", "toml", _guided_plan, load_guided_plan),
         Reader("published", ".toml", "toml", _shipped("references/thesis-tables.toml"), load_published),
     )

@@ -241,8 +241,7 @@ def test_version(command, program: str):
         ("uwlts design --medium water", "SENSOR"),
         ("uwlts nominal thesis --out x.json", "--medium"),
         ("uwlts evaluate scan.ply", "--out"),
-        ("uwlts thesis", "--folder is missing"),
-        ("uwlts thesis campaign --trials many", "many"),
+        ("uwlts thesis", "--out"),
         ("twin simulate --out x.h5", "SCENE"),
         ("twin simulate spheres", "--out"),
         ("twin simulate spheres --out x.h5 --spp many", "many"),
@@ -303,8 +302,8 @@ PLACES = {
     "evaluate, cloud": ("uwlts evaluate {} --out x.json", {"scan.ply"}),
     "evaluate, artefact": ("uwlts evaluate scan.ply --artefact {} --out x.json", {"artefact.toml"}),
     "evaluate, truth": ("uwlts evaluate scan.ply --truth {} --out x.json", set()),
-    "thesis, folder": ("uwlts thesis {}", set()),
-    "thesis, published": ("uwlts thesis campaigns --published {}", set()),
+    "thesis, calibration": ("uwlts thesis {} --out x.json", {"calibration.json"}),
+    "thesis, step": ("uwlts thesis calibration.json --step {} --out x.json", set()),
     "reproduce, campaign": ("twin reproduce {} --campaigns 1 --out x", set()),
     "simulate, scene": ("twin simulate {} --sensor sensor.toml --out x.h5", {"scene.toml"}),
     "simulate, sensor": ("twin simulate scene.toml --sensor {} --out x.h5", {"sensor.toml"}),
@@ -588,8 +587,6 @@ def test_unknown_medium(fails, tmp_path: Path):
         ("--every 0", "every is 0"),
         ("--workers 0", "workers is 0"),
         ("--spp 0", "spp is 0"),
-        ("--trials 5", "trials is 5; expected at least 20, or 0"),
-        ("--trials -20", "trials is -20"),
         ("--out scan.h5", "cannot use the folder scan.h5"),
         ("--out scan.h5/runs", "cannot use the folder scan.h5/runs"),
     ],
@@ -597,42 +594,6 @@ def test_unknown_medium(fails, tmp_path: Path):
 def test_reproductions_that_cannot_be(fails, folder: Path, monkeypatch, options: str, says: str):
     monkeypatch.chdir(folder)
     fails("twin", "reproduce", *options.split(), says=says)
-
-
-def test_theses_that_cannot_be(fails, tmp_path: Path):
-    fails("uwlts", "thesis", tmp_path / "missing", says="missing contains no campaign")
-    (tmp_path / "runs").mkdir()
-    fails(
-        "uwlts", "thesis", tmp_path / "runs", says="runs contains no campaign; expected folders campaign-0, campaign-1"
-    )
-    place = tmp_path / "runs" / "campaign-0"
-    place.mkdir()
-    fails("uwlts", "thesis", tmp_path / "runs", says="campaign-0 has no ")
-    (place / "results.json").write_text("{", encoding="utf-8")
-    fails("uwlts", "thesis", tmp_path / "runs", says="results.json")
-    for text, words in (
-        ("[]", "expected an object with"),
-        ('{"format": "uwlts-thesis-results", "version": 0}', "no results"),
-    ):
-        (place / "results.json").write_text(text, encoding="utf-8")
-        fails("uwlts", "thesis", tmp_path / "runs", says=words)
-    fails("uwlts", "thesis", tmp_path / "runs", "--again", says="campaign-0 has no ")
-    fails("uwlts", "thesis", tmp_path / "runs", "--trials", "5", says="trials is 5; expected at least 20, or 0")
-    fails("uwlts", "thesis", tmp_path / "runs", "--trials", "-1", says="trials is -1")
-    fails("uwlts", "thesis", tmp_path / "runs", "--workers", "0", says="workers is 0; it must be at least 1")
-    fails("uwlts", "thesis", tmp_path / "runs", "--published", "thesis", says="known are thesis-tables")
-    (tmp_path / "foreign.toml").write_text('title = "No tables"\n', encoding="utf-8")
-    fails(
-        "uwlts",
-        "thesis",
-        tmp_path / "runs",
-        "--published",
-        tmp_path / "foreign.toml",
-        says="contains no published tables",
-    )
-    (tmp_path / "runs" / "report.html").write_text("precious", encoding="utf-8")
-    fails("uwlts", "thesis", tmp_path / "runs", says="report.html exists already")
-    assert (tmp_path / "runs" / "report.html").read_text(encoding="utf-8") == "precious"
 
 
 # --- outputs

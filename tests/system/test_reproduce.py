@@ -298,11 +298,11 @@ def test_wrong_descriptions_leave_nothing(described: Path, tmp_path: Path, how: 
 
 
 @pytest.fixture
-def reproduce(capfd, monkeypatch) -> Callable[..., tuple[int, str]]:
-    """Run ``twin reproduce`` in this process; return exit code and output, including that of its own processes."""
+def run(capfd, monkeypatch) -> Callable[..., tuple[int, str]]:
+    """Run ``twin`` in this process; return exit code and output, including that of its own processes."""
 
     def run(*arguments: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["twin", "reproduce", *map(str, arguments)])
+        monkeypatch.setattr(sys, "argv", ["twin", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
             cli.main()
         said = "".join(capfd.readouterr())
@@ -312,30 +312,28 @@ def reproduce(capfd, monkeypatch) -> Callable[..., tuple[int, str]]:
     return run
 
 
-def test_a_complete_campaign_goes_on_to_its_evaluation(reproduce, rendered: tuple[Path, Progress], described: Path):
-    """It needs the thesis's recordings, which these are not."""
-    before = contents(rendered[0])
-    arguments = ["--out", rendered[0], "--campaigns", 1, "--spp", 4]
-    code, said = reproduce(described / "small.toml", *arguments)
+def test_a_campaign_without_the_scans_is_not_reproduced(run, described: Path, tmp_path: Path):
+    code, said = run("reproduce", described / "small.toml", "--out", tmp_path / "runs")
     assert code == 2
-    assert "campaign-0 has no step-near-water.h5: record the campaign's calibration first" in said
-    assert contents(rendered[0]) == before
+    assert "campaign 'Small' has none of the scans that the calibrations measure" in said
+    assert not (tmp_path / "runs").exists()
 
 
-def test_the_command_refuses_another_plan(reproduce, rendered: tuple[Path, Progress], described: Path):
-    before = contents(rendered[0])
-    code, said = reproduce(described / "small.toml", "--out", rendered[0], "--campaigns", 1, "--spp", 3)
+def test_the_command_refuses_another_plan(run, described: Path, tmp_path: Path):
+    assert record_one(described / "small.toml", out=tmp_path / "one", spp=4, workers=2)
+    before = contents(tmp_path / "one")
+    code, said = run("record", described / "small.toml", "--out", tmp_path / "one", "--spp", 3)
     assert code == 2
     assert said.startswith("error: ")
     assert "made with another spp" in said
-    assert contents(rendered[0]) == before
+    assert contents(tmp_path / "one") == before
 
 
-def test_a_take_that_fails_is_named(reproduce, described: Path, tmp_path: Path):
-    code, said = reproduce(described / "impossible.toml", "--out", tmp_path / "runs", "--campaigns", 1, "--spp", 2)
+def test_a_take_that_fails_is_named(run, described: Path, tmp_path: Path):
+    code, said = run("record", described / "impossible.toml", "--out", tmp_path / "runs", "--spp", 2)
     assert code == 2
     assert said.startswith("error: ")
-    assert "campaign-0/board-moon-air.h5: " in said and "choose another placement" in said
+    assert "board-moon-air.h5: " in said and "choose another placement" in said
     assert len(said.splitlines()) == 1
     assert not list(tmp_path.rglob("board-moon-air*"))
 
@@ -343,16 +341,16 @@ def test_a_take_that_fails_is_named(reproduce, described: Path, tmp_path: Path):
 @pytest.mark.parametrize("all_of_them", [True, False], ids=["terminal", "command"])
 def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: Path, all_of_them: bool):
     """Ctrl-C on the terminal reaches all processes, a signal from elsewhere the command alone."""
-    options = ["--out", tmp_path / "runs", "--campaigns", 1, "--spp", 1, "--workers", 2]
+    options = ["--out", tmp_path / "runs", "--spp", 1, "--workers", 2]
     command = subprocess.Popen(
-        [sys.executable, "-m", "twin", "reproduce", described / "many.toml", *map(str, options)],
+        [sys.executable, "-m", "twin", "record", described / "many.toml", *map(str, options)],
         start_new_session=True,
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-    parts = [tmp_path / "runs" / "campaign-0" / f"{name}.h5.part" for name in ("first", "second")]
+    parts = [tmp_path / "runs" / f"{name}.h5.part" for name in ("first", "second")]
     while command.poll() is None and not all(part.exists() for part in parts):
         time.sleep(0.01)
     start = time.monotonic()
@@ -366,7 +364,7 @@ def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: 
     assert command.returncode == 130, errors
     assert output == ""
     assert errors.splitlines()[-1].startswith("interrupted; ")
-    assert sorted(contents(tmp_path / "runs")) == ["campaign-0/first.h5.part", "campaign-0/second.h5.part", "plan.json"]
+    assert sorted(contents(tmp_path / "runs")) == ["first.h5.part", "plan.json", "second.h5.part"]
     for part in parts:
         with Capture(part) as capture:
             assert len(capture) < LONG

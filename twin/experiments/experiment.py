@@ -2,13 +2,13 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
 from twin.experiments.figures import describe_conditions, read_figures, read_flaws
+from twin.experiments.published import load_published
 from twin.experiments.result import ExperimentResult
 from twin.experiments.runner import COLOURED, Method, evidence_of, inspected_as, is_evaluated, plan_lines, run_stages
 from twin.recording.campaigns import RecordingOptions, make_folder, record_campaigns, require_at_least
@@ -206,24 +206,29 @@ def run_experiment(
     name: str,
     with_truth: bool,
     methods: Sequence[Method] = (),
+    published: str | Path | None = None,
     progress: ProgressListener = ignore_progress,
 ) -> ExperimentResult:
     """Record a campaign for each seed, calibrate it, measure its scans, and write table and page.
 
     ``methods`` are the calibrations, whose scans count if the campaign has them; by default the joint one with all
     recordings of targets and steps. ``with_truth`` compares all scans with the ground truth, so that scans of any scene
-    count; otherwise those of an artefact, a pitted pipe or a weld. Raises as `experiment`.
+    count; otherwise those of an artefact, a pitted pipe or a weld. ``published`` are tables to compare with, by name or
+    path. Raises as `experiment`.
     """
     every = options.every
     require_at_least(0, seed=min(seeds))
     methods = methods or [choose_joint(campaign, every, all_scans=with_truth)]
     takes = [{take.name: take for take in list_takes(campaign, seed=seed, every=every)} for seed in seeds]
+    methods = [each for method in methods if (each := method.restrict_to(takes[0])).scans]
+    if not methods:
+        raise DescriptionError(f"campaign {campaign.title!r} has none of the scans that the calibrations measure")
+    tables = None if published is None else load_published(published)
     understated = find_understated(campaign, [*takes[0].values()])
     for each in understated:
         warnings.warn(each.text(), DescriptionWarning, stacklevel=3)
     folders = record_campaigns(campaign, folder, seeds=seeds, options=options, progress=progress)
     by_folder = dict(zip(folders, takes, strict=True))
-    methods = [replace(each, scans=[scan for scan in each.scans if scan in takes[0]]) for each in methods]
     lines = [
         line
         for place, of_seed in by_folder.items()
@@ -234,17 +239,19 @@ def run_experiment(
     run_stages(lines, scheduler=options.scheduler, progress=progress)
     rows = [row for place, of_seed in by_folder.items() for row in read_figures(place, of_seed, methods)]
     detections, depths = read_flaws(by_folder, methods[0])
-    conditions = {row.scan: describe_conditions(takes[0][row.scan]) for row in rows}
+    conditions = {row.scan: describe_conditions(takes[0][row.scan]) for row in rows if row.scan in takes[0]}
+    table = FigureTable(rows=(*rows, *depths))
     result = ExperimentResult(
         campaign=name,
         sensor=campaign.sensor,
         as_built=campaign.as_built,
         water=campaign.water,
         seeds=tuple(seeds),
-        table=FigureTable(rows=(*rows, *depths)),
+        table=table,
         conditions=conditions | {f"{each.flaw}s": each.checked for each in detections},
         detections=detections,
         understated=understated,
+        published=() if tables is None else tables.compare(table),
     )
     coloured = {scan: methods[0].result(folders[0], scan, COLOURED) for scan in methods[0].scans}
     result.write(folder, {scan: path for scan, path in coloured.items() if path.is_file()})

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from twin.experiments.detection import FlawFindings, ProbabilityOfDetection, collect_findings, deep_values, flaws_of
-from twin.experiments.runner import Method, inspected_as
+from twin.experiments.runner import THESIS, Method, inspected_as
 from twin.scene.campaign import Take
 from twin.scene.description import Scene, medium_of
 from twin.scene.forms import PittedPipe
@@ -14,14 +14,20 @@ from twin.scene.motion import Motion
 from uwlts.errors import CaptureError
 from uwlts.files.json_files import read_json
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, StepStandard, parse_artefact
-from uwlts.storage.figure_table import MeasuredFigure
+from uwlts.storage.figure_table import MeasuredFigure, read_figures as read_table
 
 _AXES = "XYZ"
+_RANGES = "PE", "RE"
+"""Ranges that are also given without 0.3 % of the points, as VDI/VDE 2634 allows."""
 
 
 def read_figures(folder: Path, takes: Mapping[str, Take], methods: Sequence[Method]) -> Iterator[MeasuredFigure]:
     """Yield the figures of a campaign's scans by all methods; CaptureError if a result is incomplete."""
     for method in methods:
+        if method.made is None:
+            yield from _read_calibration(folder, method)
+        if any(method.thesis.values()):
+            yield from read_table(method.result(folder, THESIS, "json")).rows
         for scan in method.scans:
             about = {"campaign": folder.name, "scan": scan, "method": method.name}
             if (path := method.result(folder, scan, "evaluation.json")).is_file():
@@ -31,13 +37,29 @@ def read_figures(folder: Path, takes: Mapping[str, Take], methods: Sequence[Meth
                 yield MeasuredFigure(**about, **row)
 
 
+def _read_calibration(folder: Path, method: Method) -> Iterator[MeasuredFigure]:
+    """Yield the window distance of a sequential calibration, or the residual of polynomials."""
+    path = method.calibration(folder)
+    content: dict[str, Any] = read_json(path, called="calibration")
+    values = {"window distance": (content.get("window") or {}).get("distance_mm")}
+    values["residual of Z"] = content.get("residuals", {}).get("depth", {}).get("rms_mm")
+    for name, value in values.items():
+        if value is not None:
+            yield MeasuredFigure(
+                campaign=folder.name, scan=path.stem, method=method.name, figure=name, measured_mm=value
+            )
+
+
 def _read_evaluation(path: Path, take: Take) -> Iterator[dict[str, Any]]:
     """Yield the figures of an evaluation: name, true and measured value, and expanded uncertainty."""
     content: dict[str, Any] = read_json(path, called="evaluation")
     calibrated = calibrated_values(take.scene)
     try:
         stated = content.get("uncertainty", {})
-        for name, value in (content["evaluation"] or {"figures_mm": {}})["figures_mm"].items():
+        found = content["evaluation"] or {"figures_mm": {}}
+        for name, value in found["figures_mm"].items():
+            if name in _RANGES:
+                yield {"figure": f"{name}, 99.7 %", "measured_mm": found["vdi_range_mm"]}
             true, std = calibrated.get(name, (None, 0.0))
             known = stated.get(name)
             expanded = None if known is None else math.hypot(known["expanded_mm"], std)
@@ -50,6 +72,8 @@ def _read_evaluation(path: Path, take: Take) -> Iterator[dict[str, Any]]:
             yield {"figure": f"mean error {axis}", "true_mm": 0.0, "measured_mm": shift, "expanded_mm": expanded}
         for name, compared in {"as measured": truth, "after best fit": truth["after_best_fit"]}.items():
             yield {"figure": f"rms distance to truth, {name}", "measured_mm": compared["rms_mm"]}
+        if content["evaluation"] is None:
+            yield {"figure": "STD", "measured_mm": truth["after_best_fit"]["std_mm"]}
 
 
 def calibrated_values(scene: Scene) -> dict[str, tuple[float, float]]:
@@ -78,7 +102,7 @@ def calibrated_values(scene: Scene) -> dict[str, tuple[float, float]]:
 
 def _read_values(method: Method, folder: Path, take: Take) -> Iterator[dict[str, Any]]:
     """Yield the flatness of an inspected plane, or diameter and ovality of a pipe if both were measured."""
-    match inspected_as(take.scene):
+    match inspected_as(take.scene) if method.inspected else None:
         case "flange":
             plane = parse_artefact(take.scene.artefact)
             assert isinstance(plane, PlaneStandard)
@@ -113,7 +137,7 @@ def read_flaws(
     """
     groups: dict[tuple[Any, ...], FlawFindings] = {}
     campaigns: dict[tuple[Any, ...], list[str]] = {}
-    for scan in method.scans:
+    for scan in method.scans if method.inspected else ():
         for folder, takes in folders.items():
             if (kind := flaws_of(takes[scan].scene)) is None:
                 continue

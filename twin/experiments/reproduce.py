@@ -1,4 +1,7 @@
-"""Reproduction of the thesis's evaluation: campaigns are recorded, then evaluated by the sensor's software.
+"""Reproduction of the thesis's evaluation: experiments with its campaign, compared with its tables.
+
+All scans are measured with all calibrations, with the thesis's stripe detection ("low pass") and the default one. In
+air, the calibration with one refraction is used without its window. "window forgotten" is one without the window.
 
 The comparison of calibrations is an experiment on scans that no calibration has used. The thesis's two methods use the
 target in air, without or with the camera's window, and the steps. The joint calibration uses these, then also the
@@ -6,19 +9,18 @@ target in water, then also half of the scans of spheres in water, which were rec
 not used. The errors are those of the other half, and of all scans in air.
 """
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from twin.experiments.experiment import run_experiment
 from twin.experiments.result import PAGE
-from twin.experiments.runner import Method, run_program
-from twin.recording.campaigns import RecordingOptions, record_campaigns, require_at_least
+from twin.experiments.runner import Method
+from twin.recording.campaigns import RecordingOptions, require_at_least
 from twin.rendering_options import CPU, Variant
 from twin.scene.campaign import load_campaign
-from uwlts.errors import DescriptionError
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 
-_LEAST_TRIALS = 20
-"""Smallest number of trials in `uwlts thesis`, checked before anything is rendered."""
 _PLACES = "near", "standoff", "far"
 _STEPS = tuple(f"step-{place}-water" for place in _PLACES)
 _IN_AIR = tuple(f"spheres-{place}{again}-air" for place in _PLACES for again in ("", "-2"))
@@ -47,6 +49,57 @@ METHODS = (
 """Calibrations of the comparison: the thesis's two methods, and the joint one by its evidence."""
 
 
+_MEDIA = "air", "water"
+_SPHERES, _PLANES, _FORMS = (
+    {medium: [f"{thing}-{place}-{medium}" for thing in things for place in places] for medium in _MEDIA}
+    for things, places in (
+        (["spheres"], [f"{place}{again}" for place in _PLACES for again in ("", "-2")]),
+        (["plane"], [f"{place}{turned}" for place in _PLACES for turned in ("", "-turned")]),
+        (["pipe", "head", "weld"], ["standoff"]),
+    )
+)
+_ALL = {medium: [*_SPHERES[medium], *_PLANES[medium], *_FORMS[medium]] for medium in _MEDIA}
+_ONE: Mapping[str, Sequence[str]] = {"air": ("target-air",), "step": _STEPS}
+_STUDY = {"step": _STEPS, "spheres": _SPHERES["water"], "line": ("line-width", "line-height")}
+_CALIBRATIONS = (
+    Method("one refraction", _ONE, [*_ALL["air"], *_ALL["water"]], "--refractions 1", "-one-refraction"),
+    Method("two refractions", {"air": ("target-bare",), "step": _STEPS}, _ALL["water"], "", "-two-refractions"),
+    *(
+        Method("polynomials", {"captures": (f"target-{each}",)}, _ALL[each], "", f"-polynomials-{each}", "polynomials")
+        for each in _MEDIA
+    ),
+    Method("single viewpoint", {"air": ("target-water",)}, _ALL["water"], "--refractions 1", "-single-viewpoint"),
+    Method("window forgotten", {"air": ("target-bare",)}, _SPHERES["air"], "", "-window-forgotten"),
+)
+_LOW_PASS = {
+    "low pass": "low_pass=0.4",
+    "mean of 5x5": "low_pass=0",
+    "fit over 3 px": "low_pass=0.4 low_pass_fit_px=3",
+    "fit over 7 px": "low_pass=0.4 low_pass_fit_px=7",
+}
+"""The thesis's stripe detection, and other interpretations of its text, which are tried on the spheres."""
+
+
+def _detect(method: Method, name: str, scans: Sequence[str]) -> Method:
+    """Return a method with the thesis's stripe detection in one of its interpretations."""
+    ending = f"{method.suffix}-{name.replace(' ', '-')}"
+    how = {"suffix": ending, "made": method.suffix, "detection": f"--stripe {_LOW_PASS[name]}", "scans": scans}
+    return replace(method, name=f"{method.name}, {name}", **how)
+
+
+_REFRACTION = _CALIBRATIONS[0]
+THESIS_METHODS = [
+    replace(method, inspected=False)
+    for method in (
+        replace(_REFRACTION, thesis=_STUDY),
+        *_CALIBRATIONS[1:],
+        *(_detect(method, "low pass", method.scans) for method in _CALIBRATIONS),
+        *(_detect(_REFRACTION, name, [*_SPHERES["air"], *_SPHERES["water"]]) for name in [*_LOW_PASS][1:]),
+    )
+]
+"""All calibrations of the thesis with both stripe detections."""
+
+
 def reproduce(
     campaign: str | Path | None = None,
     *,
@@ -56,68 +109,51 @@ def reproduce(
     first: int = 0,
     every: int = 1,
     spp: int = 16,
-    trials: int = 100,
     workers: int | None = None,
     overwrite: bool = False,
     variant: Variant = CPU,
     progress: ProgressListener = ignore_progress,
 ) -> Path:
-    """Render the campaigns of the thesis, evaluate them by all its methods, and compare the results with its tables.
+    """Reproduce the thesis as an experiment: all its calibrations and scans, compared with its tables.
 
     Every campaign has its own imperfections and noise. An interrupted run is resumed, and campaigns are added if
-    the number is increased. The path of the report, OUT/report.html, is returned.
+    the number is increased. The path of the page, OUT/experiment.html, is returned.
 
     Parameters
     ----------
     campaign
         Name or path of the campaign's description; default: "thesis", or "joint" with ``joint``.
     joint
-        Compare the joint calibration with both methods of the thesis on the same images, as an `experiment`; writes
-        OUT/experiment.html and experiment.json.
+        Compare the joint calibration with both methods of the thesis on the same images, instead.
     out
-        Folder for campaigns and report (default: runs/CAMPAIGN). Complete recordings in it are kept.
-    trials
-        Trials of the Monte Carlo propagation of every campaign: at least 20, or 0 to skip it.
+        Folder for campaigns and results (default: runs/CAMPAIGN). Complete recordings in it are kept.
     overwrite
-        Render and evaluate everything again.
+        Render everything again.
     campaigns, first, every, workers
         As for `predict`.
     spp, variant
         As for `simulate`.
     progress
-        Called with the number of images rendered, the total number, and the name of the stage.
+        As for `predict`.
 
     Returns
     -------
     pathlib.Path
-        The report, ``OUT/report.html``, or ``OUT/experiment.html`` with ``joint``.
+        The page, ``OUT/experiment.html``.
 
     Raises
     ------
-    DescriptionError, DesignError, OutputError, SetupError
-        As `record_campaigns`, or an argument is out of its range.
-    CommandFailed
-        The evaluation failed; its output gives the reason.
+    DescriptionError, DesignError, OutputError, SetupError, CommandFailed, CaptureError
+        As for `experiment`.
     """
     options = RecordingOptions(every, spp, variant, workers, overwrite=overwrite)
     require_at_least(1, campaigns=campaigns)
     require_at_least(0, first=first)
-    if trials != 0 and trials < _LEAST_TRIALS:
-        raise DescriptionError(
-            f"trials is {trials}; expected at least {_LEAST_TRIALS}, or 0 for no Monte-Carlo propagation"
-        )
     campaign = campaign or ("joint" if joint else "thesis")
     folder = Path(out or Path("runs") / Path(campaign).stem)
-    described = load_campaign(campaign)
+    how = {"name": str(campaign), "with_truth": True, "progress": progress}
+    how |= {"methods": METHODS} if joint else {"methods": THESIS_METHODS, "published": "thesis-tables"}
     seeds = range(first, first + campaigns)
-    if joint:
-        how = {"name": str(campaign), "methods": METHODS, "with_truth": True, "progress": progress}
-        print("\n".join(run_experiment(described, folder, seeds, options, **how).lines()))
-        return folder / PAGE
-    record_campaigns(described, folder, seeds=seeds, options=options, progress=progress)
-    # The sensor's software runs as a separate program, which shares no mathematics with the twin.
-    command = ["uwlts", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
-    command += ["--again"] if overwrite else []
-    command += ["--workers", str(workers)] if workers else []
-    run_program(*command)
-    return folder / "report.html"
+    result = run_experiment(load_campaign(campaign), folder, seeds, options, **how)
+    print("\n".join(result.lines()))
+    return folder / PAGE

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from pydantic import BaseModel
 
 from twin.experiments.detection import ProbabilityOfDetection
+from twin.experiments.published import PublishedFigure, draw_means, select_means, state_agreement
 from twin.scene.stated_deviations import Understated
 from uwlts._version import __version__
 from uwlts.files.json_files import write_model
@@ -32,6 +33,7 @@ RESULT = "experiment.json"
 PAGE = "experiment.html"
 _MOST_POINTS = 12_000
 """Largest number of points in a cloud of the page, which take about 60 kB."""
+_PUBLISHED_HEAD = "table", "scan", "figure", "published", "reproduced", "range of the campaigns", "ratio"
 _DETECTION_HEAD = "flaw", "method", "width / mm", "found", "false", "a90 / mm", "a90/95", "limits"
 
 
@@ -54,6 +56,8 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
         Probabilities of detection, by kind and width of the flaws.
     understated : tuple of Understated
         Deviations of the campaign that are larger than the sensor states: U does not contain them.
+    published : tuple of PublishedFigure
+        Published values that the experiment reproduces.
     """
 
     campaign: str
@@ -65,9 +69,12 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
     conditions: dict[str, str]
     detections: tuple[ProbabilityOfDetection, ...] = ()
     understated: tuple[Understated, ...] = ()
+    published: tuple[PublishedFigure, ...] = ()
 
     def verdict(self) -> str:
         """Return the main result as a sentence."""
+        if self.published:
+            return state_agreement(self.published)
         if np.isnan(covered := self.table.covered_share()):
             return "no errors to judge"
         share = f"{100 * covered:.0f} % of all errors are within U"
@@ -76,6 +83,9 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
 
     def lines(self) -> list[str]:
         """Return the result as lines of text."""
+        if self.published:
+            means = [each.texts() for each in select_means(self.published)]
+            return [*align_columns([_PUBLISHED_HEAD, *means], right=range(3, 7)), self.verdict()]
         lines = [
             f"sensor {self.sensor}, built as {self.as_built}; campaigns {self.campaign}: {len(self.seeds)}",
             *format_errors(self.errors()),
@@ -96,6 +106,16 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
 
     def _methods(self) -> list[str]:
         return list(dict.fromkeys(row.method for row in self.table.rows))
+
+    def _mean_values(self) -> list[tuple[str, ...]]:
+        """Return scan, or object with several calibrations, then calibration, figure and mean without a true value."""
+        pooled = len(self._methods()) > 1
+        groups: dict[tuple[str, ...], list[float]] = {}
+        for row in self.table.rows:
+            if row.true_mm is None:
+                key = row.pooled_key() if pooled else (row.scan, row.method, row.figure)
+                groups.setdefault(key, []).append(row.measured_mm)
+        return [(*key, f"{np.mean(values):.4f}") for key, values in groups.items()]
 
     def errors_figure(self) -> Figure:
         """Return a chart: bars for the stated uncertainties, and a dot for the error of every measurement."""
@@ -145,9 +165,11 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
                 ("seeds", f"{self.seeds[0]} to {self.seeds[-1]}"),
             ],
             understated=[each.text() for each in self.understated],
-            figure=figure_svg(self.errors_figure()),
+            figure=figure_svg(draw_means(self.published) if self.published else self.errors_figure()),
+            published_head=_PUBLISHED_HEAD,
+            published=[each.texts() for each in self.published],
             rows=[each.texts() for each in self.errors()],
-            values=_mean_values(self.table),
+            values=self._mean_values(),
             clouds=shown,
             curves=_draw_curves(self.detections) if self.detections else None,
             detection_head=_DETECTION_HEAD,
@@ -155,15 +177,6 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
             validity=[*self.conditions.items()],
             version=__version__,
         )
-
-
-def _mean_values(table: FigureTable) -> list[tuple[str, ...]]:
-    """Return scan, calibration, figure and mean value of the figures without a true value."""
-    groups: dict[tuple[str, ...], list[float]] = {}
-    for row in table.rows:
-        if row.true_mm is None:
-            groups.setdefault((row.scan, row.method, row.figure), []).append(row.measured_mm)
-    return [(*key, f"{np.mean(values):.4f}") for key, values in groups.items()]
 
 
 def _detection_row(each: ProbabilityOfDetection) -> tuple[str, ...]:

@@ -11,14 +11,14 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from twin.scene.campaign import Take
 from twin.scene.description import Scene
 from twin.scene.forms import PittedPipe, Weld
-from uwlts.errors import CommandFailed, SetupError
+from uwlts.errors import CommandFailed, DescriptionError, SetupError
 from uwlts.runtime.console import INTERRUPTED
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import Lost, open_workers
@@ -31,6 +31,9 @@ _STEP_IMAGES = 5
 COLOURED = "coloured.ply"
 """End of the names of clouds with the colours of their deviations."""
 
+THESIS = "thesis"
+"""Begin of the name of a file with figures of `uwlts thesis`."""
+
 Inspected = Literal["flange", "pipe", "weld"]
 """Kind of object for `uwlts inspect`; a plane is the face of a flange."""
 
@@ -39,8 +42,10 @@ Inspected = Literal["flange", "pipe", "weld"]
 class Method:
     """Calibration of a sensor, and the scans that are measured with it.
 
-    ``evidence`` are names of recordings by option of `uwlts calibrate`, ``options`` its other options. ``suffix`` ends
-    the names of files, so that several methods can share a folder.
+    ``evidence`` are names of recordings by option of `uwlts calibrate`, or of another ``command``; ``options`` its
+    other options. ``suffix`` ends the names of files, so that several methods can share a folder, ``made`` that of the
+    calibration if it is another method's. ``detection`` are options of `uwlts reconstruct`. Objects are inspected
+    unless ``inspected`` is False. ``thesis`` are names of recordings by option of `uwlts thesis`.
     """
 
     name: str
@@ -48,14 +53,33 @@ class Method:
     scans: Sequence[str]
     options: str = ""
     suffix: str = ""
+    command: str = "calibrate"
+    made: str | None = None
+    detection: str = ""
+    inspected: bool = True
+    thesis: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def calibration(self, folder: Path) -> Path:
         """Return the calibration's file in a campaign's folder."""
-        return folder / f"calibration{self.suffix}.json"
+        return folder / f"calibration{self.suffix if self.made is None else self.made}.json"
 
     def result(self, folder: Path, scan: str, kind: str) -> Path:
         """Return a scan's file of a kind: cloud.h5, evaluation.json, inspection.json or `COLOURED`."""
         return folder / f"{scan}{self.suffix}.{kind}"
+
+    def restrict_to(self, takes: Mapping[str, Take]) -> "Method":
+        """Return the method with the scans of a campaign; DescriptionError if it lacks a recording for the calibration.
+
+        A method without scans needs no calibration.
+        """
+        known = {option: [name for name in names if name in takes] for option, names in self.thesis.items()}
+        of_campaign = replace(self, scans=[scan for scan in self.scans if scan in takes], thesis=known)
+        wanted = [name for names in self.evidence.values() for name in names]
+        if of_campaign.scans and (missing := [name for name in wanted if name not in takes]):
+            raise DescriptionError(
+                f"the campaign has no recording {', '.join(missing)}, which the calibration {self.name!r} needs"
+            )
+        return of_campaign
 
 
 @dataclass(frozen=True)
@@ -104,8 +128,11 @@ def plan_lines(
     ``with_truth`` compares all clouds with the ground truth of their recordings, too. With ``coloured``, those of the
     first method are also written with the colours of their deviations.
     """
-    lines = [_calibrate(folder, method) for method in methods]
+    made = {method.calibration(folder): _calibrate(folder, method) for method in methods}
+    lines = [*made.values()]
     for method in methods:
+        if any(method.thesis.values()):
+            lines.append(_summarize(folder, method))
         for scan in method.scans:
             shown = coloured and method is methods[0]
             lines += _measure(folder, method, takes[scan], with_truth=with_truth, coloured=shown)
@@ -113,18 +140,33 @@ def plan_lines(
 
 
 def _calibrate(folder: Path, method: Method) -> CommandLine:
-    given = {option: [folder / f"{name}.h5" for name in names] for option, names in method.evidence.items() if names}
-    words = " ".join(f"--{option} {' '.join(map(_quoted, paths))}" for option, paths in given.items())
+    words, reads = _give(folder, method.evidence)
     more = f" {method.options}" if method.options else ""
     made = method.calibration(folder)
-    text = f"uwlts calibrate {words}{more} --out {_quoted(made)} --overwrite"
-    return CommandLine("calibrate", text, tuple(path for paths in given.values() for path in paths), made)
+    text = f"uwlts {method.command} {words}{more} --out {_quoted(made)} --overwrite"
+    return CommandLine("calibrate", text, reads, made)
+
+
+def _summarize(folder: Path, method: Method) -> CommandLine:
+    """Return the command of the figures that follow from several recordings."""
+    words, reads = _give(folder, method.thesis)
+    calibration, made = method.calibration(folder), method.result(folder, THESIS, "json")
+    text = f"uwlts thesis {_quoted(calibration)} {words} --out {_quoted(made)} --overwrite"
+    return CommandLine("evaluate", text, (calibration, *reads), made)
+
+
+def _give(folder: Path, recordings: Mapping[str, Sequence[str]]) -> tuple[str, tuple[Path, ...]]:
+    """Return the words that give recordings by options, and their paths."""
+    given = {option: [folder / f"{name}.h5" for name in names] for option, names in recordings.items() if names}
+    words = " ".join(f"--{option} {' '.join(map(_quoted, paths))}" for option, paths in given.items())
+    return words, tuple(path for paths in given.values() for path in paths)
 
 
 def _measure(folder: Path, method: Method, take: Take, *, with_truth: bool, coloured: bool) -> Iterator[CommandLine]:
     capture, calibration = folder / f"{take.name}.h5", method.calibration(folder)
     cloud = method.result(folder, take.name, "cloud.h5")
     known = f"--calibration {_quoted(calibration)} --out {_quoted(cloud)}"
+    known += f" {method.detection}" if method.detection else ""
     yield CommandLine(
         "reconstruct", f"uwlts reconstruct {_quoted(capture)} {known} --overwrite", (capture, calibration), cloud
     )
@@ -136,7 +178,7 @@ def _measure(folder: Path, method: Method, take: Take, *, with_truth: bool, colo
             words += f" --coloured {_quoted(method.result(folder, take.name, COLOURED))}"
         text = f"uwlts evaluate {_quoted(cloud)} --out {_quoted(made)}{words} --overwrite"
         yield CommandLine("evaluate", text, (cloud,), made)
-    if (kind := inspected_as(take.scene)) is not None:
+    if method.inspected and (kind := inspected_as(take.scene)) is not None:
         made = method.result(folder, take.name, "inspection.json")
         yield CommandLine(
             "evaluate", f"uwlts inspect {_quoted(cloud)} {kind} --out {_quoted(made)} --overwrite", (cloud,), made

@@ -1,4 +1,4 @@
-"""Commands that evaluate measured objects: changes, features and the thesis's campaigns."""
+"""Commands that evaluate measured objects: changes, features and figures of the thesis."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -127,15 +127,16 @@ def findings_report(
 
 
 @command_from(app, uwlts.thesis, "evaluate_thesis", job="Inspect")
-def thesis(call: Call) -> None:
-    """`twin reproduce` renders such a folder.
-
-    Example: uwlts thesis runs/thesis
-    """
-    written = call()
-    say(written.headline.rstrip())
-    page, *others = written.files
-    say(f"wrote {page}, {', '.join(file.name for file in others)}")
+def thesis(
+    call: Call,
+    *,
+    out: Annotated[Path, a_file(".json"), Parameter(help="Figures to write (JSON).")],
+    overwrite: Overwrite = False,
+) -> None:
+    """Example: uwlts thesis calibration.json --step step.h5 --spheres near.h5 far.h5 --out thesis.json"""
+    found = call()
+    found.save(out, overwrite=overwrite)
+    wrote([f"{row.scan}, {row.figure}: {row.measured_mm:.4f}" for row in found.rows], (), out)
 
 
 @command_from(app, uwlts.report, "write_domain_gap", job="Inspect", shortcuts=STRIPE)

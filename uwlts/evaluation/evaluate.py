@@ -30,13 +30,17 @@ VERSION = 1  # of the file format
 
 
 class ArtefactFigures(StoredResult):
-    """Figures of an artefact by name, mm, the numbers of points, and results of the specific artefact."""
+    """Figures of an artefact by name, mm, the numbers of points, and results of the specific artefact.
+
+    ``vdi_range_mm`` is the range of the deviations without 0.3 % of the points, as VDI/VDE 2634 allows.
+    """
 
     kind: str
     figures_mm: dict[str, float]
     points_total: Count
     points_used: Count
     points_rejected: Count
+    vdi_range_mm: float | None = None
     within_vdi_outliers: bool
 
     @property

@@ -194,6 +194,12 @@ class ArtefactEvaluation(ABC):
         """True if the rejected fraction is at most 0.3 %, the limit of VDI/VDE 2634."""
         return self.rejected_share <= VDI_OUTLIER_SHARE
 
+    @property
+    def vdi_range_mm(self) -> float:
+        """Range of the deviations without the 0.3 % of the points with the largest ones, as VDI/VDE 2634 allows."""
+        used = self.deviation_mm[np.isfinite(self.deviation_mm)]
+        return spread_mm(used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]])
+
     @abstractmethod
     def values_mm(self) -> dict[FigureId, float | None]:
         """Return the values of the figures, mm; None or no entry for a figure that could not be measured."""
@@ -221,6 +227,7 @@ class ArtefactEvaluation(ABC):
             "points_total": self.points_total,
             **{name: _plain(getattr(self, name)) for name in own},
             "rejected_share": self.rejected_share,
+            "vdi_range_mm": self.vdi_range_mm,
             "within_vdi_outliers": self.within_vdi_outliers,
         }
 

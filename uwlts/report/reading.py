@@ -14,6 +14,7 @@ from uwlts.storage.calibration_file import FORMAT as CALIBRATION, POLYNOMIALS_FO
 from uwlts.storage.capture import FORMAT as CAPTURE, Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import CLOUD_ENDINGS, is_readable_cloud, read_cloud
+from uwlts.storage.figure_table import FORMAT as FIGURES, FigureTable, read_figures
 from uwlts.storage.hdf5_file import read_format
 from uwlts.storage.mesh_file import READ_FORMATS as MESH_FORMATS, SurfaceMesh, has_faces, read_mesh
 from uwlts.storage.mount_files import read_mount
@@ -25,19 +26,33 @@ _TABLES = (".csv", ".txt", ".asc")
 """Endings of text with a cloud or a trajectory."""
 _READABLE = (
     f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
-    "calibrations, mounts, evaluations and acceptance tests (.json), trajectories (.csv, .tum, ROS bags)"
+    "calibrations, mounts, evaluations, acceptance tests and figures (.json), trajectories (.csv, .tum, ROS bags)"
+)
+
+_Readable = (
+    Capture
+    | PointCloud
+    | SurfaceMesh
+    | Truth
+    | AnyCalibration
+    | Mount
+    | Evaluation
+    | Acceptance
+    | FigureTable
+    | Trajectory
 )
 
 
 def read(
     path: str | Path, *, pose_format: PoseFormat = SAVED_FORMAT, pose_unit: Unit | None = None, unit: Unit | None = None
-) -> Capture | PointCloud | SurfaceMesh | Truth | AnyCalibration | Mount | Evaluation | Acceptance | Trajectory:
+) -> _Readable:
     """Read a file of the program, whose content determines the type of the result.
 
     The result is an opened capture, a cloud, a mesh, ground truth, a calibration, a mount, the record of an evaluation,
-    an acceptance test, or a trajectory. A PLY file with faces is a mesh, and text with times and rotations is a
-    trajectory. The metadata of a capture's frames are read at once, and images on demand: ``capture[12]`` is a `Frame`.
-    A recording in progress can be opened by its name ``NAME.part``. Close a capture, or use it as a context manager.
+    an acceptance test, a table of figures, or a trajectory. A PLY file with faces is a mesh, and text with times and
+    rotations is a trajectory. The metadata of a capture's frames are read at once, and images on demand:
+    ``capture[12]`` is a `Frame`. A recording in progress can be opened by its name ``NAME.part``. Close a capture, or
+    use it as a context manager.
 
     Parameters
     ----------
@@ -52,7 +67,7 @@ def read(
 
     Returns
     -------
-    Capture, PointCloud, SurfaceMesh, Truth, Mount, Evaluation, Acceptance, Trajectory or a calibration
+    Capture, PointCloud, SurfaceMesh, Truth, Mount, Evaluation, Acceptance, FigureTable, Trajectory or a calibration
         An opened capture must be closed, or used in a ``with`` statement.
 
     Raises
@@ -83,6 +98,8 @@ def read(
             return read_evaluation(path)
         if found == ACCEPTANCE:
             return read_acceptance(path)
+        if found == FIGURES:
+            return read_figures(path)
         raise CaptureError(f"{path} is JSON of the format {found!r}; this reads {_READABLE}")
     if ending.lower() in _TABLES and (pose_format != SAVED_FORMAT or holds_trajectory(path)):
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)

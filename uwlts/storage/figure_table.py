@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel
 
+from uwlts.files.json_files import read_model, write_model
 from uwlts.model.short_text import Brief, align_columns
 from uwlts.runtime.optional_library import optional_library
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+FORMAT = "uwlts-figures"
+VERSION = 1  # of the file format
 _HEAD = "scan", "calibration", "figure", "U / mm", "found", "within U"
 _NUMBER = re.compile(r" (sphere \d+|\d+-\d+|[XYZ])$")
 """Sphere, pair of spheres or axis at the end of a figure's name."""
@@ -58,6 +62,14 @@ class MeasuredFigure(BaseModel, frozen=True):
     def error_mm(self) -> float | None:
         """Measured minus true value."""
         return None if self.true_mm is None else self.measured_mm - self.true_mm
+
+    def pooled_key(self) -> tuple[str, str, str]:
+        """Return object and medium, method, and figure without the number of a sphere or an axis.
+
+        A scan's name is OBJECT-PLACEMENT, and ends with "-air" if the object is in air.
+        """
+        scan = self.scan.split("-")[0] + " in air" * self.scan.endswith("-air")
+        return scan, self.method, _NUMBER.sub("", self.figure)
 
 
 class FigureErrors(BaseModel, frozen=True):
@@ -143,15 +155,8 @@ class FigureTable(Brief, BaseModel, frozen=True):
         return _group_errors(stated, [(row.scan, row.method, row.figure) for row in stated])
 
     def pooled_errors(self) -> tuple[FigureErrors, ...]:
-        """Return all errors by object and medium, figure and method: those of its scans, spheres or axes together.
-
-        A scan's name is OBJECT-PLACEMENT, and ends with "-air" if the object is in air.
-        """
-        keys = [
-            (row.scan.split("-")[0] + " in air" * row.scan.endswith("-air"), row.method, _NUMBER.sub("", row.figure))
-            for row in self.rows
-        ]
-        groups = _group_errors(self.rows, keys)
+        """Return all errors by object and medium, figure and method: those of its scans, spheres or axes together."""
+        groups = _group_errors(self.rows, [row.pooled_key() for row in self.rows])
         order = list(dict.fromkeys((each.scan, each.name) for each in groups))
         return tuple(sorted(groups, key=lambda each: order.index((each.scan, each.name))))
 
@@ -161,9 +166,18 @@ class FigureTable(Brief, BaseModel, frozen=True):
         count = sum(len(each.errors_mm) for each in groups)
         return sum(each.covered for each in groups) / count if count else float("nan")
 
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the table as indented JSON, atomically; OutputError if writing fails."""
+        write_model(path, self, file_format=FORMAT, version=VERSION, overwrite=overwrite)
+
     def lines(self) -> list[str]:
         """Return the errors by scan and figure as lines of text."""
         return format_errors(self.errors())
+
+
+def read_figures(path: str | Path) -> FigureTable:
+    """Read a table of figures; CaptureError if it is missing, newer, damaged, or of another format."""
+    return read_model(path, FigureTable, file_format=FORMAT, version=VERSION, called="table of figures")
 
 
 def _group_errors(rows: Sequence[MeasuredFigure], keys: Sequence[tuple[str, str, str]]) -> tuple[FigureErrors, ...]:

@@ -14,6 +14,7 @@ from uwlts.model.stripe import Stripe, StripeCandidates, StripeStatus
 from uwlts.stripe.block_contrast import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
 from uwlts.stripe.direct import direct_stripe
 from uwlts.stripe.learned import find_learned
+from uwlts.stripe.low_pass import fit_low_passed
 from uwlts.stripe.methods import amplitudes, method_names, place_centre
 from uwlts.stripe.options import LEARNED, PeakRule, StripeOptions
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
@@ -86,7 +87,7 @@ def extract_stripe(
         to distinguish stripe and background.
     """
     found = _search_image(image, stripe_along, options, background, saturation)
-    return leave_ends_out(found.stripe, found.options)
+    return found.complete(found.stripe)
 
 
 def extract_candidates(
@@ -128,7 +129,7 @@ def direct_stripe_in(
     stripe, rivals = found.stripe, found.find_rivals()
     if rivals is not None:
         stripe = direct_stripe(stripe, rivals, jump_px=found.options.jump_px)
-    return leave_ends_out(stripe, found.options)
+    return found.complete(stripe)
 
 
 def leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
@@ -264,6 +265,13 @@ class _SearchedImage:
     left: np.ndarray  # (L, B + 2 `MARGIN`); contrasts of the blocks not examined by the search
     noise: float  # standard deviation of a pixel's noise, grey levels
     rules: SearchRules | None  # None for a network, which finds one stripe only
+
+    def complete(self, stripe: Stripe) -> Stripe:
+        """Return the stripe without its ends, with the centres of `StripeOptions.low_pass` if it is set."""
+        stripe, tolerance = leave_ends_out(stripe, self.options), self.options.low_pass
+        if tolerance is None:
+            return stripe
+        return fit_low_passed(self.profiles, stripe, tolerance=tolerance, fitted_px=self.options.low_pass_fit_px)
 
     def is_too_wide(self) -> bool:
         """Return True if many lines show a stripe too wide to be measured."""

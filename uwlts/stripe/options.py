@@ -70,6 +70,10 @@ class StripeOptions:
     end_lines : int
         Lines omitted on either side of an end of the stripe, or of a jump by more than half of `half_window_px` between
         lines: at an edge or limb only a part of the sheet's width meets the surface. 0 keeps these lines.
+    low_pass : float, optional
+        Tolerance of the thesis's low-pass filter (`uwlts.stripe.low_pass`), 0.4 for LabVIEW's, 0 for a plain mean. The
+        centres found by `method` are then replaced by those of a quadratic through `low_pass_fit_px` filtered pixels,
+        an odd number.
     """
 
     method: str = "profile-fit"
@@ -84,6 +88,8 @@ class StripeOptions:
     min_fwhm_px: float = 1.0
     ambiguous_ratio: float = 0.6
     end_lines: int = 2
+    low_pass: float | None = None
+    low_pass_fit_px: int = 5
 
     def __post_init__(self) -> None:
         for name, known in (("method", (*method_names(), LEARNED)), ("peak", tuple(PeakRule))):
@@ -96,7 +102,7 @@ class StripeOptions:
                 f"method is {self.method!r} and model {self.model!r}; only the method {LEARNED!r} takes, and "
                 "needs, the ONNX file of a model"
             )
-        for name in ("half_window_px", "widest_window_px", "smoothing_lines", "end_lines"):
+        for name in ("half_window_px", "widest_window_px", "smoothing_lines", "end_lines", "low_pass_fit_px"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer):
                 raise RangeError(f"{name} is {value!r}; expected a whole number")
@@ -110,12 +116,15 @@ class StripeOptions:
             "min_fwhm_px": (0.0, self.half_window_px),
             "ambiguous_ratio": (0.05, 1.0),
             "end_lines": (0, 100),
-        }
+            "low_pass_fit_px": (3, 15),
+        } | ({} if self.low_pass is None else {"low_pass": (0.0, 10.0)})
         for name, (low, high) in ranges.items():
             if not low <= (value := getattr(self, name)) <= high:
                 raise RangeError(f"{name} is {value!r}; expected a number from {low:g} to {high:g}")
         if self.smoothing_lines % 2 == 0:
             raise RangeError(f"smoothing_lines is {self.smoothing_lines}; use an odd number, 1 for no averaging")
+        if self.low_pass_fit_px % 2 == 0:
+            raise RangeError(f"low_pass_fit_px is {self.low_pass_fit_px}; use an odd number")
 
     @classmethod
     def resolve(cls, sensor: Sensor, settings: StripeSettings = None) -> StripeOptions:

@@ -1,6 +1,6 @@
-"""Evaluation of recorded campaigns as in G. S. de Matos's thesis (UFSC 2017), compared with its tables.
+"""Figures of G. S. de Matos's thesis (UFSC 2017) that no other function gives: window study and budget.
 
-`twin reproduce` records the campaigns and runs it.
+`twin reproduce` compares them with its tables.
 """
 
 from uwlts.argument_types import attach_public

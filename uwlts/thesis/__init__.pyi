@@ -1,1 +1,1 @@
-from .report import evaluate_thesis as evaluate_thesis
+from .thesis_figures import evaluate_thesis as evaluate_thesis

@@ -1,12 +1,13 @@
 """Sphere spacing errors of scans, their dependence on step images (Table 4), and their budget (Table 9)."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from uwlts.calibration.capture_evidence import step_evidence
-from uwlts.calibration.sequential.step_images import StepImage, label_step, step_profile
+from uwlts.calibration.sequential.step_images import StepImage, label_step
 from uwlts.calibration.sequential.window_distance import solve_window
 from uwlts.errors import CalibrationError
 from uwlts.evaluation.spheres import evaluate_spheres
@@ -20,8 +21,6 @@ from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.shapes.sphere import Sphere
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
-from uwlts.thesis.campaign_folder import STEP_PLACES, CampaignFolder
-from uwlts.thesis.results import WindowChoice, WindowProfile
 from uwlts.thesis.uncertainty_budget import UNIFORM, UncertaintySource, combine
 
 
@@ -33,7 +32,6 @@ class SphereScan:
     distance of the centres.
     """
 
-    placement: str
     pixels: np.ndarray
     stage_mm: np.ndarray
     sphere: np.ndarray
@@ -47,7 +45,7 @@ class SphereScan:
         return float(np.linalg.norm(second - first)) - self.spacing_mm
 
 
-def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str) -> SphereScan:
+def sphere_scan(capture: Capture, calibration: AnyCalibration) -> SphereScan:
     """Assign the stripes of a scan to two spheres, with a calibration.
 
     Raises EvaluationError if the scan shows no spheres.
@@ -64,7 +62,6 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str
     kept = np.flatnonzero(np.isin(lines * stripes.frame + stripes.line, (lines * scan.frame + scan.line)[used]))
     line, centre = stripes.line[kept], stripes.centre_px[kept]
     return SphereScan(
-        placement=placement,
         pixels=stack_pixels(line, centre, stripe_along=capture.header.sensor.camera.stripe_along),
         stage_mm=capture.stage_mm[stripes.frame[kept]],
         sphere=np.argmin(away, axis=1),
@@ -72,10 +69,6 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str
         medium_index=capture.header.medium.refractive_index(capture.header.sensor.laser.wavelength_nm),
         spacing_mm=standard.spacings_mm[0],
     )
-
-
-_TRIED_SHARES = (0.25, 0.5, 1.0, 1.5)
-"""Window distances of Figure 45, relative to the calibrated one."""
 
 
 def window_of(calibration: Calibration) -> WindowModel:
@@ -103,41 +96,29 @@ def spacing_error(calibration: Calibration, scan: SphereScan, *, medium_index: f
 
 
 def window_choices(
-    folder: CampaignFolder, calibration: Calibration, scans: Sequence[SphereScan]
-) -> tuple[list[WindowChoice], list[WindowProfile]]:
-    """Determine the window from every step image, the three of each place, and all nine; also return step profiles.
+    steps: Sequence[Capture], calibration: Calibration, scans: Sequence[SphereScan]
+) -> Iterator[tuple[str, float, float]]:
+    """Yield the window distance from every step image, from those of each capture, and from all.
 
-    The profiles are those of one step at several window distances.
-
-    Raises CaptureError if a recording is missing or damaged; CalibrationError if the calibration has no window.
+    An item has the name of the images, the distance, and the mean absolute sphere spacing error of the scans with it,
+    mm. Images that determine no distance are left out. Raises CaptureError if a capture shows no step; CalibrationError
+    if the calibration has no window.
     """
     nominal = window_of(calibration)
     images: dict[str, list[StepImage]] = {}
-    for place, path in zip(STEP_PLACES, folder.steps(), strict=True):
-        with Capture(path) as capture:
-            evidence, _ = step_evidence([capture])
-            camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
+    for capture in steps:
+        camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
         described = WindowModel.from_description(camera.window, laser.wavelength_nm, refractions=nominal.refractions)
-        images[place] = [label_step(calibration, described, step) for step in evidence]
-    subsets = {f"{place} {number}": [image] for place in images for number, image in enumerate(images[place], start=1)}
-    subsets |= images | {"all": [image for place in images for image in images[place]]}
-    choices = []
+        images[capture.path.stem] = [label_step(calibration, described, step) for step in step_evidence([capture])[0]]
+    subsets = {f"{name} {number}": [image] for name in images for number, image in enumerate(images[name], start=1)}
+    subsets |= images | {"all step images": [image for name in images for image in images[name]]}
     for name, chosen in subsets.items():
         try:
             window = solve_window(calibration, nominal, chosen).model
         except CalibrationError:
-            choices.append(WindowChoice(name, None, None))
             continue
         moved = calibration.model_copy(update={"window": window})
-        choices.append(WindowChoice(name, window.distance_mm, mean_spacing_error(moved, scans)))
-    shown = images[STEP_PLACES[1]][0]
-    profiles = []
-    for share in _TRIED_SHARES:
-        window = nominal.model_copy(update={"distance_mm": share * nominal.distance_mm})
-        profile = step_profile(calibration, window, shown.pixels, medium_index=shown.medium_index)
-        seen = profile[np.isfinite(profile).all(axis=1)][::4]
-        profiles.append(WindowProfile(window.distance_mm, [(y, z) for y, z in np.round(seen, 4).tolist()]))
-    return choices, profiles
+        yield name, window.distance_mm, mean_spacing_error(moved, scans) if scans else math.nan
 
 
 TEMPERATURE_HALF_WIDTH_C = 5.0  # the thesis's 5 K

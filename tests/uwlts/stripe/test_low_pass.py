@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from uwlts.model.library import load_sensor
-from uwlts.model.sensor import Medium
-from uwlts.storage.capture import Capture, CaptureHeader, Frame
-from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.stripe import CaptureStripes
-from uwlts.thesis.measurements import apply_low_pass, thesis_stripes
+from uwlts.errors import RangeError
+from uwlts.model.stripe import Stripe
+from uwlts.stripe import StripeOptions, extract_stripe
+from uwlts.stripe.low_pass import apply_low_pass, fit_low_passed
 
 LINES, LENGTH = 40, 64
 
@@ -60,37 +58,19 @@ def test_black_stays_black():
     np.testing.assert_array_equal(apply_low_pass(np.zeros((9, 9), np.uint8), tolerance=0.4), np.zeros((9, 9)))
 
 
-def capture(path, images, *, stripe_along):
-    """Write a capture of images with a stripe along the width, rotated for a stripe along the height."""
-    images = images if stripe_along == "width" else [np.ascontiguousarray(image.T) for image in images]
-    sensor = load_sensor("thesis")
-    size = {"height_px": images[0].shape[0], "width_px": images[0].shape[1], "stripe_along": stripe_along}
-    sensor = sensor.model_copy(update={"camera": sensor.camera.model_copy(update=size)})
-    header = CaptureHeader(
-        name="stripe",
-        sensor=sensor,
-        medium_name="air",
-        medium=Medium(kind="air"),
-        saturation_dn=65535,
-        stage_direction=(1.0, 0.0, 0.0),
+def fit(image, centres, *, tolerance=0.4, fitted_px=5):
+    """Fit the stripe of an image with known centres (LINES,), position first."""
+    known = Stripe(
+        centres,
+        np.ones(LINES, np.float32),
+        np.full(LINES, 4.0, np.float32),
+        np.zeros(LINES, np.uint8),
+        stripe_along="width",
     )
-    with CaptureWriter(path, header, dtype=images[0].dtype) as writer:
-        for number, image in enumerate(images):
-            writer.append(Frame(image, float(number), True, 1.0, 0.0))
-    return Capture(path)
-
-
-def found(centres):
-    """Stripes of images at centres (F, LINES), on every line."""
-    frames, lines = np.indices(centres.shape)
-    return CaptureStripes(
-        frames.ravel(),
-        lines.ravel(),
-        centres.ravel(),
-        np.ones(centres.size),
-        np.full(centres.size, 4.0),
-        {"ok": centres.size},
-    )
+    found = fit_low_passed(image, known, tolerance=tolerance, fitted_px=fitted_px)
+    for name in ("amplitude", "width_px", "status"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(known, name))
+    return found.centre_px
 
 
 def parabolas(vertices, *, height=60000, curvature=640):
@@ -101,72 +81,52 @@ def parabolas(vertices, *, height=60000, curvature=640):
     return image
 
 
-VERTICES = np.array([30.0 + np.arange(LINES) / 8, 41.5 - np.arange(LINES) / 8])
-
-
-@pytest.mark.parametrize("stripe_along", ["width", "height"])
 @pytest.mark.parametrize("fitted_px", [3, 5, 7])
-def test_the_vertex_of_a_sampled_parabola_is_exact(tmp_path, stripe_along, fitted_px):
-    images = [parabolas(vertices) for vertices in VERTICES]
+@pytest.mark.parametrize("vertices", [30.0 + np.arange(LINES) / 8, 41.5 - np.arange(LINES) / 8])
+def test_the_vertex_of_a_sampled_parabola_is_exact(vertices, fitted_px):
     # The approximate position decides where to search, not the result.
-    known = found(VERTICES + np.random.default_rng(1).uniform(-5, 5, VERTICES.shape))
-    with capture(tmp_path / "stripe.h5", images, stripe_along=stripe_along) as opened:
-        measured = thesis_stripes(opened, known, fitted_px=fitted_px)
+    known = vertices + np.random.default_rng(1).uniform(-5, 5, LINES)
     # Differences of whole numbers below 2^24 are exact in float32; the fit's weights are rounded at 1e-16.
-    np.testing.assert_allclose(measured.centre_px, VERTICES.ravel(), atol=1e-10)
-    for name in ("frame", "line", "amplitude"):
-        np.testing.assert_array_equal(getattr(measured, name), getattr(known, name))
-    assert measured.lines_by_status == known.lines_by_status
+    np.testing.assert_allclose(fit(parabolas(vertices), known, fitted_px=fitted_px), vertices, atol=1e-10)
 
 
-def test_the_mean_of_the_neighbours_keeps_a_parabolas_vertex(tmp_path):
-    vertices = np.full((1, LINES), 30.375)
-    with capture(tmp_path / "stripe.h5", [parabolas(vertices[0])], stripe_along="width") as opened:
-        measured = thesis_stripes(opened, found(vertices), tolerance=0.0)
+def test_the_mean_of_the_neighbours_keeps_a_parabolas_vertex():
+    vertices = np.full(LINES, 30.375)
     # The mean of a parabola's samples is the parabola, lower. Float32 rounds 6e4 by 0.002; the slope of the fit is a
     # mean of five with weights of 0.2, the vertex the slope over twice the curvature: 4 * 0.002 * 0.45 / 1280.
-    np.testing.assert_allclose(measured.centre_px, vertices.ravel(), atol=1e-5)
+    np.testing.assert_allclose(fit(parabolas(vertices), vertices, tolerance=0.0), vertices, atol=1e-5)
 
 
-def test_noise_within_the_tolerance_is_not_smoothed(tmp_path):
+def test_noise_within_the_tolerance_is_not_smoothed():
     """Noise that the plain mean removes reaches the fit through LabVIEW's filter: 25 pixels against a few."""
-    rng, vertices = np.random.default_rng(2), np.full((4, LINES), 30.0)
+    rng, vertices = np.random.default_rng(2), np.full(LINES, 30.0)
     images = [
-        (parabolas(row, height=40000, curvature=320) + rng.normal(0, 100, (LENGTH, LINES))).astype(np.uint16)
-        for row in vertices
+        (parabolas(vertices, height=40000, curvature=320) + rng.normal(0, 100, (LENGTH, LINES))).astype(np.uint16)
+        for _ in range(4)
     ]
-    spreads = []
-    with capture(tmp_path / "stripe.h5", images, stripe_along="width") as opened:
-        for tolerance in (0.4, 0.0):
-            measured = thesis_stripes(opened, found(vertices), tolerance=tolerance)
-            spreads.append(np.std(measured.centre_px - vertices.ravel()))
+    spreads = [
+        np.std([fit(image, vertices, tolerance=tolerance) - vertices for image in images]) for tolerance in (0.4, 0.0)
+    ]
     # Slope of a line through five pixels: 100 / sqrt(10); over 640 per px. A standard deviation of 160 is good to
     # 5.6 %; 3.5 of it. Of the mean of 24 less than half is left.
     assert spreads[0] == pytest.approx(100 / np.sqrt(10) / 640, rel=0.2)
     assert spreads[1] < 0.5 * spreads[0]
 
 
-def test_unless_set_the_tolerance_is_labviews(tmp_path):
+def test_the_tolerance_decides_what_is_smoothed():
     """Limit of 40 %: a pixel 30 % above its neighbours remains, and shifts the vertex towards it."""
     image = parabolas(np.full(LINES, 30.0))
     image[31] = (1.3 * image[31]).astype(np.uint16) // 2
-    known = found(np.full((1, LINES), 30.0))
-    with capture(tmp_path / "stripe.h5", [image], stripe_along="width") as opened:
-        default, manual, lower = (
-            thesis_stripes(opened, known, **how).centre_px for how in ({}, {"tolerance": 0.4}, {"tolerance": 0.2})
-        )
-    np.testing.assert_array_equal(default, manual)
+    default, lower = (fit(image, np.full(LINES, 30.0), tolerance=tolerance) for tolerance in (0.4, 0.2))
     assert (np.abs(default - lower)[2:-2] > 0.01).all()
 
 
-def test_a_plateau_is_placed_at_the_stripe_known_or_in_its_own_middle(tmp_path):
+def test_a_plateau_is_placed_at_the_stripe_known_or_in_its_own_middle():
     image = np.full((LENGTH, LINES), 10, np.uint8)
     image[26:35, :20] = 255
     image[28:33, 20:] = [[180], [225], [255], [225], [180]]
     image[29:32, 30:] = 255
-    known = np.full((1, LINES), 30.3)
-    with capture(tmp_path / "stripe.h5", [image], stripe_along="width") as opened:
-        centre = thesis_stripes(opened, found(known)).centre_px
+    centre = fit(image, np.full(LINES, 30.3))
     # Nine pixels wide: no vertex within the fit. Three pixels or one: the same on both sides, so exactly the middle;
     # columns 17 to 32 are left out, where the filter sees different stripes side by side.
     np.testing.assert_allclose(centre[:17], 30.0, atol=1e-10)
@@ -174,18 +134,38 @@ def test_a_plateau_is_placed_at_the_stripe_known_or_in_its_own_middle(tmp_path):
     np.testing.assert_allclose(centre[33:], 30.0, atol=1e-10)
 
 
-def test_the_vertex_stays_within_the_fit(tmp_path):
+def test_the_vertex_stays_within_the_fit():
     """A peak at the rim of the searched range, on a slope, without a vertex there."""
     image = np.repeat((np.arange(LENGTH, dtype=np.uint16) ** 2 * 10)[:, None], LINES, axis=1)
-    known = np.full((1, LINES), 30.0)
-    with capture(tmp_path / "stripe.h5", [image], stripe_along="width") as opened:
-        centre = thesis_stripes(opened, found(known)).centre_px
-    assert (np.abs(centre - known) <= 8 + 2).all()
+    assert (np.abs(fit(image, np.full(LINES, 30.0)) - 30.0) <= 8 + 2).all()
 
 
-def test_stripes_at_the_border_of_the_image_have_a_finite_centre(tmp_path):
+def test_stripes_at_the_border_of_the_image_have_a_finite_centre():
     vertices = np.concatenate([np.full(LINES // 2, 0.25), np.full(LINES // 2, LENGTH - 1.25)])
-    with capture(tmp_path / "stripe.h5", [parabolas(vertices)], stripe_along="width") as opened:
-        centre = thesis_stripes(opened, found(vertices[None])).centre_px
     # Pixels beyond the border are repeated, which shifts the vertex towards it by less than the fit's half width.
-    assert (np.abs(centre - vertices) < 2).all()
+    assert (np.abs(fit(parabolas(vertices), vertices) - vertices) < 2).all()
+
+
+@pytest.mark.parametrize("stripe_along", ["width", "height"])
+def test_the_option_replaces_the_centres_of_the_other_methods(stripe_along):
+    """The lines, heights and widths stay; images rotated by a quarter turn give the same centres."""
+    rows = np.arange(200.0)[:, None]
+    image = 20 + 200 * np.exp(-0.5 * ((rows - 80.3 - 0.01 * np.arange(LINES)) / 2.5) ** 2)
+    image = np.random.default_rng(3).poisson(image).astype(np.uint8)
+    turned = image if stripe_along == "width" else np.ascontiguousarray(image.T)
+    plain, fitted = (
+        extract_stripe(turned, stripe_along=stripe_along, options=StripeOptions(low_pass=low_pass))
+        for low_pass in (None, 0.4)
+    )
+    np.testing.assert_array_equal(plain.amplitude, fitted.amplitude)
+    lines = plain.lines
+    assert len(lines) > 30
+    expected = fit_low_passed(image, plain, tolerance=0.4, fitted_px=5).centre_px
+    np.testing.assert_array_equal(fitted.centre_px, expected)
+    assert 0 < np.abs(fitted.centre_px - plain.centre_px)[lines].max() < 2
+
+
+@pytest.mark.parametrize("wrong", [{"low_pass": -0.1}, {"low_pass_fit_px": 4}, {"low_pass_fit_px": 1}])
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(RangeError, match=next(iter(wrong))):
+        StripeOptions(**wrong)
