@@ -241,7 +241,7 @@ def test_version(command, program: str):
         ("uwlts design --medium water", "SENSOR"),
         ("uwlts nominal thesis --out x.json", "--medium"),
         ("uwlts evaluate scan.ply", "--out"),
-        ("uwlts thesis", "--out"),
+        ("uwlts thesis", "--calibration is missing"),
         ("twin simulate --out x.h5", "SCENE"),
         ("twin simulate spheres", "--out"),
         ("twin simulate spheres --out x.h5 --spp many", "many"),

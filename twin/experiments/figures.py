@@ -24,7 +24,7 @@ _RANGES = "PE", "RE"
 def read_figures(folder: Path, takes: Mapping[str, Take], methods: Sequence[Method]) -> Iterator[MeasuredFigure]:
     """Yield the figures of a campaign's scans by all methods; CaptureError if a result is incomplete."""
     for method in methods:
-        if method.made is None:
+        if method.made is None and method.calibration(folder).is_file():
             yield from _read_calibration(folder, method)
         if any(method.thesis.values()):
             yield from read_table(method.result(folder, THESIS, "json")).rows

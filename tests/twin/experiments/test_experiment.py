@@ -228,7 +228,7 @@ def write_results(folder: Path, name: str, *, error_mm: float, random_mm: float,
     parts = {"random_mm": random_mm, "systematic_mm": systematic_mm, "expanded_mm": expanded}
     evaluation = {
         "format": "uwlts-evaluation",
-        "evaluation": {"figures_mm": {"SSE": error_mm, "PE": 0.1}},
+        "evaluation": {"figures_mm": {"SSE": error_mm, "PE": 0.1}, "vdi_range_mm": 0.08},
         "uncertainty": {"SSE": parts},
     }
     flatness = {"value": 0.02 + error_mm, "random": random_mm, "systematic": systematic_mm}
