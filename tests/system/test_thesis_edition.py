@@ -150,7 +150,7 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
 
     Root mean square errors on a processor with AVX2, for all nine figures (three spacings, six diameters) of scans that
     no calibration has used: 0.019 mm jointly with other scans, 0.036 mm with the target in water, 0.091 mm with one
-    refraction and 0.102 mm with two. The stated uncertainty is 0.020 mm, as the water could have drifted between scans.
+    refraction and 0.102 mm with two. The stated uncertainty is 0.025 mm, as the water could have drifted between scans.
     """
     ways = (JOINT, "joint, with the target in water", "one refraction", "two refractions")
     pooled = [each for each in imperfect.pooled_errors() if each.name in ("SSE", "diameter error")]
@@ -172,7 +172,7 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
     # and circles, to a few percent, and from descriptions. 30 % are far beyond a probability of 1e-4. It may neither
     # shrink to half or a third (overconfident) nor grow (an advantage lost); the simulated campaigns of
     # tests/uwlts/calibration/joint/test_coverage.py show that it is correct.
-    assert 0.0204 / 1.3 < root_mean_square(stated) < 0.0204 * 1.3
+    assert 0.0247 / 1.3 < root_mean_square(stated) < 0.0247 * 1.3
 
     # Factors of 4.7 and 5.3 are expected, and 2.5 is required: errors of the joint estimate that are 1.9 times larger
     # fail.

@@ -48,9 +48,8 @@ def read(
 ) -> _Readable:
     """Read a file of the program, whose content determines the type of the result.
 
-    The result is an opened capture, a cloud, a mesh, ground truth, a calibration, a mount, the record of an evaluation,
-    an acceptance test, a table of figures, or a trajectory. A PLY file with faces is a mesh, and text with times and
-    rotations is a trajectory. The metadata of a capture's frames are read at once, and images on demand:
+    The result is of the class that was saved, or an opened capture. A PLY file with faces is a mesh, text with times
+    and rotations a trajectory. The metadata of a capture's frames are read at once, and images on demand:
     ``capture[12]`` is a `Frame`. A recording in progress can be opened by its name ``NAME.part``. Close a capture, or
     use it as a context manager.
 
