@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence, outliers
+from uwlts.calibration.joint.gathering import USUAL_DISTORTION
 from uwlts.calibration.joint.residuals import SHIFT, STRETCH, TARGET, Residuals, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.fitting.least_squares import robust_std
@@ -104,7 +105,6 @@ _POSITIONS_WRONG = 3.0
 """Rms position error of the stage divided by its stated uncertainty: four positions exceed it once in a million."""
 _FEWEST_POSITIONS = 4  # for which the limit above holds
 NOTICED = 3.0  # standard uncertainties: a parameter wrongly considered less certain loses little
-_UNDETERMINED = 1e-3  # relative shift of the outermost point by a coefficient's uncertainty: a pixel in a thousand
 _MOST_NAMED = 4  # findings of a kind that a message lists
 _MOST_SAID = 6  # findings in a readable message
 
@@ -117,7 +117,7 @@ class Findings:
     that contradict all others to messages. ``misfits`` are kinds of residuals with a systematic misfit. Doubts are
     everything else. ``stretch`` is the target's stretch from the evidence alone if it differs from the prior; pixels of
     another aspect ratio have the same effect. ``form`` says whether the target's form or size differs from the prior,
-    as a wrong lens also makes it appear.
+    as a wrong lens also makes it appear. ``judged`` doubts enlarged uncertainties, by ``enlarged`` all.
     """
 
     contradictions: list[str]
@@ -126,6 +126,8 @@ class Findings:
     doubts: list[str]
     stretch: dict[ParameterKey, float] = field(default_factory=dict)
     form: bool = False
+    judged: tuple[str, ...] = ()
+    enlarged: float = 1.0
 
     def all_against(self) -> list[str]:
         """Return all messages except doubts."""
@@ -243,7 +245,7 @@ def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
     """Compare parameters with prior knowledge; return deviation and relative information gain.
 
     The stripe's shift on the target is excluded: images have little information on it, so that small model errors
-    dominate.
+    dominate. The size of k1 and k2 is that of usual lenses, and nothing that a lens contradicts.
     """
     parameters, covariance = result.parameters, result.covariance
     formal = covariance if result.formal_covariance is None else result.formal_covariance
@@ -256,7 +258,7 @@ def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
         np.diag(formal),
         strict=True,
     ):
-        if np.isfinite(std) and key is not SHIFT:
+        if np.isfinite(std) and key not in (SHIFT, *USUAL_DISTORTION):
             # The estimate includes the prior, with the weight of the formal variance, in which tied parameters are
             # exact: this is the variance of their difference if both are right (for none tied, 1 - after / std^2).
             gain = float(np.sqrt(max(1.0 + (after - 2 * exact) / std**2, _LEAST_GAIN**2)))
@@ -494,22 +496,6 @@ def _check_correlations(result: Estimate) -> Iterator[tuple[bool, str, str]]:
                 f"the {kind} has systematic deviations {where} beyond noise ({noise.sigma_px:.2f} px rms, equivalent "
                 f"to one independent value in {noise.together:.0f} {values}): check {check}",
             )
-
-
-def list_undetermined(result: Estimate, evidence: Sequence[Evidence]) -> list[str]:
-    """Describe distortion coefficients that the images do not determine.
-
-    Their uncertainty alone shifts the outermost point of the target noticeably, and zero is as likely.
-    """
-    camera, std, found = result.parameters.camera(result.values), result.std(), []
-    points = [e.placement.pixels for e in evidence if isinstance(e, TargetEvidence)]
-    off = (np.vstack(points) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-    reach = float(np.linalg.norm(off, axis=1).max())
-    for key, power in ((LensParameter.K1, 2), (LensParameter.K2, 4), (LensParameter.K3, 6)):
-        value = getattr(camera.distortion, key.text)
-        if key in std and std[key] * reach**power > _UNDETERMINED and abs(value) < 2 * std[key]:
-            found.append(f"{key.quantity.words} is not determined: {key.quantity.format_with_std(value, std[key])}")
-    return found
 
 
 def find_excess_outliers(result: Estimate) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -80,6 +81,17 @@ class Estimate:
     def std(self) -> dict[ParameterKey, float]:
         """Return the standard uncertainty of every parameter."""
         return dict(zip(self.parameters.keys, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def no_surer_than(self, other: Self) -> Self:
+        """Return the estimate with uncertainties at least those of another of the same parameters."""
+        local = map(_enlarge, self.local_covariances, other.local_covariances)
+        return replace(self, covariance=_enlarge(self.covariance, other.covariance), local_covariances=[*local])
+
+
+def _enlarge(covariance: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Return a covariance with variances at least those of another, and its own correlations."""
+    larger = np.sqrt(np.maximum(np.diag(least) / np.diag(covariance), 1.0))
+    return covariance * np.outer(larger, larger)
 
 
 def estimate(

@@ -38,6 +38,9 @@ from uwlts.stripe import StripeSettings, find_stripes
 
 _FEWEST_KEPT = 3  # images that must remain if some are rejected
 _MOST_LEFT_OUT = 0.3  # fraction of the images: if more contradict the rest, it is unclear which are right
+USUAL_DISTORTION: dict[ParameterKey, Prior] = {LensParameter.K1: Prior(0.0, 1 / 3), LensParameter.K2: Prior(0.0, 1.0)}
+"""Size of the coefficients that every lens has: k1 is -1/3 for r = f angle, and smaller for most lenses. Images that do
+not determine one then state what it does to the others: without it, a window or focal length takes its place."""
 Scanned = SphereStandard | PlaneStandard | PipeStandard
 
 
@@ -277,7 +280,14 @@ def build_priors(
         priors |= {key: Prior(0.0, std) for key, std in zip(STRETCH, known.stretch_by_axis(), strict=True)}
         priors[SHIFT] = Prior(0.0, known.target_stripe_px)
         priors |= dict.fromkeys(list_added_tangential(options.camera, known), Prior(0.0, known.tangential))
+        if options.lens is not None and options.lens.distortion == "auto":
+            priors |= usual_distortion(options.camera)
     return priors | heights
+
+
+def usual_distortion(camera: CameraOptions) -> dict[ParameterKey, Prior]:
+    """Return prior knowledge of k1 and k2; none in a rational function, whose coefficients cancel each other."""
+    return {} if "k4" in camera.distortion else USUAL_DISTORTION
 
 
 def list_added_tangential(camera: CameraOptions, known: Uncertainty) -> tuple[LensParameter, ...]:

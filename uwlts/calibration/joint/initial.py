@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import assert_never
 
 import cv2
@@ -137,14 +138,18 @@ def estimate_series_start(
     intrinsics = Intrinsics(extended, width_px=width_px, height_px=height_px)
     base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
     staged = not free and base.approaching is not None
-    seen = solve_camera(
+    solve = partial(
+        solve_camera,
         base.found.images,
         width_px=width_px,
         height_px=height_px,
         poses="stage-normal" if staged else "free",
         approaching=bool(base.approaching),
-        options=camera,
     )
+    try:
+        seen = solve(options=camera)
+    except CalibrationError:
+        seen = solve(options=replace(camera, distortion=()))  # coefficients that are not determined start at zero
     rms = seen.image_rms_px()
     explained = np.median(rms) <= max(_LARGEST_MISFIT_PX, _LARGEST_MISFIT * seen.model.fx_px)
     if base.view == ViewMedium(False, None) and not explained:

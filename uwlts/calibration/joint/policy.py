@@ -1,6 +1,6 @@
 """Changes of a joint calibration because of what its residuals show: uncertainties, lens, images, weights."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Self
@@ -18,7 +18,6 @@ from uwlts.calibration.joint.diagnose import (
     compute_size_deviations,
     describe_wrong_sizes,
     deviations,
-    list_undetermined,
 )
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered
@@ -48,7 +47,7 @@ def solve_consistently(
 
     Returns the problem, its estimate, the findings against it, and the changes.
     """
-    attempt = _solve_first(gathered, options)
+    attempt = _Attempt.solve(gathered, options)
     if not options.strict:
         attempt = attempt.improve()
     return attempt.problem, attempt.result, attempt.against, attempt.said
@@ -99,7 +98,7 @@ class _FormVerdict:
     refused: dict[Deviation, float]
     tied: dict[ParameterKey, float]
 
-    def describe(self, against: Findings, *, misfits: Collection[str]) -> tuple[list[str], list[str]]:
+    def describe(self, against: Findings) -> tuple[list[str], list[str]]:
         """Return contradictions and doubts about the target."""
         doubts = [
             f"{each.words()}; its uncertainty was enlarged accordingly"
@@ -109,7 +108,7 @@ class _FormVerdict:
         doubts += [f"{each.words()}: {_NOT_BELIEVED}, the target is taken as described" for each in self.apart]
         contradictions = []
         # Systematic deviations enlarge all uncertainties; without them, nothing would.
-        covered = misfits or (not against.contradictions and against.all_against())
+        covered = not against.contradictions and against.all_against()
         for each, times in self.refused.items() if not self.apart else ():
             found = f"{each.words()}; {times:.0f} times what is stated"
             if each.wrong() and not covered:
@@ -128,12 +127,12 @@ def _solve_with_observed_uncertainties(problem: JointProblem) -> tuple[Estimate,
 
     If all prior knowledge deviates more than stated, all prior uncertainties are multiplied by Birge's ratio, because
     parameters without evidence may be as wrong. For the form and size of the target, see `_FormVerdict`. Both are not
-    done if a single other parameter contradicts prior knowledge.
+    done if a single other parameter contradicts prior knowledge, nor again for an incomplete model.
     """
     result = problem.solve()
     seen, sensor = PriorDeviations.from_estimate(result), problem.sensor
-    contradictions, doubts = [], []
-    if not seen.show_understated():
+    contradictions, doubts, factor = [], [], 1.0
+    if problem.misfits or not seen.show_understated():
         against = check_consistency(result, problem.evidence, sensor=sensor)
     else:
         factor = seen.birge_ratio
@@ -141,14 +140,15 @@ def _solve_with_observed_uncertainties(problem: JointProblem) -> tuple[Estimate,
         sensor = sensor.model_copy(update={"uncertainty": sensor.uncertainty.scaled(factor)})
         result = replace(problem, parameters=parameters, sensor=sensor).solve()
         against = check_consistency(result, problem.evidence, sensor=sensor)
-        contradictions, doubts = verdict.describe(against, misfits=problem.misfits)
+        contradictions, doubts = verdict.describe(against)
         if factor > 1.0:
             doubts.append(
                 f"the description's values of window, media, laser, stage and target deviate by {factor:.1f} times the "
                 "stated uncertainties: all uncertainties were enlarged by this factor; check [uncertainty]"
             )
     found = {"contradictions": [*contradictions, *against.contradictions], "doubts": [*doubts, *against.doubts]}
-    return result, replace(against, **found, stretch=seen.stretch(), form=bool(seen.form()))
+    judged = {"judged": tuple(doubts), "enlarged": factor}
+    return result, replace(against, **found, **judged, stretch=seen.stretch(), form=bool(seen.form()))
 
 
 def _judge_form(problem: JointProblem, seen: PriorDeviations, near: Estimate) -> tuple[Parameters, _FormVerdict]:
@@ -235,7 +235,7 @@ class _Attempt:
         return None if fewer.against.contradictions else fewer
 
     def _with_better_lens(self) -> "_Attempt":
-        """Try fewer and more distortion coefficients, free pixel shape, or both, if something is odd.
+        """Try more distortion coefficients, free pixel shape, or both, if something is odd.
 
         Only parameters that the options leave open are changed. The pixel shape of a sensor on a stage is not freed for
         contradictions only: a wrong spacing along one side has the same effect.
@@ -244,18 +244,21 @@ class _Attempt:
         if choice is None or choice.distortion != "auto":
             return best
         odd = any(isinstance(each.key, LensParameter) for each in deviations(self.result, least=NOTICED))
-        odd |= bool(
-            self.against.all_against() or self.against.form or list_undetermined(self.result, self.problem.evidence)
-        )
+        odd |= bool(self.against.all_against() or self.against.form)
         free_pixels = choice.pixels == "auto" and self.options.poses == "free"
         # All are compared at once: pixels that are not square hide the gain of a coefficient.
         shapes = dict.fromkeys((camera.pixel_aspect, None) if free_pixels else (camera.pixel_aspect,))
-        known = DISTORTIONS if odd else (camera.distortion,)
+        known = [each for each in DISTORTIONS if {*camera.distortion} <= {*each}] if odd else (camera.distortion,)
         if len(lenses := [replace(camera, distortion=d, pixel_aspect=shape) for shape in shapes for d in known]) > 1:
             chosen = self._select_lens(lenses)
             if "k3" in chosen.distortion and odd:
                 chosen = self._select_lens([chosen, *(replace(chosen, distortion=names) for names in RATIONAL)])
             best = self._with_lens(chosen) or self if chosen != camera else self
+        if any(isinstance(each.key, LensParameter) and each.wrong() for each in deviations(best.result)):
+            # Before the usual size of p1 and p2 refuses anything, they are free.
+            freer = replace(camera, distortion=(*best.options.camera.distortion, "p1", "p2"))
+            freed = (best._with_lens(replace(freer, pixel_aspect=shape)) for shape in shapes)
+            best = next((each for each in freed if each is not None), best)
         if choice.pixels == "auto" and not free_pixels:
             if best.against.misfits:
                 free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
@@ -281,15 +284,12 @@ class _Attempt:
         return select_model(compare_models(squares, least_gain=_LEAST_GAIN), self.options.camera)
 
     def _describe_lens(self, before: CameraOptions) -> "_Attempt":
-        """Add warnings on changes of the lens, and on coefficients that remain undetermined."""
-        camera, said = self.options.camera, []
+        """Add a warning on additions to the lens."""
+        camera = self.options.camera
         given = [name for name in camera.distortion if name not in before.distortion]
         given += ["free pixels"] if camera.pixel_aspect != before.pixel_aspect else []
-        if given:
-            said.append(f"{', '.join(given)} were added to the lens: held-out images are predicted better with them")
-        if fewer := [name for name in before.distortion if name not in camera.distortion]:
-            said.append(f"{', '.join(fewer)} were left out of the lens: images are predicted as well without them")
-        return replace(self, said=(*self.said, *said, *list_undetermined(self.result, self.problem.evidence)))
+        said = f"{', '.join(given)} were added to the lens: held-out images are predicted better with them"
+        return replace(self, said=(*self.said, said)) if given else self
 
     def _with_spacings_and_pixels_free(self) -> "_Attempt | None":
         """Estimate the target's spacings and the pixel shape; None if the spacings are as described.
@@ -329,15 +329,17 @@ class _Attempt:
         halves = self.problem.linearise(self.result).disagreements()
         if not halves and not self.against.all_against():
             return None
-        problem = replace(self.problem, misfits=frozenset(self.result.noise))
+        stated = self.problem.sensor
+        sensor = stated.model_copy(update={"uncertainty": stated.uncertainty.scaled(self.against.enlarged)})
+        problem = replace(
+            self.problem, misfits=frozenset(self.result.noise), parameters=self.result.parameters, sensor=sensor
+        )
         result, against = solve_and_check(problem)
-        before, after = self.result.std(), result.std()
-        factor = float(np.median([after[key] / before[key] for key in before if key in after]))
+        result = result.no_surer_than(self.result)
+        factor = float(np.median(list(result.std().values()) / np.sqrt(np.diag(self.result.covariance))))
         said = [each.words() for each in halves[:_MOST_HALVES]]
         said += [f"{words}; kept, as too many images are like this" for words in self.against.unfit.values()]
-        said += self.against.misfits.values()
-        # Larger uncertainties hide what the halves disagree on.
-        said += [words for words in self.against.doubts if _NOT_BELIEVED in words and words not in against.doubts]
+        said += [*self.against.misfits.values(), *self.against.judged]
         said.append(
             "images show systematic deviations from the model: all points of an image count as one, which makes "
             f"uncertainties {factor:.1f} times larger (median)"
@@ -368,18 +370,3 @@ _RULES = (
 def _scatter(result: Estimate) -> float:
     """Return the geometric mean of the scatter of target points and stripes, px."""
     return float(np.exp(np.mean(np.log([noise.sigma_px for noise in result.noise.values()]))))
-
-
-def _solve_first(gathered: Gathered, options: CalibrationOptions) -> _Attempt:
-    """Solve with the usual lens, or with fewer coefficients if the images do not determine them."""
-    try:
-        return _Attempt.solve(gathered, options)
-    except CalibrationError as refusal:
-        if options.lens is None or options.lens.distortion != "auto":
-            raise
-        for fewer in (("k1",), ()):
-            said = f"the lens has {' '.join(fewer) or 'no distortion'}: with {' '.join(options.camera.distortion)}, "
-            with suppress(CalibrationError):
-                camera = replace(options.camera, distortion=fewer)
-                return _Attempt.solve(gathered, replace(options, camera=camera), (said + str(refusal),))
-        raise

@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
-from uwlts.calibration.joint.gathering import Gathered, build_priors
+from uwlts.calibration.joint.gathering import Gathered, build_priors, usual_distortion
 from uwlts.calibration.joint.initial import (
     build_all_scan_evidence,
     build_step_evidence,
@@ -82,7 +82,7 @@ class JointProblem:
             key: fixed if isinstance(key, TargetParameter) else prior
             for key, prior in known.priors.items()
             if not isinstance(key, LensParameter)
-        }
+        } | usual_distortion(camera)
         parameters = replace(known, intrinsics=intrinsics, priors=priors)
         start = dict(zip(known.keys, near.values, strict=True))
         start |= {LensParameter.FX: start.get(LensParameter.F, start.get(LensParameter.FX))}
