@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -336,6 +337,15 @@ def test_laser_off_works_while_the_stage_moves_and_in_the_live_image(desk, page,
     # The light is not switched on again automatically.
     page.wait_for_timeout(1000)
     assert not served.controller.state().laser_on
+    tab(page, "Connect")
+    press(page, "laser")
+    assert within(20.0, lambda: served.controller.state().laser_on)
+    # Live images flash several times a second; they end 5 s after the page.
+    page.goto("about:blank")
+    time.sleep(8.0)
+    assert not within(1.5, lambda: served.controller.state().laser_on)
+    page.goto(desk.operator_address)
+    says(page, "no operator's page is open")
 
 
 SIZES = {"desktop": (1280, 800), "tablet": (800, 1280), "phone": (390, 844)}

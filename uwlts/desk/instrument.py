@@ -45,6 +45,8 @@ _PREVIEW_S = 0.15
 """Pause between two live images."""
 _MOST_LOST = 2
 """Consecutive live images that may be lost before an error is reported."""
+_UNATTENDED_S = 5.0
+"""Time without an operator's page after which live images with the laser end: loading it again takes less."""
 _EARLIER = 200
 """Images of an interrupted scan that are shown again when it is continued."""
 
@@ -84,6 +86,7 @@ class Instrument:
         self._rig: Rig | None = None
         self._darkened, self._lost = False, 0
         self._live: Picture | None = None
+        self._attended_s = -math.inf
         self.exposure_ms: dict[Light, float] = {"laser": START_MS, "lamp": START_MS}
         self.calibration: AnyCalibration | None = None
         """Calibration for the profile of live laser images."""
@@ -109,8 +112,13 @@ class Instrument:
         self._show_laser()
         self._ask(self._after_darkening)
 
+    def attend(self) -> None:
+        """Record that an operator's page is open; live images with the laser end without it."""
+        self._attended_s = time.monotonic()
+
     def show_light(self, light: Light | None) -> None:
         """Show live images in a light, or none; the laser is refused while no stage can switch it."""
+        self.attend()
         if light == "laser" and self.state != InstrumentState.READY:
             self._board.say(f"the laser stays off: {self.state}", "warning")
         elif light == "laser" and not self._switches_laser():
@@ -361,6 +369,9 @@ class Instrument:
         if light == "laser" and not self._switches_laser():
             # A fault, or Laser off, has locked the stage.
             light = self.light = None
+        if light == "laser" and time.monotonic() - self._attended_s > _UNATTENDED_S:
+            light = self.light = None
+            self._board.say("live images with the laser end: no operator's page is open", "warning")
         if connected is None or light is None or connected.stage.faulty:
             if connected is not None and connected.stage.faulty:
                 # No live image until the stage is homed or unlocked; then the rig is set up again.

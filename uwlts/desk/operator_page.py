@@ -255,6 +255,8 @@ class _OperatorPage:
         return button
 
     def _refresh(self) -> None:
+        if ui.context.client.has_socket_connection:
+            self._instrument.attend()
         self._view.refresh()
         self._show_request()
         self._analyses.refresh()

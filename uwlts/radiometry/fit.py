@@ -150,14 +150,14 @@ def fit_radiometry(
             whole, covariance = evidence.estimate_with_covariance(attenuation_per_m=described)
             whole[1], covariance[1, 1] = free, free_variance
         with nullcontext() if repeats is None else open_capture(repeats) as again:
-            noise = measure_noise(scan, stripes, repeats=again)
+            noise = measure_noise(scan if again is None else again)
         std = np.sqrt(np.diag(covariance))
         estimates = [
             ImageEstimate(name, float(value), float(error), *_TEXTS[name])
             for name, value, error in zip(_NAMES, whole, std, strict=True)
         ]
-        estimates.append(ImageEstimate("dark_noise_dn", noise.dark_dn, noise.dark_std, *_TEXTS["dark_noise_dn"]))
-        if noise.gain is not None and noise.gain_std is not None:
+        if noise is not None:
+            estimates.append(ImageEstimate("dark_noise_dn", noise.dark_dn, noise.dark_std, *_TEXTS["dark_noise_dn"]))
             estimates.append(ImageEstimate("gain_dn_per_e", noise.gain, noise.gain_std, *_TEXTS["gain_dn_per_e"]))
         scale = np.where(std > 0, std, 1.0)
         correlation = covariance / np.outer(scale, scale)
@@ -444,11 +444,12 @@ def _not_separable(
             a, b = (_TEXTS[_NAMES[k]][1] for k in (i, j))
             found.append(f"{a}, and {b}: correlated by {correlation[i, j]:.2f}")
     scattering = by_name["scattering_per_m"]
+    found.append("scattering and phase function, which is assumed: another one can halve or double the coefficient")
     if scattering.value < 2 * scattering.std:
         most = scattering.value + 2 * scattering.std
         found.append(f"scattering and none: below {most:.2g}/m no halo is seen beside the stripe")
     if "gain_dn_per_e" not in by_name:
-        found.append("gain and speckle: repeat laser images at one position and exposure to measure the gain")
+        found.append("gain, noise in the dark and speckle: repeat laser images at one position and exposure")
     if by_name["stripe_sigma_px"].value < _LEAST_SIGMA_PX:
         found.append("radius of the sheet and pixel: the stripe is narrower than a pixel, and the radius is its limit")
     found.append("waist and focus of the sheet: only its radius at the surface; the described focus is kept")

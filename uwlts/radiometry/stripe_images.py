@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from scipy.signal import savgol_filter
+from scipy.stats import chi2
 
 from uwlts.errors import CaptureError
 from uwlts.fitting.propagation import jackknife
@@ -41,6 +42,8 @@ LONGEST_GAP = 8
 _ROUNDS = 5  # of weights, which follow from the fitted variance
 _BINS = 24
 """Bins of the photon transfer."""
+_STILL = 0.99
+"""Fraction of the pixels without particles that are kept for the noise."""
 _BAND_PX = 32
 """Width of the bands across the stripe. The dimmest is taken as dark; each has thousands of pixels."""
 _HALO_STD = 0.5
@@ -233,33 +236,30 @@ def _measure_run(profiles: np.ndarray, line: np.ndarray, centre_px: np.ndarray, 
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """Noise of the camera: grey values per electron and standard deviation in the dark, with standard uncertainties.
+    """Noise of the camera: grey values per electron and standard deviation in the dark, with standard uncertainties."""
 
-    ``gain`` and its uncertainty are None without repeated images.
-    """
-
-    gain: float | None
-    gain_std: float | None
+    gain: float
+    gain_std: float
     dark_dn: float
     dark_std: float
 
 
-def measure_noise(capture: Capture, stripes: CaptureStripes, *, repeats: Capture | None) -> CameraNoise:
+def measure_noise(source: Capture) -> CameraNoise | None:
     """Measure noise by photon transfer from laser images that were repeated at one place and exposure (EMVA 1288).
 
-    Speckle is the same in repeated images and does not add to their differences. Without repeated images, only the
-    noise of pixels far from the stripe is measured, from differences of successive images.
+    Speckle is the same in repeated images and does not add to their differences. Pixels that particles change in one of
+    the images are left out. Returns None without repeated images.
     """
-    source = capture if repeats is None else repeats
     full_dn = source.header.saturation_dn
     parts = []
     for numbers in _repeated(source):
         images = np.stack([source.image(number) for number in numbers.tolist()]).astype(np.float32)
-        parts.append(np.stack([images.mean(axis=0), images.var(axis=0, ddof=1)]))
+        # Particles change the mean of a pixel, but seldom its median.
+        parts.append(np.stack([np.median(images, axis=0), _still_variance(images)]))
     if parts:
         mean, variance = np.stack(parts, axis=1)
         # Most pixels are dark.
-        noise_dn, background_dn = math.sqrt(float(np.median(variance))), float(np.median(mean))
+        noise_dn, background_dn = math.sqrt(float(np.nanmedian(variance))), float(np.median(mean))
         # The means of dark pixels differ by noise alone: they are one bin.
         dark_dn = max(6.0 * noise_dn / math.sqrt(2.0), 2.0)
         edges = background_dn + np.concatenate([[-math.inf], np.geomspace(dark_dn, 0.85 * full_dn, _BINS)])
@@ -277,7 +277,23 @@ def measure_noise(capture: Capture, stripes: CaptureStripes, *, repeats: Capture
             dark = math.sqrt(max(whole[1] - halo, 0.0))
             variance_std = math.hypot(float(std[1]), _HALO_STD * halo)
             return CameraNoise(whole[0], float(std[0]), dark, variance_std / max(2 * dark, 1e-3))
-    return _dark_noise(capture, stripes)
+    return None
+
+
+def _still_variance(images: np.ndarray) -> np.ndarray:
+    """Return the variance (H, W) of N repeated images; NaN where it is beyond the usual of equally bright pixels.
+
+    Variances of normal noise have a chi-square distribution with N - 1 degrees of freedom. The median of a bin gives
+    its scale. Kept variances are corrected for those beyond the limit.
+    """
+    variance, middle, freedom = images.var(axis=0, ddof=1), np.median(images, axis=0), len(images) - 1
+    limit = float(chi2.ppf(_STILL, freedom))
+    above = np.maximum(middle - np.median(middle), 1.0)
+    cell = np.digitize(above, np.geomspace(2.0, max(float(above.max()), 4.0), _BINS))
+    most = np.array([np.median(variance[cell == k]) if (cell == k).any() else 0.0 for k in range(_BINS + 1)])
+    most = np.maximum(most, 1.0 / 12.0) * limit / float(chi2.median(freedom))
+    kept = variance <= most[cell]
+    return np.where(kept, variance * _STILL / float(chi2.cdf(limit, freedom + 2)), np.nan)
 
 
 def _repeated(capture: Capture) -> list[np.ndarray]:
@@ -290,7 +306,7 @@ def _repeated(capture: Capture) -> list[np.ndarray]:
 def _bin_variance(mean: np.ndarray, variance: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return the number, and the sums of means and of variances, (3, B) of pixels in bins of their mean."""
     cell = np.digitize(mean, edges) - 1
-    held = (cell >= 0) & (cell < len(edges) - 1)
+    held = (cell >= 0) & (cell < len(edges) - 1) & np.isfinite(variance)
     sums = [np.bincount(cell[held], weight, len(edges) - 1) for weight in (None, mean[held], variance[held])]
     return np.array(sums, dtype=float)
 
@@ -318,29 +334,3 @@ def _fit_transfer(counted: np.ndarray, background_dn: float) -> tuple[float, flo
         gain, dark = np.linalg.lstsq(design * root[:, None], variance * root, rcond=None)[0]
         expected = gain * mean + dark
     return float(gain), float(dark) - 1.0 / 12.0
-
-
-def _dark_noise(capture: Capture, stripes: CaptureStripes) -> CameraNoise:
-    along = capture.header.sensor.camera.stripe_along
-    lit = np.flatnonzero(capture.laser_on & capture.has_image)
-    found = []
-    before: np.ndarray | None = None
-    for frame in lit.tolist():
-        image = capture.image(frame).astype(np.float32)
-        profiles = image if along == "height" else image.T
-        own = stripes.frame == frame
-        values = np.full_like(profiles, np.nan)
-        near = np.abs(np.arange(profiles.shape[1]) - stripes.centre_px[own][:, None]) <= TAIL_PX
-        line = stripes.line[own]
-        values[line] = np.where(near, np.nan, profiles[line])
-        if before is not None:
-            difference = (values - before)[np.isfinite(values) & np.isfinite(before)]
-            if difference.size > 100:
-                limit = 5 * max(float(np.quantile(np.abs(difference), 0.683)), 1.0)
-                found.append(0.5 * float(np.var(difference[np.abs(difference) < limit])))
-        before = values
-    if not found:
-        return CameraNoise(None, None, math.nan, math.nan)
-    dark = math.sqrt(max(float(np.mean(found)) - 1.0 / 12.0, 0.0))
-    spread = float(np.std(found)) / math.sqrt(len(found)) if len(found) > 1 else float(found[0])
-    return CameraNoise(None, None, dark, spread / max(2 * dark, 1e-3))

@@ -47,7 +47,7 @@ def outlook(
     whole = exposure * light.grey_per_mw * power * np.exp(-1e-3 * attenuation * light.path_mm())
     peak = whole / (math.sqrt(2 * math.pi) * math.hypot(value["stripe_sigma_px"], math.sqrt(1 / 12)))
     options = StripeOptions.resolve(sensor, None)
-    noise = value.get("dark_noise_dn", 0.0)
+    noise = value.get("dark_noise_dn", sensor.detector.gain_dn_per_e() * sensor.detector.read_noise_e)
     least = max(options.threshold_sigmas * noise, options.threshold_floor)
     window = calibration.window
     outer = 0.0 if window is None or not camera.window.mounted else window.distance_mm + window.thickness_mm

@@ -116,10 +116,8 @@ def find_blobs(image, noise):
     dark pixels. It is one local step of Ridler and Calvard's iteration per pass, and removes uneven lighting. Only
     outer contours are used, which fills holes. Blobs at the image border and small blobs are removed.
 
-    The first family contains all blobs of the window and polarity with most blobs of similar size; of equally many,
-    the smaller blobs, because the bright region around each dark circle is also a blob. The other families are blobs
-    of a window and polarity whose sizes differ by less than `BlobRule.size_range`: a texture may have more specks than
-    a target has circles.
+    The first family contains all blobs of its window and polarity; of equally many, the smaller blobs, because the
+    bright region around each dark circle is also a blob. Other families are similar in size (`BlobRule.size_range`).
 
     ``noise`` is the standard deviation of a pixel of the image (H, W). The first family may be empty.
     """

@@ -122,11 +122,8 @@ class Lattice:
 def detect_lattice(image, read=lambda lattice: lattice):
     """Find the circles of a regular rectangular array without marks and number them.
 
-    ``read`` turns the largest connected part of a lattice into a result, or raises `TargetError`: then the lattice of
-    the next family of circles is tried. Returns the first result.
-
-    ``image`` is (H, W) of uint8 or uint16; ImageError for others. If no family has a result, the TargetError is that
-    of the largest lattice.
+    ``read`` turns the largest connected part of a lattice into a result, or raises `TargetError`: then the next family
+    of circles is tried. If none has a result, the TargetError is that of the largest lattice.
     """
     most, reason = -1, TargetError("")
     for circles in find_circles(image):
