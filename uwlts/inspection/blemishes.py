@@ -156,8 +156,7 @@ def measure_blemish(
     moves = [scale * each for each in moves]
     by_noise = np.std([field.depths(each) for each in moves[: _RULE.depth_draws]], axis=0, ddof=1)
     edge = max(SEARCH_RULE.edge_share * depth, SEARCH_RULE.edge_std * float(np.median(by_noise[field.region])))
-    seen = field.figures(depths, edge, deepest)
-    seen[0] += between
+    seen = field.figures(depths, edge, deepest, between)
     # Errors of simulated blemishes of this size, measured at these points: noise, sampling and smoothing. One of
     # another outline than a bell is its own model.
     bells = [_Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, p) for p in _RULE.exponents]
@@ -175,22 +174,22 @@ def measure_blemish(
     # Uncertainty by the footprints' size and, without a known form, by a second correction of the smoothing and by the
     # width of its quadratics.
     again: list[dict[str, Any]] = [{"share": 1 - field.footprint_std}] + [{"steps": 2}] * (not is_bell)
-    resolved = np.array([field.figures(field.depths(heights, **each), edge, deepest) - seen for each in again])
-    resolved[:, 0] += between
+    resolved = np.array([field.figures(field.depths(heights, **each), edge, deepest, between) - seen for each in again])
     if wide_depth is not None:
         resolved = np.vstack([resolved, [wide_depth - seen[0], 0, 0, 0, 0]])
         # This model has the noise already, whose bias increases in proportion to its standard deviation.
         smoothed = field.measure(own_heights, edge) - seen
         bias = smoothed + BIAS_FACTOR * (bias - smoothed)
-    plain = np.maximum(seen - bias, 0)
+    tail = field.measure_tail(heights, noise, deepest)
+    plain = np.maximum(seen - bias - np.array([tail, 0, 0, 0, 0]), 0)
     without_bias = np.hypot(random, np.linalg.norm(resolved, axis=0))
+    # A tail may reach beyond the surroundings: it is corrected by as much as it is uncertain.
+    without_bias[0] = np.hypot(without_bias[0], tail)
     random = np.hypot(without_bias, BIAS_STD * bias)
 
     def changed(pattern: np.ndarray) -> np.ndarray:
         """Return the change of all figures by a pattern of height errors."""
-        found = field.figures(depths + field.depths(pattern), edge, deepest) - seen
-        found[0] += between
-        return found
+        return field.figures(depths + field.depths(pattern), edge, deepest, between) - seen
 
     common = own.by_patterns(changed)
     length, width = plain[1], plain[2]
@@ -258,9 +257,9 @@ def _choose_field(
     if local < 0.5 * _RULE.compact * float(np.max(seen[1:3])):
         return field, local, depth
     bells = [_Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, p) for p in _RULE.exponents]
-    off = min(field.mean_square(depths - bell.depths_at(field.grid)) for bell in bells)
+    off = min(np.mean(np.square(depths - bell.depths_at(field.grid))[field.region]) for bell in bells)
     # A correction increases the variance of the noise, by up to four.
-    if off < (_RULE.off_bell * depth) ** 2 + 4 * field.mean_square(noise):
+    if off < (_RULE.off_bell * depth) ** 2 + 4 * np.mean(np.square(noise[field.region])):
         return field, local, None
     narrow = _RULE.narrow * search.smallest_mm / _RULE.bandwidth
     return _Field.about(surface, search, indication, local_mm=narrow), local, depth
@@ -314,6 +313,7 @@ class _Field:
     # (n, 3) and (3, n); terms of the undamaged plane, and their least-squares rows.
     design: np.ndarray
     plane: np.ndarray
+    outer: np.ndarray  # (3, n); these rows by the outer half of the surroundings, minus those by all
     # (n, G) sparse; heights that points with and without their footprint measure for given depths on the grid.
     seen: sparse.csr_array
     sharp: sparse.csr_array
@@ -333,7 +333,8 @@ class _Field:
         reach = max(_RULE.ring * radius, 3 * search.smallest_mm)
         around = surface.points_between(low - reach, high + reach)
         around = around[search.undamaged[around]]
-        around = around[KDTree(own).query(surface.places[around])[0] <= reach]
+        away = KDTree(own).query(surface.places[around])[0]
+        around, away = around[away <= reach], away[away <= reach]
         if len(around) < _RULE.fewest_points:
             raise EvaluationError(f"{len(around)} undamaged points surround it; {_RULE.fewest_points} are needed")
         near = np.concatenate([indication.points, around])
@@ -365,9 +366,12 @@ class _Field:
             ]
             seen = sparse.csr_array(sum(parts[1:], parts[0]))
         design = np.column_stack([np.ones(len(places)), places])
-        plane = fit_biweight(design, heights, ring)[0]
+        plane, outer = fit_biweight(design, heights, ring)[0], np.zeros((3, len(near)))
+        far = np.append(np.zeros(len(own), bool), away > 0.5 * reach)
+        if np.count_nonzero(far) >= _RULE.fewest_points:
+            outer = fit_biweight(design, heights, far)[0] - plane
         known = surface.places[near], size, grid + middle, shape, cell
-        return cls(near, *known, smooth, design, plane, seen, sharp, surface.footprint_std, stride, region, gap)
+        return cls(near, *known, smooth, design, plane, outer, seen, sharp, surface.footprint_std, stride, region, gap)
 
     def depths(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
         """Return heights (G,) above the undamaged surface for point heights (n,).
@@ -383,6 +387,12 @@ class _Field:
                 there = share * there + (1 - share) * (self.sharp @ depths)
             depths = depths + self.smooth @ (left - there)
         return depths
+
+    def measure_tail(self, heights: np.ndarray, noise: np.ndarray, cell: int) -> float:
+        """Return the change of the undamaged surface at a cell by its outer surroundings alone, beyond noise (n,)."""
+        row = (self.smooth[[cell]] @ self.design).ravel() @ self.outer
+        change = float(row @ heights)
+        return float(np.sign(change)) * float(np.sqrt(max(change**2 - float(np.square(row * noise).sum()), 0.0)))
 
     def find_total(self, heights: np.ndarray, beneath: np.ndarray) -> float:
         """Return the largest depth of the blemish and a smooth surface ``beneath`` (n,) together."""
@@ -437,16 +447,10 @@ class _Field:
         """Return the standard deviations (G,) of the smooth surface by the noise of independent points."""
         return noise_mm * np.sqrt(np.asarray(self.smooth.power(2).sum(axis=1)).ravel())
 
-    def mean_square(self, depths: np.ndarray) -> float:
-        """Return the mean square of depths (G,) in the region."""
-        return float(np.mean(np.square(depths[self.region])))
-
     def measure(self, heights: np.ndarray, edge: float) -> np.ndarray:
         """Return the figures for point heights (n,), at their own deepest place."""
         top, between = self.find_deepest(heights)
-        found = self.figures(self.depths(heights), edge, top)
-        found[0] += between
-        return found
+        return self.figures(self.depths(heights), edge, top, between)
 
     def scatter_ratio(self, heights: np.ndarray, moves: list[np.ndarray], inside: np.ndarray) -> float:
         """Return the ratio of residual scatter ``inside`` (n,) the blemish to that around it; at least 1.
@@ -500,10 +504,10 @@ class _Field:
         own = (labelled[0] == labelled[0][top]) & (labelled[0][top] > 0)
         return fine, ndimage.binary_dilation(own, structure=np.ones((3, 3))), self.cell / _RULE.subdivision
 
-    def figures(self, depths: np.ndarray, edge: float, deepest: int) -> np.ndarray:
-        """Return the depth of cell ``deepest``, and length, width, area and lost area within the contour at an edge."""
+    def figures(self, depths: np.ndarray, edge: float, deepest: int, between: float = 0.0) -> np.ndarray:
+        """Return the depth of cell ``deepest`` and ``between`` it, length, width, area and lost area within an edge."""
         fine, grown, cell = self._contoured(depths, edge, deepest)
-        depth = float(depths[deepest])
+        depth = float(depths[deepest]) + between
         if not grown.any():
             return np.array([depth, 0.0, 0.0, 0.0, 0.0])
         field = np.where(grown, fine, -np.inf)

@@ -276,11 +276,11 @@ def _blemish_features(
         try:
             blemish = measured_by()
         except NotSignificantError as error:
-            notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
+            notes.append(_note_indication(cloud, chosen[points], indication.height_mm, f"is omitted: {error}"))
             return False
         except EvaluationError as error:
             if any(np.isin(points, whole.own.points).all() and indication is not whole.own for whole, _ in large):
-                notes.append(_note_omission(cloud, chosen[points], indication.height_mm, str(error)))
+                notes.append(_note_indication(cloud, chosen[points], indication.height_mm, f"is omitted: {error}"))
                 return False
             add_unsized(points, indication.height_mm, 0.0, str(error))
             return False
@@ -304,8 +304,8 @@ def _blemish_features(
         parts = whole.parts_beside(search.indications)
         formed = [abs(part.height_mm) for part in parts if whole.is_form(part)]
         if formed:
-            reason = f"{len(formed)} departures of up to {max(formed):.2g} mm from a smooth surface belong to its form"
-            notes.append(_note_large(cloud, chosen[whole.own.points], whole.own.height_mm, reason))
+            departs = f"has {len(formed)} departures of up to {max(formed):.2g} mm from a smooth surface, by its form"
+            notes.append(_note_indication(cloud, chosen[whole.own.points], whole.own.height_mm, departs))
         for part in parts:
             points = whole.chosen[part.points]
             if not taken[points].any() and not whole.is_form(part):
@@ -382,16 +382,10 @@ def _note_merged(feature: Feature) -> list[str]:
     ]
 
 
-def _note_omission(cloud: PointCloud, points: np.ndarray, height_mm: float, reason: str) -> str:
-    """Return a note on an omitted indication at some points."""
+def _note_indication(cloud: PointCloud, points: np.ndarray, height_mm: float, text: str) -> str:
+    """Return a note on an indication at some points."""
     x, y, z = cloud.points_mm[points].mean(axis=0)
-    return f"an indication of {height_mm:.2g} mm at ({x:.1f}, {y:.1f}, {z:.1f}) mm is omitted: {reason}"
-
-
-def _note_large(cloud: PointCloud, points: np.ndarray, height_mm: float, text: str) -> str:
-    """Return a note on a large blemish at some points."""
-    x, y, z = cloud.points_mm[points].mean(axis=0)
-    return f"in the indication of {height_mm:.2g} mm at ({x:.1f}, {y:.1f}, {z:.1f}) mm, {text}"
+    return f"an indication of {height_mm:.2g} mm at ({x:.1f}, {y:.1f}, {z:.1f}) mm {text}"
 
 
 def _note_limits(cloud: PointCloud, form: PipeForm, search: BlemishSearch) -> list[str]:
