@@ -162,15 +162,7 @@ class Study(Description):
             raise ValueError(f"unknown figure {', '.join(unknown)}; known are {', '.join(FIGURES)}")
         if not self.variables and not self.choices:
             raise ValueError("nothing is free: give variables or choices")
-        if twice := set(self.variables) & set(self.choices):
-            raise ValueError(f"{', '.join(sorted(twice))}: a variable has this name; give the choice another")
-        if empty := [name for name, options in self.choices.items() if not options]:
-            raise ValueError(f"choices.{empty[0]} is empty; give at least one option")
-        if taken := [name for name in self.choices if name in (*FIGURES, *OTHER_COLUMNS)]:
-            raise ValueError(f"choices.{taken[0]}: a figure has this name; give the choice another")
-        chosen = self.choice_paths()
-        if twice := sorted(chosen.keys() & self.variables):
-            raise ValueError(f"{twice[0]} is set by a variable and by a choice")
+        chosen = self._check_choices()
         for what, path in FOLLOWING.items():
             if what in self.follow and path in (*self.variables, *chosen):
                 raise ValueError(f"{path} is free, but follow sets it: leave '{what}' out of follow, or the path")
@@ -183,6 +175,19 @@ class Study(Description):
                 f"the grid has {count:.3g} designs, more than {MOST_DESIGNS:g}: use fewer steps, or sampling 'sobol'"
             )
         return self
+
+    def _check_choices(self) -> dict[str, None]:
+        """Return the paths that choices set, after checks of their names and options."""
+        if twice := set(self.variables) & set(self.choices):
+            raise ValueError(f"{', '.join(sorted(twice))}: a variable has this name; give the choice another")
+        if empty := [name for name, options in self.choices.items() if not options]:
+            raise ValueError(f"choices.{empty[0]} is empty; give at least one option")
+        if taken := [name for name in self.choices if name in (*FIGURES, *OTHER_COLUMNS)]:
+            raise ValueError(f"choices.{taken[0]}: a figure has this name; give the choice another")
+        chosen = self.choice_paths()
+        if twice := sorted(chosen.keys() & self.variables):
+            raise ValueError(f"{twice[0]} is set by a variable and by a choice")
+        return chosen
 
     def choice_paths(self) -> dict[str, None]:
         """Return the paths that options of choices set, in order, as keys."""

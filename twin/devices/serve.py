@@ -21,7 +21,7 @@ from twin.devices.grbl_controller import GrblController, StageState
 from twin.recording.render import AnyScene, choose_scene
 from twin.rendering_options import CPU, Options, Variant, use_variant
 from twin.scene.campaign import AnySensor, choose_sensors
-from twin.scene.description import replace_values
+from twin.scene.description import Scene, replace_values
 from twin.scene.motion import Light, Motion, Shot
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
@@ -288,6 +288,15 @@ class ServedTwin:
                 signal.signal(number, handler)
 
 
+def _stage_motion(described: Scene) -> Motion:
+    motion = described.motion
+    if not isinstance(motion, Motion):
+        raise DescriptionError(
+            f"{described.title} moves on a {motion.kind}; expected a scene with a motion of the stage"
+        )
+    return motion
+
+
 @contextmanager
 def serve(
     scene: AnyScene,
@@ -364,11 +373,7 @@ def serve(
         raise DescriptionError("lamp-and-laser cannot be served, because the controller switches the laser: remove it")
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
-    motion = described.motion
-    if not isinstance(motion, Motion):
-        raise DescriptionError(
-            f"{described.title} moves on a {motion.kind}; expected a scene with a motion of the stage"
-        )
+    motion = _stage_motion(described)
     _, built = choose_sensors(sensor, as_built)
     faults = [parse_fault(text) for text in fault]
     use_variant(variant)

@@ -223,6 +223,12 @@ def pattern_texture(plate: PrintedPlate) -> mi.Texture:
 
 def register_textures() -> None:
     """Register the textures ``target_pattern`` and ``random_reflectance`` with the selected Mitsuba variant."""
+    mi.register_texture("target_pattern", _target_pattern())
+    mi.register_texture("random_reflectance", _random_reflectance())
+
+
+def _target_pattern() -> type[mi.Texture]:
+    """Return a texture of the selected variant, from which it derives."""
 
     class TargetPattern(mi.Texture):
         """Reflectance of a printed plate whose uv coordinates run from 0 to 1 over its bounds.
@@ -289,6 +295,12 @@ def register_textures() -> None:
         def to_string(self) -> str:
             return f"TargetPattern[{type(self.plate.described_target()).__name__}]"
 
+    return TargetPattern
+
+
+def _random_reflectance() -> type[mi.Texture]:
+    """Return a texture of the selected variant, from which it derives."""
+
     class RandomReflectance(mi.Texture):
         """Log-normal reflectance, limited to 1, with patches of another one, both times a scale.
 
@@ -331,8 +343,7 @@ def register_textures() -> None:
         def to_string(self) -> str:
             return "RandomReflectance[]"
 
-    mi.register_texture("target_pattern", TargetPattern)
-    mi.register_texture("random_reflectance", RandomReflectance)
+    return RandomReflectance
 
 
 def _sum_waves(waves: Float, p: Point3f, active: Bool) -> Float:

@@ -20,6 +20,20 @@ from uwlts.storage.cloud_files import is_cloud
 _SHOWN = 500  # the latest files; a longer list is not read
 _REMEMBERED = 4 * _SHOWN  # files whose description is kept
 _FORMATS = {CALIBRATION_FORMAT: "calibration", POLYNOMIAL_FORMAT: "calibration", EVALUATION_FORMAT: "evaluation"}
+_KINDS = {
+    ".h5.part": "interrupted capture",
+    ".truth.h5": "truth",
+    ".ply": "cloud",
+    ".h5": "capture",
+    **dict.fromkeys((".laz", ".las", ".xyz", ".e57", ".mcap"), "exported cloud"),
+    ".measured.json": "measured values",
+    **dict.fromkeys((".findings.json", ".registration.json", ".measured.csv"), "figures"),
+    ".json": "calibration",
+    ".pdf": "printed report",
+    ".toml": "description",
+    ".html": "report",
+}
+"""Kinds by endings; the first that fits counts."""
 _LONGEST_NAME = 200
 """Longest name of a new file in bytes: file systems allow 255, including appended endings."""
 
@@ -54,31 +68,7 @@ def list_files(folder: Path) -> list[ListedFile]:
 
 def guess_kind(name: str) -> str:
     """Return the kind of a file by its name; empty if the program does not use such files."""
-    match name.split("."):
-        case [_, *_, "h5", "part"]:
-            return "interrupted capture"
-        case [_, *_, "truth", "h5"]:
-            return "truth"
-        case [_, *_, "ply"]:
-            return "cloud"
-        case [_, *_, "h5"]:
-            return "capture"
-        case [_, *_, "laz" | "las" | "xyz" | "e57" | "mcap"]:
-            return "exported cloud"
-        case [_, *_, "measured", "json"]:
-            return "measured values"
-        case [_, *_, "findings" | "registration", "json"] | [_, *_, "measured", "csv"]:
-            return "figures"
-        case [_, *_, "json"]:
-            return "calibration"
-        case [_, *_, "pdf"]:
-            return "printed report"
-        case [_, *_, "toml"]:
-            return "description"
-        case [_, *_, "html"]:
-            return "report"
-        case _:
-            return ""
+    return next((kind for ending, kind in _KINDS.items() if name.endswith(ending)), "")
 
 
 @lru_cache(_REMEMBERED)

@@ -185,6 +185,25 @@ def compare_cloud_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison
     )
 
 
+def _compare_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
+    """Compare a cloud with its ground truth, as it is and after the best-fit motion.
+
+    A calibrated sensor's frame has its own origin and axes. After the best-fit motion, errors of form and size remain.
+    """
+    compared = compare_cloud_with_truth(cloud, truth)
+    measured, errors = cloud.points_mm[compared.is_matched], compared.error_mm[compared.is_matched]
+    motion = fit_rigid_transform(measured, measured - errors)
+    moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
+    stated = None if cloud.uncertainty is None else tuple((2 * shift_std_mm(cloud, compared.is_matched)).tolist())
+    return compared.model_copy(
+        update={
+            "after_best_fit": compare_cloud_with_truth(replace(cloud, points_mm=moved), truth),
+            "shift_mm": tuple(np.mean(errors, axis=0).tolist()),
+            "shift_expanded_mm": stated,
+        }
+    )
+
+
 def _read_matching_truth(path: str | Path, cloud: PointCloud) -> Truth:
     """Read a truth file; EvaluationError if it is that of another scene than the cloud's."""
     header, truth = read_truth(path)
@@ -267,28 +286,15 @@ def evaluate(
         raise EvaluationError(
             "there is no reference for the evaluation: the capture names no artefact. Give `artefact` or `truth`"
         )
-    compared = fitted = None
-    if truth is not None:
-        compared = compare_cloud_with_truth(cloud, truth)
-        # A calibrated sensor's frame has its own origin and axes. After the best-fit motion, errors of form and size
-        # remain.
-        measured = cloud.points_mm[compared.is_matched]
-        motion = fit_rigid_transform(measured, measured - compared.error_mm[compared.is_matched])
-        moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
-        fitted = compare_cloud_with_truth(replace(cloud, points_mm=moved), truth)
+    compared = None if truth is None else _compare_with_truth(cloud, truth)
     found = None if artefact is None else evaluate_cloud(cloud, artefact)
-    deviation = np.full(len(cloud), np.nan) if fitted is None else fitted.distance_mm
-    if compared is not None:
-        stated = None if cloud.uncertainty is None else tuple((2 * shift_std_mm(cloud, compared.is_matched)).tolist())
-        shift = tuple(np.mean(compared.error_mm[compared.is_matched], axis=0).tolist())
-        compared = compared.model_copy(
-            update={"after_best_fit": fitted, "shift_mm": shift, "shift_expanded_mm": stated}
-        )
     name = source or str(cloud.metadata.get("capture", ""))
     content: dict[str, Any] = {"cloud": name, **cloud.metadata, "artefact": None, "evaluation": None, "truth": compared}
     if EDITED in content:
         # The cloud names the part; the evaluation has a mark, which the seal protects.
         content[EDITED] = bool(content[EDITED])
+    fitted = None if compared is None else compared.after_best_fit
+    deviation = np.full(len(cloud), np.nan) if fitted is None else fitted.distance_mm
     if found is not None:
         deviation = found.deviation_mm
         content |= {"artefact": found.artefact, "evaluation": found.as_dict()}

@@ -4,7 +4,7 @@ from uwlts.errors import CalibrationError
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.model.sensor import CaptureHeader
+from uwlts.model.sensor import Camera, CaptureHeader
 
 _LARGEST_INDEX_CHANGE = 1e-3
 """Limit for the medium's index, about the change from 20 to 30 degC. Polynomials contain the refraction of their own
@@ -15,15 +15,8 @@ _OTHER_LENS = 1.1
 """Limit for the ratio of two focal lengths: lenses of the same type differ by less."""
 
 
-def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: str) -> list[str]:
-    """Compare the header of a recording, named ``source``, with a calibration, and return warnings about differences.
-
-    Raises CalibrationError if image size, a stated offset of the images on the image sensor, stripe orientation,
-    wavelength or focal length differ; the recording was made in water and the calibration has no window; or a
-    polynomial calibration was made in another medium, or with the window mounted and the recording without, or the
-    reverse.
-    """
-    camera = header.sensor.camera
+def _check_images(camera: Camera, calibration: AnyCalibration, *, source: str) -> None:
+    """Raise CalibrationError if size, offset or orientation of images differ."""
     model = calibration if isinstance(calibration, PolynomialCalibration) else calibration.camera
     size, wanted = (camera.width_px, camera.height_px), (model.width_px, model.height_px)
     if size != wanted:
@@ -45,6 +38,18 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
             f"in {source} the stripe runs along the image's {camera.stripe_along}, in the calibration along "
             f"its {calibration.stripe_along}"
         )
+
+
+def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: str) -> list[str]:
+    """Compare the header of a recording, named ``source``, with a calibration, and return warnings about differences.
+
+    Raises CalibrationError if image size, a stated offset of the images on the image sensor, stripe orientation,
+    wavelength or focal length differ; the recording was made in water and the calibration has no window; or a
+    polynomial calibration was made in another medium, or with the window mounted and the recording without, or the
+    reverse.
+    """
+    camera = header.sensor.camera
+    _check_images(camera, calibration, source=source)
     if abs(header.sensor.laser.wavelength_nm - calibration.wavelength_nm) > _LARGEST_CHANGE_NM:
         raise CalibrationError(
             f"{source} was taken with a laser of {header.sensor.laser.wavelength_nm:g} nm, the calibration is for "
@@ -73,7 +78,7 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
             f"({calibration.medium_kind}), which includes the refraction: calibrate in air"
         )
     warnings = [f"{named}: check that it is the right one"] if other else []
-    if (camera.offset_px is None) == bool(offsets):
+    if (camera.offset_px is None) == bool(_offsets(calibration)):
         warnings.append(
             f"only one of {source} and the calibration states the images' offset on the image sensor "
             "(offset_px): check that it is the same"

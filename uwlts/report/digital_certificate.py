@@ -230,14 +230,19 @@ def _add_results(parent: ET.Element, content: AnyCertificate, stated: Administra
     for row in content.parameters:
         words = f"{row.words} ({row.name}){' in pixels' if row.unit == 'px' else ''}"
         _quantity(parameters, words, row.value, _unit_of(row), None if row.std is None else 2 * row.std)
-    if isinstance(content, JointCertificate) and content.lengths:
+    if isinstance(content, JointCertificate):
+        _add_lengths_and_volume(results, content)
+
+
+def _add_lengths_and_volume(results: ET.Element, content: JointCertificate) -> None:
+    if content.lengths:
         lengths = _result(results, "Lengths measured on surfaces of many points")
         points = _result(results, "Lengths between two single points")
         for each in content.lengths:
             words = f"length of {each.length_mm:g} mm along {each.axis}"
             for group, expanded in ((lengths, each.calibration_mm), (points, each.point_mm)):
                 _quantity(group, words, each.length_mm, UNITS["mm"], expanded, "basic_nominalValue")
-    if isinstance(content, JointCertificate) and content.validity:
+    if content.validity:
         volume = _result(results, "Volume")
         for region in content.validity:
             ends = {"distance from the pupil": region.camera_depth_mm, "Y": region.y_mm, "Z": region.z_mm}

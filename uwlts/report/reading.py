@@ -1,5 +1,6 @@
 """Reading of any file of the program; the content determines the type of the result."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from uwlts.acceptance.accept import FORMAT as ACCEPTANCE, Acceptance, read_acceptance
@@ -24,6 +25,14 @@ from uwlts.storage.truth import FORMAT as TRUTH, Truth, read_truth
 
 _TABLES = (".csv", ".txt", ".asc")
 """Endings of text with a cloud or a trajectory."""
+_JSON_READERS: dict[str, Callable[[Path], AnyCalibration | Mount | Evaluation | Acceptance | FigureTable]] = {
+    CALIBRATION: load_calibration,
+    POLYNOMIALS_FORMAT: load_calibration,
+    MOUNT: read_mount,
+    EVALUATION: read_evaluation,
+    ACCEPTANCE: read_acceptance,
+    FIGURES: read_figures,
+}
 _READABLE = (
     f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
     "calibrations, mounts, evaluations, acceptance tests and figures (.json), trajectories (.csv, .tum, ROS bags)"
@@ -89,17 +98,9 @@ def read(
     ending = next((each for each in reversed(path.suffixes) if each != ".part"), "")
     if ending == ".json":
         found = read_json(path, called="file of this program", check_seal=False).get("format")
-        if found in (CALIBRATION, POLYNOMIALS_FORMAT):
-            return load_calibration(path)
-        if found == MOUNT:
-            return read_mount(path)
-        if found == EVALUATION:
-            return read_evaluation(path)
-        if found == ACCEPTANCE:
-            return read_acceptance(path)
-        if found == FIGURES:
-            return read_figures(path)
-        raise CaptureError(f"{path} is JSON of the format {found!r}; this reads {_READABLE}")
+        if (reader := _JSON_READERS.get(str(found))) is None:
+            raise CaptureError(f"{path} is JSON of the format {found!r}; this reads {_READABLE}")
+        return reader(path)
     if ending.lower() in _TABLES and (pose_format != SAVED_FORMAT or holds_trajectory(path)):
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
     if ending.lower() in MESH_FORMATS and (ending.lower() != ".ply" or has_faces(path)):

@@ -228,15 +228,13 @@ class Capture(AbstractContextManager["Capture"]):
         if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
             raise CaptureError(f"{self.path} is damaged: frames are {images.dtype} in chunks of {images.chunks}")
         columns = {
-            name: self._dataset(name, shape, "b" if name == "laser_on" else "f") for name, shape in PER_FRAME.items()
+            name: self._column(name, shape, "b" if name == "laser_on" else "f") for name, shape in PER_FRAME.items()
         }
-        for name, dataset in columns.items():
-            require_small_chunks(dataset, name, path=self.path)
         self._images, self.dtype = images, images.dtype.newbyteorder("=")
         self.holds_lines = "centre_lines" in self.file
         self.moving = "stage_reports" in self.file
         more = {
-            name: self._dataset(name, (), "b" if kind is bool else "f")
+            name: self._column(name, (), "b" if kind is bool else "f")
             for name, kind in MORE.items()
             if name in self.file
         }
@@ -247,41 +245,21 @@ class Capture(AbstractContextManager["Capture"]):
                 raise CaptureError(f"{self.path} is damaged: centre lines are in chunks of {self._lines.chunks}")
             counted.append(self._lines)
         self._count = min(map(len, counted))
-        for dataset, name in zip(more.values(), more, strict=True):
-            require_small_chunks(dataset, name, path=self.path)
         known = {name: read_values(dataset, slice(self._count)) for name, dataset in more.items()}
         self.has_image = known.get("has_image", np.ones(self._count, bool))
         self.encoder = known.get("encoder", np.full(self._count, np.nan))
         self.speed_mm_per_s = known.get("speed_mm_per_s", np.zeros(self._count))
         self.stage_reports = np.empty((0, 2))
         if self.moving:
-            reports = self._dataset("stage_reports", (2,), "f")
-            require_small_chunks(reports, "stage_reports", path=self.path)
-            self.stage_reports = read_values(reports)
-        if not (np.isfinite(self.speed_mm_per_s).all() and np.isfinite(self.stage_reports).all()):
-            raise CaptureError(f"{self.path} holds speeds or reports of the stage that are not finite")
+            self.stage_reports = read_values(self._column("stage_reports", (2,), "f"))
         if self.holds_lines:
             self._require_stored(self._lines, int(np.count_nonzero(~self.has_image)), "centre lines")
         self._require_stored(images, int(np.count_nonzero(self.has_image)), "images")
         self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
             read_values(dataset, slice(self._count)) for dataset in columns.values()
         )
-        if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
-            raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
-        self.pose_covariance: np.ndarray | None = None
-        if COVARIANCE in self.file:
-            covariances = read_values(self._dataset(COVARIANCE, (6, 6), "f"), slice(self._count))
-            known = np.isfinite(covariances).all(axis=(1, 2))
-            if known.any():
-                require_covariances(covariances[known], self.path)
-            self.pose_covariance = covariances
-        finite = np.isfinite(self.pose).reshape(self._count, 16)
-        if (finite.any(axis=1) != finite.all(axis=1)).any():
-            raise CaptureError(f"{self.path} holds poses with only some of their elements")
-        if not is_rigid(self.pose[finite.all(axis=1)], within=POSE_ROUNDED):
-            raise CaptureError(f"{self.path} holds poses that are no rotation with a shift")
-        if (self.exposure_ms < 0).any():
-            raise CaptureError(f"{self.path} holds negative exposures")
+        self._require_plausible()
+        self.pose_covariance = self._checked_poses()
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
             # The writer was killed between extending the datasets and storing its last frame.
             self._count -= 1
@@ -289,6 +267,30 @@ class Capture(AbstractContextManager["Capture"]):
                 setattr(self, name, getattr(self, name)[: self._count])
         if (np.diff(self.time_s) < 0).any():
             raise CaptureError(f"{self.path} holds times that decrease")
+
+    def _require_plausible(self) -> None:
+        """Raise CaptureError for numbers that are not finite, and negative exposures."""
+        if not (np.isfinite(self.speed_mm_per_s).all() and np.isfinite(self.stage_reports).all()):
+            raise CaptureError(f"{self.path} holds speeds or reports of the stage that are not finite")
+        if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
+            raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
+        if (self.exposure_ms < 0).any():
+            raise CaptureError(f"{self.path} holds negative exposures")
+
+    def _checked_poses(self) -> np.ndarray | None:
+        """Check the poses, and return their covariances if the file has them."""
+        finite = np.isfinite(self.pose).reshape(self._count, 16)
+        if (finite.any(axis=1) != finite.all(axis=1)).any():
+            raise CaptureError(f"{self.path} holds poses with only some of their elements")
+        if not is_rigid(self.pose[finite.all(axis=1)], within=POSE_ROUNDED):
+            raise CaptureError(f"{self.path} holds poses that are no rotation with a shift")
+        if COVARIANCE not in self.file:
+            return None
+        covariances = read_values(self._column(COVARIANCE, (6, 6), "f"), slice(self._count))
+        known = np.isfinite(covariances).all(axis=(1, 2))
+        if known.any():
+            require_covariances(covariances[known], self.path)
+        return covariances
 
     def _require_stored(self, parts: h5py.Dataset, count: int, called: str) -> None:
         # HDF5 returns zeros for chunks that were never stored.
@@ -303,6 +305,12 @@ class Capture(AbstractContextManager["Capture"]):
                 f"{self.path} contradicts itself: '{name}' is {dataset.dtype} of {dataset.shape[1:]} per frame, "
                 f"expected {shape} of kind '{kind}'"
             )
+        return dataset
+
+    def _column(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
+        """Return such a dataset that is read as a whole."""
+        dataset = self._dataset(name, shape, kind)
+        require_small_chunks(dataset, name, path=self.path)
         return dataset
 
     def __repr__(self) -> str:

@@ -406,7 +406,26 @@ def _metadata(comments: list[str]) -> Table:
     return metadata
 
 
-def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
+def _read_uncertainty(names: Mapping[str, str], column: Callable[[str], np.ndarray]) -> PointUncertainty | None:
+    """Return the uncertainty in columns ``names``; None without all of them."""
+    count, parts = (sum(f"{part}{k}_x" in names for k in range(len(names))) for part in ("pattern", "pose"))
+    wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
+    if not count or not all(name in names for name in wanted):
+        return None
+    columns = np.stack([column(name) for name in wanted])
+    random, position = columns[:6].T.copy(), columns[6:9].T.copy()
+
+    def vectors(rows: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.moveaxis(rows.reshape(len(rows) // 3, 3, -1), 1, 2))
+
+    poses = None
+    if parts and all(name in names for name in _pose_names(parts)):
+        poses = vectors(np.stack([column(name) for name in _pose_names(parts)]))
+    return PointUncertainty(random, position, vectors(columns[9:]), poses_mm=poses)
+
+
+def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Return the vertices of a PLY file as a structured array, and the comments."""
     try:
         whole, comments = read_ply(path, "vertex", called="cloud")
     except OSError as error:
@@ -415,6 +434,11 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         raise CaptureError(f"{path} does not fit into the memory") from error
     if whole is None:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
+    return whole, comments
+
+
+def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
+    whole, comments = _read_vertices(path)
     vertices, names = whole[rows(len(whole))], whole.dtype.names or ()
     known = {name.lower().removeprefix("scalar_"): name for name in names} | {name: name for name in names}
     if missing := [axis for axis in "xyz" if axis not in known]:
@@ -438,16 +462,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     points = np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"])
     chosen, warnings = omit_points(points, {})
     points, vertices = points[chosen], vertices[chosen]
-    uncertainty, count = None, sum(f"pattern{m}_x" in known for m in range(len(known)))
-    wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
-    if count and known.keys() >= set(wanted):
-        columns = np.stack([column(name, np.nan) for name in wanted])
-        random, position, patterns = columns[:6].T.copy(), columns[6:9].T.copy(), columns[9:].reshape(count, 3, -1)
-        uncertainty = PointUncertainty(random, position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
-        parts = sum(f"pose{k}_x" in known for k in range(len(known)))
-        if parts and known.keys() >= set(_pose_names(parts)):
-            poses = np.stack([column(name, np.nan) for name in _pose_names(parts)]).reshape(parts, 3, -1)
-            uncertainty = replace(uncertainty, poses_mm=np.ascontiguousarray(np.moveaxis(poses, 1, 2)))
+    uncertainty = _read_uncertainty(known, lambda name: column(name, np.nan))
 
     def lean(name: str) -> np.ndarray | None:
         return column(name, np.nan) if name in known and uncertainty is None else None

@@ -63,39 +63,30 @@ def write_e57(
             if further:
                 image.extensionsAdd(PREFIX, EXTENSION)
 
-            def structure(values: dict[str, Any]) -> Any:
-                node = lib.StructureNode(image)
-                for label, value in values.items():
-                    kind = lib.IntegerNode if isinstance(value, int) else lib.FloatNode
-                    node.set(label, kind(image, value))
-                return node
-
             scan, prototype, buffers = lib.StructureNode(image), lib.StructureNode(image), lib.VectorSourceDestBuffer()
             scan.set("guid", lib.StringNode(image, f"{{{uuid.uuid4()}}}"))
             scan.set("name", lib.StringNode(image, to.stem))
             named = list(zip(("x", "y", "z"), coordinates, strict=True))
-            scan.set("cartesianBounds", structure(_limits(named, float)))
+            scan.set("cartesianBounds", _structure(lib, image, _limits(named, float)))
             if "intensity" in fields:
-                scan.set("intensityLimits", structure(_limits([("intensity", fields["intensity"])], float)))
+                scan.set(
+                    "intensityLimits", _structure(lib, image, _limits([("intensity", fields["intensity"])], float))
+                )
             if COLOURS[0] in fields:
                 limits = {
                     f"{label}{end}": full for label in COLOURS for end, full in (("Minimum", 0), ("Maximum", 255))
                 }
-                scan.set("colorLimits", structure(limits))
+                scan.set("colorLimits", _structure(lib, image, limits))
             if "rowIndex" in fields:
                 named = [(each, fields[f"{each}Index"]) for each in ("row", "column")]
-                scan.set("indexBounds", structure(_limits(named, int)))
+                scan.set("indexBounds", _structure(lib, image, _limits(named, int)))
             if time_s is not None:
-                scan.set("acquisitionStart", structure({"dateTimeValue": start, "isAtomicClockReferenced": 0}))
+                scan.set(
+                    "acquisitionStart", _structure(lib, image, {"dateTimeValue": start, "isAtomicClockReferenced": 0})
+                )
             for label, values in fields.items():
-                low, high = values.min(), values.max()
-                if values.dtype.kind in "iu":
-                    node = lib.IntegerNode(image, int(low), int(low), int(high))
-                elif label == "timeStamp" or (label.startswith("cartesian") and not single):
-                    node = lib.FloatNode(image, float(low), lib.E57_DOUBLE, float(low), float(high))
-                else:
-                    node = lib.FloatNode(image, float(low), lib.E57_SINGLE, float(low), float(high))
-                prototype.set(label, node)
+                double = label == "timeStamp" or (label.startswith("cartesian") and not single)
+                prototype.set(label, _field_node(lib, image, values, double=double))
                 buffers.append(lib.SourceDestBuffer(image, label, values, len(values), True, True))
             points = lib.CompressedVectorNode(image, prototype, lib.VectorNode(image, True))
             scan.set("points", points)
@@ -109,6 +100,23 @@ def write_e57(
             file.close = lambda: None
         full = " (is the disk full?)" if "ErrorWriteFailed" in str(error) else ""
         raise OutputError(f"cannot write {to}: {shorten_error(error).partition(' ****')[0]}{full}") from error
+
+
+def _structure(lib: Any, image: Any, values: dict[str, Any]) -> Any:
+    node = lib.StructureNode(image)
+    for label, value in values.items():
+        kind = lib.IntegerNode if isinstance(value, int) else lib.FloatNode
+        node.set(label, kind(image, value))
+    return node
+
+
+def _field_node(lib: Any, image: Any, values: np.ndarray, *, double: bool) -> Any:
+    """Return the node of a column, with its limits."""
+    if values.dtype.kind in "iu":
+        low, high = int(values.min()), int(values.max())
+        return lib.IntegerNode(image, low, low, high)
+    low, high = float(values.min()), float(values.max())
+    return lib.FloatNode(image, low, lib.E57_DOUBLE if double else lib.E57_SINGLE, low, high)
 
 
 def _limits(named: Sequence[tuple[str, np.ndarray]], kind: type[int] | type[float]) -> dict[str, int | float]:

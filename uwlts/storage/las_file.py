@@ -234,6 +234,15 @@ def _require_sound_points(file: BufferedReader) -> None:
         raise ValueError(f"its point format is none of {', '.join(map(str, _POINT_BYTES))}")
     if count > _LARGEST_RATIO * stored:
         raise ValueError(f"its header declares {count} points in {stored} bytes")
+    layers += point_bytes - bytes_of_format if layers else 0
+    _require_sound_chunks(file, points_begin, size, count=count, point_bytes=point_bytes, layers=layers)
+    file.seek(0)
+
+
+def _require_sound_chunks(
+    file: BufferedReader, points_begin: int, size: int, *, count: int, point_bytes: int, layers: int
+) -> None:
+    """Raise ValueError if the table of chunks of compressed points declares other points than the header."""
     file.seek(points_begin)
     (table,) = struct.unpack("<q", file.read(8))
     if table == -1:  # written to a stream: the place is at the end
@@ -243,14 +252,12 @@ def _require_sound_points(file: BufferedReader) -> None:
         raise ValueError("the table of its chunks is outside the file")
     file.seek(table)
     _, chunks = struct.unpack("<II", file.read(8))
-    if chunks * point_bytes > stored:
-        raise ValueError(f"it declares {chunks} chunks of points in {stored} bytes")
+    if chunks * point_bytes > size - points_begin:
+        raise ValueError(f"it declares {chunks} chunks of points in {size - points_begin} bytes")
     if layers:
-        layers += point_bytes - bytes_of_format
         found = _count_layered_points(file, points_begin + 8, table, point_bytes=point_bytes, layers=layers)
         if found != count:
             raise ValueError(f"its chunks have {found} points and its header {count}")
-    file.seek(0)
 
 
 def _count_layered_points(file: BufferedReader, begin: int, end: int, *, point_bytes: int, layers: int) -> int:

@@ -138,25 +138,10 @@ def check_unit(unit: Unit) -> Unit:
     return unit
 
 
-def read_number_table(path: Path, digests: dict[str, str] | None = None, *, named: bool = True) -> NumberTable:
-    """Read a table of numbers, separated by commas, semicolons, tabs or blanks.
-
-    With separators other than commas, numbers may have decimal commas. Lines that begin with #, //, % or ! are
-    comments; the last comment before the numbers names the columns if it contains x and z, or an angle. A first line
-    with the number of rows is recognised, as are other lines before such names, a row of units below them, UTF-8,
-    UTF-16 and Latin-1. Names are in lower case and without unit.
-    Usual names for times, positions, quaternions and Euler angles become ``time_s``, ``x``, ``qw``, ``roll`` and so
-    on. Without names, two columns are x and z, and others are numbered. ``digests`` takes the file's SHA-256 by name.
-
-    Raises DescriptionError if the file is no such table, rows are missing, or a name states an unknown unit.
-    """
-    content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
-    if digests is not None:
-        digests[path.name] = hash_file(path)
-    content = _decode_wide(content, path)
-    if is_gocator_csv(content):
-        columns, notes = read_gocator_csv(content, path)
-        return NumberTable(path, columns, dict.fromkeys("xyz", "mm"), notes=notes)
+def _split_lines(
+    content: bytes, path: Path
+) -> tuple[list[bytes], list[bytes], bytes | None, bytes | None, list[bytes]]:
+    """Return comments at the beginning, lines before the names of columns, these names, units and rows."""
     lines = [stripped for line in content.splitlines() if (stripped := line.strip(b" ")) and not stripped.isspace()]
     comments = [*takewhile(lambda line: line.startswith(_COMMENTS), lines)]
     if any(mark in content for mark in _COMMENTS):
@@ -176,13 +161,42 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
             f"{path} states {counted} rows in its first line and has {len(lines)}: it is incomplete or has several "
             "parts"
         )
-    delimiter, comma = _separators(lines[0])
-    count = len(_cells(lines[0], delimiter))
+    return comments, block, header, unit_row, lines
+
+
+def _find_names(
+    header: bytes | None, unit_row: bytes | None, comments: list[bytes], delimiter: bytes, count: int, path: Path
+) -> list[str]:
+    """Return the names of ``count`` columns in the line before them or in a comment, with their units."""
     if header is None:
         header = next((each for each in reversed(comments) if _names_columns(each, delimiter, count)), None)
     cells = [] if header is None else _name_cells(header, delimiter, count)
-    if unit_row is not None:
-        cells = _add_units(cells, _name_cells(unit_row, delimiter, count), path)
+    return cells if unit_row is None else _add_units(cells, _name_cells(unit_row, delimiter, count), path)
+
+
+def read_number_table(path: Path, digests: dict[str, str] | None = None, *, named: bool = True) -> NumberTable:
+    """Read a table of numbers, separated by commas, semicolons, tabs or blanks.
+
+    With separators other than commas, numbers may have decimal commas. Lines that begin with #, //, % or ! are
+    comments; the last comment before the numbers names the columns if it contains x and z, or an angle. A first line
+    with the number of rows is recognised, as are other lines before such names, a row of units below them, UTF-8,
+    UTF-16 and Latin-1. Names are in lower case and without unit.
+    Usual names for times, positions, quaternions and Euler angles become ``time_s``, ``x``, ``qw``, ``roll`` and so
+    on. Without names, two columns are x and z, and others are numbered. ``digests`` takes the file's SHA-256 by name.
+
+    Raises DescriptionError if the file is no such table, rows are missing, or a name states an unknown unit.
+    """
+    content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
+    if digests is not None:
+        digests[path.name] = hash_file(path)
+    content = _decode_wide(content, path)
+    if is_gocator_csv(content):
+        columns, notes = read_gocator_csv(content, path)
+        return NumberTable(path, columns, dict.fromkeys("xyz", "mm"), notes=notes)
+    comments, block, header, unit_row, lines = _split_lines(content, path)
+    delimiter, comma = _separators(lines[0])
+    count = len(_cells(lines[0], delimiter))
+    cells = _find_names(header, unit_row, comments, delimiter, count, path)
     body = b"\n".join(lines) + b"\n"
     if delimiter == b" " and b"  " in body:
         body = re.sub(rb" {2,}", b" ", body)
@@ -204,9 +218,7 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
         del columns[names[-1]]
     if "time_s" in columns:
         columns["time_s"] = columns["time_s"] * _TIMES[units.get("time_s", "s")]
-    notes: list[str] = []
-    if comma and delimiter == b" ":
-        notes.append("commas between digits were read as decimal commas, blanks as separators")
+    notes = ["commas between digits were read as decimal commas, blanks as separators"] * (comma and delimiter == b" ")
     if block:
         notes.append(
             f"lines before the names of columns are omitted ({len(block)}): {shorten(_text(block[0]), 60)} ..."

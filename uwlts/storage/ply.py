@@ -95,7 +95,8 @@ def _fault(path: Path, what: str) -> CaptureError:
     return CaptureError(f"{path} is not a complete PLY file: {what}")
 
 
-def _read_header(path: Path, *, called: str) -> _Header:
+def _split_header(path: Path, *, called: str) -> tuple[bytes, int, int]:
+    """Return the header, its length with the line of its end, and the size of the file."""
     with open_regular(path, called=called) as file:
         start, size = file.read(_LONGEST_HEADER), os.fstat(file.fileno()).st_size
     text, end, rest = start.partition(b"end_header")
@@ -106,6 +107,11 @@ def _read_header(path: Path, *, called: str) -> _Header:
     newline = b"\n" if text.startswith(b"ply\n") else b"\r\n" if text.startswith(b"ply\r\n") else b"\r"
     if not rest.startswith(newline):
         raise _fault(path, "early end-of-file, or other characters after end_header")
+    return text, len(text) + len(end) + len(newline), size
+
+
+def _read_header(path: Path, *, called: str) -> _Header:
+    text, used, size = _split_header(path, called=called)
     order, elements, comments = "", {}, []
     count, properties = 0, []
     for line in text.translate(_IN_ASCII).decode("ascii").splitlines()[1:]:
@@ -127,6 +133,14 @@ def _read_header(path: Path, *, called: str) -> _Header:
                 raise _fault(path, f"{shorten(repr(line))} is not an element, property, format or comment of PLY")
     if not order:
         raise _fault(path, "its header names no format")
+    _require_complete(elements, size, path, ascii_text=order == "ascii")
+    return _Header(order == "ascii", _ORDERS[order], elements, comments, used)
+
+
+def _require_complete(
+    elements: dict[str, tuple[int, list[_Property]]], size: int, path: Path, *, ascii_text: bool
+) -> None:
+    """Raise CaptureError if names stand twice, or a file of ``size`` bytes is too short for its elements."""
     total, least = 0, 0
     for name, (number, columns) in elements.items():
         names = [each.name for each in columns]
@@ -134,7 +148,7 @@ def _read_header(path: Path, *, called: str) -> _Header:
             raise _fault(path, f"a property of the element {shorten(name)} is declared twice")
         total += len(columns)
         # In text a number takes at least a digit and a separator; a list takes at least its length.
-        least += number * sum(2 if order == "ascii" else np.dtype(c.length or c.kind).itemsize for c in columns)
+        least += number * sum(2 if ascii_text else np.dtype(c.length or c.kind).itemsize for c in columns)
     if total > _MOST_PROPERTIES:
         raise CaptureError(f"{path} has {total:,} properties; this program reads up to {_MOST_PROPERTIES:,}")
     # The last line of a text may end without a separator.
@@ -143,8 +157,6 @@ def _read_header(path: Path, *, called: str) -> _Header:
             path,
             f"early end-of-file, its header declares at least {least:,} bytes of values, and the file has {size:,}",
         )
-    used = len(text) + len(end) + len(newline)
-    return _Header(order == "ascii", _ORDERS[order], elements, comments, used)
 
 
 def _table_type(properties: Sequence[_Property], order: str) -> np.dtype:

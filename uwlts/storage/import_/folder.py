@@ -246,27 +246,16 @@ def import_images(
     try:
         with writer:
             for number, row in enumerate(frames):
-                laser_on = row.light == "laser"
                 # An unknown exposure or time is stored as 0, as stated in the provenance.
                 exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s if in_time else 0.0]).tolist()
+                encoder = None
                 if row.profile is not None:
                     content.add_line(row.profile)
-                    encoder = None if math.isnan(row.encoder) else row.encoder
-                    writer.append(Frame(row.profile, row.stage_mm, True, exposure_ms, time_s, row.pose, encoder))
-                    progress(number + 1, len(frames))
-                    continue
-                image, clipped, _ = reader.image(row.file, laser_on=laser_on)
-                unsigned = np.maximum(image, 0).astype(reader.dtype, copy=False)
-                content.add_image(unsigned, clipped, laser_on=laser_on, name=Path(row.file).name)
-                if laser_on and zero:
-                    unlit = np.zeros_like(image) if row.background is None else reader.background(row.background)
-                    image = subtract_background(image, unlit, clipped, zero_dn=zero)
+                    image, encoder = row.profile, None if math.isnan(row.encoder) else row.encoder
                 else:
-                    image = unsigned
-                if laser_on:
-                    content.find_stripe(image, header.saturation_dn)
-                image = image.astype(dtype, copy=False)
-                writer.append(Frame(image, row.stage_mm, laser_on, exposure_ms, time_s, row.pose))
+                    image = _stored_image(row, reader, content, zero_dn=zero, saturation_dn=header.saturation_dn)
+                    image = image.astype(dtype, copy=False)
+                writer.append(Frame(image, row.stage_mm, row.light == "laser", exposure_ms, time_s, row.pose, encoder))
                 progress(number + 1, len(frames))
             content.refuse_black()
     except BaseException:
@@ -282,6 +271,23 @@ def import_images(
         few = ", ".join(unmatched[:3])
         warnings.append(f"{len(unmatched)} images of the folder are left out because nothing describes them: {few}")
     return Imported(len(matched.laser), len(matched.lamp), tuple(warnings))
+
+
+def _stored_image(
+    row: ImageRow, reader: "_Reader", content: _Content, *, zero_dn: int, saturation_dn: int
+) -> np.ndarray:
+    """Read an image and add it to the ``content``; return it without its background, if one is subtracted."""
+    laser_on = row.light == "laser"
+    image, clipped, _ = reader.image(row.file, laser_on=laser_on)
+    unsigned = np.maximum(image, 0).astype(reader.dtype, copy=False)
+    content.add_image(unsigned, clipped, laser_on=laser_on, name=Path(row.file).name)
+    if not laser_on:
+        return unsigned
+    if zero_dn:
+        unlit = np.zeros_like(image) if row.background is None else reader.background(row.background)
+        unsigned = subtract_background(image, unlit, clipped, zero_dn=zero_dn)
+    content.find_stripe(unsigned, saturation_dn)
+    return unsigned
 
 
 def _in_order(frames: list[ImageRow]) -> bool:
