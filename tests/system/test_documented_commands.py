@@ -229,9 +229,10 @@ PAGES_RUN = {
         tables={"small-pipe-campaign.toml": 0},
         instead={
             "thesis-small --water clear": "thesis-small --campaign small-pipe-campaign.toml --water clear",
-            "--campaign detection --water coastal --campaigns 2 --every 2": "--campaign small-pipe-campaign.toml "
-            "--campaigns 1 --every 4",
-            "--campaigns 10": "--campaigns 1 --every 4",
+            # The recordings of the first call.
+            "--campaign detection --water coastal --campaigns 2 --every 2 --out runs/detection": "--campaign "
+            "small-pipe-campaign.toml --water clear --campaigns 1 --every 4 --out runs/predicted",
+            "--campaigns 10": "--campaigns 1 --every 8",
         },
     ),
     "docs/how-to/inspect-a-pipe.md": Page(
@@ -269,11 +270,13 @@ PAGES_RUN = {
     "docs/tutorials/choose-a-design.md": Page(
         prepare={"twin sweep study.toml --out runs/study": study_of_the_page},
         again=("twin sweep study.toml --out runs/study --verify 2",),
-        instead={"--verify 2": "--verify 1", "steps = 26": "steps = 6", "steps = 24": "steps = 5"},
+        instead={"--verify 2": "--verify 1", "steps = 26": "steps = 6", "steps = 24": "steps = 5"}
+        | {'sensor = "thesis"': 'sensor = "thesis-small"'},
     ),
     "docs/tutorials/import-foreign-images.md": Page(prepare={"uwlts import photographs": photographs_of_the_page}),
     "docs/tutorials/learn-from-a-data-set.md": Page(
-        instead={"scenes=50": "scenes=6"}, not_run={"example = next(": NEEDS_LEARN, "methods = {": NEEDS_LEARN}
+        instead={"scenes=50": "scenes=4", 'base = "stripe-turbid"': 'base = "stripe-clean"\nsensor = "thesis-small"'},
+        not_run={"example = next(": NEEDS_LEARN, "methods = {": NEEDS_LEARN},
     ),
     "docs/tutorials/photographs-to-cloud.md": Page(prepare={"uwlts import target": both_folders_of_the_page}),
     "docs/tutorials/photographs-to-sensor.md": Page(
