@@ -258,9 +258,9 @@ def test_what_noise_does_to_a_shape_is_that_of_drawn_noise(shape):
         measured = fit_shape_near(cloud, CENTRE, 60.0, shape)
         assert measured.points_used == len(cloud)
         stated = [measured.uncertainty[name].random_mm for name in measured.figures_mm]
-        ratios.append(np.square(stated) / remeasured(shape, cloud, "random", 500))
+        ratios.append(np.square(stated) / remeasured(shape, cloud, "random", 150))
     for ratio in np.mean(ratios, axis=0):
-        # The drawn variances' own chance, 6 % each and 2 % together, hides in that of 7 degrees of freedom ten times.
+        # The drawn variances' own chance, 12 % each and 4 % together, hides in that of 7 degrees of freedom ten times.
         assert agree(ratio, 10 * 7), ratios
 
 

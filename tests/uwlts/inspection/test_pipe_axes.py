@@ -22,10 +22,10 @@ DRAWS = [
     *(pytest.param(axis, 1, id=f"{name}-1") for name, axis in AXES.items()),
     *(
         pytest.param(AXES[name], seed, id=f"{name}-{seed}", marks=pytest.mark.slow)
-        for name, seed in zip([*AXES] * 3, (0, *range(2, 13)), strict=True)
+        for name, seed in zip(AXES, (0, 2, 3, 4), strict=True)
     ),
 ]
-"""Axis and seed: a pipe along each axis, and three more in slow tests."""
+"""Axis and seed: a pipe along each axis, and one more in slow tests."""
 DEPTHS_MM = 0.3, 0.6, 1.2, 2.0, 3.0
 """The shallowest is fifteen times the noise of a point; the deepest is within the 6 % of the radius that count."""
 BLEMISHES = FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION
