@@ -35,7 +35,7 @@ _JSON_READERS: dict[str, Callable[[Path], AnyCalibration | Mount | Evaluation | 
 }
 _READABLE = (
     f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
-    "calibrations, mounts, acceptance tests, tables of figures and evaluations (.json), trajectories (.csv, .tum, ROS bags)"
+    "calibrations, mounts, acceptance tests, figures and evaluations (.json), trajectories (.csv, .tum, ROS bags)"
 )
 
 _Readable = (
