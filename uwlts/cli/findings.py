@@ -46,7 +46,7 @@ def evaluate(
     wrote(evaluation_lines(evaluation), doubts, out)
 
 
-@command_from(app, uwlts, "compare_clouds", job="Inspect")
+@command_from(app, uwlts, "compare_clouds", job="Inspect", also=[(uwlts.report, "write_change")])
 def compare(
     call: Call,
     *,
@@ -59,14 +59,17 @@ def compare(
             "to this PLY, LAZ or LAS file."
         ),
     ] = None,
+    pdf=False,
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts compare after.cloud.h5 before.cloud.h5 --out change.html"""
     change = call()
     title = f"{Path(call.given['cloud']).name} against {Path(call.given['reference']).name}"
-    uwlts.report.write_change(out, change, title=title, coloured=coloured, overwrite=overwrite)
+    uwlts.report.write_change(out, change, title=title, coloured=coloured, pdf=pdf, overwrite=overwrite)
     show(change.lines())
     wrote_page(out)
+    if pdf:
+        wrote_files(out.with_suffix(".pdf"))
 
 
 @command_from(

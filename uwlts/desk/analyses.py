@@ -143,9 +143,11 @@ def _inspect(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
 
 
 def _compare(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcome:
-    change = uwlts.compare_clouds(**job.values)
-    title = f"{Path(job.values['cloud']).name} against {Path(job.values['reference']).name}"
-    uwlts.report.write_change(job.path(".html"), change, title=title, coloured=job.path("-coloured.ply"))
+    values = dict(job.values)
+    how = {"coloured": job.path("-coloured.ply"), "pdf": values.pop("pdf", False)}
+    change = uwlts.compare_clouds(**values)
+    title = f"{Path(values['cloud']).name} against {Path(values['reference']).name}"
+    uwlts.report.write_change(job.path(".html"), change, title=title, **how)
     findings = tuple(
         AnalysisFinding(
             f"region {number}",
@@ -186,6 +188,7 @@ def _reconstruct(job: AnalysisJob, progress: ProgressListener) -> AnalysisOutcom
 
 
 _REPORT = (uwlts.report, "write_findings", ("order", "measured", "calibration", "pdf"))
+_COMPARED = ("cloud", "reference", "register", "same_water", "cloud_std_mm", "reference_std_mm")
 _CLOUD = ".cloud.h5"
 """Ending of clouds to measure, with the whole uncertainty."""
 _INSPECTED = (".html", ".findings.json", "-coloured.ply")
@@ -204,13 +207,7 @@ ANALYSES: Mapping[str, Analysis] = MappingProxyType(
         },
         "compare": Analysis(
             _compare,
-            (
-                (
-                    uwlts,
-                    "compare_clouds",
-                    ("cloud", "reference", "register", "same_water", "cloud_std_mm", "reference_std_mm"),
-                ),
-            ),
+            ((uwlts, "compare_clouds", _COMPARED), (uwlts.report, "write_change", ("pdf",))),
             "-change",
             (".html", ".json", "-coloured.ply"),
         ),

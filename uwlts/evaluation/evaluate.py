@@ -195,13 +195,9 @@ def _compare_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
     motion = fit_rigid_transform(measured, measured - errors)
     moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
     stated = None if cloud.uncertainty is None else tuple((2 * shift_std_mm(cloud, compared.is_matched)).tolist())
-    return compared.model_copy(
-        update={
-            "after_best_fit": compare_cloud_with_truth(replace(cloud, points_mm=moved), truth),
-            "shift_mm": tuple(np.mean(errors, axis=0).tolist()),
-            "shift_expanded_mm": stated,
-        }
-    )
+    fitted = compare_cloud_with_truth(replace(cloud, points_mm=moved), truth)
+    shift = tuple(np.mean(errors, axis=0).tolist())
+    return compared.model_copy(update={"after_best_fit": fitted, "shift_mm": shift, "shift_expanded_mm": stated})
 
 
 def _read_matching_truth(path: str | Path, cloud: PointCloud) -> Truth:

@@ -121,6 +121,7 @@ def write_page(
     Raises OutputError if a file exists and ``overwrite`` is not set, or cannot be written.
     """
     if pdf:
+        refuse_unsuitable_page(Path(path), kind=kind, pdf=True, overwrite=overwrite)
         print_pdf(text, Path(path).with_suffix(".pdf"), overwrite=overwrite)
     with ExitStack() as stack:
         if beside is not None:

@@ -41,6 +41,7 @@ def write_change(
     *,
     title: str = "Change of a surface",
     coloured: str | Path | None = None,
+    pdf: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Write the page of a change, its figures as JSON beside it, and its points as a cloud.
@@ -58,6 +59,8 @@ def write_change(
         Title of the page.
     coloured : str or Path, optional
         Cloud to write, in PLY, LAZ or LAS depending on its ending.
+    pdf : bool
+        Also print the page to a PDF beside it, with an installed Chromium or Chrome.
     overwrite : bool
         Replace existing files.
 
@@ -65,6 +68,8 @@ def write_change(
     ------
     OutputError
         A file exists and ``overwrite`` is not given, or cannot be written.
+    SetupError
+        A PDF is requested, but no browser is installed.
     """
     text = render_page(
         "uwlts.report",
@@ -80,7 +85,7 @@ def write_change(
     )
     if coloured is not None:
         _write_places(Path(coloured), change, overwrite=overwrite)
-    write_page(path, text, beside=json_text(change.record()), overwrite=overwrite)
+    write_page(path, text, beside=json_text(change.record()), pdf=pdf, overwrite=overwrite)
 
 
 def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None:

@@ -153,10 +153,8 @@ def _require_complete(
         raise CaptureError(f"{path} has {total:,} properties; this program reads up to {_MOST_PROPERTIES:,}")
     # The last line of a text may end without a separator.
     if least > size:
-        raise _fault(
-            path,
-            f"early end-of-file, its header declares at least {least:,} bytes of values, and the file has {size:,}",
-        )
+        declared = f"its header declares at least {least:,} bytes of values, and the file has {size:,}"
+        raise _fault(path, f"early end-of-file, {declared}")
 
 
 def _table_type(properties: Sequence[_Property], order: str) -> np.dtype:

@@ -506,7 +506,8 @@ def test_unknown_uncertainties_are_warned_of_on_all_outputs_and_can_be_stated(tm
         "no uncertainty of the cloud",
         "no uncertainty of the reference",
     ]
-    uwlts.report.write_change(tmp_path / "a.html", scatter)
+    uwlts.report.write_change(tmp_path / "a.html", scatter, pdf=True)
+    assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
     recorded, page = json.loads((tmp_path / "a.json").read_text()), (tmp_path / "a.html").read_text()
     for warning in scatter.warnings:
         assert f"warning: {warning}" in scatter.lines() and warning in recorded["warnings"]
