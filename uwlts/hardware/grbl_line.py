@@ -372,7 +372,8 @@ class GrblLine:
     def end(self) -> None:
         """Abort the lines of `begin` by Ctrl-X, which also switches the laser off; the position is kept at rest."""
         self._refuse_after_fault()
-        self._reset()
+        if (alarm := self._reset()) is not None:
+            raise self.stop_and_make_error(code_text("ALARM", alarm))
 
     def settings(self) -> dict[int, float]:
         """Return the answer to ``$$``: values by number."""
@@ -445,7 +446,9 @@ class GrblLine:
         while self._read_line(time.monotonic() + _QUIET_S) is not None:
             pass
 
-    def _reset(self) -> None:
+    def _reset(self) -> int | None:
+        """Reset by Ctrl-X; return the number of an alarm that came before the greeting."""
+        alarm = None
         self.fault, self.unacknowledged = None, 0
         self._received.clear()
         self._write(SOFT_RESET)
@@ -454,7 +457,9 @@ class GrblLine:
         while (line := self._read_line(deadline)) is not None:
             reply = parse_reply(line)
             if isinstance(reply, Reply) and reply.kind == "banner":
-                return
+                return alarm
+            if isinstance(reply, Reply) and reply.kind == "ALARM":
+                alarm = reply.number
         raise self.stop_and_make_error("the controller does not restart on Ctrl-X: switch its power off and on")
 
     def stop_and_make_error(self, what: str) -> HardwareError:

@@ -585,12 +585,13 @@ def test_a_fault_while_moving_is_named_and_the_laser_is_off(real, sweeping, faul
         assert controller.state().position_mm == 20.0
 
 
-def test_a_restart_at_the_moment_of_a_reset_is_named(controller, stage, monkeypatch):
+@pytest.mark.parametrize(("fault", "message"), [("restart", r"restarted by itself: home"), ("alarm", "ALARM:1, hard")])
+def test_a_fault_at_the_moment_of_a_reset_is_named(controller, stage, monkeypatch, fault, message):
     """A light ends by a reset; the greeting after a restart just before it looks like the answer."""
     stage.laser(True, at_most_s=5.0)
     end = stage._line.end
-    monkeypatch.setattr(stage._line, "end", lambda: (controller.inject("restart"), end()))
-    with pytest.raises(HardwareError, match=r"restarted by itself: home"):
+    monkeypatch.setattr(stage._line, "end", lambda: (controller.inject(fault), end()))
+    with pytest.raises(HardwareError, match=message):
         stage.laser(False)
     assert not controller.state().laser_on
 
