@@ -25,7 +25,9 @@ from uwlts.storage.truth import FORMAT as TRUTH, Truth, read_truth
 
 _TABLES = (".csv", ".txt", ".asc")
 """Endings of text with a cloud or a trajectory."""
-_JSON_READERS: dict[str, Callable[[Path], AnyCalibration | Mount | Evaluation | Acceptance | FigureTable]] = {
+_Stored = AnyCalibration | Mount | Evaluation | Acceptance | FigureTable
+_Readable = Capture | PointCloud | SurfaceMesh | Truth | Trajectory | _Stored
+_JSON_READERS: dict[str, Callable[[Path], _Stored]] = {
     CALIBRATION: load_calibration,
     POLYNOMIALS_FORMAT: load_calibration,
     MOUNT: read_mount,
@@ -36,19 +38,6 @@ _JSON_READERS: dict[str, Callable[[Path], AnyCalibration | Mount | Evaluation | 
 _READABLE = (
     f"captures and ground truth (.h5), clouds ({', '.join(CLOUD_ENDINGS)}), meshes ({', '.join(MESH_FORMATS)}), "
     "calibrations, mounts, acceptance tests, figures and evaluations (.json), trajectories (.csv, .tum, ROS bags)"
-)
-
-_Readable = (
-    Capture
-    | PointCloud
-    | SurfaceMesh
-    | Truth
-    | AnyCalibration
-    | Mount
-    | Evaluation
-    | Acceptance
-    | FigureTable
-    | Trajectory
 )
 
 
