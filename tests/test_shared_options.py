@@ -34,7 +34,6 @@ MEANING = {
         "--kind": "Kind of the object",
         "--medium": "One of the sensor's media",
         "--out": "to write|New folder",
-        "--page": "Page to write",
         "--title": "Title of the",
         "--overwrite": "Replace|replace",
         "--pixels": "Whether pixels are square",

@@ -24,7 +24,7 @@ _RANGES = "PE", "RE"
 def read_figures(folder: Path, takes: Mapping[str, Take], methods: Sequence[Method]) -> Iterator[MeasuredFigure]:
     """Yield the figures of a campaign's scans by all methods; CaptureError if a result is incomplete."""
     for method in methods:
-        if method.made is None and method.calibration(folder).is_file():
+        if method.suffix and method.made is None and method.calibration(folder).is_file():
             yield from _read_calibration(folder, method)
         if any(method.thesis.values()):
             yield from read_table(method.result(folder, THESIS, "json")).rows
@@ -38,7 +38,7 @@ def read_figures(folder: Path, takes: Mapping[str, Take], methods: Sequence[Meth
 
 
 def _read_calibration(folder: Path, method: Method) -> Iterator[MeasuredFigure]:
-    """Yield the window distance of a sequential calibration, or the residual of polynomials."""
+    """Yield the window distance or the residual of one of several calibrations."""
     path = method.calibration(folder)
     content: dict[str, Any] = read_json(path, called="calibration")
     values = {"window distance": (content.get("window") or {}).get("distance_mm")}

@@ -36,6 +36,7 @@ Result = TypeVar("Result")
 Send = Callable[[Any], None]
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+_STARTING = threading.Lock()  # the environment belongs to all threads
 
 _GRACE_S = 5.0
 """Time for a stopped process to clean up its files; afterwards it removes incomplete ones."""
@@ -255,7 +256,8 @@ class _Process:
     def give(self, work: Callable[[Any, Send], Any], job: Any) -> None:
         """Send a job, and its function if that is new."""
         if self._process.pid is None:
-            _start(self._process, self._threads)
+            with _STARTING:
+                _start(self._process, self._threads)
             self._theirs.close()
         # If the process has ended, `message` reports it.
         with suppress(BrokenPipeError):

@@ -105,17 +105,15 @@ def write_e57(
 def _structure(lib: Any, image: Any, values: dict[str, Any]) -> Any:
     node = lib.StructureNode(image)
     for label, value in values.items():
-        kind = lib.IntegerNode if isinstance(value, int) else lib.FloatNode
-        node.set(label, kind(image, value))
+        node.set(label, (lib.IntegerNode if isinstance(value, int) else lib.FloatNode)(image, value))
     return node
 
 
 def _field_node(lib: Any, image: Any, values: np.ndarray, *, double: bool) -> Any:
     """Return the node of a column, with its limits."""
+    low, high = values.min().item(), values.max().item()
     if values.dtype.kind in "iu":
-        low, high = int(values.min()), int(values.max())
         return lib.IntegerNode(image, low, low, high)
-    low, high = float(values.min()), float(values.max())
     return lib.FloatNode(image, low, lib.E57_DOUBLE if double else lib.E57_SINGLE, low, high)
 
 
