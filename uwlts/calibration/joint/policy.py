@@ -256,7 +256,7 @@ class _Attempt:
             best = self._with_lens(chosen) or self if chosen != camera else self
         if any(isinstance(each.key, LensParameter) and each.wrong() for each in deviations(best.result)):
             # Before the usual size of p1 and p2 refuses anything, they are free.
-            freer = replace(camera, distortion=(*best.options.camera.distortion, "p1", "p2"))
+            freer = replace(camera, distortion=tuple(dict.fromkeys((*best.options.camera.distortion, "p1", "p2"))))
             freed = (best._with_lens(replace(freer, pixel_aspect=shape)) for shape in shapes)
             best = next((each for each in freed if each is not None), best)
         if choice.pixels == "auto" and not free_pixels:
@@ -288,7 +288,7 @@ class _Attempt:
         camera = self.options.camera
         given = [name for name in camera.distortion if name not in before.distortion]
         given += ["free pixels"] if camera.pixel_aspect != before.pixel_aspect else []
-        said = f"{', '.join(given)} were added to the lens: held-out images are predicted better with them"
+        said = f"{', '.join(given)} were added to the lens: images are predicted better, or not refused, with them"
         return replace(self, said=(*self.said, said)) if given else self
 
     def _with_spacings_and_pixels_free(self) -> "_Attempt | None":
