@@ -133,11 +133,11 @@ def find_blobs(image, noise):
     families = []
     for bright, mask in _local_masks(image, noise):
         blobs = _select_ellipses(mask, bright=bright)
+        blobs = blobs[np.argsort(blobs.radii)]
         while len(blobs) >= _RULE.fewest:
             first, last = _largest_family(blobs.radii, _RULE.size_range)
-            order = np.argsort(blobs.radii)
-            families.append(blobs[order[first:last]])
-            blobs = blobs[np.delete(order, slice(first, last))]
+            families.append(blobs[first:last])
+            blobs = blobs[np.delete(np.arange(len(blobs)), slice(first, last))]
     yield from sorted(families, key=len, reverse=True)[: _RULE.most_families]
 
 
