@@ -162,7 +162,7 @@ class ExperimentResult(Brief, BaseModel, frozen=True):
                 ("built as", self.as_built),
                 ("campaign", self.campaign),
                 *water,
-                ("seeds", f"{self.seeds[0]} to {self.seeds[-1]}"),
+                ("seeds", " to ".join(dict.fromkeys(map(str, (self.seeds[0], self.seeds[-1]))))),
             ],
             understated=[each.text() for each in self.understated],
             figure=figure_svg(draw_means(self.published) if self.published else self.errors_figure()),
