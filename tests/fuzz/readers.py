@@ -48,7 +48,7 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.acceptance_page import acceptance_page
 from uwlts.report.certificate import check_certificate, make_certificate
 from uwlts.report.file_description import describe
-from uwlts.storage.calibration_file import load_calibration, read_calibration
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.data_set import load_dataset
@@ -113,7 +113,7 @@ def _certified(path: Path) -> Path:
 
 def _certificate(path: Path) -> None:
     calibration = _certified(path)
-    content = make_certificate(read_calibration(calibration), calibration, issued="2026-01-02T03:04:05+00:00")
+    content = make_certificate(load_calibration(calibration), calibration, issued="2026-01-02T03:04:05+00:00")
     path.write_text(json.dumps(content.in_file()))
 
 
@@ -433,7 +433,7 @@ READERS = {
     each.name: each
     for each in (
         Reader("calibration", ".json", "json", _nominal, load_calibration),
-        Reader("joint", ".json", "json", _joint, read_calibration),
+        Reader("joint", ".json", "json", _joint, load_calibration),
         Reader("polynomials", ".json", "json", _polynomials, load_calibration),
         Reader("certificate", ".json", "json", _certificate, lambda path: check_certificate(path, _certified(path))),
         Reader("evaluation", ".json", "json", _evaluation, read_evaluation),

@@ -25,7 +25,7 @@ from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.model.library import load_sensor
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, part_path
 from uwlts.targets import CircleTarget
 
@@ -138,7 +138,7 @@ def wait_for(part: Path, count: int) -> None:
 
 def check_camera(path: Path, sensor: Sensor) -> None:
     """Compare with the description of the simulated sensor."""
-    calibration = read_calibration(path)
+    calibration = load_calibration(path)
     figures = calibration.residuals["camera"]
     # Circles are found to some 0.05 px in small images with noise.
     assert figures["rms_px"] < 0.12
@@ -171,7 +171,7 @@ def test_the_stage_leads_to_the_twins_camera_and_sheet(served, plan, sensor, tmp
     # The captures give the same calibration again.
     with Capture(tmp_path / "c-target.h5") as capture:
         again = calibrate_sequentially([capture]).calibration
-    assert read_calibration(tmp_path / "c.json").camera == again.camera
+    assert load_calibration(tmp_path / "c.json").camera == again.camera
 
 
 def test_an_interrupted_one_is_dark_keeps_the_accepted_and_can_be_gone_on_from(served, plan, tmp_path):
@@ -306,7 +306,7 @@ def test_a_target_held_by_hand_is_led_to_a_calibration(served, folder, tmp_path)
         served.camera.connect()
     text = "".join(said)
     assert "too similar to image 1" in text and "next: tilt the target" in text
-    calibration = read_calibration(tmp_path / "c.json")
+    calibration = load_calibration(tmp_path / "c.json")
     assert calibration.residuals["camera"]["std"]["f"] < 0.5
     assert calibration.residuals["camera"]["rms_px"] < 0.15
     assert calibration.camera.fx_px == pytest.approx(small.camera.focal_length_px(), rel=2e-3)

@@ -23,7 +23,7 @@ from uwlts import cli as uwlts_cli
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.report.plot import DEVIATIONS, colour_limit_mm
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud
@@ -168,7 +168,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "twin simulate scene.toml --sensor sensor.toml --out rendered.h5 --spp 1",
         ):
             assert exit_code(*line.split()) == 0, line
-    dry = read_calibration(folder / "calibration.json").model_copy(update={"window": None, "medium_kind": "air"})
+    dry = load_calibration(folder / "calibration.json").model_copy(update={"window": None, "medium_kind": "air"})
     dry.save(folder / "dry.json")
     (folder / "campaigns" / "campaign-0").mkdir(parents=True)
     (folder / "campaign").mkdir()

@@ -10,7 +10,7 @@ import pytest
 
 from tests.system.test_calibrate_live import COUNT, folder, plan, sensor, served
 from tests.waiting import within
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def test_a_guided_calibration_is_led_through_and_calculated(plan, served, chromi
         page.locator('img[src^="coverage.png"]').wait_for()
         page.locator(".log").get_by_text("wrote calibration.json").wait_for()
         assert within(1.0, lambda: not served.controller.state().laser_on)
-        found = read_calibration(place / "calibration.json")
+        found = load_calibration(place / "calibration.json")
         with Capture(place / "calibration-target.h5") as target:
             assert (~target.laser_on).sum() == COUNT
         line = page.locator(".log").get_by_text(re.compile("camera: f ")).first.inner_text()

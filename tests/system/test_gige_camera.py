@@ -122,12 +122,14 @@ def test_every_trigger_gives_one_frame_of_its_moment(scene, camera):
     assert camera.counts.ok == 5 and camera.counts.unanswered == 1
 
 
-def test_a_region_is_cut_out_of_the_image(scene, camera):
+def test_a_region_is_cut_out_of_the_image_and_binning_is_switched_off(scene, camera, caplog):
     region = Region(600, 500, 64, 32)
+    camera._call("set_integer", b"BinningHorizontal", 2)
     assert camera.configure(region=region, trigger="software").region == region
     camera.start()
     camera.trigger()
     assert np.array_equal(camera.grab(WAIT_S).image, scene.frame(0.0)[500:532, 600:664])
+    assert "BinningHorizontal was 2 and is now 1" in caplog.text
 
 
 def test_free_running_frames_follow_each_other_past_the_end_of_the_counter(scene):

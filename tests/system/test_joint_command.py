@@ -14,7 +14,7 @@ from tests.system.in_process import run_program, uwlts
 from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
 from uwlts.model.sensor import Sensor
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 
 QUICK = ("--without", "multiple-scattering", "secondary-light", "haze", "--as-built", "thesis-as-built")
 SCENE = """
@@ -51,7 +51,7 @@ def folder(tmp_path_factory) -> Path:
 @pytest.mark.slow
 def test_lens_and_window_are_found_from_a_target_in_water(folder: Path, thesis_as_built: Sensor):
     """Besides the stated uncertainty the finite pupil, which no pinhole knows, shifts images by some 0.01 px."""
-    calibration = read_calibration(folder / "calibration.json")
+    calibration = load_calibration(folder / "calibration.json")
     joint = calibration.joint
     std = {key.text: value for key, value in zip(joint.parameters, joint.std, strict=True)}
     camera = thesis_as_built.camera

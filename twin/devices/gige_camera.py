@@ -236,8 +236,6 @@ class GigeCamera:
         # The library does not keep a reference to the callback.
         self._callback = _FILL(self._fill)
         self._server: int | None = None
-        self._stream: socket.socket
-        self._camera = 0
         self._lock = threading.Lock()
         self._faults: Counter[str] = Counter()
         self._delay_s = 0.0
@@ -343,7 +341,9 @@ class GigeCamera:
         usual = library.arv_fake_camera_new(self._serial)
         described = ctypes.string_at(library.arv_fake_camera_get_genicam_xml(usual, ctypes.byref(size)), size.value)
         library.g_object_unref(usual)
-        root = ElementTree.fromstring(described)
+        # The standard's name of the exposure (GenICam SFNC 2.7).
+        root = ElementTree.fromstring(described.replace(b"ExposureTimeAbs", b"ExposureTime"))
+        root.attrib |= {"VendorName": "UWLTS", "ModelName": "Twin", "ToolTip": "digital twin of a camera"}
         more = ElementTree.fromstring((Path(__file__).parent / "scan3d_features.xml").read_bytes())
         scan3d = {} if self._scan3d is None else {"Coord3D_C16": _COORD3D_C16}
         for feature in more:

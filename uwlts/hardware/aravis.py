@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import HardwareError
+from uwlts.files.reading import log_warnings
 from uwlts.hardware.camera_interface import (
     BUFFERS,
     CENTRE_LINES,
@@ -26,6 +27,7 @@ from uwlts.hardware.camera_interface import (
     LINE_RATE,
     LINE_SELECTOR,
     MONO_BITS,
+    PLAIN,
     CameraDevice,
     CameraInfo,
     CameraSettings,
@@ -67,6 +69,7 @@ _OF_CAMERA: tuple[tuple[Any, str, list[Any]], ...] = (
     (None, "set_chunk_state", [c_char_p, c_int]),
     (c_double, "get_float", [c_char_p]),
     (c_int, "get_boolean", [c_char_p]),
+    (None, "set_boolean", [c_char_p, c_int]),
     (c_char_p, "get_string", [c_char_p]),
 )
 # Result type, full names, and all arguments.
@@ -91,6 +94,9 @@ _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
     (c_int, "arv_buffer_has_chunks", [c_void_p]),
     (None, "g_object_unref g_free g_error_free", [c_void_p]),
 )
+
+
+_KINDS: dict[type, str] = {str: "string", float: "float", bool: "boolean", int: "integer"}
 
 
 def _load_functions() -> SimpleNamespace:
@@ -197,16 +203,36 @@ class AravisCamera(CameraDevice):
             )
             coordinates = self._coordinates() if self._pixel_format() == CENTRE_LINES else None
             bits = MONO_BITS.get(self._pixel_format(), 8) if coordinates is None else COORDINATE_BITS
+            black = self._feature("BlackLevel", float)
         except BaseException:
             self._close()
             raise
-        return CameraInfo(f"{maker} {model}", serial, width, height, bits, coordinates)
+        return CameraInfo(f"{maker} {model}", serial, width, height, bits, coordinates, black)
 
-    def _feature(self, name: str, kind: type[str] | type[float] | type[bool]) -> Any:
+    def _feature(self, name: str, kind: type[str] | type[float] | type[int]) -> Any:
         if not self._offers(name):
             return None
-        value = self._call({str: "get_string", float: "get_float", bool: "get_boolean"}[kind], name.encode())
+        value = self._call(f"get_{_KINDS[kind]}", name.encode())
         return _text(value) if kind is str else value
+
+    def _set_plain(self) -> None:
+        """Switch off what mirrors, bins or bends the images; a calibration is for images without it."""
+        found = {name: self._feature(name, type(plain)) for name, plain in PLAIN.items()}
+        if found["GammaEnable"] is not None:
+            # Then Gamma has no effect, and is often locked.
+            found["Gamma"] = None
+        changed = {name: value for name, value in found.items() if value not in (None, PLAIN[name])}
+        for name, value in changed.items():
+            plain = PLAIN[name]
+            with suppress(HardwareError):
+                self._call(f"set_{_KINDS[type(plain)]}", name.encode(), plain)
+            if self._feature(name, type(plain)) != plain:
+                raise HardwareError(
+                    f"the camera {self.address} has {name} = {value:g}, and does not accept {plain:g}: change it in "
+                    "the camera's own program; images must be as on the image sensor, and linear in light"
+                )
+        if said := ", ".join(f"{name} was {value:g} and is now {PLAIN[name]:g}" for name, value in changed.items()):
+            log_warnings(self.address, [f"{said}: calibrations of images with the old value do not apply"])
 
     def _offers(self, name: str) -> bool:
         return bool(self._call("is_feature_available", name.encode()))
@@ -257,6 +283,7 @@ class AravisCamera(CameraDevice):
     def _configure(self, wanted: CameraSettings) -> CameraSettings:
         self._call("set_acquisition_mode", 0)
         self._call("clear_triggers")
+        self._set_plain()
         region = wanted.region
         if self.info.coordinates is None:
             count = c_uint()

@@ -8,6 +8,7 @@ Cameras number their frames and stamp them with their own clock. A delivered fra
 late, or follow frames that were lost in transfer.
 """
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
@@ -20,6 +21,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from uwlts.errors import HardwareError, ImageError
+from uwlts.files.reading import log_warnings
 from uwlts.model.stripe import Coordinates, Stripe
 
 Trigger = Literal["free", "software", "line"]
@@ -32,6 +34,11 @@ LINE_RATE, LINE_SELECTOR = "AcquisitionLineRate", "ChunkScanLineSelector"
 
 CHUNKS = ("EncoderValue", "Timestamp")
 """Requested chunk data; the name of each feature is prefixed with ``Chunk``."""
+
+PLAIN: dict[str, bool | int | float] = dict.fromkeys(["ReverseX", "ReverseY", "LUTEnable", "GammaEnable"], False)
+PLAIN |= dict.fromkeys(["BinningHorizontal", "BinningVertical", "DecimationHorizontal", "DecimationVertical"], 1)
+PLAIN |= {"Gamma": 1.0}
+"""Features (GenICam SFNC 2.7) and their values for images as on the image sensor, with grey values linear in light."""
 
 BUFFERS = 32
 """Capacity of a driver's frame queue: half a second at 60 frames/s. Further frames are lost."""
@@ -62,7 +69,7 @@ class FrameStatus(StrEnum):
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """Numbers of frames of each status, and of unanswered triggers."""
+    """Numbers of frames of each status, of unanswered triggers, and of numbers that contradict the time stamps."""
 
     ok: int = 0
     short: int = 0
@@ -70,16 +77,21 @@ class FrameCounts:
     dropped: int = 0
     late: int = 0
     unanswered: int = 0
+    renumbered: int = 0
 
 
 class FrameCheck:
     """Comparison of each frame with the previous one.
 
     ``period_s`` is the time between frames of a free-running camera. Without it the time stamp marks no frame as late.
+    With ``triggered``, each frame answers a trigger.
+
+    Frames are lost only if there was time for them. Some cameras count other frames, too, or restart their count when
+    a setting changes: such a number is counted as ``renumbered``, and is no fault.
     """
 
-    def __init__(self, *, period_s: float | None = None):
-        self._period_s = period_s
+    def __init__(self, *, period_s: float | None = None, triggered: bool = False):
+        self._period_s, self._triggered = period_s, triggered
         self._last_id: int | None = None
         self._last_time_s: float | None = None
         self._counts: Counter[str] = Counter()
@@ -91,8 +103,8 @@ class FrameCheck:
 
     def judge(self, *, frame_id: int, time_s: float | None, complete: bool) -> FrameStatus:
         """Return the status of the next frame; ``time_s`` is None without a time stamp."""
-        advance = 1 if self._last_id is None else _advance(self._last_id, frame_id)
         since_s = None if time_s is None or self._last_time_s is None else time_s - self._last_time_s
+        advance = 1 if self._last_id is None else self._correct(_advance(self._last_id, frame_id), since_s)
         self._counts["dropped"] += max(advance - 1, 0)
         if not complete:
             status = FrameStatus.SHORT
@@ -110,6 +122,16 @@ class FrameCheck:
         if advance >= 0:
             self._last_id, self._last_time_s = frame_id, time_s
         return status
+
+    def _correct(self, advance: int, since_s: float | None) -> int:
+        """Return the increment of the frame number that fits the time since the previous frame, if that is known."""
+        restarted, most = advance < 0 and since_s is not None and since_s > 0, math.inf
+        if self._triggered or restarted:
+            most = 1
+        elif self._period_s is not None and since_s is not None:
+            most = max(round(since_s / self._period_s), 1)
+        self._counts["renumbered"] += restarted or advance > most
+        return int(most) if restarted or advance > most else advance
 
     def restart_comparison(self, counted: Literal["unanswered", "late"]) -> None:
         """Count an unanswered trigger or a discarded late frame, and forget the previous frame.
@@ -150,6 +172,7 @@ class CameraInfo:
     """Identity of a camera: name, serial number, size of the image sensor, and bit depth.
 
     ``coordinates`` is the encoding of a 3D camera's centre lines, or None if the camera delivers images.
+    ``black_level`` is the camera's feature of this name, if it has one.
     """
 
     name: str
@@ -158,6 +181,7 @@ class CameraInfo:
     height_px: int
     bits: int
     coordinates: Coordinates | None = None
+    black_level: float | None = None
 
 
 @dataclass(frozen=True)
@@ -231,7 +255,7 @@ class CameraDevice(ABC):
         self._settings: CameraSettings | None = None
         self._started = False
         self._check = FrameCheck()
-        self._skip = False
+        self._skip = self._renumbering_said = False
         self._later: deque[GrabbedFrame] = deque()
 
     @property
@@ -334,7 +358,8 @@ class CameraDevice(ABC):
         if self._started:
             raise HardwareError(f"the camera {self.address} is running already")
         together = 1 if self.info.coordinates is None else settings.region.height_px
-        self._check = FrameCheck(period_s=together / settings.frame_rate_hz if settings.frame_rate_hz else None)
+        period_s = together / settings.frame_rate_hz if settings.frame_rate_hz else None
+        self._check = FrameCheck(period_s=period_s, triggered=settings.trigger == "software")
         self._later.clear()
         self._skip = faults == "skip"
         self._start()
@@ -377,6 +402,9 @@ class CameraDevice(ABC):
                     continue
                 raise self._no_frame(timeout_s)
             status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.seen is not None)
+            if self.counts.renumbered and not self._renumbering_said:
+                self._renumbering_said = True
+                log_warnings(self.address, ["its frame numbers jump, but no frame is missing: time stamps decide"])
             usable = status is FrameStatus.OK or (self._skip and status is not FrameStatus.DUPLICATED)
             if frame.seen is not None and usable:
                 self._later.extend(self._make_grabbed_frame(each, FrameStatus.OK) for each in frame.later)
@@ -477,7 +505,7 @@ class CameraDevice(ABC):
         invalid = self._feature("Scan3dInvalidDataValue", float) if marked else None
         return Coordinates(1.0 if scale is None else scale, offset or 0.0, invalid)
 
-    def _feature(self, name: str, kind: type[str] | type[float] | type[bool]) -> Any:
+    def _feature(self, name: str, kind: type[str] | type[float] | type[int]) -> Any:
         """Return the value of a camera feature, or None if the camera does not have it."""
         return None
 

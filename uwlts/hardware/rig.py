@@ -147,7 +147,6 @@ _PROMPT_S = 0.1
 """Longest delay between a trigger and the start of the exposure."""
 _RUN_UP_MM = 1.0
 """More than the backlash of a ball screw or belt."""
-"""More than the play of a ball screw or belt."""
 
 
 def add_provenance(
@@ -161,6 +160,7 @@ def add_provenance(
         "source": source,
         "title": plan.title,
         "camera": f"{camera.info.name} {camera.info.serial}".strip(),
+        "black_level": camera.info.black_level,
         "stage": stage,
         **more,
         "laser_power": plan.laser_power,

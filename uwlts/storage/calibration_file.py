@@ -1,9 +1,8 @@
 """Files of calibrations: JSON, written completely or not at all, and validated when read."""
 
 from pathlib import Path
-from typing import TypedDict
 
-from uwlts.files.json_files import model_from_json, read_json, read_model
+from uwlts.files.json_files import model_from_json, read_json
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import FORMAT, VERSION, Calibration
 from uwlts.model.polynomial_calibration import (
@@ -13,38 +12,19 @@ from uwlts.model.polynomial_calibration import (
 )
 
 
-class _Known(TypedDict):
-    """Properties that identify a file of calibrations."""
-
-    file_format: str
-    version: int
-    called: str
-
-
-_CALIBRATION: _Known = {"file_format": FORMAT, "version": VERSION, "called": "calibration"}
-_POLYNOMIALS: _Known = {
-    "file_format": POLYNOMIALS_FORMAT,
-    "version": POLYNOMIALS_VERSION,
-    "called": "polynomial calibration",
-}
-
-
-def read_calibration(path: str | Path) -> Calibration:
-    """Read a calibration; raises CaptureError if the file is missing, foreign, newer or damaged."""
-    return read_model(path, Calibration, **_CALIBRATION)
-
-
-def read_polynomials(path: str | Path) -> PolynomialCalibration:
-    """Read a polynomial calibration; raises CaptureError if the file is missing, foreign, newer or damaged."""
-    return read_model(path, PolynomialCalibration, **_POLYNOMIALS)
-
-
 def load_calibration(path: str | Path) -> AnyCalibration:
     """Read a calibration of any kind; raises CaptureError if the file is missing, foreign, newer or damaged."""
     content = read_json(path, called="calibration")
     if content.get("format") == POLYNOMIALS_FORMAT:
-        return model_from_json(content, path, PolynomialCalibration, **_POLYNOMIALS)
-    return model_from_json(content, path, Calibration, **_CALIBRATION)
+        return model_from_json(
+            content,
+            path,
+            PolynomialCalibration,
+            file_format=POLYNOMIALS_FORMAT,
+            version=POLYNOMIALS_VERSION,
+            called="polynomial calibration",
+        )
+    return model_from_json(content, path, Calibration, file_format=FORMAT, version=VERSION, called="calibration")
 
 
 def resolve_calibration(calibration: AnyCalibration | str | Path) -> AnyCalibration:

@@ -2,12 +2,14 @@
 
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from uwlts.errors import HardwareError, ImageError, SetupError
+from uwlts.hardware.aravis import AravisCamera
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice, FrameCheck, FrameCounts, FrameStatus, Region
 from uwlts.hardware.replay import ReplayCamera
@@ -19,9 +21,9 @@ from uwlts.storage.capture_writer import CaptureWriter
 SHORT, DUPLICATED, DROPPED, LATE, OK = FrameStatus
 
 
-def judged(frames: list[tuple[int, float | None, bool]], *, period_s: float | None = None):
+def judged(frames: list[tuple[int, float | None, bool]], *, period_s: float | None = None, triggered: bool = False):
     """Status of each (number, time, complete), and the counts."""
-    check = FrameCheck(period_s=period_s)
+    check = FrameCheck(period_s=period_s, triggered=triggered)
     statuses = [check.judge(frame_id=number, time_s=at, complete=whole) for number, at, whole in frames]
     return statuses, check.counts
 
@@ -43,10 +45,22 @@ def judged(frames: list[tuple[int, float | None, bool]], *, period_s: float | No
         ([(65535, 0.0, True), (0, 0.1, True), (1, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3)),
         ([(65534, 0.0, True), (2, 0.3, True)], [OK, DROPPED], FrameCounts(ok=1, dropped=2)),
         ([(65535, 0.0, True), (65536, 0.1, True)], [OK, OK], FrameCounts(ok=2)),
+        # A number that jumps or restarts is no loss where the time stamps leave no room for one.
+        ([(1, 0.0, True), (40, 0.1, True), (41, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3, renumbered=1)),
+        ([(1, 0.0, True), (40, 0.3, True)], [OK, DROPPED], FrameCounts(ok=1, dropped=2, renumbered=1)),
+        ([(57, 0.0, True), (1, 0.1, True), (2, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3, renumbered=1)),
+        ([(57, 0.0, True), (1, 0.4, True)], [OK, LATE], FrameCounts(ok=1, late=1, renumbered=1)),
     ],
 )
 def test_each_fault_has_its_name_and_is_counted(frames, statuses, counts):
     assert judged(frames, period_s=0.1) == (statuses, counts)
+
+
+@pytest.mark.parametrize("times_s", [(0.0, 7.0, 9.0), (None, None, None)])
+def test_an_answered_trigger_lost_no_frame_whatever_its_number(times_s):
+    frames = [(number, time_s, True) for number, time_s in zip((3, 9, 10), times_s, strict=True)]
+    assert judged(frames, triggered=True) == ([OK, OK, OK], FrameCounts(ok=3, renumbered=1))
+    assert judged([(9, 1.0, True), (3, 0.5, True)], triggered=True)[0] == [OK, LATE]
 
 
 def test_without_a_period_or_time_stamps_nothing_is_late_or_equal():
@@ -224,6 +238,44 @@ def test_calls_in_the_wrong_order_are_refused(tmp_path):
     camera.close()
     with pytest.raises(HardwareError, match="call open"):
         _ = camera.info
+
+
+class FeatureCamera(AravisCamera):
+    """Features of a camera without the library; locked ones ignore what is set."""
+
+    def __init__(self, features: dict[str, bool | int | float], locked: str = ""):
+        super().__init__("x")
+        self.features, self.locked = features, locked
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        feature = arguments[0].decode()
+        if name == "is_feature_available":
+            return feature in self.features
+        if name.startswith("set_") and feature != self.locked:
+            self.features[feature] = arguments[1]
+        return self.features[feature]
+
+
+@pytest.mark.parametrize(
+    ("features", "said"),
+    [
+        ({"ReverseX": True, "ReverseY": False}, "ReverseX was 1 and is now 0"),
+        ({"BinningVertical": 2, "Gamma": 0.45}, "BinningVertical was 2 and is now 1, Gamma was 0.45 and is now 1"),
+        ({"GammaEnable": True, "Gamma": 0.45}, "GammaEnable was 1 and is now 0:"),
+        ({"ReverseX": False, "Gamma": 1.0, "BinningHorizontal": 1}, None),
+        ({}, None),
+    ],
+)
+def test_images_are_as_on_the_image_sensor_and_linear_in_light(features, said, caplog):
+    camera = FeatureCamera(features)
+    camera._set_plain()
+    camera._set_plain()
+    assert [said in record.getMessage() for record in caplog.records] == [True] * (said is not None)
+
+
+def test_a_camera_that_stays_mirrored_is_refused():
+    with pytest.raises(HardwareError, match="has ReverseX = 1, and does not accept 0: change it in the camera's own"):
+        FeatureCamera({"ReverseX": True}, locked="ReverseX")._set_plain()
 
 
 def test_a_missing_aravis_is_said_with_what_to_install(monkeypatch, tmp_path):

@@ -14,7 +14,7 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.errors import CalibrationError, CaptureError
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Medium
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 
 WATER = Medium(kind="fresh", temperature_c=25.0)
 
@@ -85,7 +85,7 @@ def test_a_damaged_estimate_is_noticed_when_it_is_read(written, tmp_path, damage
     path = tmp_path / "damaged.json"
     path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(CaptureError, match="is not a valid calibration: joint") as refused:
-        read_calibration(path)
+        load_calibration(path)
     assert said in str(refused.value)
 
 
@@ -105,12 +105,12 @@ def test_a_damaged_origin_is_noticed_when_it_is_read(written, tmp_path, key, val
     path = tmp_path / "damaged.json"
     path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(CaptureError, match="is not a valid calibration: provenance") as refused:
-        read_calibration(path)
+        load_calibration(path)
     assert said in str(refused.value)
 
 
 def test_indices_without_their_media_are_noticed(written):
-    calibration = read_calibration(written)
+    calibration = load_calibration(written)
     assert read_original_estimate(calibration, WATER).parameters.media == ("water",)
     with pytest.raises(CalibrationError, match="1 indices for 0 media"):
         read_original_estimate(calibration.model_copy(update={"media": ()}), WATER)

@@ -21,7 +21,7 @@ from uwlts.optics.fitness import check_fits
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.reconstruction.reconstruct import reconstruct, reconstruct_stripes
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import NO_STAGE, Capture, CaptureHeader, Frame, FrameTable, describe_source
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import StripeOptions, find_stripes
@@ -295,7 +295,7 @@ def test_the_medium_of_the_targets_images_is_kept(tmp_path):
         solved = solve(replace(evidence, medium_kind=medium_kind), options=CalibrationOptions()).calibration
         assert (solved.medium_kind, solved.window) == (medium_kind, None)
         solved.save(tmp_path / f"{medium_kind}.json")
-        assert read_calibration(tmp_path / f"{medium_kind}.json").medium_kind == medium_kind
+        assert load_calibration(tmp_path / f"{medium_kind}.json").medium_kind == medium_kind
 
 
 def test_images_of_the_target_come_from_one_medium(tmp_path):

@@ -36,7 +36,7 @@ from uwlts.report.certificate_volume import (
     remove_rigid_motion,
     uncertainty_maps,
 )
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 
 BUILT = built_sensor()
 ISSUED = "2026-01-02T03:04:05+00:00"
@@ -56,7 +56,7 @@ def path(thesis, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def calibration(path):
-    return read_calibration(path)
+    return load_calibration(path)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def content(calibration, path):
 
 
 def test_the_same_calibration_gives_the_same_json(calibration, path, content):
-    again = make_certificate(read_calibration(path), path, issued=ISSUED)
+    again = make_certificate(load_calibration(path), path, issued=ISSUED)
     stored = content.in_file()
     assert json.dumps(again.in_file()) == json.dumps(stored)
     # The seal depends neither on the order of keys nor on the stored seal.
@@ -287,7 +287,7 @@ def test_the_certificate_is_complete_and_loads_nothing_from_the_network(calibrat
 def test_a_certificate_without_a_joint_estimate_states_no_uncertainty(thesis, tmp_path):
     path = tmp_path / "nominal.json"
     nominal_calibration(thesis).save(path)
-    known = read_calibration(path)
+    known = load_calibration(path)
     content = make_certificate(known, path, issued=ISSUED)
     assert content.remark == NOT_JOINT
     assert not content.uncertainty_known

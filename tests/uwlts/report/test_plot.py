@@ -21,7 +21,6 @@ from uwlts.pages.cloud_display import choose_points
 from uwlts.pages.numbers import format_fixed, format_to_scale
 from uwlts.pages.toolkit import figure_png, figure_svg
 from uwlts.report import plot
-from uwlts.report.pictures import StripeView, stripe_picture
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import extract_stripe
 
@@ -93,17 +92,6 @@ def test_centres_are_drawn_where_the_light_is():
         assert tuple(ax.images[0].get_extent()) == (-0.5, WIDTH - 0.5, HEIGHT - 0.5, -0.5)
         (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
         assert left < columns.min() < columns.max() < right and top < centres.min() < centres.max() < bottom
-
-
-def test_the_enlarged_part_is_marked_and_shows_lines_of_the_image():
-    image = stripe_image(60.37 + 0.02 * np.arange(WIDTH))
-    upper, lower = stripe_picture(StripeView(3, image, extract_stripe(image, stripe_along="width"))).axes
-    (mark,) = upper.patches
-    assert mark.get_bbox().intervalx.tolist() == list(lower.get_xlim())
-    assert mark.get_bbox().intervaly.tolist() == sorted(lower.get_ylim())
-    assert "image 3" in upper.get_title()
-    assert np.array_equal(lower.images[0].get_array(), image)
-    assert np.array_equal(upper.images[0].get_array(), np.sqrt(image.astype(np.float32)))
 
 
 def test_a_standing_stripe_is_shown_lying():

@@ -13,7 +13,7 @@ from uwlts.errors import CaptureError, Error, OutputError
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def path(tmp_path: Path, calibration: Calibration) -> Path:
 
 def refused(path: Path, *words: str) -> None:
     with pytest.raises(CaptureError) as caught:
-        read_calibration(path)
+        load_calibration(path)
     assert all(word in str(caught.value) for word in (str(path), *words)), str(caught.value)
 
 
@@ -50,7 +50,7 @@ def edited(path: Path, **changes) -> Path:
 
 
 def test_everything_comes_back_exactly(path: Path, calibration: Calibration):
-    assert read_calibration(path) == calibration
+    assert load_calibration(path) == calibration
     content = json.loads(path.read_text(encoding="utf-8"))
     assert (content["format"], content["version"]) == ("uwlts-calibration", 1)
     assert content["residuals"]["camera"]["rms_px"] == 0.1 + 0.2
@@ -60,7 +60,7 @@ def test_everything_comes_back_exactly(path: Path, calibration: Calibration):
 def test_calibration_for_air_only(tmp_path: Path, calibration: Calibration):
     dry = calibration.model_copy(update={"window": None})
     dry.save(tmp_path / "dry.json")
-    assert read_calibration(tmp_path / "dry.json") == dry
+    assert load_calibration(tmp_path / "dry.json") == dry
 
 
 def test_existing_file_is_only_replaced_on_demand(path: Path, calibration: Calibration):
@@ -70,7 +70,7 @@ def test_existing_file_is_only_replaced_on_demand(path: Path, calibration: Calib
         other.save(path)
     assert path.read_bytes() == before
     other.save(path, overwrite=True)
-    assert read_calibration(path).sensor_name == "other"
+    assert load_calibration(path).sensor_name == "other"
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -162,7 +162,7 @@ def test_values_that_describe_no_sensor(path: Path, changes: dict, words: str):
 
 def test_rotation_rounded_to_seven_digits_is_accepted(path: Path, calibration: Calibration):
     rounded = np.round(calibration.object_transform(), 7).tolist()
-    assert read_calibration(edited(path, camera_from_object=rounded)).camera_from_object == tuple(map(tuple, rounded))
+    assert load_calibration(edited(path, camera_from_object=rounded)).camera_from_object == tuple(map(tuple, rounded))
 
 
 def test_missing_keys_are_named(path: Path):
@@ -183,7 +183,7 @@ def test_random_damage_gives_only_known_errors(tmp_path: Path, calibration: Cali
     content[place : place + data.draw(st.integers(0, 8))] = new
     path.write_bytes(content)
     try:
-        found = read_calibration(path)
+        found = load_calibration(path)
     except Error as error:
         assert str(path) in str(error)
     else:

@@ -11,7 +11,6 @@ import uwlts
 from tests.uwlts.storage.test_import import GIVEN, HEIGHT, WIDTH, lamp_image
 from uwlts.errors import CaptureError, DescriptionError, ImageError
 from uwlts.model.stripe import Coordinates
-from uwlts.report.pictures import stripe_picture, stripe_view
 from uwlts.storage.capture import Capture, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import StripeStatus, find_stripes
@@ -164,20 +163,6 @@ def test_the_ends_of_a_centre_line_are_left_out_as_those_of_an_image(tmp_path: P
         left_out = set(range(WIDTH)) - set(find_stripes(capture).line.tolist())
         # Two lines on either side of the gap, by StripeOptions; the image's border is not an end.
         assert left_out == set(range(28, 42)) and find_stripes(capture).lines_by_status["end"] == 4
-
-
-def test_a_picture_shows_the_centres_without_an_image(tmp_path: Path):
-    folder = described(tmp_path / "f", "map.npy")
-    places = profiles(1)
-    places[0, :40] = np.nan
-    write(folder / "map.npy", places)
-    uwlts.import_images(folder, tmp_path / "a.h5")
-    with Capture(tmp_path / "a.h5") as capture:
-        view = stripe_view(capture)
-    assert view is not None and not view.image.any()
-    upper, lower = stripe_picture(view).axes
-    drawn = upper.lines[0].get_xdata()
-    assert len(drawn) == len(view.stripe.lines) and lower.get_xlim()[0] >= 35
 
 
 def test_centre_lines_of_another_length_are_refused(tmp_path: Path):

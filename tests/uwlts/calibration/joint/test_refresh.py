@@ -30,7 +30,7 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.report.certificate import make_certificate
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture
 
 BUILT = built_sensor()
@@ -253,7 +253,7 @@ def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
     result = refreshed(earlier, steps(thesis), index_std=POORLY_KNOWN)
     path = tmp_path / "new.json"
     result.calibration.save(path)
-    calibration = read_calibration(path)
+    calibration = load_calibration(path)
     joint, before = calibration.joint, earlier.joint
     count = len(before.parameters)
     assert joint.parameters[:count] == before.parameters
@@ -338,7 +338,7 @@ def test_the_command_refreshes_and_says_what_changed(drawn):
     told = ("refresh", folder / "calibration.json", "--step", capture, "--index-std", 0.001)
     done = uwlts(*told)
     assert done.returncode == 0, done.stderr
-    new = read_calibration(folder / "calibration.refreshed.json")
+    new = load_calibration(folder / "calibration.refreshed.json")
     assert f"index of water 2: {WARM.refractive_index(WAVELENGTH):.5f} ± 0.001 before, {new.media[1].index:.5f} ±" in (
         done.stdout
     )
@@ -391,7 +391,7 @@ def renamed(sensor, **changes):
 )
 def test_an_unsuitable_capture_is_refused(drawn, tmp_path, header, error, said):
     folder, sensor = drawn
-    calibration = read_calibration(folder / "calibration.json")
+    calibration = load_calibration(folder / "calibration.json")
     path = step_capture(tmp_path, sensor, **header(sensor))
     with Capture(path) as capture, pytest.raises(error, match=said):
         refresh(calibration, [capture])
@@ -403,7 +403,7 @@ def test_a_capture_given_twice_is_refused(drawn, tmp_path):
     path = step_capture(tmp_path, sensor)
     copy = tmp_path / "copy.h5"
     copy.write_bytes(path.read_bytes())
-    known, said = read_calibration(folder / "calibration.json"), r"step\.h5 and copy\.h5 are the same capture"
+    known, said = load_calibration(folder / "calibration.json"), r"step\.h5 and copy\.h5 are the same capture"
     with Capture(path) as one, Capture(copy) as other, pytest.raises(CalibrationError, match=said):
         refresh(known, [one, other])
 
@@ -417,4 +417,4 @@ def test_an_unsuitable_calibration_is_refused(drawn, earlier):
     with pytest.raises(CalibrationError, match="is empty: give at least one image of a step"):
         refresh(earlier, [])
     with Capture(step_capture(folder, sensor, "again.h5")) as capture, pytest.raises(RangeError, match="be positive"):
-        refresh(read_calibration(folder / "calibration.json"), [capture], index_std=0.0)
+        refresh(load_calibration(folder / "calibration.json"), [capture], index_std=0.0)

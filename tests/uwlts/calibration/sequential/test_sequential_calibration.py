@@ -22,7 +22,7 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium
-from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 
@@ -157,7 +157,7 @@ def test_images_left_out_are_reported(result):
 
 def test_the_file_keeps_the_figures(result, tmp_path):
     result.calibration.save(tmp_path / "sensor.json")
-    kept = read_calibration(tmp_path / "sensor.json")
+    kept = load_calibration(tmp_path / "sensor.json")
     assert kept == result.calibration.model_validate(json.loads(result.calibration.model_dump_json()))
     assert kept.residuals["camera"]["rms_px"] == result.camera.rms_px()
     assert kept.residuals["window"]["distance_mm"] == kept.window.distance_mm
