@@ -171,15 +171,19 @@ def measure_blemish(
         wrong.append(field.measure(field.observe(bell, shift) + move, edge) - bell.figures(edge))
     low, bias, high = np.quantile(wrong, [0.5 - 0.5 * COVERAGE, 0.5, 0.5 + 0.5 * COVERAGE], axis=0)
     random = 0.5 * (high - low) / COVERAGE_FACTOR
-    # Uncertainty by the footprints' size and, without a known form, by a second correction of the smoothing and by the
-    # width of its quadratics.
-    again: list[dict[str, Any]] = [{"share": 1 - field.footprint_std}] + [{"steps": 2}] * (not is_bell)
+    # Uncertainty by the footprints' size and, without a known form, by the smoothing's correction, a second one, and
+    # the width of the quadratics. After the first remains between none, for smooth ground, and sqrt(2) times it, at a
+    # ridge in a Gaussian kernel: with either sign, a rectangular distribution of about its size.
+    again: list[dict[str, Any]] = [{"share": 1 - field.footprint_std}] + [{"steps": 0}, {"steps": 2}] * (not is_bell)
     resolved = np.array([field.figures(field.depths(heights, **each), edge, deepest, between) - seen for each in again])
     if wide_depth is not None:
         resolved = np.vstack([resolved, [wide_depth - seen[0], 0, 0, 0, 0]])
-        # This model has the noise already, whose bias increases in proportion to its standard deviation.
+        # This model has the noise already. Its bias increases with the variance at a single summit, and with the
+        # standard deviation in level ground: between 1 and `BIAS_FACTOR` times the increase by the same noise again.
         smoothed = field.measure(own_heights, edge) - seen
-        bias = smoothed + BIAS_FACTOR * (bias - smoothed)
+        bias = smoothed + 0.5 * (1 + BIAS_FACTOR) * (bias - smoothed)
+        # The largest of many similar depths scatters less than one, and the noise adds to their number.
+        random[0] = max(random[0], by_noise[deepest])
     tail = field.measure_tail(heights, noise, deepest)
     plain = np.maximum(seen - bias - np.array([tail, 0, 0, 0, 0]), 0)
     without_bias = np.hypot(random, np.linalg.norm(resolved, axis=0))
@@ -603,28 +607,24 @@ def _interpolation_rows(places: np.ndarray, shape: tuple[int, int]) -> sparse.cs
 def _quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidth: float) -> sparse.csr_array:
     """Return rows (G, n) that give local quadratics at the grid's places as products with heights.
 
-    Weights are Epanechnikov's. A place with fewer than nine points in the window takes the mean of its three nearest
-    points.
+    Weights are Epanechnikov's. A place with fewer than nine points in the window takes the mean of the nearest three.
     """
-    columns, values, starts = [], [], [0]
-    nearest: Any = tree.query(grid, k=3)
-    for place, close, fallback in zip(grid, tree.query_ball_point(grid, bandwidth), nearest[1], strict=True):
-        chosen = np.asarray(close, np.intp)
-        away = (places[chosen] - place) / bandwidth if len(chosen) >= 9 else np.zeros((0, 2))
-        row = None
-        if len(away):
-            u, v = away.T
-            design = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=1)
-            weight = np.maximum(1 - u * u - v * v, 0)
-            normal = (design * weight[:, None]).T @ design
-            if np.linalg.cond(normal) < 1e8:
-                row = np.linalg.solve(normal, np.eye(6)[0]) @ (design * weight[:, None]).T
-                # Quadratics extrapolate badly beside the points.
-                row = row if row @ row < _RULE.most_variance / len(chosen) else None
-        if row is None:
-            chosen, row = fallback, np.full(3, 1 / 3)
-        columns.append(chosen)
-        values.append(row)
-        starts.append(starts[-1] + len(chosen))
-    parts = np.concatenate(values), np.concatenate(columns), np.array(starts)
+    close = tree.query_ball_point(grid, bandwidth)
+    number = np.array([len(each) for each in close])
+    many = np.flatnonzero(number >= 9)
+    points = np.concatenate([np.zeros(0, np.intp), *(np.array(close[k], np.intp) for k in many)])
+    own, starts = np.repeat(np.arange(len(many)), number[many]), np.cumsum(number[many]) - number[many]
+    u, v = ((places[points] - grid[many[own]]) / bandwidth).T
+    weight, terms = np.maximum(1 - u * u - v * v, 0), (np.ones(len(u)), u, v, u * u, u * v, v * v)
+    normal = np.array([[np.add.reduceat(weight * a * b, starts) for a in terms] for b in terms]).transpose(2, 0, 1)
+    regular = np.linalg.cond(normal) < 1e8
+    normal[~regular] = np.eye(6)
+    first = np.linalg.solve(normal, np.eye(6)[:, :1])[own, :, 0].T
+    values = weight * sum(a * b for a, b in zip(terms, first, strict=True))
+    # Quadratics extrapolate badly beside the points.
+    regular &= np.add.reduceat(values * values, starts) < _RULE.most_variance / number[many]
+    kept, others = regular[own], np.setdiff1d(np.arange(len(grid)), many[regular])
+    nearest: Any = tree.query(grid[others], k=3)
+    rows = np.concatenate([many[own[kept]], np.repeat(others, 3)])
+    parts = np.append(values[kept], np.full(3 * len(others), 1 / 3)), (rows, np.append(points[kept], nearest[1]))
     return sparse.csr_array(parts, shape=(len(grid), len(places)))
