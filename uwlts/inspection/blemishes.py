@@ -152,8 +152,8 @@ def measure_blemish(
     rng, own = np.random.default_rng(SEED), errors[field.near]
     moves = list(replace(own, single_mm=noise).draw(_RULE.draws, rng))
     inside = np.arange(len(noise)) < len(indication.points)
-    scale = np.where(inside, field.scatter_ratio(heights, moves[: _RULE.depth_draws], inside), 1.0)
-    moves = [scale * each for each in moves]
+    more = field.scatter_ratio(heights, moves[: _RULE.depth_draws], inside)
+    moves = [np.where(inside, more, 1.0) * each for each in moves]
     by_noise = np.std([field.depths(each) for each in moves[: _RULE.depth_draws]], axis=0, ddof=1)
     edge = max(SEARCH_RULE.edge_share * depth, SEARCH_RULE.edge_std * float(np.median(by_noise[field.region])))
     seen = field.figures(depths, edge, deepest, between)
@@ -180,8 +180,9 @@ def measure_blemish(
         resolved = np.vstack([resolved, [wide_depth - seen[0], 0, 0, 0, 0]])
         # This model has the noise already. Its bias increases with the variance at a single summit, and with the
         # standard deviation in level ground: between 1 and `BIAS_FACTOR` times the increase by the same noise again.
+        # Scatter that steep ground adds to it is a misfit of the quadratics, which makes no place deeper.
         smoothed = field.measure(own_heights, edge) - seen
-        bias = smoothed + 0.5 * (1 + BIAS_FACTOR) * (bias - smoothed)
+        bias = smoothed + 0.5 * (1 + BIAS_FACTOR) / more * (bias - smoothed)
         # The largest of many similar depths scatters less than one, and the noise adds to their number.
         random[0] = max(random[0], by_noise[deepest])
     tail = field.measure_tail(heights, noise, deepest)
