@@ -11,7 +11,7 @@ import sys
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -24,7 +24,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from tests.waiting import within
-from uwlts.desk.access import PageAccess
+from uwlts.desk.access import MOST_VIEWERS, PageAccess
 from uwlts.desk.board_page import BoardView, update_regularly
 from uwlts.desk.guided import BoardScreen, answer_buttons
 from uwlts.desk.server import DeskServer
@@ -285,6 +285,23 @@ def test_the_operators_clicks_are_obeyed_and_no_bystanders_are(page):
             assert page.board.lines() == []
             operator.click(off)
             assert within(20.0, lambda: "no laser is connected" in "".join(line.text for line in page.board.lines()))
+
+
+def test_viewers_are_limited_and_keep_no_operator_out(page):
+    with ExitStack() as viewers:
+        for _ in range(MOST_VIEWERS):
+            viewers.enter_context(opened(page, Origin=page.address))
+        with pytest.raises(InvalidStatus, match="403"), opened(page, Origin=page.address):
+            pass
+        with opened(page, Origin=page.address, Cookie=cookie(page)) as connection:
+            assert connection.recv(timeout=20).startswith("0{")
+
+    def free() -> bool:
+        with suppress(InvalidStatus), opened(page, Origin=page.address):
+            return True
+        return False
+
+    assert within(20.0, free)
 
 
 def test_what_is_said_reaches_everybody(page):

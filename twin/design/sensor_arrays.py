@@ -14,6 +14,7 @@ from numpy.polynomial import Chebyshev
 
 from twin.sensor.speckle import coherence, pixel_contrast
 from uwlts.errors import DescriptionError
+from uwlts.model.media import FUSED_SILICA_MPA
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.design import (
@@ -321,7 +322,7 @@ def extract_numbers(sensor: Sensor, medium: Medium) -> SensorArrays:
         "ambient_w_per_mm2": 1e-6 * sensor.lamp.ambient_w_per_m2,
         "speckle_coherence": speckle,
         "stage_resolution_mm": sensor.stage.resolution_mm,
-        "window_strength_mpa": window.strength_mpa(),
+        "window_strength_mpa": window.strength_mpa() or FUSED_SILICA_MPA,
         "near_mm": sensor.volume.near_mm,
         "far_mm": sensor.volume.far_mm,
     }

@@ -20,6 +20,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketClose
 
 _HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]+)(:\d{1,5})?")
+MOST_VIEWERS = 16
+"""Windows of viewers at once. Each is updated five times a second, and 40 delayed the operator's page by 20 s."""
 _PROTECTION = (
     (b"x-frame-options", b"DENY"),
     (b"referrer-policy", b"no-referrer"),
@@ -136,18 +138,21 @@ class PageAccess:
 class GuardedApp:
     """An ASGI application behind the access rules, with protective headers in all responses.
 
-    ``laser_port`` is the port of the process that obeys Laser off, to which the page may send.
+    ``laser_port`` is the port of the process that obeys Laser off, to which the page may send. At most `MOST_VIEWERS`
+    connections for events are those of viewers.
     """
 
     def __init__(self, app: ASGIApp, access: PageAccess, *, laser_port: int | None = None):
         self._app, self._access, self._laser_port = app, access, laser_port
+        self._viewers = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        answer = self._access.answer(scope)
-        if answer is not None and scope["type"] == "websocket":
+        answer, connects = self._access.answer(scope), scope["type"] == "websocket"
+        views = connects and not self._access.is_operator(Headers(scope=scope))
+        if connects and (answer is not None or (views and self._viewers >= MOST_VIEWERS)):
             # Closed before it is accepted: the browser sees status 403.
             await WebSocketClose()(scope, receive, send)
             return
@@ -164,4 +169,8 @@ class GuardedApp:
         policy = _POLICY
         if self._laser_port is not None and host is not None:
             policy += f" http://{host[1]}:{self._laser_port}"
-        await (answer or self._app)(scope, receive, protected)
+        self._viewers += views
+        try:
+            await (answer or self._app)(scope, receive, protected)
+        finally:
+            self._viewers -= views

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from nicegui.element import Element
-from nicegui.events import GenericEventArguments
 
 from uwlts.pages.cloud_figure import THREE, VIEW
 
@@ -16,7 +15,7 @@ class CloudView(Element, component=VIEW, esm={"nicegui-scene": str(THREE.parent)
         super().__init__()
         self._props |= {"field": "depth", "version": -1, "marks": [], "fit": 0, "closer": False}
         if picked is not None:
-            self.on("pick", lambda event: picked(_place(event)))
+            self.on("pick", lambda event: picked(np.array(event.args["at"], float)))
 
     def show_version(self, version: int) -> None:
         """Make the browser fetch the cloud if its version differs."""
@@ -42,7 +41,3 @@ class CloudView(Element, component=VIEW, esm={"nicegui-scene": str(THREE.parent)
         if self._props[name] != value:
             self._props[name] = value
             self.update()
-
-
-def _place(event: GenericEventArguments) -> np.ndarray:
-    return np.array(event.args["at"], dtype=float)

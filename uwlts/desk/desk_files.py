@@ -14,7 +14,6 @@ from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT
 from uwlts.files.json_files import read_json
 from uwlts.files.reading import is_regular_file
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT, POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
-from uwlts.storage.capture import part_path
 from uwlts.storage.cloud_files import is_cloud
 
 _SHOWN = 500  # the latest files; a longer list is not read
@@ -105,8 +104,3 @@ def new_path(folder: Path, name: str, *, suffix: str) -> Path:
 def _is_plain(name: str) -> bool:
     """Return whether a name is that of a file in the folder itself, and not hidden."""
     return bool(name) and Path(name).name == name and not name.startswith(".") and name.isprintable()
-
-
-def is_interrupted(path: Path) -> bool:
-    """Return whether an interrupted recording of a path can be continued."""
-    return part_path(path).is_file()

@@ -17,7 +17,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from uwlts.desk.analyses import Analyses
 from uwlts.desk.analysis_panel import AnalysisPanel
 from uwlts.desk.board_page import BoardView, build_board, update_regularly
-from uwlts.desk.desk_files import find_file, guess_kind, is_interrupted, list_files, new_path
+from uwlts.desk.desk_files import find_file, guess_kind, list_files, new_path
 from uwlts.desk.guided import answer_buttons
 from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.measure_panel import MeasurePanel, Measuring
@@ -31,6 +31,7 @@ from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
 from uwlts.model.library import validate_description
 from uwlts.report.file_description import describe
 from uwlts.storage.calibration_file import load_calibration
+from uwlts.storage.capture import part_path
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_thinned_cloud
 
@@ -429,7 +430,7 @@ class _OperatorPage:
         overwrite = bool(self._overwrite.value)
         if out.exists() and not overwrite and not resume:
             raise DescriptionError(f"{out.name} exists: give another name, or tick 'replace'")
-        if is_interrupted(out) and not resume and not overwrite:
+        if part_path(out).is_file() and not resume and not overwrite:
             raise DescriptionError(f"{out.name} was interrupted: continue it, give another name, or tick 'replace'")
         known = self._calibration.value
         self._desk.measuring.open(None)

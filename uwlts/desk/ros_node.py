@@ -6,7 +6,7 @@ The libraries of ROS 2 are imported when the node starts.
 import sys
 from array import array
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -129,8 +129,10 @@ def serve_ros(
         for name in ("start", "stop", "laser_off"):
             node.create_service(services.Trigger, f"~/{name}", _answer(getattr(service, name)))
         node.get_logger().info("ready: start, stop and laser_off are services of the node")
-        with suppress(KeyboardInterrupt, executors.ExternalShutdownException):
+        try:
             rclpy.spin(node)
+        except executors.ExternalShutdownException as ended:
+            raise KeyboardInterrupt from ended  # rclpy turns Ctrl-C into this
 
 
 def _answer(work: Callable[[], str]) -> Callable[[Any, Any], Any]:

@@ -17,7 +17,7 @@ from nicegui import Client, ui
 from starlette.requests import Request
 from starlette.responses import Response
 
-from uwlts.desk.access import GuardedApp, PageAccess, is_local
+from uwlts.desk.access import MOST_VIEWERS, GuardedApp, PageAccess, is_local
 from uwlts.desk.board_page import build_board
 from uwlts.desk.laser_listener import BACKLOG, HEAD_BYTES
 from uwlts.desk.laser_switch import LaserSwitch
@@ -30,19 +30,16 @@ _PORTS = 100
 """Number of ports that are tried."""
 _MOST_CONNECTIONS = 300
 """Connections at once; further requests are refused. A window has up to seven; a process may open 1024 files."""
+_NO_PAGES: Any = {"openapi_url": None, "docs_url": None, "redoc_url": None}
 _LATEST = {"Cache-Control": "no-store"}
 _ALONE = threading.Lock()
 """Held by the page that is served."""
 
 
-def _application(**settings: Any) -> FastAPI:
-    return FastAPI(openapi_url=None, docs_url=None, redoc_url=None, **settings)
-
-
 @cache
 def _nicegui() -> FastAPI:
     """Return the only NiceGUI application of the process; ``state.show`` builds its present page."""
-    app = _application()
+    app = FastAPI(**_NO_PAGES)
 
     def root(request: Request) -> None:
         app.state.show(request)
@@ -98,7 +95,7 @@ class DeskServer:
         switch: LaserSwitch | None = None,
     ):
         self._access, nicegui, self._switch = PageAccess(host), _nicegui(), switch
-        self._app = _application(lifespan=nicegui.router.lifespan_context)
+        self._app = FastAPI(**_NO_PAGES, lifespan=nicegui.router.lifespan_context)
         self._add_content(board)
         # Handles all requests that no other route matches.
         self._app.router.default = nicegui
@@ -106,6 +103,10 @@ class DeskServer:
         def show(request: Request) -> None:
             ui.page_title(board.title)
             operator = self.is_operator(request)
+            if not operator and len(Client.instances) > 2 * MOST_VIEWERS:
+                # A page that costs little: those whose browsers are gone are forgotten within seconds.
+                ui.label("too many viewers: try again later")
+                return
             (build or build_board)(board, operator)
             if operator and switch is not None:
                 switch.show_button()

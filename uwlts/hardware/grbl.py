@@ -14,19 +14,8 @@ light together with the command that starts it; `GrblStage.keep_lit` renews a li
 (`sweep`) the laser is on by M4, which Grbl's laser mode switches off at rest, and the controller knows only the next
 part of the travel.
 
-The laser is switched off earlier in these cases:
-
-- the ``with`` block ends, normally or by an exception, including Ctrl-C: the driver sends Ctrl-X and awaits the answer.
-  Grbl obeys it in its receive interrupt, so it works while the controller moves, waits or is locked;
-- a fault is found: the driver sends Ctrl-X before it raises the error;
-- the program is killed (SIGTERM, SIGKILL), crashes, ends without closing, is suspended or hangs: `laser_guard`, a
-  separate process, sends Ctrl-X. While the laser is on it expects signs of life: every exchange with the controller is
-  one, and `GrblStage.keep_lit` announces longer waits;
-- the guard is gone: the driver notices at the next exchange or `keep_lit`, and sends Ctrl-X;
-- the cable is pulled out: the Uno is powered by it, and the pull-down at the laser's transistor switches the laser off;
-- the controller restarts for any reason, including the next opening of the port: Grbl starts with the pin off.
-
-If the controller itself hangs, only hardware helps; see docs/how-to/hardware-stage.md.
+docs/explanation/laser-control.md lists what switches the laser off earlier: the end of the ``with`` block, every fault,
+the guard process, and the controller itself.
 """
 
 import math

@@ -114,7 +114,6 @@ class GrblSettings:
     max_feed_mm_per_min: float
     acceleration_mm_per_s2: float
     travel_mm: float
-    soft_limits: bool
     homing: bool
     homes_to_negative: bool
     homing_feed_mm_per_min: float
@@ -148,7 +147,6 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
         max_feed_mm_per_min=values[110],
         acceleration_mm_per_s2=values[120],
         travel_mm=values[130],
-        soft_limits=values[20] != 0,
         homing=values[22] != 0,
         homes_to_negative=bool(int(values[23]) & 1),
         homing_feed_mm_per_min=values[24],

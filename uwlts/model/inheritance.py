@@ -119,10 +119,8 @@ def find_misfits(levels: Sequence[Level], sensor: Sensor) -> list[str]:
     - ``camera.principal_point_px`` does not fit another image size, nor ``camera.distortion`` another lens.
     - Optical constants of a medium do not fit another medium.
 
-    ``levels`` lead from the first base to the description itself.
+    ``levels`` lead from the first base to the description itself. Only its own ``volume`` is checked, too.
     """
-    if len(levels) == 1:
-        return []
     inherited = _Inherited(levels)
     own = "state it in this description"
     found = inherited.say("name", _PARTS, "", "give this sensor its own name, because calibrations are compared by it")
@@ -183,12 +181,11 @@ def _check_places(inherited: _Inherited, sensor: Sensor) -> Iterator[str]:
         yield from inherited.say("laser.waist_distance_mm", depends_on, misfit, advice)
     outside = standoff - camera.window.distance_mm - camera.window.thickness_mm
     if not volume.near_mm <= outside <= volume.far_mm:
-        misfit = f"; the stand-off, {outside:.1f} mm from the window, is outside the measuring volume"
-        for key in ("volume.near_mm", "volume.far_mm"):
-            advice = "set near_mm and far_mm about the stand-off"
-            if said := inherited.say(key, [*_PLACEMENT, *window], misfit, advice):
-                yield from said
-                break
+        misfit = f"the stand-off, {outside:.1f} mm from the window, is outside the measuring volume"
+        advice, depends_on = "set near_mm and far_mm about the stand-off", [*_PLACEMENT, *window]
+        keys = "volume.near_mm", "volume.far_mm"
+        said = [text for key in keys for text in inherited.say(key, depends_on, f"; {misfit}", advice)]
+        yield (said or [f"{inherited.name}: {misfit} of {volume.near_mm:g} to {volume.far_mm:g} mm: {advice}"])[0]
 
 
 def _apparent_mm(window: Window, distance_mm: float, *, index: float, wavelength_nm: float) -> float:

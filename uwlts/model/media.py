@@ -69,12 +69,16 @@ def _soda_lime(um: float) -> float:
 
 
 _BK7 = _sellmeier((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653))
+_SAPPHIRE = _sellmeier((1.4313493, 0.65054713, 5.3414021), (0.0726631**2, 0.1193242**2, 18.028251**2))
+"""Ordinary ray, that of a window whose optical axis is normal to its faces; the other index is lower by 0.008."""
 _SILICA = _sellmeier((0.6961663, 0.4079426, 0.8974794), (0.0684043**2, 0.1162414**2, 9.896161**2))
 
 FUSED_SILICA_MPA = 60.0
 """Fracture strength that is used for windows of unknown strength, as in the thesis (Figure 34, after Harris 1999)."""
 _FLOAT_GLASS = 45.0, "EN 572-1, annealed float glass"
 """Characteristic bending strength: at most 5 % of panes break below it."""
+_SAPPHIRE_LIMIT = 275.0, "apparent elastic limit, Uni Optics"
+"""Well below the strengths of any cut of the crystal, 580 MPa and more (Fischer et al. 1990, Proc. SPIE 1326)."""
 _CAST_ACRYLIC = 41.4, "4 times the 1500 psi of continuous load, Altuglas, Plexiglas G"
 """Acrylic breaks at 70 MPa, but crazes under a continuous tension above 1500 psi (10.3 MPa)."""
 
@@ -83,6 +87,7 @@ GLASSES = {
     "fused-silica": Glass(_SILICA, 0.21, 3.71, 0.0, "Malitson 1965, JOSA 55:1205", FUSED_SILICA_MPA, "Harris 1999"),
     "soda-lime": Glass(_soda_lime, 0.31, 4.6, 14.5, "Rubin 1985, clear", *_FLOAT_GLASS),
     "soda-lime-low-iron": Glass(_soda_lime, 0.31, 4.6, 3.25, "Rubin 1985, low iron", *_FLOAT_GLASS),
+    "sapphire": Glass(_SAPPHIRE, 0.2, 5.0, 0.0, "Malitson and Dodge 1972", *_SAPPHIRE_LIMIT),
     "PMMA": Glass(_sellmeier((1.1819,), (0.011313,)), 0.4368, 1.052, 0.0, "Sultanova 2009", *_CAST_ACRYLIC),
 }
 

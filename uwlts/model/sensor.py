@@ -106,10 +106,9 @@ class Window(Description):
             return 1e-3 * self.absorption_per_m
         return 1e-3 * media.find_glass(self.glass).absorption_per_m if isinstance(self.glass, str) else 0.0
 
-    def strength_mpa(self) -> float:
-        """Return the fracture strength of the named glass in MPa; that of fused silica if it is unknown."""
-        known = media.find_glass(self.glass).strength_mpa if isinstance(self.glass, str) else None
-        return media.FUSED_SILICA_MPA if known is None else known
+    def strength_mpa(self) -> float | None:
+        """Return the fracture strength of the named glass in MPa; None if it is unknown."""
+        return media.find_glass(self.glass).strength_mpa if isinstance(self.glass, str) else None
 
     def normal(self) -> np.ndarray:
         """Return the unit normal (3,) in the module's frame, directed away from the module."""

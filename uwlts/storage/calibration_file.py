@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from uwlts.files.json_files import model_from_json, read_json
+from uwlts.files.json_files import read_json, read_model
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import FORMAT, VERSION, Calibration
 from uwlts.model.polynomial_calibration import (
@@ -12,19 +12,17 @@ from uwlts.model.polynomial_calibration import (
 )
 
 
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a calibration; raises CaptureError if the file is missing, foreign, newer or damaged."""
+    return read_model(path, Calibration, file_format=FORMAT, version=VERSION, called="calibration")
+
+
 def load_calibration(path: str | Path) -> AnyCalibration:
     """Read a calibration of any kind; raises CaptureError if the file is missing, foreign, newer or damaged."""
-    content = read_json(path, called="calibration")
-    if content.get("format") == POLYNOMIALS_FORMAT:
-        return model_from_json(
-            content,
-            path,
-            PolynomialCalibration,
-            file_format=POLYNOMIALS_FORMAT,
-            version=POLYNOMIALS_VERSION,
-            called="polynomial calibration",
-        )
-    return model_from_json(content, path, Calibration, file_format=FORMAT, version=VERSION, called="calibration")
+    if read_json(path, called="calibration", check_seal=False).get("format") != POLYNOMIALS_FORMAT:
+        return read_calibration(path)
+    known = {"file_format": POLYNOMIALS_FORMAT, "version": POLYNOMIALS_VERSION, "called": "polynomial calibration"}
+    return read_model(path, PolynomialCalibration, **known)
 
 
 def resolve_calibration(calibration: AnyCalibration | str | Path) -> AnyCalibration:

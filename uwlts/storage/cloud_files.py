@@ -45,7 +45,7 @@ VERSION = 1  # of the file format
 POINTS_OF_PART = 1_000_000
 """Number of points in a part of a large cloud."""
 
-CLOUD_ENDINGS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.read))
+CLOUD_ENDINGS = (".ply", ".h5", *FORMATS)
 """Endings of the clouds that can be read."""
 CLOUD_FORMATS = (".ply", ".h5", *(ending for ending, each in FORMATS.items() if each.write))
 """Endings of the clouds that can be written."""
@@ -73,27 +73,7 @@ def write_cloud(
 ) -> None:
     """Write a cloud in the format of the path's ending, completely or not at all.
 
-    - ``.h5``: mm, with all attributes. The datasets have the names in `PointCloud` and `PointUncertainty`, plus
-      systematic_mm2 (N, 6).
-    - ``.ply``: mm, for other programs, binary and little-endian. The vertex properties are x, y, z (double) and
-      intensity (float). If known, there are deviation, random_std, common_std (float), time (double, s), frame and line
-      (int). The two are standard deviations along the surface normal (`PointCloud`). The metadata is JSON in comments
-      that every reader accepts.
-    - ``.full.ply``: the same with the whole uncertainty in place of both (`PointUncertainty`). The covariances
-      are random_xx to random_zz and systematic_xx to systematic_zz in mm2. Shared errors in mm are position_x to
-      position_z, pattern0_x, pattern0_y and so on, and optionally pose0_x to pose5_z.
-    - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan if unknown) of every point, with all
-      digits.
-    - ``.laz``, ``.las``: LAS 1.4, point format 6, or 7 with colours, metres in steps of 1e-7 m. The standard intensity
-      is rounded to integers (0 if unknown) and ``amplitude`` holds its value; the standard ``gps_time`` is the time in
-      s if known. Extra fields are ``frame``, ``line``, ``deviation_mm``, and the covariance ``cov_xx_mm2`` to
-      ``cov_zz_mm2``, and ``random_std_mm`` and ``common_std_mm``.
-    - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the image as
-      column and the line as row if both are known and below 65536; ``timeStamp`` in 64 bits since ``acquisitionStart``
-      if times are known; the covariance as an extension, ``uwlts:cov_xx_mm2`` to ``uwlts:cov_zz_mm2``,
-      and ``uwlts:random_std_mm`` and ``uwlts:common_std_mm``.
-    - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, one for each image if the points' times are known
-      (`uwlts.storage.mcap_clouds`).
+    docs/reference/cloud-formats.md describes the formats: unit, numbers, and fields of each.
 
     ``colours`` (N, 3) uint8, red, green and blue, are stored for other programs in PLY, LAS, LAZ and E57
     (`COLOURED_FORMATS`); HDF5 has the deviation instead. A PLY with colours names the intensity ``scalar_intensity``.
@@ -107,7 +87,7 @@ def write_cloud(
         The format's library is not installed.
     """
     path = Path(path)
-    _require_format(path, coloured=colours is not None)
+    require_ending(path, CLOUD_FORMATS if colours is None else COLOURED_FORMATS)
     if find_format(path) is not None:
         write_foreign(path, cloud, overwrite=overwrite, colours=colours)
         return
@@ -147,12 +127,8 @@ def refuse_unsuitable_cloud(path: str | os.PathLike[str], *, overwrite: bool, co
     """Raise OutputError or SetupError if a cloud, possibly with colours, cannot be written (`refuse_unsuitable`)."""
     path = Path(path)
     refuse_unsuitable(path, overwrite=overwrite)
-    _require_format(path, coloured=coloured)
-    require_libraries(path)
-
-
-def _require_format(path: Path, *, coloured: bool) -> None:
     require_ending(path, COLOURED_FORMATS if coloured else CLOUD_FORMATS)
+    require_libraries(path)
 
 
 def read_cloud(path: str | os.PathLike[str], *, unit: Unit | None = None) -> PointCloud:
@@ -194,7 +170,7 @@ def read_thinned_cloud(
     For HDF5 and binary PLY only these are held in memory.
     """
     with _naming(path):
-        if _is_foreign(path):
+        if find_format(path) is not None:
             whole = read_foreign(Path(path), unit=unit)
             cloud, total = whole.select(_every(len(whole), at_most)), len(whole)
         else:
@@ -234,7 +210,7 @@ def read_parts(
 
     For HDF5 and binary PLY only one part is held in memory.
     """
-    if _is_foreign(path):
+    if find_format(path) is not None:
         whole = read_cloud(path, unit=unit)
         yield from (whole.select(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
         return
@@ -274,11 +250,6 @@ def _in_mm(cloud: PointCloud, path: str | os.PathLike[str], unit: Unit | None) -
             cloud = note_step(known, scale * step)
     log_warnings(path, cloud.warnings)
     return cloud
-
-
-def _is_foreign(path: str | os.PathLike[str]) -> bool:
-    form = find_format(path)
-    return form is not None and form.read is not None
 
 
 @contextmanager
@@ -322,12 +293,12 @@ def is_cloud(path: str | os.PathLike[str]) -> bool:
     if Path(path).suffix.lower() == ".ply":
         return True
     form = find_format(path)
-    return form is not None and form.read is not None and not form.ambiguous
+    return form is not None and not form.ambiguous
 
 
 def is_readable_cloud(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is a cloud (`is_cloud`), or is text, which may contain one."""
-    return is_cloud(path) or _is_foreign(path)
+    return is_cloud(path) or find_format(path) is not None
 
 
 def _in_hdf5(path: str | os.PathLike[str]) -> bool:

@@ -16,11 +16,9 @@ from uwlts.files.writing import require_possible_name
 from uwlts.model.stripe import stack_rows
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import (
     CLOUD_FORMATS,
     is_readable_cloud,
-    read_cloud,
     read_region,
     read_thinned_cloud,
     refuse_unsuitable_cloud,
@@ -84,21 +82,19 @@ def export(
     SetupError
         The library for the cloud's format is not installed.
     """
-    if of_points := is_readable_cloud(file):
+    if is_readable_cloud(file):
         refuse_unsuitable_cloud(out, overwrite=overwrite)
+        cloud = (
+            read_thinned_cloud(file, at_most, unit=unit)[0]
+            if region_mm is None
+            else read_region(file, *region_mm, at_most, unit=unit)
+        )
+        if len(cloud) == 0:
+            raise OutputError("the cloud has no points: there is nothing to export")
+        write_cloud(out, cloud, overwrite=overwrite)
+        return len(cloud)
     if region_mm is not None or at_most is not None:
-        if not of_points:
-            raise CaptureError(f"{file} is not a cloud: only clouds have regions and points")
-        if region_mm is None:
-            cloud = read_thinned_cloud(file, at_most, unit=unit)[0]
-        else:
-            cloud = read_region(file, *region_mm, at_most, unit=unit)
-        _write(cloud, out, overwrite=overwrite)
-        return len(cloud)
-    if of_points:
-        cloud = read_cloud(file, unit=unit)
-        _write(cloud, out, overwrite=overwrite)
-        return len(cloud)
+        raise CaptureError(f"{file} is not a cloud: only clouds have regions and points")
     if Path(out).name.lower().endswith(CLOUD_FORMATS):
         raise OutputError(
             f"{file} is a capture, which is exported to a folder of images, but {out} is named like a cloud; "
@@ -107,12 +103,6 @@ def export(
     with Capture(file) as capture:
         export_capture(capture, Path(out), image_format=images, progress=progress)
         return len(capture)
-
-
-def _write(cloud: PointCloud, out: str | Path, *, overwrite: bool) -> None:
-    if len(cloud) == 0:
-        raise OutputError("the cloud has no points: there is nothing to export")
-    write_cloud(out, cloud, overwrite=overwrite)
 
 
 def export_capture(

@@ -25,8 +25,8 @@ Colours = np.ndarray | None
 class CloudFormat:
     """Format of files with a cloud."""
 
-    read: Callable[[Path, Unit | None], PointCloud] | None = None
-    """Reads a file whose numbers are in a unit if it states none. None if files are only written."""
+    read: Callable[[Path, Unit | None], PointCloud]
+    """Reads a file whose numbers are in a unit if it states none."""
     write: Callable[[Path, PointCloud, Colours, Path], object] | None = None
     """Writes a cloud with colours (N, 3) or None to a path that is renamed to the second one afterwards. None if
     files are only read."""
@@ -50,7 +50,7 @@ def read_foreign(path: Path, *, unit: Unit | None = None) -> PointCloud:
     Raises CaptureError if the file is damaged or foreign, SetupError if the library for its format is not installed.
     """
     form = find_format(path)
-    assert form is not None and form.read is not None
+    assert form is not None
     return form.read(path, unit)
 
 

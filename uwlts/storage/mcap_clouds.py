@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.reading import require_regular_file
 from uwlts.runtime.optional_library import optional_library
 from uwlts.storage.cloud import FARTHEST_SINGLE_MM, PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.number_tables import Unit
@@ -24,9 +23,10 @@ from uwlts.storage.point_cloud2 import (
     point_cloud2,
     unpack_points,
 )
+from uwlts.storage.ros_bags import list_topics, open_bag, read_messages
 
 TOPIC = "/points"
-_POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
+_POINT_CLOUD2, _SCAN = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/LaserScan"
 
 
 def mcap_content(cloud: PointCloud) -> bytes:
@@ -77,27 +77,35 @@ def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
 def read_bag_cloud(path: Path, unit: Unit | None = None) -> PointCloud:
     """Read the points of all messages PointCloud2 of a recording of ROS 1 or 2, in m, without moving them.
 
-    Raises CaptureError if the file is damaged, or has no such message; SetupError if the library is not installed.
+    Without such messages the points are those of all LaserScan, each in the plane z = 0 of its scanner. Raises
+    CaptureError if the file is damaged, or has neither; SetupError if the library is not installed.
     """
-    highlevel, typesys = _library("rosbags.highlevel"), _library("rosbags.typesys")
-    require_regular_file(path, called="cloud")
-    try:
-        with highlevel.AnyReader([path], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)) as bag:
-            chosen = [connection for connection in bag.connections if connection.msgtype == _POINT_CLOUD2]
-            messages = (bag.deserialize(data, _POINT_CLOUD2) for _, _, data in bag.messages(connections=chosen))
-            parts = [unpack_points(message) for message in messages] if chosen else []
-            points = np.concatenate([np.column_stack([part[axis] for axis in "xyz"]) for part in parts])
-            columns: dict[str, Any] = {
-                name: np.concatenate([part[name] for part in parts])
-                for name in ("intensity", "frame", "line", "time")
-                if all(name in (part.dtype.names or ()) for part in parts)
-            }
-    except Exception as error:
-        # The library raises errors of file formats, compression, SQLite and the operating system.
-        raise CaptureError(f"{path} is no recording with messages PointCloud2, or damaged: {error}") from error
+    with open_bag(path, error=CaptureError) as bag:
+        kinds = [each.msgtype for each in bag.connections]
+        kind, unpack = (_POINT_CLOUD2, unpack_points) if _POINT_CLOUD2 in kinds else (_SCAN, _unpack_scan)
+        parts = [unpack(message) for _, message in read_messages(bag, lambda each: each.msgtype == kind)]
+        if not parts:
+            raise CaptureError(
+                f"{path} has the topics {list_topics(bag)}, and no points (PointCloud2, LaserScan): write images to a "
+                "folder, and read poses as a trajectory"
+            )
+        points = np.concatenate([np.column_stack([part[axis] for axis in "xyz"]) for part in parts])
+        columns: dict[str, Any] = {
+            name: np.concatenate([part[name] for part in parts])
+            for name in ("intensity", "frame", "line", "time")
+            if all(name in (part.dtype.names or ()) for part in parts)
+        }
     times = columns.pop("time", None)
     step_mm = 1e3 * find_float_step(points)
     return make_foreign_cloud(1e3 * points.astype(float), time_s=times, step_mm=step_mm, **columns)
+
+
+def _unpack_scan(message: Any) -> np.ndarray:
+    """Return the points of a LaserScan that are within its range, as an array (N,) with the fields x, y, z in m."""
+    far = np.asarray(message.ranges)
+    seen = np.flatnonzero((far >= message.range_min) & (far <= message.range_max))
+    far, angle = far[seen], message.angle_min + message.angle_increment * seen
+    return np.rec.fromarrays([far * np.cos(angle), far * np.sin(angle), 0 * far], dtype=[(a, "f4") for a in "xyz"])
 
 
 def bag_types(store: Any) -> MessageTypes:

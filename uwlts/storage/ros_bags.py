@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from uwlts.errors import DescriptionError
+from uwlts.errors import DescriptionError, Error
 from uwlts.files.reading import require_regular_file
 from uwlts.runtime.optional_library import optional_library
 
@@ -43,22 +45,35 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
     SetupError
         The library for bags is not installed.
     """
+    with open_bag(path, error=DescriptionError) as bag:
+        return _poses(bag, path, wanted)
+
+
+@contextmanager
+def open_bag(path: Path, *, error: type[Error]) -> Iterator[Any]:
+    """Return a bag as a context; other exceptions than ``error`` are raised as one that calls the file damaged.
+
+    Raises SetupError if the library for bags is not installed.
+    """
     highlevel, typesys = (
         optional_library(f"rosbags.{part}", needed_by="a ROS bag", extra="ros") for part in ("highlevel", "typesys")
     )
     if not path.is_dir():
-        require_regular_file(path, error=DescriptionError, called="bag")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        require_regular_file(path, error=error, called="bag")
     try:
-        with highlevel.AnyReader([path], default_typestore=store) as bag:
-            return _poses(bag, path, wanted)
-    except DescriptionError:
+        with highlevel.AnyReader([path], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)) as bag:
+            yield bag
+    except error:
         raise
-    except Exception as error:
+    except Exception as fault:
         # The library raises errors of file formats, compression, SQLite and the operating system.
-        raise DescriptionError(
-            f"{path} is no ROS bag (.bag, .mcap, .db3 or a bag's folder), or damaged: {error}"
-        ) from error
+        raise error(f"{path} is no ROS bag (.bag, .mcap, .db3 or a bag's folder), or damaged: {fault}") from fault
+
+
+def list_topics(bag: Any, kinds: Container[str] | None = None) -> str:
+    """Return the topics of a bag, or those with messages of some kinds, as text."""
+    found = {each.topic: each.msgtype for each in bag.connections if kinds is None or each.msgtype in kinds}
+    return ", ".join(f"{name} ({kind.split('/')[-1]})" for name, kind in sorted(found.items())) or "none"
 
 
 def _poses(bag: Any, path: Path, wanted: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -74,13 +89,12 @@ def _poses(bag: Any, path: Path, wanted: str) -> tuple[np.ndarray, np.ndarray, n
     else:
         topic = wanted or (next(iter(topics)) if len(topics) == 1 else "")
         if topic not in topics:
-            held = ", ".join(f"{name} ({kind.split('/')[-1]})" for name, kind in sorted(topics.items())) or "none"
             raise DescriptionError(
-                f"{path} has the topics with poses {held}; found none called '{wanted}': name one of them, or the "
-                "frames of a transform as PARENT>CHILD"
+                f"{path} has the topics with poses {list_topics(bag, _POSES)}; found none called '{wanted}': name one "
+                "of them, or the frames of a transform as PARENT>CHILD"
             )
         rows = []
-        for connection, message in _read_messages(bag, lambda connection: connection.topic == topic):
+        for connection, message in read_messages(bag, lambda connection: connection.topic == topic):
             rows.append(_row(message.header.stamp, _POSES[connection.msgtype](message)))
             if connection.msgtype in _WITH_COVARIANCE:
                 covariances.append(np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6))
@@ -89,7 +103,8 @@ def _poses(bag: Any, path: Path, wanted: str) -> tuple[np.ndarray, np.ndarray, n
     return table[:, 0], table[:, 1:], known if stated else None
 
 
-def _read_messages(bag: Any, chosen: Any) -> Any:
+def read_messages(bag: Any, chosen: Any) -> Any:
+    """Iterate over the connection and the message of all messages whose connection is ``chosen``."""
     connections = [connection for connection in bag.connections if chosen(connection)]
     for connection, _, data in bag.messages(connections=connections) if connections else ():
         yield connection, bag.deserialize(data, connection.msgtype)
@@ -97,7 +112,7 @@ def _read_messages(bag: Any, chosen: Any) -> Any:
 
 def _transforms(bag: Any) -> Any:
     """Iterate over the frames (parent, child) and the row of every transform of the bag."""
-    for _, message in _read_messages(bag, lambda connection: connection.msgtype == _TRANSFORMS):
+    for _, message in read_messages(bag, lambda connection: connection.msgtype == _TRANSFORMS):
         for each in message.transforms:
             frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
             yield frames, _row(each.header.stamp, each.transform)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwlts.desk.desk_files import find_file, guess_kind, is_interrupted, list_files, new_path
+from uwlts.desk.desk_files import find_file, guess_kind, list_files, new_path
 from uwlts.errors import DescriptionError
 from uwlts.optics.nominal import nominal
 from uwlts.storage.cloud import PointCloud
@@ -171,9 +171,3 @@ def test_a_result_gets_its_ending_once(folder, name):
 def test_names_for_results_that_lead_elsewhere_are_refused(folder, name):
     with pytest.raises(DescriptionError, match="not a name for a file in the folder"):
         new_path(folder, name, suffix=".h5")
-
-
-def test_an_interrupted_recording_is_noticed(folder):
-    assert not is_interrupted(folder / "scan.h5")
-    (folder / "scan.h5.part").touch()
-    assert is_interrupted(folder / "scan.h5")

@@ -4,6 +4,8 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.desk import ros_node
 from uwlts.desk.scan_service import ScanService
 from uwlts.errors import CalibrationError, HardwareError
 from uwlts.hardware.grbl import GrblStage
@@ -174,3 +177,22 @@ def test_a_calibration_of_another_sensor_is_refused_before_anything_moves(tmp_pa
 def replace_size(calibration: Calibration) -> Calibration:
     camera = calibration.camera.model_copy(update={"width_px": calibration.camera.width_px // 2})
     return calibration.model_copy(update={"camera": camera})
+
+
+def test_a_node_of_ros_that_is_interrupted_ends_as_interrupted(capture: Path, calibration: Calibration, monkeypatch):
+    class Ended(Exception):
+        pass
+
+    def spin(_: object) -> None:
+        raise Ended
+
+    done: list[str] = []
+    node = Mock()
+    rclpy = SimpleNamespace(
+        init=lambda: done.append("init"), try_shutdown=lambda: done.append("end"), spin=spin, create_node=lambda _: node
+    )
+    modules = rclpy, SimpleNamespace(ExternalShutdownException=Ended), Mock(), Mock(), Mock(), Mock()
+    monkeypatch.setattr(ros_node, "_import_ros", lambda: modules)
+    with pytest.raises(KeyboardInterrupt):
+        ros_node.serve_ros(capture, calibration=calibration)
+    assert done == ["init", "end"]

@@ -305,7 +305,7 @@ def test_blocks_hold_words_and_commands_apart():
 def test_opening_reads_version_settings_and_state(controller):
     with GrblStage(controller.port) as stage:
         assert stage.version == "1.1h"
-        assert (stage.settings.step_mm, stage.settings.travel_mm, stage.settings.soft_limits) == (STEP_MM, 750.0, True)
+        assert (stage.settings.step_mm, stage.settings.travel_mm) == (STEP_MM, 750.0)
         assert stage.limits_mm == (0.0, 750.0)
         assert not stage.position_known
         with pytest.raises(HardwareError, match="home it first"):

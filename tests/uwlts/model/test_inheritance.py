@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from uwlts.errors import DescriptionWarning
+from uwlts.model.inheritance import Level, find_misfits
 from uwlts.model.library import list_names, load_sensor
 
 OWN = 'name = "mine"\nnotes = "a sensor of its own"\n'
@@ -62,6 +63,17 @@ def test_another_stand_off_is_said_with_the_values_to_set(tmp_path):
     assert "176.0 in water" in found[0]
     assert "from the stand-off, 261.5" in found[1]
     assert "145.5 mm from the window, is outside the measuring volume" in found[2]
+
+
+def test_a_volume_beside_the_stand_off_is_said_without_a_base(thesis):
+    whole = Level("own", thesis.model_dump(mode="json"), thesis.model_dump(mode="json"))
+    assert find_misfits([whole], thesis) == []
+    beside = thesis.model_copy(update={"volume": thesis.volume.model_copy(update={"near_mm": 90.0, "far_mm": 200.0})})
+    # 265 / tan 35 deg - 62.8 - 5.93 = 309.7 mm.
+    (found,) = find_misfits([whole], beside)
+    assert found.startswith(
+        "own: the stand-off, 309.7 mm from the window, is outside the measuring volume of 90 to 200 mm"
+    )
 
 
 def test_a_description_that_follows_the_stand_off_is_not_warned_of(tmp_path):

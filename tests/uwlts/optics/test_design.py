@@ -299,8 +299,9 @@ def test_the_table_of_the_thesis_sensor(thesis):
         "depth per pixel by the thesis's factor n": (0.1722, "mm/px"),
         "depth in view along the laser's axis": (237.4, "mm"),
         "line needed for a 300 mm pipe in 5 passes": (176.3, "mm"),
-        # 63 sqrt(3 / S) / 2 with the strengths of 60, 45 and 41.4 MPa.
+        # 63 sqrt(3 / S) / 2 with the strengths of 60, 275, 45 and 41.4 MPa.
         "fused-silica window for 1 MPa, clamped": (7.044, "mm"),
+        "sapphire window for 1 MPa, clamped": (3.290, "mm"),
         "soda-lime window for 1 MPa, clamped": (8.133, "mm"),
         "soda-lime-low-iron window for 1 MPa, clamped": (8.133, "mm"),
         "PMMA window for 1 MPa, clamped": (8.480, "mm"),

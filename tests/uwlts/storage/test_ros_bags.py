@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import uwlts
-from uwlts.errors import DescriptionError, SetupError
+from uwlts.errors import CaptureError, DescriptionError, SetupError
 
 TIMES = 1.7e9 + np.arange(6) * 0.1
 PLACES_M = np.column_stack([0.05 * np.arange(6), np.zeros(6), np.full(6, 0.4)])
@@ -123,3 +123,33 @@ def test_a_topic_without_messages_is_refused(tmp_path):
         bag.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=get_typestore(Stores.ROS2_HUMBLE))
     with pytest.raises(DescriptionError, match="bag"):
         uwlts.read(tmp_path / "bag", pose_format="ros")
+
+
+def write_messages(path, topic, *content):
+    """Write messages of one type on a topic."""
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connection = bag.add_connection(topic, content[0].__msgtype__, typestore=types)
+        for number, message in enumerate(content):
+            bag.write(connection, number, types.serialize_cdr(message, message.__msgtype__))
+    (file,) = path.glob("*.mcap")
+    return file
+
+
+def test_points_of_laser_scans(tmp_path):
+    held = get_typestore(Stores.ROS2_HUMBLE).types
+    header = held["std_msgs/msg/Header"](held["builtin_interfaces/msg/Time"](0, 0), "scanner")
+    # Out of range, unknown and nothing are no points.
+    far = np.array([0.5, 0.05, np.inf, np.nan, 2.0, 11.0], np.float32)
+    scan = held["sensor_msgs/msg/LaserScan"](header, 0.1, 1.0, 0.25, 0.0, 0.0, 0.1, 10.0, far, np.empty(0, np.float32))
+    found = uwlts.read(write_messages(tmp_path / "bag", "/scan", scan, scan))
+    expected = [[500 * np.cos(0.1), 500 * np.sin(0.1), 0], [2000 * np.cos(1.1), 2000 * np.sin(1.1), 0]] * 2
+    np.testing.assert_allclose(found.points_mm, expected, atol=1e-3)
+
+
+def test_a_bag_without_points_is_said_with_its_topics(tmp_path):
+    held = get_typestore(Stores.ROS2_HUMBLE).types
+    header = held["std_msgs/msg/Header"](held["builtin_interfaces/msg/Time"](0, 0), "camera")
+    image = held["sensor_msgs/msg/Image"](header, 2, 2, "mono8", 0, 2, np.zeros(4, np.uint8))
+    with pytest.raises(CaptureError, match=r"has the topics /cam \(Image\), and no points .*write images to a folder"):
+        uwlts.read(write_messages(tmp_path / "bag", "/cam", image))

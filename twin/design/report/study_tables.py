@@ -15,7 +15,7 @@ from twin.design.figures_of_merit import CLASS_NAMES, FIGURES, RENDERED_SCATTERI
 from twin.design.study import Study, Variable
 from twin.design.verification import Agreement
 from twin.scene.paths import Value
-from uwlts.model.media import GLASSES
+from uwlts.model.media import FUSED_SILICA_MPA, GLASSES
 from uwlts.model.sensor import Window
 from uwlts.pages.toolkit import Tile
 
@@ -232,12 +232,11 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
     found += [tile(name, accent=True, note="an objective") for name in objectives]
     found += [tile(name) for name in others]
     required, used = (chosen.design.number_of(name) for name in ("required_ms", "exposure_ms"))
-    darker = f"required for the wanted brightness: {value_text('required_ms', required)}"
-    darker = darker if required > 1.001 * used else ""
+    darker = f"required for the wanted brightness: {value_text('required_ms', required)}" * (required > 1.001 * used)
     last = (("exposure_ms", darker), ("laser_class", "estimate, IEC 60825-1"))
     found += [tile(name, note=note) for name, note in last if name not in (*objectives, *others)]
     if "window_mm" not in objectives:
-        thin = " – too thin" if needed > window.thickness_mm else ""
+        thin = " – too thin" if window.strength_mpa() and needed > window.thickness_mm else ""
         note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}"
         note = f"{note}\n{_by_material(window, needed)}" if window.mounted else ""
         text = value_text("window_mm", window.thickness_mm) if window.mounted else "none"
@@ -247,13 +246,13 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
 
 def _by_material(window: Window, needed_mm: float) -> str:
     """Return the thicknesses of other materials that replace a window which needs a thickness."""
-    thicknesses = {
-        name: needed_mm * math.sqrt(window.strength_mpa() / glass.strength_mpa)
+    own = window.strength_mpa() or FUSED_SILICA_MPA
+    texts = (
+        f"{value_text('window_mm', needed_mm * math.sqrt(own / glass.strength_mpa))} of {name}"
         for name, glass in GLASSES.items()
         if glass.strength_mpa is not None
-    }
+    )
     unknown = ", ".join(name for name, glass in GLASSES.items() if glass.strength_mpa is None)
-    texts = (f"{value_text('window_mm', thickness)} of {name}" for name, thickness in thicknesses.items())
     return f"by material: {', '.join(texts)}; unknown for {unknown}"
 
 
