@@ -171,9 +171,8 @@ def measure_blemish(
         wrong.append(field.measure(field.observe(bell, shift) + move, edge) - bell.figures(edge))
     low, bias, high = np.quantile(wrong, [0.5 - 0.5 * COVERAGE, 0.5, 0.5 + 0.5 * COVERAGE], axis=0)
     random = 0.5 * (high - low) / COVERAGE_FACTOR
-    # Uncertainty by the footprints' size and, without a known form, by the smoothing's correction, a second one, and
-    # the width of the quadratics. After the first remains between none, for smooth ground, and sqrt(2) times it, at a
-    # ridge in a Gaussian kernel: with either sign, a rectangular distribution of about its size.
+    # Uncertainty by the footprints' size and, without a known form, by the width of the quadratics, the smoothing's
+    # correction (at a ridge sqrt(2) times as much remains after a Gaussian kernel), and a second one.
     again: list[dict[str, Any]] = [{"share": 1 - field.footprint_std}] + [{"steps": 0}, {"steps": 2}] * (not is_bell)
     resolved = np.array([field.figures(field.depths(heights, **each), edge, deepest, between) - seen for each in again])
     if wide_depth is not None:

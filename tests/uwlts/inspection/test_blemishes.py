@@ -1,5 +1,8 @@
 """Depths of shallow pits without the bias of a maximum in noise; sizes of known shapes, and exact quadratics."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
@@ -9,6 +12,7 @@ from uwlts.inspection.bead_profiles import interpolation_rows, profile_rows
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
 from uwlts.inspection.blemishes import _Bell, _interpolation_rows, _measure_section, _quadratic_rows, measure_blemish
+from uwlts.inspection.features import FeatureValue
 
 
 def test_shallow_pits_are_as_deep_as_they_are_on_average() -> None:
@@ -28,6 +32,42 @@ def test_shallow_pits_are_as_deep_as_they_are_on_average() -> None:
     wrong = [each.values[0].value - depth for each in measured]
     assert len(wrong) >= 12
     assert abs(np.mean(wrong)) < 0.015
+
+
+def measure_deepest(depths: Callable[[np.ndarray], np.ndarray], side: float, seed: int) -> FeatureValue:
+    """Return the depth of the deepest indication of depths over places (N, 2), with a noise of 0.01 mm."""
+    rng, noise = np.random.default_rng(seed), 0.01
+    places = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
+    places, count = places + rng.uniform(-0.3, 0.3, places.shape), len(places)
+    heights = noise * rng.standard_normal(count) - depths(places - side / 2)
+    surface = UnrolledSurface(places, heights, np.full(count, noise), np.zeros((count, 2)))
+    search = search_blemishes(surface, false_alarm=0.05)
+    errors = PointErrors(np.zeros(count), np.zeros((0, count)), np.arange(count), None)
+    deepest = max(search.indications, key=lambda each: abs(each.height_mm))
+    return measure_blemish(surface, search, deepest, errors, diameter_mm=100.0).values[0]
+
+
+def test_the_interval_of_a_dent_contains_its_tail_in_the_surroundings() -> None:
+    """A tenth of a normal distribution's depth is its edge: its tail raises the undamaged surface by 0.01 mm of 2."""
+    found = measure_deepest(lambda places: 2 * np.exp(-np.sum(places**2, axis=1) / 128), 90, 0)
+    assert found.low < 2.0 < found.high
+    assert found.high - found.low < 0.08
+
+
+def test_steep_sides_do_not_lower_the_depth_of_a_gouge() -> None:
+    """Gouges 1.2 mm deep and six points wide, in five directions: their sides scatter more than the noise.
+
+    With this scatter as noise of the maximum they would be 0.04 mm too shallow on average; 0.016 mm are smoothed away.
+    """
+
+    def depths(places: np.ndarray, turn: float) -> np.ndarray:
+        along, across = places @ [np.cos(turn), np.sin(turn)], places @ [-np.sin(turn), np.cos(turn)]
+        section = np.where(np.abs(across) < 3, 0.6 + 0.6 * np.cos(np.pi * across / 3), 0.0)
+        return section * np.clip(2 - np.abs(along) / 9, 0, 1)
+
+    found = [measure_deepest(partial(depths, turn=0.7 * k), 60, k) for k in range(5)]
+    assert abs(np.mean([each.value for each in found]) - 1.2) < 0.025
+    assert all(each.low < 1.2 < each.high for each in found)
 
 
 def quadratic(u: np.ndarray, v: np.ndarray) -> np.ndarray:
