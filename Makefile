@@ -61,8 +61,9 @@ oldest: export OPENBLAS_NUM_THREADS := 1
 oldest: setup $(OLDEST)/.installed
 	@$(WITH_ARAVIS)
 	@echo "oldest: documented commands with the oldest allowed libraries"
-	@# They use what newer libraries below them call outdated.
-	@$(OLDEST)/bin/python -m pytest -q -n 2 -W default::DeprecationWarning \
+	@# They use what newer libraries below them call outdated. Beside other tests each may take long.
+	@$(OLDEST)/bin/python -m pytest -q -n 2 --dist loadfile -o faulthandler_timeout=3600 \
+		-W default::DeprecationWarning \
 		tests/test_documentation.py tests/system/test_documented_commands.py \
 		-k "test_documentation or README or api.md or calibrate-a-mount or large-clouds"
 

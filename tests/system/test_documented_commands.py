@@ -165,7 +165,7 @@ PAGES_RUN = {
     "README.md": Page(
         given=THREE_VIEWS | {"after.cloud.h5": "pipe.cloud.h5", "before.cloud.h5": "pipe.cloud.h5"},
         small_python=True,
-        instead={"--scenes 200": "--scenes 1"},
+        instead={"stripe-turbid --scenes 200": "stripe-clean --scenes 1"},
         again=("twin simulate spheres",),
         not_run=MAKE | {"uwlts scan": HARDWARE, "uwlts desk": HARDWARE},
     ),
@@ -222,17 +222,16 @@ PAGES_RUN = {
     "docs/how-to/describe-your-sensor.md": Page(tables={"reef.toml": 0, "reef-close.toml": 1}),
     "docs/how-to/follow-a-sensor.md": Page(tables={"wall.toml": 0}, again=("uwlts radiometry wall.h5",)),
     "docs/how-to/predict-uncertainty.md": Page(
-        texts={
-            "my-sensor.toml": 'base = "thesis-small"\nname = "mine"\n',
-            "small-pipe.toml": 'base = "pipe"\ntitle = "small pipe"\n',
-        },
+        texts={"small-pipe.toml": 'base = "pipe"\ntitle = "small pipe"\n'},
         tables={"small-pipe-campaign.toml": 0},
         instead={
             "thesis-small --water clear": "thesis-small --campaign small-pipe-campaign.toml --water clear",
+            "count = 16": "count = 8",
             # The recordings of the first call.
             "--campaign detection --water coastal --campaigns 2 --every 2 --out runs/detection": "--campaign "
             "small-pipe-campaign.toml --water clear --campaigns 1 --every 4 --out runs/predicted",
-            "--campaigns 10": "--campaigns 1 --every 8",
+            "my-sensor.toml": "thesis-small",
+            "--campaigns 10 --out runs/small-pipe": "--water clear --campaigns 1 --every 4 --out runs/predicted",
         },
     ),
     "docs/how-to/inspect-a-pipe.md": Page(
@@ -250,7 +249,8 @@ PAGES_RUN = {
         given={"scan.cloud.h5": "pipe.cloud.h5"}, instead={"1000 -50 300 1100 50 600": "-10 -50 0 10 50 30"}
     ),
     "docs/how-to/make-a-data-set.md": Page(
-        tables={"mine.toml": 0}, instead={"--scenes 200": "--scenes 1", "scenes = 40": "scenes = 2"}
+        tables={"mine.toml": 0},
+        instead={"stripe-turbid --scenes 200": "stripe-clean --scenes 1", "scenes = 40": "scenes = 2"},
     ),
     "docs/how-to/make-a-mesh.md": Page(given=THREE_VIEWS | {"merged.cloud.h5": "pipe.cloud.h5"}),
     "docs/how-to/register-scans.md": Page(given=THREE_VIEWS, texts={"start.csv": NO_MOVEMENT}),

@@ -113,7 +113,7 @@ def least_scatter_mm(campaign: Campaign) -> float:
         (None, 0),
         *(
             pytest.param(radius, seed, marks=pytest.mark.slow)
-            for radius, seed in ((None, 1), (None, 2), (RADIUS_MM, 0), (RADIUS_MM, 1), (RADIUS_MM, 2))
+            for radius, seed in ((None, 1), (RADIUS_MM, 0), (RADIUS_MM, 1))
         ),
     ],
 )
@@ -220,7 +220,7 @@ def test_usual_mistakes_are_named(rng, radius, says):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("robot_mm", "campaigns"), [(0.0, 20), (0.05, 40)])
+@pytest.mark.parametrize(("robot_mm", "campaigns"), [(0.0, 12), (0.05, 20)])
 def test_intervals_hold_as_often_as_stated(robot_mm, campaigns):
     """At least 92 % of the six values of a campaign are within their 95 % intervals.
 
