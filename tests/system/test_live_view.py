@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
+from uwlts.desk import recording_view
 from uwlts.desk.recording_view import RecordingView, follow_frames
 from uwlts.desk.shown_state import Board
 from uwlts.errors import CaptureError
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -143,6 +144,17 @@ def test_a_damaged_file_is_no_recording_to_wait_for(tmp_path):
     (tmp_path / "live.h5").write_bytes(b"no capture")
     with pytest.raises(CaptureError):
         list(follow_frames(tmp_path / "live.h5"))
+
+
+def test_a_recording_that_is_cut_off_is_not_waited_for(thesis, tmp_path, monkeypatch):
+    monkeypatch.setattr(recording_view, "_DAMAGED_S", 0.3)
+    write(tmp_path / "whole.h5", thesis, [(stripe_image(thesis, height_dn=150.0), True)])
+    part_path(tmp_path / "a.h5").write_bytes((tmp_path / "whole.h5").read_bytes()[:5000])
+    followed = follow_frames(tmp_path / "a.h5")
+    assert next(followed) is None
+    with pytest.raises(CaptureError, match="a.h5.part"):
+        for _ in followed:
+            time.sleep(0.05)
 
 
 def test_the_page_is_served_to_this_machine_until_it_is_closed(thesis, tmp_path):

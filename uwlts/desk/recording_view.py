@@ -21,6 +21,8 @@ from uwlts.stripe import find_stripe, warm_up
 
 LOOK_S = 0.1
 """Interval between checks for new images; a check takes a few ms."""
+_DAMAGED_S = 5.0
+"""Time after which a recording that cannot be read is damaged; an image is written in a fraction of a second."""
 _WAITING = 64
 """Images in the queue for display during a scan; further ones are recorded but not shown."""
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
@@ -106,9 +108,10 @@ def _find(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | Non
 def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:
     """Iterate over the images of a recording as it is written, with their numbers; None if there is no new one.
 
-    Ends with the last image of the finished file. Raises CaptureError if the finished file is damaged.
+    Ends with the last image of the finished file. Raises CaptureError if the finished file is damaged, or the
+    unfinished one cannot be read for 5 s.
     """
-    shown = 0
+    shown, readable_s = 0, time.monotonic()
     while True:
         finished = path.is_file() and not part_path(path).exists()
         current = path if finished else part_path(path)
@@ -117,9 +120,12 @@ def follow_frames(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | Non
                 for number in range(shown, len(capture)):
                     yield capture.header, number, capture[number]
                     shown = number + 1
+            readable_s = time.monotonic()
         except CaptureError:
-            # Not written yet, or being renamed.
-            if finished:
+            if not current.is_file():
+                # Not written yet, or being renamed.
+                readable_s = time.monotonic()
+            elif finished or time.monotonic() > readable_s + _DAMAGED_S:
                 raise
         if finished:
             return

@@ -80,21 +80,6 @@ def read_model(
     Raises CaptureError if the file is missing, foreign, newer or damaged.
     """
     content = read_json(path, called=called)
-    return model_from_json(content, path, model, file_format=file_format, version=version, called=called, advice=advice)
-
-
-def model_from_json(
-    content: dict[str, JsonValue],
-    path: str | Path,
-    model: type[AnyModel],
-    *,
-    file_format: str,
-    version: int,
-    called: str,
-    advice: str = "",
-) -> AnyModel:
-    """Convert the result of `read_json` to a model; raises CaptureError like `read_model`."""
-    content = dict(content)
     if content.pop("format", None) != file_format:
         raise CaptureError(f'{path} is JSON but not {add_article(called)}: expected "format": "{file_format}"')
     if (found := content.pop("version", None)) != version:
