@@ -15,8 +15,12 @@ from twin.datasets.data_set import DataSetDescription, LineStatus
 from twin.datasets.labels import MEANINGS
 from twin.scene.paths import Value
 from uwlts.files.json_files import write_model
+from uwlts.files.reading import log_warnings
 from uwlts.files.writing import hash_file
 from uwlts.storage.data_set import CARD, CARD_FORMAT, CARD_VERSION, SPLITS, DataCard, DataSet, Shard, Split
+
+_BRIGHT = 0.03
+"""Largest fraction of pixels at the maximum without a warning; a stripe of 20 px with all its pixels there has 2 %."""
 
 
 @dataclass
@@ -26,6 +30,7 @@ class _Collected:
     drawn: dict[str, list[Value]] = field(default_factory=dict)
     status: Counter[int] = field(default_factory=Counter)
     redrawn: set[int] = field(default_factory=set)
+    bright: int = 0
 
 
 def write_card(
@@ -67,6 +72,9 @@ def write_card(
             "status": {LineStatus(number).name.lower(): count for number, count in sorted(found.status.items())},
         }
     )
+    if found.bright:
+        said = f"{found.bright} of {sum(frames.values())} images have more than {100 * _BRIGHT:g} % of their pixels"
+        log_warnings(folder, [f"{said} at the maximum: lower exposure.auto_level, frame.exposure or the ambient light"])
     if "mask" in names:
         write_coco(folder, card)
     # The last file: with it the data set is complete.
@@ -78,6 +86,7 @@ def _collect_statistics(samples: DataSet) -> _Collected:
     found = _Collected()
     for sample in samples:
         info = sample["info"]
+        found.bright += info.get("at_maximum", 0.0) > _BRIGHT
         for path, value in info["drawn"].items():
             # Values that all frames of a scene share count once.
             if info["frame"] == 0 or path == "frame.exposure":

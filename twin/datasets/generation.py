@@ -232,6 +232,7 @@ def _make_frame_metadata(
         "light": shot.light,
         "stage_mm": shot.stage_mm,
         "exposure_ms": taken.exposure_ms,
+        "at_maximum": float((taken.image >= studio.sensor.detector.full_scale_dn()).mean()),
         "drawn": drawn.values | {"frame.exposure": drawn.exposures[index]},
         "T_scene_object": studio.pose(shot).tolist(),
         "T_camera_object": camera_from_object(studio.sensor).tolist(),

@@ -109,7 +109,7 @@ def test_an_interrupted_run_goes_on(folder, tmp_path):
     assert not list(copy.glob(".*")) and (copy / "mine.txt").is_file()
 
 
-def test_another_data_set_is_refused_unless_it_is_to_be_replaced(folder, tmp_path):
+def test_another_data_set_is_refused_unless_it_is_to_be_replaced(folder, tmp_path, caplog):
     place = twin.dataset(
         small(scenes=2, splits={"train": 1, "validation": 0, "test": 0}), out=tmp_path / "x", workers=1
     )
@@ -117,7 +117,11 @@ def test_another_data_set_is_refused_unless_it_is_to_be_replaced(folder, tmp_pat
         twin.dataset(small(scenes=1), out=place, workers=1)
     (place / "mine.txt").write_text("kept", encoding="utf-8")
     only = {"splits": {"train": 0, "validation": 0, "test": 1}, "labels": ("centre",), "scenes": 1}
+    assert "at the maximum" not in caplog.text
+    day = {"exposure": {"laser_ms": 5000.0}, "lamp": {"ambient_w_per_m2": 1.0}}
+    only["sensor"] = altered(load_sensor("thesis"), SMALL | day)
     twin.dataset(small(**only), out=place, workers=1, overwrite=True)
+    assert "2 of 2 images have more than 3 % of their pixels at the maximum" in caplog.text
     assert [path.name for path in place.glob("*.tar")] == ["test-000000.tar"]
     assert (place / "mine.txt").is_file()
     with pytest.raises(DescriptionError, match="workers is 0"):

@@ -8,13 +8,22 @@ from scipy.signal import argrelmin
 
 from twin.scene import scene_object
 from twin.scene.forms import Head, PittedPipe, Weld
-from twin.scene.forms.head import head_depth
+from twin.scene.forms.head import _front, _outline
 from twin.scene.forms.pitted_pipe import pit_depths, pit_places, pitted_radius
 from twin.scene.forms.triangles import bowed_plate
 from twin.scene.forms.weld import undercut_depths, weld_height
 from uwlts.errors import DescriptionError
 
 HEIGHT = 160.0
+
+
+def head_depth(x: np.ndarray, y: np.ndarray, *, height_mm: float) -> np.ndarray:
+    """Return z of the front of a head at ``x``, ``y`` (N,), all in mm; NaN outside its outline."""
+    x, y = x / height_mm, y / height_mm
+    half_width, front, _ = _outline(y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        facing = np.sqrt(1 - np.square(x / half_width))
+    return height_mm * np.where(np.abs(y) <= 0.5, _front(x, y, front, facing), np.nan)
 
 
 def mesh_of(surface: tuple[np.ndarray, np.ndarray]) -> trimesh.Trimesh:

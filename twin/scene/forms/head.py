@@ -58,15 +58,6 @@ class Head(FreeForm):
         return _triangles(self.height_mm)
 
 
-def head_depth(x: np.ndarray, y: np.ndarray, *, height_mm: float) -> np.ndarray:
-    """Return z of the front of a head at ``x``, ``y`` (N,), all in mm; NaN outside its outline."""
-    x, y = x / height_mm, y / height_mm
-    half_width, front, _ = _outline(y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        facing = np.sqrt(1 - np.square(x / half_width))
-    return height_mm * np.where(np.abs(y) <= 0.5, _front(x, y, front, facing), np.nan)
-
-
 def _triangles(height_mm: float) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) in mm and faces (F, 3) of a dummy head with the stub of its neck, a closed surface."""
     # Rows at equal distances along the front outline, from the crown, where it is level, to the neck.

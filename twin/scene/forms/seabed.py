@@ -106,20 +106,6 @@ def _stone(diameter_mm: float) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([vertices[:, 2], vertices[:, 1], -vertices[:, 0]], axis=1)[: (rings - 1) * around + 1], faces
 
 
-def seabed_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the height of the sea floor towards -z at ``x``, ``y`` (N,), all in mm.
-
-    Sum of cosine ripples and smooth waves between -roughness and roughness, or the upper half of a spheroid, half as
-    high as wide, where it is higher: d / 4 sqrt(1 - t^2), where t is 0 at a stone's centre and 1 at its rim.
-    """
-    height = _sediment_height(bed, x, y)
-    for (at_x, at_y), diameter in zip(bed.stone_places(), bed.stone_diameters(), strict=True):
-        squared = (np.square(x - at_x) + np.square(y - at_y)) / (0.5 * diameter) ** 2
-        stone = 0.25 * diameter * np.sqrt(np.maximum(1 - squared, 0))
-        height = np.where(squared < 1, np.maximum(height, stone), height)
-    return height
-
-
 def _sediment_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the height of the sea floor without stones."""
     places = np.stack(np.broadcast_arrays(x, y)) / bed.ripple_pitch_mm
