@@ -55,12 +55,12 @@ def describe_verification(
             made = datetime.fromisoformat(str(calibration.provenance.get("date")))
         except ValueError:
             return None, []
-        if now - (made if made.tzinfo else made.replace(tzinfo=UTC)) <= _VALID:
+        if abs(now - (made if made.tzinfo else made.replace(tzinfo=UTC))) <= _VALID:
             return None, []
         return None, [f"the calibration of {made:%Y-%m-%d} was not verified since: measure an artefact (uwlts verify)"]
     if not record.passed:
         return None, [f"the calibration FAILED its verification of {record.date:%Y-%m-%d}: {'; '.join(record.lines)}"]
-    until = record.date + _VALID
-    if now > until:
+    # A date in the future is that of another clock, or the clock was set back.
+    if abs(now - record.date) > _VALID:
         return None, [f"the calibration was last verified on {record.date:%Y-%m-%d}: today's check is missing"]
-    return f"{until:%Y-%m-%d %H:%M} UTC", []
+    return f"{record.date + _VALID:%Y-%m-%d %H:%M} UTC", []

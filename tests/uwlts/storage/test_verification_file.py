@@ -45,6 +45,9 @@ def test_a_verification_is_valid_for_a_day_and_for_its_calibration(dated, caplog
     assert doubts == [] and until.startswith(f"{datetime.now(UTC) + timedelta(days=1):%Y-%m-%d}")
     later = datetime.now(UTC) + timedelta(hours=30)
     assert "today's check is missing" in describe_verification(path, calibration, now=later)[1][0]
+    # A clock that was set back.
+    earlier = datetime.now(UTC) - timedelta(hours=30)
+    assert "today's check is missing" in describe_verification(path, calibration, now=earlier)[1][0]
     other = calibration.model_copy(update={"sensor_name": "other"})
     assert "not verified since" in describe_verification(path, other)[1][0]
 
