@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -45,7 +44,8 @@ def mcap_content(cloud: PointCloud) -> bytes:
             f"the cloud reaches {farthest:.6g} mm from the origin, where the 32-bit numbers of MCAP are coarser than a "
             "micrometre: write HDF5, PLY, E57 or LAZ, or move the cloud"
         )
-    mcap, typesys = _library("mcap.writer"), _library("rosbags.typesys")
+    names = "mcap.writer", "rosbags.typesys"
+    mcap, typesys = (optional_library(each, needed_by="MCAP", extra="ros") for each in names)
     store: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     types = bag_types(store)
     table = pack_points(cloud, covariance_columns(cloud))
@@ -112,7 +112,3 @@ def bag_types(store: Any) -> MessageTypes:
     """Return the types of messages of a type store of the library rosbags."""
     names = (_POINT_CLOUD2, "sensor_msgs/msg/PointField", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
     return MessageTypes(*(store.types[name] for name in names), pack=lambda data: np.frombuffer(data, np.uint8))
-
-
-def _library(module: str) -> ModuleType:
-    return optional_library(module, needed_by="MCAP", extra="ros")

@@ -248,13 +248,17 @@ def _find_alternation(poses: np.ndarray) -> list[str]:
     steps, apart = (np.linalg.norm(places[lag:] - places[:-lag], axis=1) for lag in (1, 2))
     away = np.minimum(steps[:-1], steps[1:])
     jumps = (apart < _RETURNED * away) & (away > _LEAST_JUMP_MM)
+    # Every second pose lies on a smooth path of its own, also if the offset is along the path.
+    bent = np.linalg.norm(np.diff(places, 2, axis=0), axis=1)[1:-1]
+    smooth = np.linalg.norm(places[4:] - 2 * places[2:-2] + places[:-4], axis=1)
+    jumps[1:-1] |= (smooth < _RETURNED * bent) & (bent > 2 * _LEAST_JUMP_MM)
     if np.mean(jumps) < _ALTERNATING:
         return []
-    turned = np.linalg.norm(np.diff(poses[:, :3, 0], axis=0), axis=1)[:-1][jumps]
-    moved = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[:-1][jumps]
+    changes = (np.linalg.norm(np.diff(poses[:, :3, column], axis=0), axis=1)[:-1][jumps] for column in (0, 3))
+    turned, moved = map(np.median, changes)
     return [
-        f"{100 * np.mean(jumps):.0f} % of the poses jump away and back, by {np.median(moved):.3g} mm and "
-        f"{np.degrees(np.median(turned)):.2g} deg: are two sources or frames in one track? Keep one of them"
+        f"{100 * np.mean(jumps):.0f} % of the poses jump away and back, by {moved:.3g} mm and "
+        f"{np.degrees(turned):.2g} deg: are two sources or frames in one track? Keep one of them"
     ]
 
 

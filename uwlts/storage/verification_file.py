@@ -48,8 +48,7 @@ def describe_verification(
     """
     now, record = now or datetime.now(UTC), None
     if is_regular_file(beside := verification_path(path)):
-        called = "record of a verification"
-        record = read_model(beside, VerificationRecord, file_format=FORMAT, version=VERSION, called=called)
+        record = read_model(beside, VerificationRecord, file_format=FORMAT, version=VERSION, called="verification")
     if record is None or record.calibration != calibration_digest(calibration):
         try:
             made = datetime.fromisoformat(str(calibration.provenance.get("date")))
