@@ -32,6 +32,9 @@ class BlemishSearchRule:
 
     points_in_smallest: int = 12
     """Points in a disc of the smallest size: at least three profiles, even if points are much denser along profiles."""
+    gap: float = 2.1
+    """Distance from all points from which a place is not seen, in the 90 % quantile of these distances. One of 26,000
+    places is as far among points at random places, and none among profiles."""
     cells_per_radius: int = 3  # cells of the maps per radius of a bell
     window: float = 1.8  # radius of the fitted surroundings, in radii of the bell
     size_ratio: float = np.sqrt(2.0)

@@ -33,6 +33,7 @@ from uwlts.inspection.bell_maps import (
     fit_bells,
     limit_deviations,
 )
+from uwlts.inspection.features import SEED
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +71,7 @@ class BlemishSearch:
     level_mm: np.ndarray  # (N,); least significant height of an indication of the smallest size
     noise_mm: np.ndarray  # (N,); effective noise of each point
     smallest_mm: float  # smallest radius of the search
+    gap_mm: float  # distance from all points, from which a place is not seen
     threshold: float  # least significant z
     false_alarm: float  # probability of any false indication
 
@@ -90,17 +92,17 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
             f"{len(places)} points are too few to search for blemishes; "
             f"{20 * SEARCH_RULE.points_in_smallest} are needed"
         )
-    smallest = float(
-        np.median(tree.query(places[:: max(1, len(places) // 2000)], k=SEARCH_RULE.points_in_smallest)[0][:, -1])
-    )
+    some = places[:: max(1, len(places) // 2000)]
+    smallest = float(np.median(tree.query(some, k=SEARCH_RULE.points_in_smallest)[0][:, -1]))
+    anywhere = some + smallest * np.random.default_rng(SEED).uniform(-1, 1, some.shape)
+    gap = min(smallest, SEARCH_RULE.gap * float(np.quantile(tree.query(anywhere)[0], 0.9)))
     seen, together = surface, smallest
     surface, outliers, wider = limit_deviations(seen, tree, together_mm=together, false_alarm=false_alarm)
     extent = surface.corners[1] - surface.corners[0]
     largest = min(SEARCH_RULE.largest_size * float(np.min(extent)), largest_mm)
     largest = max(largest, smallest)
     # The smallest size is larger if its map would not fit into memory.
-    area = float(np.prod(extent))
-    smallest = max(smallest, SEARCH_RULE.cells_per_radius * float(np.sqrt(area / SEARCH_RULE.most_cells)))
+    smallest = max(smallest, SEARCH_RULE.cells_per_radius * float(np.sqrt(np.prod(extent) / SEARCH_RULE.most_cells)))
     radii = smallest * SEARCH_RULE.size_ratio ** np.arange(
         1 + max(0, int(np.log(largest / smallest) / np.log(SEARCH_RULE.size_ratio)))
     )
@@ -145,7 +147,7 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float, largest_mm
             kept.append(replace(outcome, z=peak.z, false_alarm=chance, noise_mm=wider * outcome.noise_mm))
     departures = [each.outcome for each in found if isinstance(each.outcome, UnresolvedDeparture)]
     known = tuple(kept), (*departures, *small), outliers, undamaged, level, wider * noise
-    return BlemishSearch(*known, smallest, threshold, false_alarm)
+    return BlemishSearch(*known, smallest, gap, threshold, false_alarm)
 
 
 class _Candidate(NamedTuple):

@@ -67,8 +67,8 @@ class BlemishRule:
     docs/studies/inspection_verdicts.py."""
     single: float = 0.75
     """Radius of the deepest hollow, in radii of the blemish, from which the blemish is this hollow."""
-    beyond: float = 1.5
-    """Distance beyond the contour, in the largest spacing, within which places without points leave it open."""
+    beyond: float = 1.85
+    """Distance beyond the contour, in gaps, within which places without points leave it open."""
     subdivision: int = 2  # subdivision of cells for contours, on a cubic spline
     end_std: float = 1 / np.sqrt(12.0)
     """Standard uncertainty of each end of a length, in spacings of profiles or points: rectangular distribution
@@ -142,7 +142,7 @@ def measure_blemish(
     """
     sign = float(np.sign(indication.height_mm))
     field, local, wide_depth = _choose_field(surface, search, indication)
-    is_bell = wide_depth is None
+    is_rough = wide_depth is not None
     heights = sign * surface.heights[field.near]
     depths = field.depths(heights)
     deepest, between = field.find_deepest(heights)
@@ -163,7 +163,7 @@ def measure_blemish(
     wrong: list[np.ndarray] = []
     own_heights = field.seen @ np.where(field.region, depths, 0.0)
     for move in moves:
-        if not is_bell:
+        if is_rough:
             wrong.append(field.measure(own_heights + move, edge) - seen)
             continue
         bell = bells[rng.integers(len(bells))]
@@ -173,7 +173,7 @@ def measure_blemish(
     random = 0.5 * (high - low) / COVERAGE_FACTOR
     # Uncertainty by the footprints' size and, without a known form, by the width of the quadratics, the smoothing's
     # correction (at a ridge sqrt(2) times as much remains after a Gaussian kernel), and a second one.
-    again: list[dict[str, Any]] = [{"share": 1 - field.footprint_std}] + [{"steps": 0}, {"steps": 2}] * (not is_bell)
+    again: list[dict[str, Any]] = [{"share": 1 - field.footprint_std}] + [{"steps": 0}, {"steps": 2}] * is_rough
     resolved = np.array([field.figures(field.depths(heights, **each), edge, deepest, between) - seen for each in again])
     if wide_depth is not None:
         resolved = np.vstack([resolved, [wide_depth - seen[0], 0, 0, 0, 0]])
@@ -223,7 +223,6 @@ def measure_blemish(
         # On a slope the deepest place of both surfaces together is not that of the blemish.
         beneath = field.find_total(heights, sign * beneath_mm[field.near]) - float(seen[0])
     level = float(np.sqrt(2) * np.median(by_noise[field.region]))
-    spacing = measure_spacing(surface.places[field.near], np.flatnonzero(inside))
     reason = field.find_reason(surface, depths, edge, deepest)
     if reason:
         values = [value if value.name == "edge depth" else value.as_bound() for value in values]
@@ -235,7 +234,7 @@ def measure_blemish(
         indication.points,
         field.trace_outline(depths, edge, deepest),
         field.grid[field.find_hollows(depths, edge, std=level)],
-        spacing,
+        measure_spacing(surface.places[field.near], np.flatnonzero(inside)),
         reason,
         beneath,
     )
@@ -280,10 +279,7 @@ class _Bell:
 
     @classmethod
     def resembling(cls, seen: np.ndarray, edge: float, middle: np.ndarray, radius: float, exponent: int) -> _Bell:
-        """Return a bell with the measured depth, length and width at an edge.
-
-        The half axes equal the radius if the measured sizes are zero.
-        """
+        """Return a bell with the measured depth, and length and width at an edge; ``radius`` instead of zero sizes."""
         rim = float(np.sqrt(1 - min(edge / seen[0], 0.99) ** (1 / exponent)))
         half = np.where(seen[1:3] > 0, 0.5 * seen[1:3] / rim, radius)
         return cls(middle, half, float(seen[0]), exponent)
@@ -355,8 +351,7 @@ class _Field:
         sides = [np.arange(a - cell, b + 2 * cell, cell) for a, b in zip(low - middle, high - middle, strict=True)]
         shape = len(sides[0]), len(sides[1])
         grid = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
-        tree = KDTree(places)
-        smooth = _quadratic_rows(grid, places, tree, bandwidth)
+        smooth = _quadratic_rows(grid, places, KDTree(places), bandwidth)
         # Beyond a border of the points quadratics would extrapolate.
         spacing = measure_spacing(surface.places[near], np.flatnonzero(~ring))
         gap = max(search.smallest_mm, float(np.max(spacing)))
@@ -375,6 +370,7 @@ class _Field:
         if np.count_nonzero(far) >= _RULE.fewest_points:
             outer = fit_biweight(design, heights, far)[0] - plane
         known = surface.places[near], size, grid + middle, shape, cell
+        gap = max(search.gap_mm, float(np.max(spacing)))
         return cls(near, *known, smooth, design, plane, outer, seen, sharp, surface.footprint_std, stride, region, gap)
 
     def depths(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
@@ -414,34 +410,24 @@ class _Field:
         return top, self.interpolate_depth(smooth, top) - float(smooth[top])
 
     def hollow_radius(self, heights: np.ndarray, noise_mm: float) -> float:
-        """Return the radius of the deepest hollow, from the distance of its deepest place to half its depth.
-
-        Depths count as less than half where they are so by some standard deviations of the noise.
-        """
+        """Return the radius of the deepest hollow, from its deepest place to depths significantly below half of it."""
         smooth = self.depths(heights, steps=0)
         top = int(np.argmax(np.where(self.region, smooth, -np.inf)))
         away = np.hypot(*(self.grid - self.grid[top]).T)
         below = smooth < 0.5 * smooth[top] - SEARCH_RULE.edge_std * self.noise_of_means(noise_mm)
-        half = float(np.min(away, where=below, initial=float(away.max())))
-        return half / _RULE.half_depth
+        return float(np.min(away, where=below, initial=float(away.max()))) / _RULE.half_depth
 
     def find_reason(self, surface: UnrolledSurface, depths: np.ndarray, edge: float, deepest: int) -> str | None:
-        """Return why a blemish is not seen whole or not sized; None if it is.
-
-        It is not seen whole if there are places without points within its contour or directly beyond.
-        """
+        """Return why a blemish is not seen whole (places in it or beside it have no points) or not sized, or None."""
         labelled: Any = ndimage.label((self.region & (depths > edge)).reshape(self.shape), np.ones((3, 3)))
         labels = labelled[0].ravel()
-        within = np.flatnonzero((labels == labels[deepest]) & (labels > 0))
-        if not len(within):
-            within = np.array([deepest])
+        within = np.union1d(np.flatnonzero((labels == labels[deepest]) & (labels > 0)), [deepest])
         turns = np.arange(8) * np.pi / 4
         around = _RULE.beyond * self.gap_mm * np.vstack([[0.0, 0.0], np.column_stack([np.cos(turns), np.sin(turns)])])
         probes = (self.grid[within, None] + around).reshape(-1, 2)
-        reach = 2 * self.gap_mm
-        near = surface.points_between(probes.min(axis=0) - reach, probes.max(axis=0) + reach)
+        near = surface.points_between(probes.min(axis=0) - 2 * self.gap_mm, probes.max(axis=0) + 2 * self.gap_mm)
         if np.any(KDTree(surface.places[near]).query(probes)[0] > self.gap_mm):
-            return f"not seen whole: no points {self.gap_mm:.2g} mm or less beyond its edge, or within it"
+            return f"not seen whole: the points end beside it, or have a gap of {2 * self.gap_mm:.2g} mm or more in it"
         own = KDTree(self.grid[within]).query(surface.places[near])[0] < self.cell
         if np.count_nonzero(own) < SEARCH_RULE.points_in_smallest:
             return f"not sized: {np.count_nonzero(own)} points show it; {SEARCH_RULE.points_in_smallest} are needed"

@@ -26,9 +26,10 @@ def test_no_verdict_on_a_damaged_pipe_is_false(kind: str, seed: int) -> None:
     assert not counts["not mentioned"] + counts["false within"] + counts["false exceeds"], counts
 
 
-def test_a_finding_cut_by_a_border_says_so() -> None:
-    """Its values are bounds, as text and as JSON, and the reason is stated."""
-    found = inspect(KINDS["pits cut by a border"](np.random.default_rng([200, 1])))
+@pytest.mark.parametrize("seed", [200, 418])
+def test_a_finding_cut_by_a_border_says_so(seed: int) -> None:
+    """Its values are bounds, as text and as JSON, and the reason is stated. The hole of 418 is 4 points wide."""
+    found = inspect(KINDS["pits cut by a border"](np.random.default_rng([seed, 1])))
     cut = [each for each in found.features if each.reason]
     assert len(cut) == 4
     for each in cut:
