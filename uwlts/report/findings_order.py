@@ -153,4 +153,4 @@ def format_place(feature: Feature, whole: Feature | None, start_mm: np.ndarray, 
     axis, up, _ = resolve_datum(datum, whole.axes[2])
     about = feature.place_mm - whole.place_mm
     minutes = round(720 * float(np.arctan2(about @ np.cross(axis, up), about @ up)) / (2 * np.pi)) % 720
-    return f"{minutes // 60 or 12}:{minutes % 60:02d}", f"{round(away @ axis)}"
+    return f"{minutes // 60 or 12}:{minutes % 60:02d}", f"{round(float(away @ axis))}"
