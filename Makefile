@@ -40,20 +40,16 @@ demo: $(INSTALLED)
 	@$(PYTHON) -m twin demo
 
 test: PYTEST_OPTIONS := -m "not slow"
-test-full: BESIDE := types oldest
+test-full: AFTERWARDS := types oldest
 # Threads of several test processes on two cores would wait for each other in every small product of matrices.
 test test-full: export OPENBLAS_NUM_THREADS := 1
 test test-full: style
 	@$(WITH_ARAVIS)
 	@# Without a browser only the tests of pages fail; without any font a page shows no text.
 	-@$(WITH_BROWSER)
-	@# Beside the tests, in time that those leave: many wait for simulated hardware and for pages.
-	@folder=$$(mktemp -d); jobs=; \
-	trap 'kill $$jobs 2>/dev/null; rm -rf $$folder' EXIT; trap 'exit 130' INT TERM; \
-	for name in $(BESIDE); do nice -n 19 $(BY_ITSELF) $$name >$$folder/$$name 2>&1 & jobs="$$jobs $$!"; done; \
-	$(PYTHON) -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS); failed=$$?; \
-	for job in $$jobs; do wait $$job || failed=$$((failed ? failed : $$?)); done; jobs=; \
-	for name in $(BESIDE); do echo "$$name:"; cat $$folder/$$name; done; exit $$failed
+	@# Nothing runs beside the tests: many check times, also on a slow machine.
+	@$(PYTHON) -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS); failed=$$?; \
+	for name in $(AFTERWARDS); do $(BY_ITSELF) $$name || failed=$$?; done; exit $$failed
 
 # Compiled loops are kept apart: both environments would replace those of the other.
 oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(OLDEST)/numba
@@ -61,9 +57,8 @@ oldest: export OPENBLAS_NUM_THREADS := 1
 oldest: setup $(OLDEST)/.installed
 	@$(WITH_ARAVIS)
 	@echo "oldest: documented commands with the oldest allowed libraries"
-	@# They use what newer libraries below them call outdated. Beside other tests each may take long.
-	@$(OLDEST)/bin/python -m pytest -q -n 2 --dist loadfile -o faulthandler_timeout=3600 \
-		-W default::DeprecationWarning \
+	@# They use what newer libraries below them call outdated.
+	@$(OLDEST)/bin/python -m pytest -q -n 2 --dist loadfile -W default::DeprecationWarning \
 		tests/test_documentation.py tests/system/test_documented_commands.py \
 		-k "test_documentation or README or api.md or calibrate-a-mount or large-clouds"
 
