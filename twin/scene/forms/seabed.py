@@ -22,8 +22,7 @@ class Seabed(FreeForm):
 
     Ripples are parallel to y, with ``ripple_pitch_mm`` between crests along x and ``ripple_height_mm`` from trough to
     crest. The surface has a roughness of up to ``roughness_mm``. ``stones`` of ``stone_diameter_mm`` are half buried at
-    random positions from ``seed`` (`seabed_height`). With ``smallest_stone_mm``, diameters are log-uniform between
-    both.
+    random positions from ``seed``. With ``smallest_stone_mm``, diameters are log-uniform between both.
     """
 
     kind: Literal["seabed"]
