@@ -85,13 +85,12 @@ class FrameCheck:
 
     ``period_s`` is the time between frames of a free-running camera. Without it the time stamp marks no frame as late.
     With ``triggered``, each frame answers a trigger.
-
-    Frames are lost only if there was time for them. Some cameras count other frames, too, or restart their count when
-    a setting changes: such a number is counted as ``renumbered``, and is no fault.
+    Frames are lost only if there was time for them. A number without, of cameras that count other frames, too, or
+    restart when a setting changes, is counted as ``renumbered``, and is no fault. Frames may come faster than stated.
     """
 
     def __init__(self, *, period_s: float | None = None, triggered: bool = False):
-        self._period_s, self._triggered = period_s, triggered
+        self._period_s, self._triggered, self._shortest_s = period_s, triggered, period_s
         self._last_id: int | None = None
         self._last_time_s: float | None = None
         self._counts: Counter[str] = Counter()
@@ -125,11 +124,11 @@ class FrameCheck:
 
     def _correct(self, advance: int, since_s: float | None) -> int:
         """Return the increment of the frame number that fits the time since the previous frame, if that is known."""
-        restarted, most = advance < 0 and since_s is not None and since_s > 0, math.inf
-        if self._triggered or restarted:
-            most = 1
-        elif self._period_s is not None and since_s is not None:
-            most = max(round(since_s / self._period_s), 1)
+        restarted = advance < 0 and since_s is not None and since_s > 0
+        most = 1 if self._triggered or restarted else math.inf
+        if most > 1 and self._shortest_s is not None and since_s is not None:
+            self._shortest_s = min(self._shortest_s, since_s) if advance == 1 and since_s > 0 else self._shortest_s
+            most = max(round(since_s / self._shortest_s), 1)
         self._counts["renumbered"] += restarted or advance > most
         return int(most) if restarted or advance > most else advance
 

@@ -49,6 +49,8 @@ def judged(frames: list[tuple[int, float | None, bool]], *, period_s: float | No
         ([(1, 0.0, True), (40, 0.1, True), (41, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3, renumbered=1)),
         ([(1, 0.0, True), (40, 0.3, True)], [OK, DROPPED], FrameCounts(ok=1, dropped=2, renumbered=1)),
         ([(57, 0.0, True), (1, 0.1, True), (2, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3, renumbered=1)),
+        # Faster than stated: there was time for the lost frame.
+        ([(1, 0.0, True), (2, 0.06, True), (4, 0.18, True)], [OK, OK, DROPPED], FrameCounts(ok=2, dropped=1)),
         ([(57, 0.0, True), (1, 0.4, True)], [OK, LATE], FrameCounts(ok=1, late=1, renumbered=1)),
     ],
 )
