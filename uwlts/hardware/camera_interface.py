@@ -85,6 +85,7 @@ class FrameCheck:
 
     ``period_s`` is the time between frames of a free-running camera. Without it the time stamp marks no frame as late.
     With ``triggered``, each frame answers a trigger.
+
     Frames are lost only if there was time for them. A number without, of cameras that count other frames, too, or
     restart when a setting changes, is counted as ``renumbered``, and is no fault. Frames may come faster than stated.
     """
@@ -127,7 +128,8 @@ class FrameCheck:
         restarted = advance < 0 and since_s is not None and since_s > 0
         most = 1 if self._triggered or restarted else math.inf
         if most > 1 and self._shortest_s is not None and since_s is not None:
-            self._shortest_s = min(self._shortest_s, since_s) if advance == 1 and since_s > 0 else self._shortest_s
+            if advance == 1 and since_s > 0:
+                self._shortest_s = min(self._shortest_s, since_s)
             most = max(round(since_s / self._shortest_s), 1)
         self._counts["renumbered"] += restarted or advance > most
         return int(most) if restarted or advance > most else advance
@@ -403,7 +405,7 @@ class CameraDevice(ABC):
             status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.seen is not None)
             if self.counts.renumbered and not self._renumbering_said:
                 self._renumbering_said = True
-                log_warnings(self.address, ["its frame numbers jump, but no frame is missing: time stamps decide"])
+                log_warnings(self.address, ["its frame numbers jump: time stamps or triggers show which are lost"])
             usable = status is FrameStatus.OK or (self._skip and status is not FrameStatus.DUPLICATED)
             if frame.seen is not None and usable:
                 self._later.extend(self._make_grabbed_frame(each, FrameStatus.OK) for each in frame.later)

@@ -353,9 +353,8 @@ class _Field:
         grid = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
         smooth = _quadratic_rows(grid, places, KDTree(places), bandwidth)
         # Beyond a border of the points quadratics would extrapolate.
-        spacing = measure_spacing(surface.places[near], np.flatnonzero(~ring))
-        gap = max(search.smallest_mm, float(np.max(spacing)))
-        region = KDTree(places[~ring]).query(grid)[0] < min(bandwidth, gap)
+        widest = float(np.max(measure_spacing(surface.places[near], np.flatnonzero(~ring))))
+        region = KDTree(places[~ring]).query(grid)[0] < min(bandwidth, max(search.smallest_mm, widest))
         stride = max(1, round(0.5 * bandwidth / cell))
         size = surface.footprint_mm[near]
         sharp = seen = _interpolation_rows((places - grid[0]) / cell, shape)
@@ -370,7 +369,7 @@ class _Field:
         if np.count_nonzero(far) >= _RULE.fewest_points:
             outer = fit_biweight(design, heights, far)[0] - plane
         known = surface.places[near], size, grid + middle, shape, cell
-        gap = max(search.gap_mm, float(np.max(spacing)))
+        gap = max(search.gap_mm, widest)
         return cls(near, *known, smooth, design, plane, outer, seen, sharp, surface.footprint_std, stride, region, gap)
 
     def depths(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:

@@ -231,8 +231,8 @@ def tiles(study: Study, chosen: HighlightedDesign, compared: HighlightedDesign |
     found = [tile(name, accent=True) for name in study.free()]
     found += [tile(name, accent=True, note="an objective") for name in objectives]
     found += [tile(name) for name in others]
-    required, used = (chosen.design.number_of(name) for name in ("required_ms", "exposure_ms"))
-    darker = f"required for the wanted brightness: {value_text('required_ms', required)}" * (required > 1.001 * used)
+    needs, used = (chosen.design.number_of(name) for name in ("required_ms", "exposure_ms"))
+    darker = f"required for the wanted brightness: {value_text('required_ms', needs)}" if needs > 1.001 * used else ""
     last = (("exposure_ms", darker), ("laser_class", "estimate, IEC 60825-1"))
     found += [tile(name, note=note) for name, note in last if name not in (*objectives, *others)]
     if "window_mm" not in objectives:
