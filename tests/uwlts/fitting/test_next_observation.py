@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, eliminate_others, rank_candidates
+from uwlts.fitting.next_observation import (
+    Candidate,
+    CovarianceRoot,
+    Forecast,
+    eliminate_others,
+    find_weak_directions,
+    rank_candidates,
+)
 
 RNG = np.random.default_rng(5)
 BY_PARAMETERS = RNG.normal(size=(40, 4)) * [1.0, 1e3, 1e-3, 1.0]
@@ -57,7 +64,19 @@ def test_a_candidate_is_advised_if_it_lowers_the_uncertainty_by_a_twentieth():
 
 
 def test_weak_directions_are_the_principal_components_of_the_lengths():
-    known = CovarianceRoot.from_covariance(np.diag([4.0, 1.0]))
-    (size, direction), (other, _) = known.weak_directions(np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
-    assert (size, other) == pytest.approx((2.0, 1.0))
-    assert np.abs(direction) == pytest.approx([2.0, 0.0])
+    weak, other = find_weak_directions(np.diag([4.0, 1.0]), np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
+    assert np.abs(weak.changes) == pytest.approx([2.0, 0.0, 0.0])
+    assert np.abs(other.changes) == pytest.approx([0.0, 1.0, 0.0])
+    assert (weak.parameters, other.parameters, weak.confused) == ([0], [1], False)
+
+
+def test_the_second_of_two_passes_is_ranked_after_the_first():
+    """Two passes determine the same parameter better than a third determines the other: one of each is chosen."""
+    known, lengths = CovarianceRoot(np.eye(2)), np.eye(2)
+    names = {"shift": [99, 0], "long shift": [120, 0], "lift": [0, 50]}
+    passes = [Candidate(words=name, information=np.diag(added)) for name, added in names.items()]
+    first = rank_candidates(known, lengths, passes)[0]
+    second = rank_candidates(first.known, lengths, [each for each in passes if each is not first.candidate])[0]
+    assert (first.candidate.words, second.candidate.words) == ("long shift", "lift")
+    assert second.before == first.after
+    np.testing.assert_allclose(second.known.covariance(), np.diag([1 / 121, 1 / 51]))
