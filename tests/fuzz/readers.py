@@ -51,8 +51,7 @@ from uwlts.report.file_description import describe
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
-from uwlts.storage.data_set import load_dataset
-from uwlts.storage.data_set_shards import Sample, ShardReader, open_shard
+from uwlts.storage.data_set import Sample, ShardReader, load_dataset, open_shard
 from uwlts.storage.figure_table import FigureTable, MeasuredFigure, read_figures
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, set_intrinsics

@@ -27,8 +27,7 @@ from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.runtime.workers import run_jobs
-from uwlts.storage.data_set import CARD, SPLITS, Split
-from uwlts.storage.data_set_shards import SUFFIX, Sample, open_shard
+from uwlts.storage.data_set import CARD, SPLITS, SUFFIX, Sample, Split, open_shard
 
 if TYPE_CHECKING:
     from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage

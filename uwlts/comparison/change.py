@@ -21,9 +21,8 @@ from uwlts.comparison.change_reference import (
     require_same_unit,
     stated_variance,
 )
-from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.comparison.ideal_shapes import IdealShape, place_shape
-from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, average_locally
+from uwlts.comparison.local_means import OPTIONS, TWO_SIDED, LocalMeans, average_locally
 from uwlts.comparison.seen_side import select_seen_side
 from uwlts.errors import EvaluationError
 from uwlts.fitting.point_spacing import choose_disc_diameter, number_cubes

@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial import KDTree
 
-from uwlts.comparison.comparison_options import OPTIONS
 from uwlts.comparison.ideal_shapes import KINDS, IdealShape, read_shape
+from uwlts.comparison.local_means import OPTIONS
 from uwlts.comparison.seen_side import orient_triangles
 from uwlts.errors import DescriptionError, EvaluationError, describe_problems
 from uwlts.evaluation.figures import TOWARDS_SENSOR

@@ -19,11 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.calibration.calibrate import calibrate
-from uwlts.desk.frame_profile import FrameProfile
 from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import BackgroundView, RecordingView
-from uwlts.desk.shown_state import Board, Picture
+from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera

@@ -10,9 +10,8 @@ from typing import Self
 
 import numpy as np
 
-from uwlts.desk.frame_profile import FrameProfile
 from uwlts.desk.server import DeskServer
-from uwlts.desk.shown_state import Board, Picture
+from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import CaptureError
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.storage.calibration_file import resolve_calibration

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.desk.frame_profile import FrameProfile
 from uwlts.desk.guided import Ended
 from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames
+from uwlts.desk.shown_state import FrameProfile
 from uwlts.errors import Error, HardwareError
 from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.grbl import GrblStage

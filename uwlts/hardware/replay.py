@@ -12,8 +12,7 @@ from uwlts.files.reading import is_regular_file, natural_key
 from uwlts.hardware.camera_interface import BUFFERS, CameraDevice, CameraInfo, CameraSettings, Delivered
 from uwlts.model.stripe import Coordinates, Stripe
 from uwlts.storage.capture import Capture
-from uwlts.storage.image_file import read_image
-from uwlts.storage.image_header import SUFFIXES
+from uwlts.storage.image_file import SUFFIXES, read_image
 
 
 class ReplayCamera(CameraDevice):

@@ -16,8 +16,7 @@ from uwlts.model.library import load_sensor, validate_description
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import CAPTURES, Capture
 from uwlts.storage.data_set import CARD, load_dataset
-from uwlts.storage.image_file import read_image
-from uwlts.storage.image_header import SUFFIXES
+from uwlts.storage.image_file import SUFFIXES, read_image
 from uwlts.stripe import PeakRule, StripeOptions, StripeSettings, extract_stripe
 
 _BITS = (8, 10, 12, 14, 16)

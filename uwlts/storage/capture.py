@@ -35,8 +35,16 @@ from uwlts.model.calibration import is_rigid
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import Camera, CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, StripeStatus
-from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_label, read_plan, read_values, require_small_chunks
-from uwlts.storage.unfinished_hdf5 import UnfinishedFile, has_writer
+from uwlts.storage.hdf5_file import (
+    DAMAGE,
+    UnfinishedFile,
+    find_dataset,
+    has_writer,
+    read_label,
+    read_plan,
+    read_values,
+    require_small_chunks,
+)
 
 FORMAT = "uwlts-capture"
 VERSION = 2

@@ -13,10 +13,9 @@ from uwlts.files.writing import write_atomically
 from uwlts.storage.cloud import PointCloud, find_float_step, make_foreign_cloud
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
 from uwlts.storage.las_file import encode_las, load_library, read_las
-from uwlts.storage.mcap_clouds import mcap_content, read_bag_cloud
 from uwlts.storage.normal_std import compute_normal_std
 from uwlts.storage.number_tables import Unit, read_number_table
-from uwlts.storage.point_cloud2 import covariance_columns
+from uwlts.storage.point_cloud2 import covariance_columns, mcap_content, read_bag_cloud
 
 Colours = np.ndarray | None
 

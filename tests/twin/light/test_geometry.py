@@ -33,7 +33,7 @@ from twin.light.renderer import Renderer
 from twin.light.sheet import Sheet
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
-from uwlts.storage.import_.equidistant import convert_equidistant
+from uwlts.storage.import_.camera_files import convert_equidistant
 
 RAY_MM = 3e-4
 

@@ -13,8 +13,8 @@ import uwlts
 from uwlts.cli import app
 from uwlts.comparison.change import SurfaceChange, _estimate_areas, _thin_points
 from uwlts.comparison.change_reference import read_reference, sample_mesh
-from uwlts.comparison.comparison_options import ComparisonOptions
 from uwlts.comparison.ideal_shapes import IdealCylinder, IdealPlane, IdealSphere, place_shape
+from uwlts.comparison.local_means import ComparisonOptions
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
 from uwlts.fitting.point_spacing import number_cubes
 from uwlts.registration.surface_registration import SampledSurface, register_to_surface

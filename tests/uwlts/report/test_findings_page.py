@@ -12,7 +12,7 @@ from uwlts.cli import app
 from uwlts.errors import EvaluationError, OutputError, SetupError
 from uwlts.files.writing import hash_file
 from uwlts.model.artefacts import SphereStandard
-from uwlts.pages import pdf
+from uwlts.pages import toolkit
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 
 DEPTH_MM = 1.5
@@ -96,7 +96,7 @@ def test_foreign_calibrations_and_missing_browsers_are_refused(folder, tmp_path,
     with pytest.raises(OutputError, match="give a name like a.html"):
         uwlts.report.write_findings(folder / "pipe.ply", out=tmp_path / "a.json")
     monkeypatch.delenv("CHROMIUM", raising=False)
-    monkeypatch.setattr(pdf, "shutil", SimpleNamespace(which=lambda name: None))
+    monkeypatch.setattr(toolkit, "shutil", SimpleNamespace(which=lambda name: None))
     with pytest.raises(SetupError, match="needs Chromium"):
         uwlts.report.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", pdf=True)
     assert {path.name for path in tmp_path.iterdir()} == {"other.json", "foreign.json"}

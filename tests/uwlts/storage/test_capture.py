@@ -21,8 +21,7 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage import capture_writer
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.hdf5_file import read_label, write_label
-from uwlts.storage.unfinished_hdf5 import has_writer, lookup3
+from uwlts.storage.hdf5_file import has_writer, lookup3, read_label, write_label
 
 ROOT = Path(__file__).resolve().parents[3]
 HEIGHT, WIDTH = 20, 24

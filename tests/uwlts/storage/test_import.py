@@ -15,8 +15,7 @@ from uwlts.files.reading import natural_key
 from uwlts.runtime.console import run
 from uwlts.storage.capture import NO_STAGE, Capture, part_path
 from uwlts.storage.export_ import export
-from uwlts.storage.image_file import read_image
-from uwlts.storage.image_header import SUFFIXES
+from uwlts.storage.image_file import SUFFIXES, read_image
 from uwlts.storage.import_ import import_images
 from uwlts.storage.import_.grey_values import extract_channel, grey_values
 from uwlts.storage.import_.matching import read_rows

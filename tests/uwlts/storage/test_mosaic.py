@@ -10,7 +10,7 @@ from tests.uwlts.storage.test_import import GIVEN, HEIGHT, WIDTH, folder_of, str
 from uwlts.errors import ImageError
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_ import import_images
-from uwlts.storage.import_.mosaic import demosaic, is_mosaic
+from uwlts.storage.import_.grey_values import demosaic, is_mosaic
 
 PATTERNS = ("RGGB", "GRBG", "GBRG", "BGGR")
 RED, GREEN, BLUE = (1.0, 0.08, 0.01), (0.1, 1.0, 0.2), (0.02, 0.3, 1.0)

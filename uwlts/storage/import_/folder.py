@@ -14,8 +14,7 @@ from uwlts.model.sensor import Sensor, Table
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import CAPTURES, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.image_file import read_image
-from uwlts.storage.image_header import ImageHeader
+from uwlts.storage.image_file import ImageHeader, read_image
 from uwlts.storage.import_.centre_lines import profile_rows
 from uwlts.storage.import_.folder_description import (
     NAME,
@@ -27,13 +26,14 @@ from uwlts.storage.import_.folder_description import (
 from uwlts.storage.import_.grey_values import (
     bits_of,
     combine_clipped,
+    demosaic,
     extract_channel,
     grey_values,
     is_formula,
+    is_mosaic,
     subtract_background,
 )
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
-from uwlts.storage.import_.mosaic import demosaic, is_mosaic
 from uwlts.stripe import Stripe
 from uwlts.stripe.capture_stripes import BLACK, FEWEST_LINES, WHITE, find_stripe_direction, is_black
 

@@ -22,8 +22,7 @@ from uwlts.model.library import (
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
 from uwlts.storage.capture import NO_STAGE, CaptureHeader
 from uwlts.storage.import_.camera_files import read_intrinsics, set_intrinsics
-from uwlts.storage.import_.grey_values import Channel, is_formula
-from uwlts.storage.import_.mosaic import BayerPattern
+from uwlts.storage.import_.grey_values import BayerPattern, Channel, is_formula
 from uwlts.targets import parse_target
 
 NAME = "import.toml"
