@@ -325,11 +325,11 @@ class _Evidence:
         bright = np.maximum(images.light - images.width * background, 1e-3) / (self.model * share)
         path_m = 1e-3 * (self.paths - self.path_mm)
         design = np.column_stack([np.ones_like(path_m), -path_m, self.fan, self.fan**2 - 1 / 3])
-        weight = _huber_weights(design[some], np.log(bright[some]))
+        weight, rest = _fit_robustly(design[some], np.log(bright[some]))
         root = np.sqrt(weight)
         # Rows for what is known: the fan's described power, and the attenuation if it is given.
         known = np.array([[0, 0, 1, 0], [0, 0, 0, 1]]) / _FAN_STD
-        scale = max(_scatter(design[some], np.log(bright[some]), weight), 1e-6)
+        scale = max(math.sqrt(np.average(rest**2, weights=weight)), 1e-6)
         rows = [design[some] * root[:, None] / scale, known]
         sides = [np.log(bright[some]) * root / scale, fan / _FAN_STD]
         if attenuation_per_m is not None:
@@ -409,22 +409,14 @@ def _fit_sigma(place_px: np.ndarray, profile: np.ndarray) -> float:
     return math.exp(float(found.x))
 
 
-def _huber_weights(design: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return Huber's weights: groups on edges, prints or scratches count less."""
-    weight = np.ones(len(values))
-    for _ in range(5):
+def _fit_robustly(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return Huber's weights, by which edges, prints or scratches count less, and the residuals of a linear fit."""
+    weight, rest = np.ones(len(values)), values
+    for _ in range(6):  # the weights then change by less than a thousandth
         root = np.sqrt(weight)
         rest = values - design @ np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
-        scale = robust_std(rest) + 1e-12
-        weight = np.minimum(1.0, 1.5 * scale / np.maximum(np.abs(rest), 1e-12))
-    return weight
-
-
-def _scatter(design: np.ndarray, values: np.ndarray, weight: np.ndarray) -> float:
-    """Return the weighted standard deviation of the residuals of a linear fit."""
-    root = np.sqrt(weight)
-    rest = values - design @ np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
-    return float(np.sqrt(np.average(rest**2, weights=weight)))
+        weight = np.minimum(1.0, 1.5 * (robust_std(rest) + 1e-12) / np.maximum(np.abs(rest), 1e-12))
+    return weight, rest
 
 
 def _not_separable(

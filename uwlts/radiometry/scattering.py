@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 _LEAST_MM = 1e-3
 """Least distance from the sheet, far below a pixel; light scattered by less stays in the stripe."""
@@ -59,9 +60,9 @@ class HaloKernel:
         for path_mm, mm_per_px in paths:
             distance = np.geomspace(_LEAST_MM, edges_px[-1] * mm_per_px, _DISTANCES)
             spread = line_spread(per_sr, distance, path_mm)
-            steps = 0.5 * np.diff(np.log(distance)) * (spread[1:] * distance[1:] + spread[:-1] * distance[:-1])
-            within = np.concatenate([[0.0], np.cumsum(steps)]) + spread[0] * distance[0]
-            held = np.interp(np.log(edges_px * mm_per_px), np.log(distance), within)
+            # Of the spread by the logarithm of the distance; light below the least distance stays in the stripe.
+            integral = CubicSpline(np.log(distance), spread * distance).antiderivative()
+            held = integral(np.log(edges_px * mm_per_px)) + spread[0] * distance[0]
             half[:-1] += np.concatenate([[2 * held[0]], np.diff(held)])
         self._transform = np.fft.rfft(np.concatenate([half, half[-2:0:-1]])).real
         place = np.fft.fftfreq(_CELLS, 1 / (_CELLS * STEP_PX))
