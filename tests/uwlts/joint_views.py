@@ -80,8 +80,8 @@ def target_series(sensor, *, medium=None, window=True, positions, bow=0.0, noise
         pixels = pixels[inside(pixels, sensor)]
         stripes.append(pixels + np.column_stack([np.zeros(len(pixels)), noise.draw(noise.stripe_px, len(pixels))]))
     names = [(0, n) for n in range(len(images))]
-    evidence = AirEvidence(TARGET, images, names, stripes, [], outliers=[0] * len(images))
-    return Series(ViewMedium(window, medium), evidence, None if tilts is not None else True, ["target"])
+    evidence = AirEvidence(TARGET, images, names, stripes, [], outliers=[0] * len(images), captures=["target"])
+    return Series(ViewMedium(window, medium), evidence, None if tilts is not None else True)
 
 
 def step_views(sensor: Sensor, *, noise=Noise(), tilts=(0.01, -0.02, 0.03)):

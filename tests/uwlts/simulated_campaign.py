@@ -262,8 +262,8 @@ def target_series(
         on_it = (np.abs((lit - origin) @ rotation)[:, :2] < 115.0).all(axis=1)
         pixels = seen(sensor, lit[on_it], index=index, window=view.window)
         stripes.append(stripe_noise(real, pixels[inside(pixels, sensor)], z_mm) + [0.0, real.gloss_px])
-    evidence = AirEvidence(TARGET, images, [(0, n) for n in range(len(images))], stripes, [])
-    return Series(view, evidence, True, ["target"])
+    evidence = AirEvidence(TARGET, images, [(0, n) for n in range(len(images))], stripes, [], captures=["target"])
+    return Series(view, evidence, True)
 
 
 def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -> list[tuple[StepEvidence, ViewMedium]]:

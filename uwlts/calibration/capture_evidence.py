@@ -1,7 +1,7 @@
 """Evidence in captures for a calibration: target points, stripes on the target, stripes on the step standard."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -23,6 +23,7 @@ from uwlts.targets import Target, TargetView, parse_target
 
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
 _MANY_OUTLIERS = 0.05  # fraction of a capture's stripe points above which rejected points give a warning
+_MOST_ROWS = 30  # of the table of images in a refusal
 _LOOKED_AT = 15  # images of a capture that are searched for the reason of a missing stripe
 
 
@@ -42,6 +43,16 @@ class AirEvidence:
     def names(self) -> list[str]:
         """Return capture and frame of each image."""
         return [f"{self.captures[capture]}, frame {frame}" for capture, frame in self.frames]
+
+    def table(self, off_px: Mapping[str, Sequence[float]]) -> str:
+        """Return lines on the images, the worst first; ``off_px`` lists the scatter of points and stripe by name."""
+        rows = [*zip(self.names(), self.images, self.stripes, strict=True)]
+        rows.sort(key=lambda row: -max(off_px.get(row[0], (0.0,))))
+        said = [f"{'image':<32}{'stage, mm':>10}{'points':>8}{'stripe':>8}  scatter of both, px"]
+        for name, image, stripe in rows[:_MOST_ROWS]:
+            off = ", ".join(f"{each:.2f}" for each in off_px.get(name, ()))
+            said.append(f"{name:<32}{image.stage_mm:>10g}{len(image.pixels):>8}{len(stripe):>8}  {off or '-'}")
+        return "\n".join(["", *said, *([f"and {len(rows) - _MOST_ROWS} more"] if len(rows) > _MOST_ROWS else [])])
 
     def only(self, chosen: np.ndarray, images: list[TargetImage]) -> "AirEvidence":
         """Return the chosen images, with their points replaced."""

@@ -10,7 +10,7 @@ from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
 from uwlts.errors import CalibrationError
-from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD
+from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD, robust_std
 from uwlts.fitting.schur_least_squares import LocalPrior, Observation, SchurFit, schur_least_squares
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Uncertainty
@@ -128,13 +128,13 @@ def estimate(
     """
     found, local, rounds, known = list(evidence), list(local), 0, dict(_FIRST)
     left_out: list[list[np.ndarray]] | None = None
-    moved = np.inf
+    moved, residuals = np.inf, list[list[Residuals]]()
     for number in range(_ROUNDS):
         first, last = number == 0, number == _ROUNDS - 1
         thinned = [e.with_stripes(_FIRST_LINES) if isinstance(e, TargetEvidence) else e for e in evidence]
         fit = _fit(parameters, thinned if first else evidence, global_values, local, uncertainty, known, left_out)
         global_values, local, rounds = fit.global_values, fit.local[:-1], rounds + fit.rounds
-        residuals = []
+        residuals.clear()
         for piece, values in zip(evidence, local, strict=True):
             if (parts := piece.residuals(parameters, global_values, values)) is None:
                 raise CalibrationError(
@@ -168,9 +168,15 @@ def estimate(
                 rounds=rounds,
                 stopped=fit.stopped if steady else UNSETTLED,
             )
+    times, kind, worst = max(
+        (robust_std(part.values) / known[part.kind].sigma_px, part.kind, piece.sources[part.image])
+        for piece, parts in zip(found, residuals, strict=True)
+        for part in parts
+    )
     raise CalibrationError(
         f"the joint calibration did not converge in {_ROUNDS} rounds: the offsets of the circles' images still change "
-        f"by {moved:.2g} px; check the diameter of the circles"
+        f"by {moved:.2g} px; check the diameter of the circles, and {worst}, where the {kind} scatters {times:.1f} "
+        "times as much as usual"
     )
 
 

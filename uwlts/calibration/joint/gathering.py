@@ -46,7 +46,7 @@ Scanned = SphereStandard | PlaneStandard | PipeStandard
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Images of the target through the same window and medium, from captures with these names.
+    """Images of the target through the same window and medium.
 
     ``approaching`` says whether the stage moves the sensor towards the target; None if it moves in another direction.
     ``directions`` (3,) are the stage directions of the captures, OCS.
@@ -55,17 +55,11 @@ class Series:
     view: ViewMedium
     found: AirEvidence
     approaching: bool | None
-    names: list[str]
     directions: Sequence[tuple[float, float, float]] = ()
 
     def placements(self, *, free: bool) -> list[Placement]:
         """Return placements: images joined by the stage's motion, or single images if ``free``."""
         return placements(self.found.images, approaching=None if free else self.approaching)
-
-    def sources(self, images: np.ndarray) -> dict[int, str]:
-        """Return capture and frame for each image number."""
-        frames = {int(image): self.found.frames[image] for image in images}
-        return {image: f"{self.names[capture]}, frame {frame}" for image, (capture, frame) in frames.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +120,7 @@ class Gathered:
         """Remove images by name; return None if too few of a series, the steps or a scan would remain."""
         series = []
         for each in self.series:
-            kept = [n for n, name in each.sources(np.arange(len(each.found.images))).items() if name not in sources]
+            kept = [n for n, name in enumerate(each.found.names()) if name not in sources]
             if not _remain_enough(len(kept), len(each.found.images)):
                 return None
             series.append(replace(each, found=each.found.only(np.array(kept), [each.found.images[n] for n in kept])))
@@ -167,7 +161,7 @@ def gather_jointly(
         found = find_air_evidence(captures, stripe=options.stripe, progress=progress)
         warnings += found.warnings
         directions = [capture.header.stage_direction for capture in captures]
-        series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures], directions))
+        series.append(Series(view, found, _approaching(captures), directions))
     for capture in steps:
         view, index = _identify_view(capture, media), options.medium_index
         found_steps, left_out = step_evidence([capture], medium_index=index, stripe=options.stripe, progress=progress)

@@ -1,6 +1,7 @@
 """Initial values of the joint estimate: camera, poses and sheet, lines of steps, surfaces of scans."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import assert_never
@@ -8,9 +9,15 @@ from typing import assert_never
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera.camera_parameters import DISTORTION, Intrinsics
+from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics
 from uwlts.calibration.camera.target_images import Placement
-from uwlts.calibration.camera.target_poses import placement_pose, refuse_turned_travel, solve_camera, stage_direction
+from uwlts.calibration.camera.target_poses import (
+    CameraSolution,
+    placement_pose,
+    refuse_turned_travel,
+    solve_camera,
+    stage_direction,
+)
 from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series, list_added_tangential
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.residuals import StepProfileEvidence, TargetEvidence
@@ -43,6 +50,12 @@ from uwlts.shapes.step import StepFace
 
 _LARGEST_MISFIT_PX = 1.5  # largest median residual of the images that a start is found from, caused by stage errors
 _LARGEST_MISFIT = 1e-3  # the same divided by the focal length, for high-resolution images; the larger limit applies
+_DRAWN = 4  # images that are drawn together to find some that are right: the fewest that determine a camera well
+_DRAWS = 25  # if 30 % of the images are wrong, one draw of four is right in all of 25 but once in a thousand
+_ODD = 8.0
+"""Ratio to the scatter of the best drawn images above which an image is wrong: distortion, which is left out here, and
+the chance that made them the best change it by a factor of three."""
+_FINEST_PX = 0.25  # scatter that images with some distortion have
 _LARGEST_REJECTED = 0.45
 """Largest fraction of stripe points off the start's sheet: the limit of a median; inliers are selected again later.
 """
@@ -137,26 +150,16 @@ def estimate_series_start(
     extended = replace(camera, distortion=(*camera.distortion, *tangential))
     intrinsics = Intrinsics(extended, width_px=width_px, height_px=height_px)
     base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
-    staged = not free and base.approaching is not None
-    solve = partial(
-        solve_camera,
-        base.found.images,
-        width_px=width_px,
-        height_px=height_px,
-        poses="stage-normal" if staged else "free",
-        approaching=bool(base.approaching),
-    )
+    solve = _camera_solver(base, sensor, options)
     try:
-        seen = solve(options=camera)
-    except CalibrationError:
-        seen = solve(options=replace(camera, distortion=()))  # coefficients that are not determined start at zero
+        seen = solve(base.found.images, options=camera)
+    except CalibrationError:  # coefficients that are not determined start at zero
+        seen = solve(base.found.images, options=replace(camera, distortion=()))
     rms = seen.image_rms_px()
-    explained = np.median(rms) <= max(_LARGEST_MISFIT_PX, _LARGEST_MISFIT * seen.model.fx_px)
-    if base.view == ViewMedium(False, None) and not explained:
-        image = int(np.argmax(rms))
+    if base.view == ViewMedium(False, None) and not np.median(rms) <= _largest_misfit_px(seen.model.fx_px):
         raise CalibrationError(
             f"no camera fits the target images in air: the median residual is {np.median(rms):.1f} px (rms), and "
-            f"{rms.max():.1f} px in {base.sources(np.array([image]))[image]}: check the target's spacing, the stage's "
+            f"{rms.max():.1f} px in {base.found.names()[np.argmax(rms)]}: check the target's spacing, the stage's "
             "positions, and that all captures are from the same camera and medium"
         )
     lens = intrinsics.from_model(seen.model)
@@ -175,6 +178,47 @@ def estimate_series_start(
         if free:
             _refuse_turned_images(part, start.local[-len(part.found.images) :], sensor)
     return start
+
+
+def _camera_solver(series: Series, sensor: Sensor, options: CalibrationOptions) -> Callable[..., CameraSolution]:
+    """Return the function that calibrates a camera without a window from images of a series."""
+    return partial(
+        solve_camera,
+        width_px=sensor.camera.width_px,
+        height_px=sensor.camera.height_px,
+        poses="free" if options.poses == "free" or series.approaching is None else "stage-normal",
+        approaching=bool(series.approaching),
+    )
+
+
+def _largest_misfit_px(focal_px: float) -> float:
+    return max(_LARGEST_MISFIT_PX, _LARGEST_MISFIT * focal_px)
+
+
+def find_odd_images(series: Series, sensor: Sensor, *, options: CalibrationOptions) -> dict[str, str]:
+    """Return images that contradict most others, by name with a message; empty if no few images agree.
+
+    Of many draws of a few images, those that a camera fits best are taken to be right; each other image is added alone.
+    """
+    solve, images = _camera_solver(series, sensor, options), series.found.images
+    pinhole, rng = CameraOptions((), sensor.camera.pixel_aspect), np.random.default_rng(0)
+
+    def misfit_px(numbers: Iterable[int]) -> float:
+        with suppress(CalibrationError):
+            return float(solve([images[number] for number in numbers], options=pinhole).image_rms_px().max())
+        return np.inf
+
+    draws = rng.permuted(np.tile(np.arange(len(images)), (_DRAWS, 1)), axis=1)[:, :_DRAWN].tolist()
+    agree_px, best = min((misfit_px(draw), draw) for draw in draws)
+    if len(images) <= _DRAWN or agree_px > _largest_misfit_px(sensor.camera.focal_length_px()):
+        return {}
+    off_px = {name: misfit_px({*best, number}) for number, name in enumerate(series.found.names())}
+    return {
+        name: f"{name}: the target is {f'{off:.1f} px off' if off < np.inf else 'as no camera sees it'}; other "
+        f"images agree to {agree_px:.2f} px (rms)"
+        for name, off in off_px.items()
+        if off > _ODD * max(agree_px, _FINEST_PX)
+    }
 
 
 def _refuse_turned_images(series: Series, poses: Sequence[np.ndarray], sensor: Sensor) -> None:
@@ -243,7 +287,7 @@ def _build_target_evidence(
         image=image,
         shifts_mm=shifts,
         across=1 if sensor.camera.stripe_along == "width" else 0,
-        sources=series.sources(numbers),
+        sources={number: found.names()[number] for number in numbers.tolist()},
         staged=staged,
         extent_mm=found.target.extent_mm,
     )

@@ -21,6 +21,7 @@ from uwlts.calibration.joint.diagnose import (
 )
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered
+from uwlts.calibration.joint.initial import find_odd_images
 from uwlts.calibration.joint.linearised_estimate import HalfDifference, compare_estimates, keep_images, split_in_halves
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.problem import JointProblem, joint_problem
@@ -47,7 +48,7 @@ def solve_consistently(
 
     Returns the problem, its estimate, the findings against it, and the changes.
     """
-    attempt = _Attempt.solve(gathered, options)
+    attempt = _solve_first(gathered, options)
     if not options.strict:
         attempt = attempt.improve()
     return attempt.problem, attempt.result, attempt.against, attempt.said
@@ -346,6 +347,20 @@ class _Attempt:
         )
         against = replace(against, unfit={}, misfits={})
         return replace(self, problem=problem, result=result, against=against, said=(*self.said, *said))
+
+
+def _solve_first(gathered: Gathered, options: CalibrationOptions) -> _Attempt:
+    """Solve for all images, or without those that contradict most others if these prevent a solution."""
+    try:
+        return _Attempt.solve(gathered, options)
+    except CalibrationError as refusal:
+        odd: dict[str, str] = {}
+        for series in gathered.series:
+            odd |= find_odd_images(series, gathered.sensor, options=options)
+        kept = gathered.remove_images(odd) if odd and not options.strict else None
+        if kept is None:
+            raise CalibrationError("; ".join([str(refusal), *odd.values()])) from refusal
+        return _Attempt.solve(kept, options, tuple(f"{words}; left out" for words in odd.values()))
 
 
 @dataclass(frozen=True)

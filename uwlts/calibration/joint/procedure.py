@@ -12,6 +12,7 @@ from uwlts.calibration.joint.scanned_surfaces import ScannedPlane, SurfaceScanEv
 from uwlts.calibration.joint.stored_estimate import build_calibration
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
+from uwlts.fitting.least_squares import robust_std
 from uwlts.model.calibration import Calibration, KnownStage
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture
@@ -50,9 +51,17 @@ def calibrate_jointly(
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
     """Calibrate from gathered evidence; errors as `calibrate_jointly`."""
-    problem, result, against, changes = solve_consistently(gathered, options)
-    if against.all_against():
-        raise CalibrationError(against.refusal())
+    off_px: dict[str, list[float]] = {}
+    try:
+        problem, result, against, changes = solve_consistently(gathered, options)
+        if against.all_against():
+            for piece, parts in zip(problem.evidence, result.residuals, strict=True):
+                for part in parts:
+                    off_px.setdefault(piece.sources[part.image], []).append(robust_std(part.values))
+            raise CalibrationError(against.refusal())
+    except CalibrationError as error:
+        table = "".join(series.found.table(off_px) for series in gathered.series)
+        raise CalibrationError(f"{error}{table}") from error
     sensor, warnings = gathered.sensor, [*problem.warnings, *changes, *against.doubts]
     provenance: dict[str, JsonValue] = {
         **gathered.provenance,

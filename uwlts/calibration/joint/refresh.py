@@ -1,13 +1,14 @@
 """Refresh a joint calibration with images in new water: its index, and the uncertainty of lengths in it."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from pydantic import JsonValue
 
+from uwlts.calibration.joint.diagnose import format_deviation
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered, build_priors, gather_jointly
 from uwlts.calibration.joint.initial import build_step_evidence, estimate_line_start
@@ -292,36 +293,24 @@ def solve_refreshed(
     problem = JointProblem(parameters, profiles, start, lines, gathered.sensor, None, warnings)
     result, against = solve_and_check(problem)
     if against.all_against():
-        raise CalibrationError(_explain_contradiction(problem, earlier) or against.refusal())
+        raise CalibrationError(_explain_by_index(problem, gathered.media) or against.refusal())
     warnings += against.doubts
     refreshed = build_refreshed_calibration(calibration, gathered, result, profiles, warnings=warnings)
     return Refreshed(refreshed, compute_water_changes(refreshed, result, earlier), warnings)
 
 
-def _explain_contradiction(problem: JointProblem, earlier: EarlierEstimate) -> str:
-    """Describe an index that makes contradicting steps consistent, or return an empty text."""
-    parameters = problem.parameters
-    new = [key for key in parameters.keys[len(earlier.values) :] if isinstance(key, MediumIndex)]
-    free = {key: replace(parameters.priors[key], std=_ANY_INDEX) for key in new}
-    freed = replace(problem, parameters=replace(parameters, priors=parameters.priors | free))
-    result, against = solve_and_check(freed)
-    if against.all_against():
-        return ""
-    found = dict(zip(parameters.keys, result.values, strict=True))
-    words = []
-    for key in new:
-        known, std = parameters.priors[key], result.std()[key]
-        sigmas = abs(found[key] - known.mean) / np.hypot(std, known.std)
-        if sigmas >= _CONTRADICTED:
-            words.append(
-                f"from the steps, the {key.text} is {found[key]:.4f} +- {std:.2g}, {sigmas:.1f} standard "
-                f"uncertainties from the described {known.mean:.5f} +- {known.std:.2g}"
-            )
-    advice = (
-        ": check the step's height and the water's temperature and salinity in the captures, or give the known index "
-        "with `index` and `index_std`; if they are right, the sensor has changed: calibrate again"
+def _explain_by_index(problem: JointProblem, media: Iterable[str]) -> str:
+    """Describe an index of new media that makes contradicting steps consistent, or return an empty text."""
+    known = {key: problem.parameters.priors[key] for key in map(MediumIndex, media)}
+    free = problem.parameters.priors | {key: replace(prior, std=_ANY_INDEX) for key, prior in known.items()}
+    result, against = solve_and_check(replace(problem, parameters=replace(problem.parameters, priors=free)))
+    found, std = dict(zip(result.parameters.keys, result.values.tolist(), strict=True)), result.std()
+    off = {key: abs(found[key] - prior.mean) / float(np.hypot(std[key], prior.std)) for key, prior in known.items()}
+    return "; ".join(
+        format_deviation(key, found[key], prior.mean, prior.std, sigmas=off[key])
+        for key, prior in known.items()
+        if off[key] >= _CONTRADICTED and not against.all_against()
     )
-    return "; ".join(words) + advice if words else ""
 
 
 def _require_earlier(calibration: Calibration) -> StoredEstimate:

@@ -120,25 +120,14 @@ def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple
         for u, w, y in product((low[0], high[0]), (low[1], high[1]), (depth, -depth)):
             section = np.sqrt(radius**2 - y**2)
             arc = np.column_stack([u + section * np.cos(angle), np.zeros(_POINTS), w + section * np.sin(angle)])
-            views.append(
-                (_to_sensor(arc, sheet), _to_sensor(np.array([u, y, w]), sheet), _describe_place(sheet, u, y, w))
-            )
+            views.append((arc, np.array([u, y, w])))
     else:
         for u, w in product((low[0], high[0]), (low[1], high[1])):
             line = np.column_stack([np.linspace(low[0], high[0], _POINTS), np.zeros(_POINTS), np.full(_POINTS, w)])
-            views.append(
-                (_to_sensor(line, sheet), _to_sensor(np.array([u, 0.0, w]), sheet), _describe_place(sheet, u, 0.0, w))
-            )
-    return views
-
-
-def _describe_place(sheet: np.ndarray, u: float, y: float, w: float) -> str:
-    at = _to_sensor(np.array([u, y, w]), sheet)
-    return f"at x = {at[0]:.0f}, y = {at[1]:.0f}, z = {at[2]:.0f} mm of the sensor's frame"
-
-
-def _to_sensor(points: np.ndarray, sheet: np.ndarray) -> np.ndarray:
-    return points @ sheet[:3, :3].T + sheet[:3, 3]
+            views.append((line, np.array([u, 0.0, w])))
+    both = [tuple(each @ sheet[:3, :3].T + sheet[:3, 3] for each in view) for view in views]
+    where = "at x = {:.0f}, y = {:.0f}, z = {:.0f} mm of the sensor's frame".format
+    return [(points, place, where(*place)) for points, place in both]
 
 
 def _on_plane(

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,27 +11,11 @@ from uwlts.calibration.sequential.step_images import StepImage
 from uwlts.calibration.sequential.window_distance import WindowSolution
 from uwlts.model.sensor import Uncertainty
 
-
-@dataclass(frozen=True)
-class PlausibilityRule:
-    """Limits for doubts about stated sizes.
-
-    Chosen on views of the as-built thesis sensor without drawn pixels, two draws of each fault; judged on other draws
-    and on drawn images of a coarse sensor.
-    """
-
-    rough: float = 2e-3
-    """Least relative error for a doubt: the usual error of sizes that are stated without an uncertainty."""
-    sigmas: float = 4.0  # least error for a doubt in standard uncertainties: one normal error in 16,000 is larger
-    fewest_steps: int = 4
-    """Step images for an estimate of the height: fewer leave no scatter beside distance and height."""
-
-    def exceeds(self, error: float, std: float) -> bool:
-        """Return whether a relative error with its standard uncertainty is a doubt."""
-        return abs(error) > max(self.rough, self.sigmas * std)
-
-
-_RULE = PlausibilityRule()
+# Limits for doubts about stated sizes. Chosen on views of the as-built thesis sensor without drawn pixels, two draws of
+# each fault; judged on other draws and on drawn images of a coarse sensor.
+_ROUGH = 2e-3  # least relative error: the usual error of sizes that are stated without an uncertainty
+_SIGMAS = 4.0  # least error in standard uncertainties: one normal error in 16,000 is larger
+_FEWEST_STEPS = 4  # images of a step for its height: fewer leave no scatter beside distance and height
 
 
 def doubt_target_size(images: Sequence[TargetImage], free: CameraSolution, *, known: Uncertainty) -> list[str]:
@@ -59,7 +42,7 @@ def doubt_target_size(images: Sequence[TargetImage], free: CameraSolution, *, kn
     rows, columns = known.stretch_by_axis()
     parts = math.sqrt(rests / freedom / squares), max(std.values(), default=0.0), known.stage_scale, rows, columns
     error, total = moved / squares - 1, math.hypot(*parts)
-    if not _RULE.exceeds(error, total):
+    if abs(error) <= max(_ROUGH, _SIGMAS * total):
         return []
     return [
         f"distances between the target's poses differ by {100 * error:+.2f} ± {100 * total:.2f} % from the stage's "
@@ -74,7 +57,7 @@ def doubt_step_height(window: WindowSolution, steps: Sequence[StepImage], *, kno
     the sensor, this finds nothing.
     """
     stated = np.array([step.height_mm() for step in steps])
-    if len(steps) < _RULE.fewest_steps:
+    if len(steps) < _FEWEST_STEPS:
         return []
     design = np.column_stack([window.slopes, -stated])
     found = np.linalg.lstsq(design, -window.errors_mm, rcond=None)[0]
@@ -85,7 +68,7 @@ def doubt_step_height(window: WindowSolution, steps: Sequence[StepImage], *, kno
         return []
     std = math.sqrt(variance * np.linalg.inv(design.T @ design)[1, 1])
     total = math.hypot(std, *(step.height_std_mm(known) / step.height_mm() for step in steps[:1]))
-    if not _RULE.exceeds(found[1], total):
+    if abs(found[1]) <= max(_ROUGH, _SIGMAS * total):
         return []
     return [
         f"the step fits best with a height {100 * found[1]:+.2f} ± {100 * total:.2f} % from the stated one, and a "

@@ -131,7 +131,11 @@ def calibrate_sequentially(
     capture does not describe its target or its step standard.
     """
     options = CalibrationOptions() if options is None else options
-    return solve(gather(air, steps, options=options, progress=progress), options=options)
+    evidence = gather(air, steps, options=options, progress=progress)
+    try:
+        return solve(evidence, options=options)
+    except CalibrationError as error:
+        raise CalibrationError(f"{error}{evidence.air.table({})}") from error
 
 
 def gather(

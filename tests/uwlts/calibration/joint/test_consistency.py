@@ -35,7 +35,11 @@ def views():
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(8))
     air = target_series(BUILT, window=False, positions=np.arange(8) * 35.0 - 200.0, noise=noise, columns=17)
     water = target_series(BUILT, medium=0, positions=np.arange(8) * 25.0 - 120.0, noise=noise, columns=17)
-    return replace(air, names=["air.h5"]), replace(water, names=["water.h5"])
+    return named(air, "air.h5"), named(water, "water.h5")
+
+
+def named(series, name):
+    return replace(series, found=replace(series.found, captures=[name]))
 
 
 def edited(series, edit):
@@ -54,7 +58,7 @@ def refusal(evidence, *, strict=False):
     """Return the reason for rejected evidence, with all lens models and rejection of images allowed."""
     with pytest.raises(CalibrationError) as error:
         solve_jointly(evidence, options=replace(OPTIONS, lens=LensChoice(), strict=strict))
-    return str(error.value)
+    return str(error.value).splitlines()[0]
 
 
 def lens_pulls(result, sensor):

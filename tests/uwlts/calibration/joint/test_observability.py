@@ -233,8 +233,8 @@ def shot(sensor, pose, view, spoilt):
     stripe = seen(sensor, lit, index=index, window=view.window)
     stripe = stripe[inside(stripe, sensor)]
     stripe = stripe + np.column_stack([np.zeros(len(stripe)), spoilt.draw(spoilt.stripe_px, len(stripe))])
-    evidence = AirEvidence(TARGET, [TargetImage(points[here], found, 0.0)], [(0, 0)], [stripe], [])
-    return Series(view, evidence, None, ["shot"])
+    evidence = AirEvidence(TARGET, [TargetImage(points[here], found, 0.0)], [(0, 0)], [stripe], [], captures=["shot"])
+    return Series(view, evidence, None)
 
 
 @pytest.mark.slow
