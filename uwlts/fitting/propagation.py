@@ -154,6 +154,16 @@ def jackknife(changes: np.ndarray) -> np.ndarray:
     return (len(changes) - 1) / max(len(changes), 1) * changes.T @ changes
 
 
+def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return derivatives (N, K) of flattened values by central differences with steps (K,); 0 for a zero step."""
+    columns = []
+    for number, size in enumerate(steps):
+        step = np.zeros(len(steps))
+        step[number] = size
+        columns.append((values(at + step) - values(at - step)).ravel() / (2 * size or 1.0))
+    return np.stack(columns, axis=1)
+
+
 class FittedShape(Protocol):
     """Fitted shape of `uwlts.shapes` with the derivatives of its distances."""
 

@@ -193,50 +193,38 @@ def calibrate_lens(
         The images determine no model, or contradict each other.
     """
 
-    def solve(
-        chosen: Sequence[TargetImage], start: CameraSolution | None = None, *, options: CameraOptions, circles: bool
-    ) -> CameraSolution:
-        return solve_camera(
-            chosen,
-            width_px=width_px,
-            height_px=height_px,
-            poses=poses,
-            approaching=approaching,
-            options=options,
-            start=start,
-            circle_diameter_mm=circle_diameter_mm if circles else None,
-        )
-
+    solve_centres = partial(solve_camera, width_px=width_px, height_px=height_px, poses=poses, approaching=approaching)
+    solve = partial(solve_centres, circle_diameter_mm=circle_diameter_mm)
     tried = _candidates(DISTORTIONS, choice, poses)
     usual = tried[0] if len(tried) == 1 else _candidates((_USUAL,), replace(choice, distortion="auto"), poses)[0]
 
-    plain = solve(images, options=usual, circles=True)
+    plain = solve(images, options=usual)
     wide = choice.distortion == "auto" and poses != "stage-normal" and _widest_deg(images, plain) > WIDE_DEG
     if wide:
         usual = replace(usual, distortion=_WIDE_USUAL)
-        plain = solve(images, options=usual, circles=True)
+        plain = solve(images, options=usual)
 
     def inliers(options: CameraOptions, plain: CameraSolution) -> list[np.ndarray]:
         """Return masks (N,) of the points near their predicted positions, from a robust fit near a plain one."""
-        robust = solve(images, plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)), circles=True)
+        robust = solve(images, start=plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)))
         return _inliers(robust)
 
     candidates: list[LensCandidate] = []
     options, keep = usual, inliers(usual, plain)
     good = [_remove_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _has_enough_inliers(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
-        centred = _correct_circles(good, solve(good, options=usual, circles=True))
+        centred = _correct_circles(good, solve(good, options=usual))
         squares: dict[CameraOptions, np.ndarray] = {}
         for further in (tried, _candidates(RATIONAL, choice, poses)):
             for number, each in enumerate(further):
-                squares[each] = _cross_validate(centred, partial(solve, options=each, circles=False))
+                squares[each] = _cross_validate(centred, partial(solve_centres, options=each))
                 progress(number + 1, len(further))
             candidates = compare_models(squares)
             options = select_model(candidates, usual)
             if choice.distortion != "auto" or ("k3" not in options.distortion and not wide):
                 break
     if options != usual:
-        keep = inliers(options, solve(images, options=options, circles=True))
+        keep = inliers(options, solve(images, options=options))
     left_out = {
         number: f"{100 * (1 - inside.mean()):.0f} % of its points are not where the other images predict them"
         for number, inside in enumerate(keep)
@@ -251,14 +239,14 @@ def calibrate_lens(
         and choice.tangential > 0
         and "p1" not in full.distortion
     ):
-        scatter = _scatter(solve([*cleaned.values()], options=options, circles=True))
+        scatter = _scatter(solve([*cleaned.values()], options=options))
         names = (*options.distortion, "p1", "p2")
         full = replace(options, distortion=names, tangential=(choice.tangential, max(scatter, _LEAST_SCATTER_PX)))
     intrinsics = Intrinsics(full, width_px=width_px, height_px=height_px)
-    solved_again = partial(solve, options=full, circles=False)
+    solved_again = partial(solve_centres, options=full)
     while True:
         chosen = [cleaned[number] for number in used]
-        solution = solve(chosen, options=full, circles=True)
+        solution = solve(chosen, options=full)
         centred = _correct_circles(chosen, solution)
         numbers = np.arange(len(used))
         all_but_one = [np.delete(numbers, number) for number in numbers]
@@ -407,14 +395,14 @@ def _solve_subsets(
     images: list[TargetImage],
     solution: CameraSolution,
     chosen: Sequence[np.ndarray],
-    solve: Callable[[Sequence[TargetImage], CameraSolution], CameraSolution],
+    solve: Callable[..., CameraSolution],
 ) -> list[CameraSolution | None]:
     """Solve for subsets of the images, given by their numbers; None if a subset does not determine the camera."""
     found: list[CameraSolution | None] = []
     for numbers in chosen:
         try:
             start = replace(solution, target_poses=solution.target_poses[numbers])
-            found.append(solve([images[number] for number in numbers], start))
+            found.append(solve([images[number] for number in numbers], start=start))
         except CalibrationError:
             found.append(None)
     return found

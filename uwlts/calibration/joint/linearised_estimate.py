@@ -48,29 +48,25 @@ class _Rows:
         return design.T @ design, design.T @ (self.values / self.scale)
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Predicted residuals of held-out images, in px: values and their kinds for each image, and parameters' number."""
+HeldOut = Sequence[tuple[np.ndarray, np.ndarray]]
+"""Predicted residuals of each held-out image, px, and their kinds."""
 
-    images: list[tuple[np.ndarray, np.ndarray]]
-    noise: dict[str, Noise]
-    parameters: int
 
-    def squares(self, noise: dict[str, Noise]) -> np.ndarray:
-        """Return the mean square (F,) of each image's errors relative to a noise, with clipped outliers.
+def mean_squares(held: HeldOut, noise: dict[str, Noise]) -> np.ndarray:
+    """Return the mean square (F,) of each held-out image's errors relative to a noise, with clipped outliers.
 
-        An image whose points are all outliers of the estimate counts as clipped.
-        """
-        found = []
-        for values, kinds in self.images:
-            if not len(values):
-                found.append(_CLIPPED**2)
-                continue
-            sigma = np.array([noise[kind].sigma_px for kind in kinds])
-            weight = np.array([noise[kind].sigma_px / noise[kind].effective_px() for kind in kinds]) ** 2
-            squares = np.minimum(np.square(values / sigma), _CLIPPED**2)
-            found.append(float(np.sum(weight * squares) / np.sum(weight)))
-        return np.array(found)
+    An image whose points are all outliers of the estimate counts as clipped.
+    """
+    found = []
+    for values, kinds in held:
+        if not len(values):
+            found.append(_CLIPPED**2)
+            continue
+        sigma = np.array([noise[kind].sigma_px for kind in kinds])
+        weight = np.array([noise[kind].sigma_px / noise[kind].effective_px() for kind in kinds]) ** 2
+        squares = np.minimum(np.square(values / sigma), _CLIPPED**2)
+        found.append(float(np.sum(weight * squares) / np.sum(weight)))
+    return np.array(found)
 
 
 @dataclass(frozen=True)
@@ -192,7 +188,7 @@ class LinearisedEstimate:
                     points = rows.kind == TARGET
                     local = -np.linalg.lstsq(rows.by_local[points], moved[points], rcond=None)[0]
                 found.append((moved + rows.by_local @ local, rows.kind))
-        return HeldOut(found, self._result.noise, self._count)
+        return found
 
     def compare_halves(self) -> list[HalfDifference]:
         """Compare the parameters estimated from every second image and from the others; empty if not determined.

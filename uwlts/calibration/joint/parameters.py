@@ -168,10 +168,6 @@ class SheetPoints:
     points: np.ndarray
     by: np.ndarray
 
-    def derivatives_along(self, directions: np.ndarray) -> np.ndarray:
-        """Return derivatives (N, 1 + P) of the points' coordinates along directions (3, N)."""
-        return np.einsum("in,nic->nc", directions, self.by)
-
 
 @dataclass(frozen=True, eq=False)
 class Parameters:

@@ -22,7 +22,13 @@ from uwlts.calibration.joint.diagnose import (
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered
 from uwlts.calibration.joint.initial import find_odd_images
-from uwlts.calibration.joint.linearised_estimate import HalfDifference, compare_estimates, keep_images, split_in_halves
+from uwlts.calibration.joint.linearised_estimate import (
+    HalfDifference,
+    compare_estimates,
+    keep_images,
+    mean_squares,
+    split_in_halves,
+)
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.problem import JointProblem, joint_problem
 from uwlts.calibration.joint.residuals import BENDS, STRETCH
@@ -218,9 +224,9 @@ class _Attempt:
     def improve(self) -> "_Attempt":
         """Change the problem by all rules in turn; contradictions of the description remain."""
         attempt = self
-        for rule in _RULES:
-            for _ in range(rule.times):
-                if (changed := rule.change(attempt)) is None:
+        for change, times in _RULES:
+            for _ in range(times):
+                if (changed := change(attempt)) is None:
                     break
                 attempt = changed
             if attempt.against.contradictions:
@@ -281,7 +287,7 @@ class _Attempt:
         if not tried:
             return self.options.camera
         noise = min((result for _, result in tried.values()), key=_scatter).noise
-        squares = {options: held.squares(noise) for options, (held, _) in tried.items()}
+        squares = {options: mean_squares(held, noise) for options, (held, _) in tried.items()}
         return select_model(compare_models(squares, least_gain=_LEAST_GAIN), self.options.camera)
 
     def _describe_lens(self, before: CameraOptions) -> "_Attempt":
@@ -363,22 +369,15 @@ def _solve_first(gathered: Gathered, options: CalibrationOptions) -> _Attempt:
         return _Attempt.solve(kept, options, tuple(f"{words}; left out" for words in odd.values()))
 
 
-@dataclass(frozen=True)
-class _Rule:
-    """Change of the problem, up to ``times`` times; the change returns None if nothing calls for it."""
-
-    change: Callable[[_Attempt], _Attempt | None]
-    times: int = 1
-
-
-# In the order in which they change least of what was described.
-_RULES = (
+# Changes of the problem, and how often each is made at most, in the order in which they change least of what was
+# described. They return None if nothing calls for them.
+_RULES: tuple[tuple[Callable[[_Attempt], _Attempt | None], int], ...] = (
     # Other coefficients or another pixel shape, if something is odd and the options leave the lens open.
-    _Rule(_Attempt._with_better_lens),
+    (_Attempt._with_better_lens, 1),
     # Images that contradict all others are left out; what remains after three rounds has another cause.
-    _Rule(_Attempt._without_unfit, times=3),
+    (_Attempt._without_unfit, 3),
     # Images still show systematic deviations, or their halves disagree: all residuals of an image count as one.
-    _Rule(_Attempt._with_error_of_model),
+    (_Attempt._with_error_of_model, 1),
 )
 
 

@@ -126,7 +126,7 @@ class StripeEvidence(ABC):
 
         ``least_share`` is the minimum ratio of the distance change to the point's shift per pixel.
         """
-        by = points.derivatives_along(off.outward)
+        by = np.einsum("in,nic->nc", off.outward, points.by)
         by_px, by_global = by[:, 0], by[:, 1:]
         for key, column in off.by_global.items():
             parameters.add(by_global, key, column)

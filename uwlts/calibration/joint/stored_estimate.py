@@ -15,6 +15,7 @@ from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
 from uwlts.calibration.joint.residuals import TARGET, SeenSheet
 from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import CalibrationError
+from uwlts.fitting.propagation import differences
 from uwlts.model.calibration import Calibration, KnownMedium
 from uwlts.model.joint_estimate import CoveredRegion, ImageFit, JointEstimate
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, SheetParameter, WindowParameter, parse_parameter
@@ -165,20 +166,14 @@ class StoredEstimate:
 
         The OCS is defined by the sheet, so it changes with the sheet's parameters.
         """
-        axis, here = self.parameters.sheet.axis, self.calibration.object_transform()
-        result = np.zeros((6, len(self.values)))
-        for column, key in enumerate(self.parameters.keys):
-            if not isinstance(key, SheetParameter):
-                continue
-            moved = []
-            for step in (_FRAME_STEP, -_FRAME_STEP):
-                values = self.values.copy()
-                values[column] += step
-                moved.append(np.linalg.inv(here) @ object_frame(self.parameters.sheet_model(values), laser_axis=axis))
-            result[:3, column] = (moved[0] - moved[1])[:3, 3] / (2 * _FRAME_STEP)
-            turned = moved[0][:3, :3] @ moved[1][:3, :3].T
-            result[3:, column] = Rotation.from_matrix(turned).as_rotvec() / (2 * _FRAME_STEP)
-        return result
+        axis, inverse = self.parameters.sheet.axis, np.linalg.inv(self.calibration.object_transform())
+
+        def moved(values: np.ndarray) -> np.ndarray:
+            frame = inverse @ object_frame(self.parameters.sheet_model(values), laser_axis=axis)
+            return np.append(frame[:3, 3], Rotation.from_matrix(frame[:3, :3]).as_rotvec())
+
+        steps = [_FRAME_STEP * isinstance(key, SheetParameter) for key in self.parameters.keys]
+        return differences(moved, self.values, np.array(steps))
 
     def across(self) -> int:
         """Return the pixel coordinate that runs across the stripe."""

@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from uwlts.model.mount import PlaneFound, SphereFound
+from uwlts.optics.window import tilt_direction
 from uwlts.shapes.flat import perpendicular_to
 from uwlts.shapes.profile_curves import Detection, find_arc, find_line
 from uwlts.storage.mount_files import Artefact
@@ -41,14 +42,6 @@ class Shape(ABC):
     @abstractmethod
     def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         """Find the artefact in a profile (N, 2), or return None."""
-
-    def find_again(
-        self, points: np.ndarray, off_mm: np.ndarray, reach_mm: float, rng: np.random.Generator
-    ) -> Detection | None:
-        """Find the artefact in a profile (N, 2) again; ``off_mm`` (N,) are distances from its estimate."""
-        near = np.abs(off_mm) < reach_mm
-        seen = self.find(points[near], rng)
-        return None if seen is None else seen.expand(near)
 
     @abstractmethod
     def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -107,7 +100,7 @@ class PlaneShape(Shape):
         return find_line(points, rng)
 
     def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return np.append(_rotate_normal(values[:3], step[:2]), values[3] + step[2])
+        return np.append(tilt_direction(values[:3], perpendicular_to(values[:3]), step[:2])[0], values[3] + step[2])
 
     def distances(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
         return points @ values[:3] - values[3]
@@ -124,8 +117,3 @@ class PlaneShape(Shape):
 
 
 SHAPES: dict[Artefact, type[Shape]] = {each.kind: each for each in (SphereShape, PlaneShape)}
-
-
-def _rotate_normal(normal: np.ndarray, step: np.ndarray) -> np.ndarray:
-    turned = normal + step @ perpendicular_to(normal)
-    return turned / np.linalg.norm(turned)

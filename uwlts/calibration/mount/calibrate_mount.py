@@ -12,7 +12,7 @@ from uwlts.calibration.mount.artefact_shapes import SHAPES
 from uwlts.calibration.mount.captured_profiles import CapturedProfiles, mount_covariance, reconstruct_profiles
 from uwlts.calibration.mount.hand_eye import mount_by_board
 from uwlts.calibration.mount.next_pose import NextPose, next_pose, require_determined, weaknesses
-from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, from_sheet, to_sheet
+from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, from_sheet, thin, to_sheet
 from uwlts.calibration.mount.restricted_likelihood import (
     LARGEST_ROUGH,
     NotSettled,
@@ -196,7 +196,7 @@ class _Calibration:
         self.shape = SHAPES[evidence.artefact](evidence.radius_mm)
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
-        self.rows = [_thin(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
+        self.rows = [thin(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
         chosen = [each[rows] for each, rows in zip(evidence.profiles, self.rows, strict=True)]
         self.profiles = [each if each.shape[1] == 3 else from_sheet(each) for each in chosen]
         self.sheet = _sheet_frame(self.profiles)
@@ -253,7 +253,7 @@ class _Calibration:
             self._require_enough(np.flatnonzero(kept))
 
         # Select the likelier estimate of two starts: this one, and unweighted least squares of all distances.
-        starts = [(each, np.array(scatter)) for each in (state, problem.solve_unweighted(state))]
+        starts = [(each, np.array(scatter)) for each in (state, problem.solve(state))]
         found, good = settle_agreeing(
             problem, starts, require=lambda good: self._require_enough(np.flatnonzero(kept)[good])
         )
@@ -384,19 +384,13 @@ class _Calibration:
         return used.project(state, used.project_on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
 
 
-def _thin(points: np.ndarray, most: int) -> np.ndarray:
-    if len(points) <= most:
-        return points
-    return points[np.linspace(0, len(points) - 1, most).astype(int)]
-
-
 def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
     """Return the frame (4, 4) of the plane of all points, with x and z in it; the identity if y is 0 everywhere."""
     points = np.vstack(profiles)
     if not points[:, 1].any():
         return np.eye(4)
     middle = points.mean(axis=0)
-    extents, axes = np.linalg.svd(_thin(points - middle, 20_000), full_matrices=False)[1:]
+    extents, axes = np.linalg.svd(thin(points - middle, 20_000), full_matrices=False)[1:]
     if extents[2] > 0.02 * extents[1]:
         raise CalibrationError(
             "the profiles are not in one plane of the sensor's frame; expected points of a laser sheet, in the "

@@ -6,7 +6,7 @@ The same estimate gives the axis of a rotary table that turns the target.
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Self
 
 import cv2
@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from uwlts.calibration.camera.target_poses import centre_offsets
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate
 from uwlts.calibration.mount.captured_profiles import mount_covariance
 from uwlts.calibration.mount.next_pose import OPEN_RAD, describe_missing_turns, require_determined, weaknesses
@@ -26,6 +27,7 @@ from uwlts.calibration.mount.restricted_likelihood import (
 )
 from uwlts.errors import CalibrationError, DescriptionError, TargetError
 from uwlts.files.writing import hash_file
+from uwlts.fitting.propagation import differences
 from uwlts.model.calibration import Calibration, WindowModel, rigid_transform
 from uwlts.model.mount import BoardFound, Mount, MountPose
 from uwlts.optics.camera import directions, project_through_window
@@ -34,7 +36,6 @@ from uwlts.optics.window import trace_window
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
 from uwlts.targets import Target, parse_target
-from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 FEWEST_IMAGES = 4
 """Three poses with rotations about two axes determine the mount; a fourth one shows whether they agree."""
@@ -132,10 +133,10 @@ def mount_by_board(
     distance = float(np.median([image.camera_from_target[2, 3] for image in used.images]))
     rms_px = float(np.sqrt(np.mean([image.rms_px**2 for image in used.images])))
     return Mount(
-        T_platform_sensor=_rows(state[0]),
+        T_platform_sensor=tuple(map(tuple, state[0].tolist())),
         covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
         coverage_factor=factor,
-        artefact=BoardFound(T_base_target=_rows(state[1])),
+        artefact=BoardFound(T_base_target=tuple(map(tuple, state[1].tolist()))),
         point_std_mm=rms_px * distance / calibration.camera.fx_px,
         pose_std_mm=float(position_mm),
         rms_mm=float(np.sqrt(np.mean(np.square(list(found.values()))))),
@@ -146,10 +147,6 @@ def mount_by_board(
         weaknesses=tuple(weak),
         inputs={capture.path.name: hash_file(capture.path)},
     )
-
-
-def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in matrix.tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,20 +225,14 @@ def estimate_board_pose(
     def moved(step: np.ndarray) -> np.ndarray:
         return move_about(start, middle, step)
 
+    seen_by = partial(project_through_window, camera, window, medium_index=index)
+
     def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-        seen = points @ pose[:3, :3].T + pose[:3, 3]
-        return project_through_window(camera, window, seen, medium_index=index)
+        return seen_by(points @ pose[:3, :3].T + pose[:3, 3])
 
     pixels = view.pixels
-    if target.circle_diameter_mm is not None:
-        bias = circle_centre_bias(
-            lambda points: projected(start, points),
-            view.points_mm,
-            diameter_mm=target.circle_diameter_mm,
-            axis_u=(1.0, 0.0, 0.0),
-            axis_v=(0.0, 1.0, 0.0),
-        )
-        pixels = pixels - bias
+    if (diameter_mm := target.circle_diameter_mm) is not None:
+        pixels = pixels - centre_offsets(seen_by, start, view.points_mm, diameter_mm=diameter_mm)
     if not np.isfinite(projected(start, view.points_mm)).all():
         raise CalibrationError("its pose would be in front of the window")
     fit = least_squares(
@@ -267,16 +258,6 @@ def estimate_board_pose(
         )
         by_sensor = -np.linalg.lstsq(by_pose, by_values, rcond=None)[0]
     return BoardImage(name, moved(fit.x), covariance, len(pixels), spread, base_from_platform, by_sensor)
-
-
-def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return derivatives (N, K) of flattened values by central differences with steps (K,); 0 for a zero step."""
-    columns = []
-    for number, size in enumerate(steps):
-        step = np.zeros(len(steps))
-        step[number] = size
-        columns.append((values(at + step) - values(at - step)).ravel() / (2 * size or 1.0))
-    return np.stack(columns, axis=1)
 
 
 def move_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:

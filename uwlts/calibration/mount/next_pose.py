@@ -89,17 +89,15 @@ def _generate_candidates(
                 points = _on_plane(points, seen, turned @ state.rotation, normal, sheet)
             if points is None:
                 continue
-            added = RestrictedEstimate(_one_pose(problem, points, turned, position), state, np.array(scatter))
+            # Without a trajectory the pose has no information on the time offset.
+            at = turned[None], position[None]
+            alone = replace(problem, points=[points], motion=lambda offset, at=at: at)
+            added = RestrictedEstimate(alone, state, np.array(scatter))
             words = (
                 f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from pose "
                 f"{names[nearest]}, with the {problem.shape.kind} {where}"
             )
             yield _CandidatePose(words=words, information=added.information[0], pose=rigid_transform(turned, position))
-
-
-def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> Problem:
-    # Without a trajectory the pose has no information on the time offset.
-    return replace(problem, points=[points], motion=lambda offset: (rotation[None], position[None]))
 
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:

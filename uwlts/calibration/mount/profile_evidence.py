@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefact_shapes import Shape
 from uwlts.calibration.mount.restricted_likelihood import GroupedEvidence, solve_step
+from uwlts.fitting.propagation import differences
 from uwlts.shapes.profile_curves import LEAST_POINTS, Detection
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
@@ -114,16 +115,13 @@ class Problem(GroupedEvidence[MountState]):
         self, state: MountState, flat: Sequence[np.ndarray], reach_mm: float, rng: np.random.Generator
     ) -> list[Detection | None]:
         """Find the artefact again in the profiles (N, 2) of all poses, near its place in a state; else None."""
-        off = np.split(self.distances(state), np.cumsum(self.counts)[:-1])
-        again = [self.shape.find_again(each, own, reach_mm, rng) for each, own in zip(flat, off, strict=True)]
-        again = [each and each.without_isolated(own) for each, own in zip(again, flat, strict=True)]
-        return [each if each is not None and each.members.sum() >= LEAST_POINTS else None for each in again]
-
-    def thin(self, most: int) -> "Problem":
-        """Return the problem with at most ``most`` evenly chosen points of each pose."""
-        return replace(
-            self, points=[each[np.unique(np.linspace(0, len(each) - 1, most).astype(int))] for each in self.points]
-        )
+        found: list[Detection | None] = []
+        for points, off in zip(flat, np.split(self.distances(state), np.cumsum(self.counts)[:-1]), strict=True):
+            near = np.abs(off) < reach_mm
+            seen = self.shape.find(points[near], rng)
+            seen = seen and seen.expand(near).without_isolated(points)
+            found.append(seen if seen is not None and seen.members.sum() >= LEAST_POINTS else None)
+        return found
 
     def apply_step(self, state: MountState, step: np.ndarray) -> MountState:
         step = self.free @ step
@@ -155,7 +153,7 @@ class Problem(GroupedEvidence[MountState]):
         A pose error is a shift in three directions of the base. For flat artefacts, a rotation about the middle of the
         profile is added. (For a sphere, a rotation is equivalent to a shift of its centre.)
         """
-        normals = self._normals(self.to_base(state), state)
+        normals = self.shape.normals(state.artefact, self.to_base(state))
         if not self.shape.flat:
             return normals
         middles = np.repeat([own.mean(axis=0) for own in self.points], self.counts, axis=0)
@@ -169,29 +167,23 @@ class Problem(GroupedEvidence[MountState]):
     def normals(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, 3) of the distances by the points, along the axes of the sensor."""
         rotations = self.motion(state.offset_s)[0]
-        return (
-            np.einsum("nij,ni->nj", rotations[self.poses], self._normals(self.to_base(state), state)) @ state.rotation
-        )
-
-    def _normals(self, base: np.ndarray, state: MountState) -> np.ndarray:
-        """Return normals (N, 3) of the artefact at points of the base frame."""
-        return self.shape.normals(state.artefact, base)
+        outward = self.shape.normals(state.artefact, self.to_base(state))
+        return np.einsum("nij,ni->nj", rotations[self.poses], outward) @ state.rotation
 
     def _derivatives(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, K) by all values."""
         rotations, positions = self.motion(state.offset_s)
         turned, base = self._all @ state.rotation.T, self.to_base(state)
-        normals = self._normals(base, state)
+        normals = self.shape.normals(state.artefact, base)
         in_platform = np.einsum("nij,ni->nj", rotations[self.poses], normals)
         columns = [in_platform, np.cross(turned, in_platform)]
         columns.append(self.shape.derivatives(state.artefact, base))
         if self.scale:
             columns.append(np.sum(normals * positions[self.poses], axis=1, keepdims=True))
         if self.time:
-            later, earlier = (
-                self.to_base(replace(state, offset_s=state.offset_s + s)) for s in (_TIME_STEP_S, -_TIME_STEP_S)
-            )
-            columns.append(np.sum(normals * (later - earlier), axis=1, keepdims=True) / (2 * _TIME_STEP_S))
+            at, step = np.array([state.offset_s]), np.array([_TIME_STEP_S])
+            moved = differences(lambda s: self.to_base(replace(state, offset_s=float(s[0]))), at, step)
+            columns.append(np.sum(normals * moved.reshape(-1, 3), axis=1, keepdims=True))
         return self.project_on_lines(np.hstack(columns))
 
     @cached_property
@@ -342,17 +334,15 @@ class Problem(GroupedEvidence[MountState]):
     def pose_directions(self, state: MountState) -> list[np.ndarray]:
         return [np.eye(each.shape[1])[:, each.any(axis=0)] for each in self.basis(state)]
 
-    def solve_unweighted(self, state: MountState) -> MountState:
-        """Minimise the squares of all distances with equal weights."""
-        return self._solve_robustly(state, Scatter(1.0, *np.full(4, _POINT_MM[0])), "linear")
+    def solve(self, state: MountState, scatter: Scatter | None = None) -> MountState:
+        """Minimise the weighted squares of all distances with a robust loss (Cauchy), or the squares without one."""
+        covariances, _ = self.covariance(state)(np.log(scatter or (1.0, *[_POINT_MM[0]] * 4)))
+        return self.apply_step(state, solve_step(self, state, covariances, loss="cauchy" if scatter else "linear"))
 
-    def solve_robustly(self, state: MountState, scatter: Scatter) -> MountState:
-        """Minimise the weighted squares with a robust loss (Cauchy)."""
-        return self._solve_robustly(state, scatter, "cauchy")
 
-    def _solve_robustly(self, state: MountState, scatter: Scatter, loss: str) -> MountState:
-        covariances, _ = self.covariance(state)(np.log(scatter))
-        return self.apply_step(state, solve_step(self, state, covariances, loss=loss))
+def thin(points: np.ndarray, most: int) -> np.ndarray:
+    """Return at most ``most`` evenly chosen rows."""
+    return points[np.linspace(0, len(points) - 1, min(most, len(points))).astype(int)]
 
 
 def to_sheet(points: Sequence[np.ndarray], sheet: np.ndarray) -> list[np.ndarray]:

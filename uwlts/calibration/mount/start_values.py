@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet, thin
 from uwlts.errors import CalibrationError
 from uwlts.shapes.profile_curves import Detection, ProfileArc, ProfileLine
 
@@ -155,12 +155,6 @@ def _misfit(
     return float(np.median(np.hypot(off, np.abs(seen[:, 1]) - depth)))
 
 
-def _to_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
-    """Convert a state of the sheet's frame to the sensor's frame."""
-    rotation = state.rotation @ sheet[:3, :3].T
-    return MountState(rotation, state.translation - rotation @ sheet[:3, 3], state.artefact)
-
-
 def _start_of_plane(
     problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
@@ -199,10 +193,16 @@ def _solve_robustly(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _refine_best(problem: Problem, states: list[MountState], sheet: np.ndarray) -> MountState:
-    """Refine states robustly; return the one with the smallest median distance, in the sensor's frame.
+    """Refine states of the sheet's frame robustly; return the best by the median distance, in the sensor's frame.
 
     Scale and time offset are not refined.
     """
-    fixed = replace(problem.thin(_THINNED), scale=False, time=False)
-    refined = [fixed.solve_robustly(_to_sensor_frame(state, sheet), _ROUGH) for state in states]
+    thinned = [thin(each, _THINNED) for each in problem.points]
+    fixed = replace(problem, points=thinned, scale=False, time=False)
+    turns = [state.rotation @ sheet[:3, :3].T for state in states]
+    moved = [
+        replace(state, rotation=turn, translation=state.translation - turn @ sheet[:3, 3])
+        for state, turn in zip(states, turns, strict=True)
+    ]
+    refined = [fixed.solve(state, _ROUGH) for state in moved]
     return min(refined, key=lambda state: float(np.median(fixed.rms_mm(state))))

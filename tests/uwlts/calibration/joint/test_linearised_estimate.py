@@ -62,8 +62,8 @@ def test_halves_of_good_evidence_agree_and_their_difference_is_as_large_as_state
 def test_held_out_images_are_predicted_to_their_noise(problem, solved):
     """Of 800 coordinates, a mean square is right to 5 %; the lens of 8 images adds less than a fifth."""
     held = problem.linearise(solved).predict()
-    points = np.concatenate([values[kinds == TARGET] for values, kinds in held.images])
-    assert len(held.images) == 8 and len(points) > 600
+    points = np.concatenate([values[kinds == TARGET] for values, kinds in held])
+    assert len(held) == 8 and len(points) > 600
     assert 0.9 < np.sqrt(np.mean(points**2)) / 0.03 < 1.25
 
 

@@ -1,4 +1,4 @@
-"""Joint calibrations from images of which one prevents any solution: it is left out by name, or a refusal names it."""
+"""Joint calibrations with one image that prevents any solution: it is left out by name, or a refusal names it."""
 
 from dataclasses import replace
 
