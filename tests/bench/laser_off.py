@@ -39,7 +39,7 @@ PROGRAM = f"""
 import sys
 from pathlib import Path
 from uwlts.errors import HardwareError
-from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.scanning import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.rig import Rig
 from uwlts.hardware.scan_plan import load_plan

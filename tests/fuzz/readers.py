@@ -48,7 +48,7 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.acceptance_page import acceptance_page
 from uwlts.report.certificate import check_certificate, make_certificate
 from uwlts.report.file_description import describe
-from uwlts.storage.calibration_file import load_calibration
+from uwlts.storage.calibration_file import describe_verification, load_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.data_set import Sample, ShardReader, load_dataset, open_shard
@@ -62,7 +62,6 @@ from uwlts.storage.mesh_file import read_mesh
 from uwlts.storage.mount_files import MountDescription, read_mount, read_profiles
 from uwlts.storage.pose_files import read_poses, read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
-from uwlts.storage.verification_file import describe_verification
 from uwlts.stripe.learned import read_model_of_lines
 
 

@@ -13,8 +13,8 @@ import pytest
 from twin.devices.gige_camera import PORT, GigeCamera
 from uwlts.errors import HardwareError
 from uwlts.hardware.aravis import list_aravis_cameras
-from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import FrameStatus, Region
+from uwlts.hardware.scanning import open_camera
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter

@@ -17,9 +17,9 @@ from twin.scene.description import Scene
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from uwlts.errors import DescriptionError, HardwareError
 from uwlts.hardware import aravis
-from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import Region
 from uwlts.hardware.replay import ReplayCamera
+from uwlts.hardware.scanning import open_camera
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture

@@ -18,9 +18,9 @@ from twin.recording.record_scene import record_scene
 from twin.rendering_options import Options
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError, DesignError, HardwareError, ImageError
-from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.scanning import open_camera
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 from uwlts.stripe import extract_stripe

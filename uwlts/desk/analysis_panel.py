@@ -19,8 +19,8 @@ from uwlts.desk.analyses import (
     list_fields,
     name_results,
 )
+from uwlts.desk.board_page import NumberField
 from uwlts.desk.desk_files import list_files
-from uwlts.desk.number_field import NumberField
 from uwlts.errors import Error
 from uwlts.report.findings_order import load_order
 

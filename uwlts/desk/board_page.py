@@ -10,9 +10,20 @@ import numpy as np
 from nicegui import ui
 from nicegui.element import Element
 
-from uwlts.desk.shown_state import KEPT_LINES, Board, LaserState, Picture, ShownLine
-from uwlts.desk.thinned_cloud import FIELDS
+from uwlts.desk.shown_state import FIELDS, KEPT_LINES, Board, LaserState, Picture, ShownLine
 from uwlts.pages.cloud_figure import THREE, VIEW
+
+
+class NumberField(ui.number):
+    """A field for a number that keeps what was typed.
+
+    NiceGUI's field is rewritten when it loses the focus, possibly with a number older than what was typed before the
+    page was connected.
+    """
+
+    def sanitize(self) -> None:
+        """Do nothing: limits are checked where the number is used."""
+
 
 _REFRESH_S = 0.2  # five times a second looks immediate
 _LASER: dict[LaserState, tuple[str, str]] = {

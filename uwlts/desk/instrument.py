@@ -25,14 +25,13 @@ from uwlts.desk.recording_view import BackgroundView, RecordingView
 from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.writing import refuse_unsuitable
-from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.guided_plan import GuidedPlan
 from uwlts.hardware.guided.record import guide
 from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
-from uwlts.hardware.scanning import check_camera, record_scan
+from uwlts.hardware.scanning import check_camera, open_camera, record_scan
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.report.file_description import calibration_lines

@@ -10,8 +10,8 @@ from typing import Literal, get_args
 import numpy as np
 from nicegui import ui
 
+from uwlts.desk.board_page import NumberField
 from uwlts.desk.desk_files import find_file, new_path
-from uwlts.desk.number_field import NumberField
 from uwlts.desk.plot_view import Plot, PlotView
 from uwlts.desk.shown_state import Board
 from uwlts.errors import DescriptionError, Error

@@ -13,9 +13,9 @@ from typing import Any
 
 from uwlts.desk.scan_service import ScanService
 from uwlts.errors import Error, SetupError
-from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
+from uwlts.hardware.scanning import open_camera
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.runtime.optional_library import pip_install
 from uwlts.storage.calibration_file import resolve_calibration

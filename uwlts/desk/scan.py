@@ -13,10 +13,9 @@ from typing import Self
 
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import refuse_unsuitable
-from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
-from uwlts.hardware.scanning import ScanProgress, record_scan
+from uwlts.hardware.scanning import ScanProgress, open_camera, record_scan
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import CAPTURES

@@ -21,8 +21,7 @@ from uwlts.desk.access import MOST_VIEWERS, GuardedApp, PageAccess, is_local
 from uwlts.desk.board_page import build_board
 from uwlts.desk.laser_listener import BACKLOG, HEAD_BYTES
 from uwlts.desk.laser_switch import LaserSwitch
-from uwlts.desk.shown_state import Board
-from uwlts.desk.thinned_cloud import pack
+from uwlts.desk.shown_state import Board, pack
 from uwlts.errors import Error, SetupError
 
 _START_S, _END_S = 30.0, 5.0

@@ -115,7 +115,7 @@ def try_camera(address: str) -> list[Finding]:
     """Open a camera, take ten frames at its own rate, and close it."""
     import numpy as np
 
-    from uwlts.hardware.camera_addresses import open_camera
+    from uwlts.hardware.scanning import open_camera
 
     try:
         with open_camera(address) as camera:

@@ -1,7 +1,7 @@
 """Common interface of all cameras: settings, frames, and the check of every frame.
 
 A driver implements the methods that begin with an underscore. `CameraDevice` keeps the order of the calls, checks every
-frame and reports faults. `uwlts.hardware.camera_addresses.open_camera` opens a camera by its address. A camera must be
+frame and reports faults. `uwlts.hardware.scanning.open_camera` opens a camera by its address. A camera must be
 used from one thread only.
 
 Cameras number their frames and stamp them with their own clock. A delivered frame may lack packets, be repeated, be

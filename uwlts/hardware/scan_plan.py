@@ -61,7 +61,7 @@ class StageSettings(Description):
 class RigPlan(Description):
     """Camera, lights and laser of a plan.
 
-    ``camera`` is an address for `uwlts.hardware.camera_addresses.open_camera`. Exposures are in ms, or "auto".
+    ``camera`` is an address for `uwlts.hardware.scanning.open_camera`. Exposures are in ms, or "auto".
     ``laser_power`` is a fraction of the full power.
     """
 

@@ -23,13 +23,12 @@ from uwlts.reconstruction.moving import add_platform_poses, add_platform_uncerta
 from uwlts.reconstruction.point_uncertainty import MOST_CORRELATED, measure_correlation, point_uncertainty
 from uwlts.runtime.compiled import compiled
 from uwlts.runtime.progress import ProgressListener, ignore_progress
-from uwlts.storage.calibration_file import resolve_calibration
+from uwlts.storage.calibration_file import describe_verification, resolve_calibration
 from uwlts.storage.capture import NO_STAGE, Capture, FrameTable, open_capture, sensor_poses
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, VERIFIED, PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import PoseFormat, read_trajectory
-from uwlts.storage.verification_file import describe_verification
 from uwlts.stripe import StripeSettings, find_stripes
 from uwlts.stripe.capture_stripes import FEWEST_LINES
 

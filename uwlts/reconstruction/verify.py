@@ -14,9 +14,8 @@ from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.sensor import Vector
 from uwlts.reconstruction.reconstruct import reconstruct
-from uwlts.storage.calibration_file import resolve_calibration
+from uwlts.storage.calibration_file import VerificationRecord, resolve_calibration, write_verification
 from uwlts.storage.capture import Capture, open_capture
-from uwlts.storage.verification_file import VerificationRecord, write_verification
 
 
 def normalise_error(error: float, measured: float | None, calibrated: float | None) -> float | None:

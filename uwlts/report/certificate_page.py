@@ -29,7 +29,7 @@ from uwlts.pages.toolkit import (
     render_page,
     write_page,
 )
-from uwlts.report.certificate import AnyCertificate, JointCertificate, make_certificate
+from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, make_certificate, parameter_rows
 from uwlts.report.certificate_volume import (
     LengthUncertainty,
     compare_calibrations,
@@ -43,7 +43,6 @@ from uwlts.report.digital_certificate import (
     load_administration,
     state_traceability,
 )
-from uwlts.report.parameters import ParameterRow, parameter_rows
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import read_calibration
 

@@ -22,7 +22,7 @@ from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.model.trajectory import Trajectory, format_time
 from uwlts.pages.numbers import numbers_in
-from uwlts.report.parameters import parameter_rows
+from uwlts.report.certificate import parameter_rows
 from uwlts.report.reading import read
 from uwlts.report.schema_check import digital_certificate_lines
 from uwlts.storage.capture import Capture

@@ -16,7 +16,7 @@ from uwlts.evaluation.evaluate import Evaluation
 from uwlts.inspection.features import Inspection
 from uwlts.model.calibration import Calibration
 from uwlts.model.short_text import Brief
-from uwlts.report.parameters import parameter_rows
+from uwlts.report.certificate import parameter_rows
 from uwlts.runtime.optional_library import optional_library
 from uwlts.storage.cloud import NO_INDEX, PointCloud
 

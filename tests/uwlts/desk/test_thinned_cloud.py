@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from uwlts.desk.thinned_cloud import FIELDS, ThinnedCloud, pack
+from uwlts.desk.shown_state import FIELDS, ThinnedCloud, pack
 
 PIECES = st.lists(st.integers(0, 60), max_size=30)
 

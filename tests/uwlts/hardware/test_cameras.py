@@ -10,9 +10,9 @@ import pytest
 
 from uwlts.errors import HardwareError, ImageError, SetupError
 from uwlts.hardware.aravis import AravisCamera
-from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice, FrameCheck, FrameCounts, FrameStatus, Region
 from uwlts.hardware.replay import ReplayCamera
+from uwlts.hardware.scanning import open_camera
 from uwlts.model.sensor import Sensor
 from uwlts.runtime import shared_library
 from uwlts.storage.capture import CaptureHeader, Frame

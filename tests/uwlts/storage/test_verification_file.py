@@ -10,7 +10,7 @@ from tests.uwlts.reconstruction.test_moving import record
 from tests.uwlts.reconstruction.test_reconstruct import CALIBRATION
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.reconstruction.verify import Verdict, Verification
-from uwlts.storage.verification_file import describe_verification
+from uwlts.storage.calibration_file import describe_verification
 
 VERDICT = {"quantity": "diameter", "calibrated_mm": 50.0, "calibrated_expanded_mm": 0.01, "measured_expanded_mm": 0.02}
 

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Annotated
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.camera.target_images import Placement, TargetImage, observe, pose_values
@@ -16,7 +18,7 @@ from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, 
 from uwlts.model.calibration import CameraModel, rigid_transform
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.placement import laser_pose
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Description, Medium, NotNegative, Positive, Sensor
 from uwlts.optics.camera import directions, project
 from uwlts.targets import Target, TargetView
 
@@ -190,22 +192,24 @@ _SAME_PLACE = 0.15  # the same for the target's middle, relative to the image's 
 _SAME_DISTANCE = 0.1  # the same for the distance, relative to it
 
 
-@dataclass(frozen=True)
-class CompletionLimits:
+class CompletionLimits(Description):
     """Limits of a complete calibration."""
 
     # Standard deviations of the focal length and of the principal point.
-    focal_std_px: float = 0.5
-    centre_std_px: float = 0.5
-    coverage: float = 0.85  # fraction of the image's cells with points
-    tilt_rad: float = float(np.radians(12))
+    focal_std_px: Positive = 0.5
+    centre_std_px: Positive = 0.5
+    coverage: Annotated[float, Field(gt=0, le=1)] = 0.85  # fraction of the image's cells with points
+    tilt_deg: NotNegative = 12.0
     """For free poses, tilt that each of the target's four sides must reach once. It reveals a target that is not
     flat or not as described."""
-    fewest_images: int = 8
+    fewest_images: Annotated[int, Field(ge=3)] = 8
 
     def std_px(self) -> dict[LensParameter, float]:
         """Return the limits of the standard deviations by parameter."""
         return dict.fromkeys(_FOCAL, self.focal_std_px) | dict.fromkeys(_CENTRE, self.centre_std_px)
+
+
+_USUAL_LIMITS = CompletionLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,9 +270,7 @@ class State:
         return replace(self.showing(pose, view.pixels), known=self.known.with_information(information))
 
 
-def solve_state(
-    recorded: Sequence[RecordedPose], setting: Setting, wanted: CompletionLimits = CompletionLimits()
-) -> State:
+def solve_state(recorded: Sequence[RecordedPose], setting: Setting, wanted: CompletionLimits = _USUAL_LIMITS) -> State:
     """Solve the calibration with the recorded poses and return its state.
 
     Raises CalibrationError if no pose of the target fits one of its images.
@@ -326,7 +328,7 @@ def _find_missing_tilt(state: State) -> np.ndarray:
         return np.zeros(4)
     across, down = np.array([tilts_rad(pose) for pose in state.poses]).reshape(-1, 2).T
     reached = np.array([np.max(tilts, initial=0.0) for tilts in (across, -across, down, -down)])
-    return np.maximum(1 - reached / state.wanted.tilt_rad, 0.0)
+    return np.maximum(1 - reached / np.radians(state.wanted.tilt_deg), 0.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -453,7 +455,7 @@ def describe_missing(state: State) -> list[str]:
         )
     level = [side for side, short in zip(_SIDES, _find_missing_tilt(state), strict=True) if short > 0]
     if level:
-        said.append(f"never tilted away by {np.degrees(wanted.tilt_rad):.0f} deg: the target's {', '.join(level)}")
+        said.append(f"never tilted away by {wanted.tilt_deg:.0f} deg: the target's {', '.join(level)}")
     return said
 
 

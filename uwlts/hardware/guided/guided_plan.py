@@ -1,7 +1,6 @@
 """Plan of a guided calibration: a TOML file with sensor, camera, stage, target, step and goals."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -69,20 +68,6 @@ class GuidedStep(Description):
         return StepStandard.model_validate(self.model_dump(include=set(StepStandard.model_fields)))
 
 
-class WantedPlan(Description):
-    """Goals for the target images."""
-
-    focal_std_px: Positive = 0.5
-    centre_std_px: Positive = 0.5
-    coverage: Annotated[float, Field(gt=0, le=1)] = 0.85
-    tilt_deg: NotNegative = 12.0
-    fewest_images: Annotated[int, Field(ge=3)] = 8
-
-    def make_goals(self) -> CompletionLimits:
-        """Return the goals with angles in rad."""
-        return CompletionLimits(**self.model_dump(exclude={"tilt_deg"}), tilt_rad=float(np.radians(self.tilt_deg)))
-
-
 class GuidedPlan(RigPlan):
     """A guided calibration as read from TOML.
 
@@ -97,7 +82,7 @@ class GuidedPlan(RigPlan):
     target: Table
     stage: GuidedStage | None = None
     step: GuidedStep | None = None
-    wanted: WantedPlan = WantedPlan()
+    wanted: CompletionLimits = CompletionLimits()
     most_images: Annotated[int, Field(ge=3)] = 40
     still_s: NotNegative = 0.8
 
@@ -111,10 +96,10 @@ class GuidedPlan(RigPlan):
 
     def goal(self) -> CompletionLimits:
         """Return the goals, with at most as many images as the stage has positions."""
-        wanted = self.wanted.make_goals()
         if self.poses == "free" or self.stage is None:
-            return wanted
-        return replace(wanted, fewest_images=min(wanted.fewest_images, len(self.stage.places_mm())))
+            return self.wanted
+        fewest = min(self.wanted.fewest_images, len(self.stage.places_mm()))
+        return self.wanted.model_copy(update={"fewest_images": fewest})
 
     def places_left(self, recorded: Sequence[RecordedPose]) -> list[float]:
         """Return the stage positions that are not yet recorded; empty for free poses."""

@@ -18,13 +18,12 @@ from uwlts.calibration.camera.target_poses import Poses
 from uwlts.calibration.guidance.pose_advice import Setting, State
 from uwlts.calibration.guidance.step import PLACES, next_depth_mm, select_separate_depths
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
-from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.guided_plan import GuidedPlan, GuidedStage, GuidedStep
 from uwlts.hardware.guided.operator import Operator, Screen
 from uwlts.hardware.guided.phases import PoseJudge, Session, StepJudge, StepPhase, TargetPhase, list_missing
 from uwlts.hardware.rig import HandSwitchedLaser, LaserStage, Rig, add_provenance
-from uwlts.hardware.scanning import check_camera, read_unfinished
+from uwlts.hardware.scanning import check_camera, open_camera, read_unfinished
 from uwlts.model.calibration import WindowModel
 from uwlts.storage.capture import Capture, CaptureHeader, part_path
 from uwlts.storage.capture_writer import CaptureWriter
