@@ -9,7 +9,7 @@ OLDEST := .venv-oldest
 # A recipe with the word MAKE would run even by make -n.
 BY_ITSELF = $(MAKE) --no-print-directory
 WITH_LLVM = $(call with_packages,$(PYTHON) -m twin.backend.llvm,libatomic1$(if $(filter x86_64,$(shell uname -m)),, libllvm19))
-WITH_ARAVIS = $(call with_packages,$(PYTHON) -m uwlts.runtime.shared_library,libaravis-0.8-0)
+WITH_ARAVIS = $(call with_packages,$(PYTHON) -m uwlts.runtime.optional_library,libaravis-0.8-0)
 WITH_BROWSER = $(call with_packages,$(PYTHON) -m tests.browser,chromium-headless-shell fonts-dejavu-core)
 
 # An activated environment, or settings that redirect Python or pip, must not reach into .venv. Without bytecode each

@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from uwlts.errors import HardwareError, ImageError
-from uwlts.runtime.shared_library import load_aravis
+from uwlts.runtime.optional_library import load_aravis
 
 # Data rate of 1 Gbit/s.
 _BYTES_PER_S = 125e6

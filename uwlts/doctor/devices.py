@@ -27,7 +27,7 @@ _JOIN_GROUP = "sudo usermod -aG {} $USER\nthen log out and in again"
 def examine_cameras() -> list[Finding]:
     """Examine the library Aravis, and search for cameras for 2.5 s."""
     from uwlts.hardware.aravis import list_aravis_cameras
-    from uwlts.runtime.shared_library import ARAVIS_VARIABLE, load_aravis
+    from uwlts.runtime.optional_library import ARAVIS_VARIABLE, load_aravis
 
     try:
         library = load_aravis()

@@ -169,14 +169,14 @@ def _brief(value: object) -> str:
     return text if len(text) <= _BRIEF else f"{text[:_BRIEF]}..."
 
 
-def json_text(content: object, *, indent: int | None = None, only_ascii: bool = True) -> str:
+def json_text(content: object, *, indent: int | None = None) -> str:
     """Return JSON text, for a model of its set fields only; raises OutputError for numbers that are not finite.
 
     Objects are sealed.
     """
     plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
     plain = add_seal(plain) if isinstance(plain, dict) else plain
-    return _dump(plain, indent=indent, ensure_ascii=only_ascii) + "\n"
+    return _dump(plain, indent=indent) + "\n"
 
 
 def _dump(content: object, **settings: Any) -> str:

@@ -34,7 +34,7 @@ from uwlts.hardware.camera_interface import (
     Delivered,
     Region,
 )
-from uwlts.runtime.shared_library import load_aravis
+from uwlts.runtime.optional_library import load_aravis
 
 BUFFER_COMPLETE = 0  # ARV_BUFFER_STATUS_SUCCESS
 

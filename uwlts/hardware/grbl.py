@@ -69,8 +69,8 @@ class GrblStage:
     variable spindle.
     """
 
-    def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
-        self._line = GrblLine(port, baud=baud, boot_s=boot_s)
+    def __init__(self, port: str, *, boot_s: float = 2.5):
+        self._line = GrblLine(port, boot_s=boot_s)
         self._power, self._held = 0.0, False
         self._lighting: tuple[str, ...] = ()
         self.lit_until_s = -math.inf
@@ -150,17 +150,10 @@ class GrblStage:
         # A reset during a movement leaves an alarm.
         self._position_known = self._position_known and self._line.status().state != "Alarm"
 
-    def move_to(
-        self,
-        position_mm: float,
-        *,
-        feed_mm_per_min: float,
-        reported: Callable[[StageReport], None] = lambda report: None,
-    ) -> float:
+    def move_to(self, position_mm: float, *, feed_mm_per_min: float) -> float:
         """Move, wait until the stage is at rest, and return the position read back in mm.
 
-        The target is within ``limits_mm``, and the speed at most that of the stage ($110). ``reported`` is called with
-        every `StageReport` during the movement, about ten times a second.
+        The target is within ``limits_mm``, and the speed at most that of the stage ($110).
 
         Raises RangeError if the target is outside the travel, or the feed outside the stage's range; nothing has moved.
         Raises HardwareError if the position is unknown, or a fault occurred: alarm, stall, hold, lost steps, restart,
@@ -168,14 +161,7 @@ class GrblStage:
         """
         start_mm = self._start_of(position_mm, feed_mm_per_min)
         self._go(position_mm, feed_mm_per_min)
-        in_motion = self._motion_watch(start_mm, feed_mm_per_min / 60)
-
-        def watch(report: Status) -> None:
-            in_motion(report)
-            if report.machine_mm is not None or report.work_mm is not None:
-                line = self._line
-                reported(StageReport(line.asked_s, line.answered_s, self._position_of(report)))
-
+        watch = self._motion_watch(start_mm, feed_mm_per_min / 60)
         return self._arrive(position_mm, position_mm - start_mm, feed_mm_per_min, watch)
 
     @property
@@ -195,7 +181,8 @@ class GrblStage:
         """Move like `move_to`, with the laser on during the movement; on the ramps the light is weaker.
 
         The controller receives the travel part by part. If this program stops, the stage comes to rest and the laser
-        goes off within a second. An exception from ``reported`` brakes the stage, which is then held as by `stop`.
+        goes off within a second. ``reported`` is called with every `StageReport`; an exception from it brakes the
+        stage, which is then held as by `stop`.
 
         Raises RangeError and HardwareError like `move_to` and `laser`. Also raises HardwareError if the next part was
         sent too late for a constant speed.

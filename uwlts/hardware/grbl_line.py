@@ -218,6 +218,7 @@ _ERRORS = {
 }
 
 SOFT_RESET, STATUS_QUERY, FEED_HOLD = b"\x18", b"?", b"!"
+_BAUD = 115200  # of Grbl 1.1
 ANSWER_S = 2.0  # of the controller; it answers within milliseconds
 # Grbl's documentation recommends at most 5 to 10 status queries a second during a movement.
 POLL_S = 0.1
@@ -248,13 +249,13 @@ class GrblLine:
     missing, forbidden or in use, nothing answers, or the answer is not that of Grbl 1.1.
     """
 
-    def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
+    def __init__(self, port: str, *, boot_s: float = 2.5):
         self.port = port
         self.fault: str | None = None
         self.offset_mm: float | None = None
         self.asked_s = self.answered_s = -math.inf
         self._received, self.unacknowledged = bytearray(), 0
-        self._serial = _open_port(port, baud)
+        self._serial = _open_port(port)
         self._guard: Heartbeat | None = None
         self._lit, self._beaten_s = False, -math.inf
         self.darkened_by_hand, self._writing, self.unreachable = False, threading.Lock(), False
@@ -323,8 +324,7 @@ class GrblLine:
                     raise HardwareError(f"{self.port} is not Grbl 1.1, it answers {heard!r}: flash Grbl 1.1h")
         if heard := heard or _readable(self._received[:60]):
             raise HardwareError(
-                f"{self.port} does not speak Grbl, it answers {heard!r}: wrong port, or not "
-                f"{self._serial.baudrate} baud"
+                f"{self.port} does not speak Grbl, it answers {heard!r}: wrong port, or not {_BAUD} baud"
             )
         raise HardwareError(
             f"nothing answers on {self.port} within {boot_s + _WAKE_S:g} s: is it the controller's port, is the "
@@ -584,11 +584,9 @@ def _readable(data: bytes | bytearray) -> str:
     return data.decode("ascii", errors="backslashreplace")
 
 
-def _open_port(port: str, baud: int) -> serial.Serial:
+def _open_port(port: str) -> serial.Serial:
     try:
-        return serial.Serial(port, baud, timeout=_READ_S, write_timeout=ANSWER_S, exclusive=True)
-    except ValueError as error:
-        raise HardwareError(f"cannot open {port} with {baud} baud: {error}") from error
+        return serial.Serial(port, _BAUD, timeout=_READ_S, write_timeout=ANSWER_S, exclusive=True)
     except OSError as error:
         found = ", ".join(sorted(entry.device for entry in comports())) or "none"
         busy = dict.fromkeys((errno.EBUSY, errno.EAGAIN), "another program uses it; close that program")

@@ -23,8 +23,8 @@ from uwlts.model.sensor import Medium, Sensor
 from uwlts.model.trajectory import Trajectory, format_time
 from uwlts.pages.numbers import numbers_in
 from uwlts.report.certificate import parameter_rows
+from uwlts.report.digital_certificate import digital_certificate_lines
 from uwlts.report.reading import read
-from uwlts.report.schema_check import digital_certificate_lines
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.hdf5_file import read_format

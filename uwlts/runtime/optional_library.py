@@ -1,11 +1,15 @@
 """Libraries that only some features need, by extras; the message for a missing one is a command that installs it.
 
 The project is not published: advice names the libraries themselves, which works in a checkout and with a wheel.
+`python -m uwlts.runtime.optional_library` prints the Aravis library in use, and exits with status 1 if there is none.
 """
 
+import ctypes
+import os
 import shlex
 import sys
 from collections.abc import Iterable
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -80,3 +84,37 @@ def read_requirements() -> tuple[str, list[str], dict[str, list[str]]]:
             if marker is not None and "extra" in str(marker) and marker.evaluate({"extra": name}):
                 extras[name].append(line.partition(";")[0].strip())
     return installed.metadata["Requires-Python"], required, extras
+
+
+ARAVIS_VARIABLE = "UWLTS_LIBARAVIS"
+ARAVIS = "libaravis-0.8.so.0"
+HOW_TO_INSTALL = f"""\
+Install it:
+  Debian, Ubuntu:  apt-get install libaravis-0.8-0   (as root)
+  Fedora:          dnf install aravis   (as root)
+  Arch:            pacman -S aravis   (as root)
+or let the environment variable {ARAVIS_VARIABLE} name the library."""
+
+
+@cache
+def load_aravis() -> ctypes.CDLL:
+    """Load Aravis 0.8: the library named by the environment variable UWLTS_LIBARAVIS, otherwise the system's.
+
+    Raises SetupError if the library is missing or does not load; the message says how to install it.
+    """
+    chosen = os.environ.get(ARAVIS_VARIABLE)
+    called = f"the environment variable {ARAVIS_VARIABLE} names {chosen}" if chosen else ARAVIS
+    try:
+        library = ctypes.CDLL(chosen or ARAVIS)
+    except OSError as error:
+        raise SetupError(f"{called}: {error}\n{HOW_TO_INSTALL}") from error
+    if not hasattr(library, "arv_camera_new"):
+        raise SetupError(f"{called}: it is not Aravis, it lacks arv_camera_new\n{HOW_TO_INSTALL}")
+    return library
+
+
+if __name__ == "__main__":
+    try:
+        print(f"Aravis: {load_aravis()._name}")
+    except SetupError as error:
+        sys.exit(f"error: {error}")

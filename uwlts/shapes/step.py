@@ -56,7 +56,7 @@ class StepMeasurement:
     std_mm: float
 
 
-def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, seed: int = 0) -> np.ndarray:
+def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0) -> np.ndarray:
     """Label the face of each point (N, 2) of a profile or (N, 3) of a scan, mm, as `StepFace` (N,) int8.
 
     Random pairs (triples) of points propose directions of two parallel lines (planes) at the distance of the height,
@@ -68,7 +68,7 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
     """
     points = check_points(points, least=20, what="a step", dimensions=(2, 3))
     least = 10 if points.shape[1] == 2 else 40
-    proposal = _best_proposal(thin_evenly(points, _THINNED), height_mm, np.random.default_rng(seed))
+    proposal = _best_proposal(thin_evenly(points, _THINNED), height_mm, np.random.default_rng(0))
     if proposal is None:
         raise EvaluationError(
             f"no two parallel step faces at a distance of about {height_mm:g} mm among {len(points)} points; "

@@ -94,12 +94,12 @@ class NumberTable:
     directions: tuple[str, ...] = ()
     titles: str = ""
 
-    def mm_per_unit(self, axes: Iterable[str] = "xyz", *, unit: Unit | None = None) -> float:
+    def mm_per_unit(self, unit: Unit | None = None) -> float:
         """Return the length unit of columns in mm, from their names or a line beside them, or ``unit``; by default 1.
 
         Raises DescriptionError if the names contradict each other or ``unit``.
         """
-        stated = {name: self.units.get(name, "") for name in axes if name in self.columns}
+        stated = {name: self.units.get(name, "") for name in "xyz" if name in self.columns}
         if len(found := set(stated.values())) > 1:
             texts = ", ".join(f"{name} in {each or 'no stated unit'}" for name, each in stated.items())
             raise DescriptionError(f"{self.path} has {texts}; expected one unit in the names of all axes")

@@ -14,7 +14,7 @@ from uwlts.hardware.camera_interface import CameraDevice, FrameCheck, FrameCount
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.scanning import open_camera
 from uwlts.model.sensor import Sensor
-from uwlts.runtime import shared_library
+from uwlts.runtime import optional_library
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 
@@ -281,15 +281,15 @@ def test_a_camera_that_stays_mirrored_is_refused():
 
 
 def test_a_missing_aravis_is_said_with_what_to_install(monkeypatch, tmp_path):
-    shared_library.load_aravis.cache_clear()
-    monkeypatch.setenv(shared_library.ARAVIS_VARIABLE, str(tmp_path / "libaravis.so"))
+    optional_library.load_aravis.cache_clear()
+    monkeypatch.setenv(optional_library.ARAVIS_VARIABLE, str(tmp_path / "libaravis.so"))
     with pytest.raises(SetupError, match=r"UWLTS_LIBARAVIS names .*libaravis.so"):
         open_camera("gige:1")
-    monkeypatch.setenv(shared_library.ARAVIS_VARIABLE, "libc.so.6")
+    monkeypatch.setenv(optional_library.ARAVIS_VARIABLE, "libc.so.6")
     with pytest.raises(SetupError, match="lacks arv_camera_new"):
         open_camera("gige:1")
-    monkeypatch.delenv(shared_library.ARAVIS_VARIABLE)
-    monkeypatch.setattr(shared_library, "ARAVIS", "libaravis-0.0.so.0")
+    monkeypatch.delenv(optional_library.ARAVIS_VARIABLE)
+    monkeypatch.setattr(optional_library, "ARAVIS", "libaravis-0.0.so.0")
     with pytest.raises(SetupError, match=r"(?s)libaravis-0.0.so.0: .*apt-get install libaravis-0.8-0"):
         open_camera("gige:1")
-    shared_library.load_aravis.cache_clear()
+    optional_library.load_aravis.cache_clear()

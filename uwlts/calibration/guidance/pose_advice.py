@@ -365,10 +365,8 @@ def candidates(state: State, *, spin_rad: float = 0.0) -> list[CandidatePose]:
         ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
         turn = cv2.Rodrigues(tilt)[0] @ spin
         pose = rigid_transform(turn, ray / ray[2] * distance - turn @ middle)
-        rotation = cv2.Rodrigues(turn)[0]
-        pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
-        ahead = points @ pose[2, :3] + pose[2, 3] > 0
-        inside = ahead & np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
+        pixels = project(camera, points @ turn.T + pose[:3, 3])
+        inside = np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
         if target.is_findable(inside):
             sample = np.flatnonzero(inside)[::step]
             added = state.information_of(points[sample], pixels[sample], pose) * inside.sum() / len(sample)
