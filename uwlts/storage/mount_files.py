@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
+from pydantic import model_validator
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
@@ -14,7 +15,7 @@ from uwlts.files.reading import log_warnings, natural_key
 from uwlts.files.writing import hash_file
 from uwlts.model.library import read_table, validate_description
 from uwlts.model.mount import FORMAT, VERSION, Mount
-from uwlts.model.sensor import Description, Positive
+from uwlts.model.sensor import Description, Positive, Table
 from uwlts.storage.cloud_files import is_cloud, read_cloud
 from uwlts.storage.number_tables import NumberTable, Unit, read_number_table
 from uwlts.storage.numbering import count_names, name_gaps
@@ -37,11 +38,14 @@ _NEAREST_MM, _TURNED = 10.0, np.radians(5)
 positions in metres of robots of up to ten metres are nearer."""
 
 
-class MountDescription(Description):
-    """Description of a mount's calibration in a TOML file; paths are relative to its folder."""
+class MountOptions(Description):
+    """Artefact, formats of files, and unknowns of a mount's calibration.
 
-    profiles: str
-    poses: str
+    Units are for files without a unit in the names of their columns. ``axis`` is the direction of the sensor's frame
+    nearest to the axis of a rotary table. ``scale`` and ``time`` ask for the scale of the robot's lengths and the
+    offset of its clock.
+    """
+
     artefact: Artefact = "sphere"
     radius_mm: Positive | None = None
     pose_format: str = "matrix"
@@ -51,6 +55,19 @@ class MountDescription(Description):
     scale: bool = False
     time: bool = False
 
+    @model_validator(mode="after")
+    def _fitting_artefact(self) -> "MountOptions":
+        if self.radius_mm is not None and self.artefact != "sphere":
+            raise ValueError(f"a {self.artefact} has no radius: leave radius_mm out")
+        return self
+
+
+class MountDescription(MountOptions):
+    """Description of a mount's calibration in a TOML file; paths are relative to its folder."""
+
+    profiles: str
+    poses: str
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MountEvidence:
@@ -58,12 +75,8 @@ class MountEvidence:
 
     profiles: list[np.ndarray]
     poses: np.ndarray
-    artefact: Artefact
-    radius_mm: float | None = None
+    options: MountOptions
     names: list[str]
-    axis: SensorAxis | None = None
-    scale: bool = False
-    time: bool = False
     profile_times_s: np.ndarray | None = None
     pose_times_s: np.ndarray | None = None
     digests: dict[str, str] = field(default_factory=dict)
@@ -72,24 +85,15 @@ class MountEvidence:
 def read_mount_evidence(
     profiles: str | Path | Sequence[np.ndarray],
     poses: str | Path | np.ndarray | None,
+    options: Table,
     *,
-    artefact: Artefact | None,
-    radius_mm: float | None,
-    pose_format: str,
-    profile_unit: Unit | None,
-    pose_unit: Unit | None,
-    axis: SensorAxis | None,
-    scale: bool,
-    time: bool,
     profile_times_s: np.ndarray | None,
     pose_times_s: np.ndarray | None,
 ) -> MountEvidence:
     """Read and check profiles and poses from arrays or files; poses are None with a TOML description of the profiles.
 
-    Units are for files without a unit in the names of their columns. ``axis`` is the direction of the sensor's frame
-    nearest to the axis of a rotary table. ``scale`` and ``time`` ask for the scale of the robot's lengths and the
-    offset of its clock. Times (N,) belong to arrays. Raises DescriptionError if profiles and poses do not match, or one
-    of them is not valid.
+    ``options`` are the given ones of `MountOptions`. Times (N,) belong to arrays. Raises DescriptionError if profiles
+    and poses do not match, or one of them is not valid.
     """
     digests: dict[str, str] = {}
     names: list[str] | None = None
@@ -97,51 +101,34 @@ def read_mount_evidence(
         path = Path(profiles)
         if poses is not None:
             raise DescriptionError(f"{path} names the poses already: leave the other ones out")
-        options = {
-            "artefact": artefact,
-            "radius_mm": radius_mm,
-            "pose_format": None if pose_format == "matrix" else pose_format,
-            "profile_unit": profile_unit,
-            "pose_unit": pose_unit,
-            "axis": axis,
-            "scale": scale or None,
-            "time": time or None,
-        }
-        if beside := [name for name, value in options.items() if value is not None]:
+        if options:
             raise DescriptionError(
                 f"{path} describes the artefact, the formats and the unknowns: leave out "
-                f"{', '.join(f'`{name}`' for name in beside)}, or change the file"
+                f"{', '.join(f'`{name}`' for name in options)}, or change the file"
             )
-        given = validate_description(MountDescription, read_table(path), path)
-        profiles, poses = path.parent / given.profiles, path.parent / given.poses
-        artefact, radius_mm = given.artefact, given.radius_mm
-        pose_format = given.pose_format
-        profile_unit, pose_unit, scale, time = given.profile_unit, given.pose_unit, given.scale, given.time
-        axis = given.axis
-    artefact = artefact or "sphere"
-    if artefact not in get_args(Artefact):
-        raise DescriptionError(f"the artefact is {artefact!r}; expected one of {', '.join(get_args(Artefact))}")
-    if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0 and artefact == "sphere"):
-        raise DescriptionError(f"radius_mm is {radius_mm:g} for a {artefact}; expected the positive radius of a sphere")
+        described = validate_description(MountDescription, read_table(path), path)
+        profiles, poses, chosen = path.parent / described.profiles, path.parent / described.poses, described
+    else:
+        chosen = validate_description(MountOptions, options, "what is given")
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):
-        names, profiles, times = read_profiles(profiles, unit=profile_unit, digests=digests)
+        names, profiles, times = read_profiles(profiles, unit=chosen.profile_unit, digests=digests)
         profile_times_s = times if profile_times_s is None else profile_times_s
     if isinstance(poses, str | Path):
-        poses, times = read_poses(poses, pose_format=pose_format, unit=pose_unit, digests=digests)
+        poses, times = read_poses(poses, pose_format=chosen.pose_format, unit=chosen.pose_unit, digests=digests)
         pose_times_s = times if pose_times_s is None else pose_times_s
     checked = [_checked_profile(profile, number) for number, profile in enumerate(profiles)]
     matrices = check_matrices(np.asarray(poses, dtype=np.float64), "poses")
-    if axis is not None:
-        if artefact != "sphere" or scale:
+    if chosen.axis is not None:
+        if chosen.artefact != "sphere" or chosen.scale:
             raise DescriptionError(
                 "from profiles, the axis of a rotary table is found with a sphere on it, without a scale"
             )
-        require_table(matrices, axis=axis)
-    if time and (profile_times_s is None or pose_times_s is None):
+        require_table(matrices, axis=chosen.axis)
+    if chosen.time and (profile_times_s is None or pose_times_s is None):
         raise DescriptionError("a time offset needs the times of profiles and poses: give both a column time_s")
-    if profile_times_s is not None and pose_times_s is not None and (time or len(matrices) != len(checked)):
+    if profile_times_s is not None and pose_times_s is not None and (chosen.time or len(matrices) != len(checked)):
         profile_times_s, pose_times_s = _checked_times(profile_times_s, pose_times_s, len(checked), len(matrices))
     else:
         profile_times_s = pose_times_s = None
@@ -155,12 +142,8 @@ def read_mount_evidence(
     return MountEvidence(
         profiles=checked,
         poses=matrices,
-        artefact=artefact,
-        radius_mm=radius_mm,
+        options=chosen,
         names=names or [str(number + 1) for number in range(len(checked))],
-        axis=axis,
-        scale=scale,
-        time=time,
         profile_times_s=profile_times_s,
         pose_times_s=pose_times_s,
         digests=digests,

@@ -24,6 +24,7 @@ from uwlts.calibration.mount.start_values import NoFit, start
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose
+from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
 from uwlts.shapes.profile_curves import LEAST_POINTS
 from uwlts.storage.calibration_file import resolve_calibration
@@ -150,17 +151,20 @@ def calibrate_mount(
     if isinstance(profiles, CapturedProfiles):
         captured, poses = profiles, profiles.poses
         profiles, profile_times_s, pose_times_s = captured.profiles, captured.times_s, captured.pose_times_s
+    options: Table = {
+        "artefact": artefact_kind,
+        "radius_mm": radius_mm,
+        "pose_format": None if pose_format == "matrix" else pose_format,
+        "profile_unit": profile_unit,
+        "pose_unit": pose_unit,
+        "axis": axis,
+        "scale": scale or None,
+        "time": time or None,
+    }
     evidence = read_mount_evidence(
         profiles,
         poses,
-        artefact=artefact_kind,
-        radius_mm=radius_mm,
-        pose_format=pose_format,
-        profile_unit=profile_unit,
-        pose_unit=pose_unit,
-        axis=axis,
-        scale=scale,
-        time=time,
+        {name: value for name, value in options.items() if value is not None},
         profile_times_s=profile_times_s,
         pose_times_s=pose_times_s,
     )
@@ -172,9 +176,10 @@ def calibrate_mount(
 
 def _advice(evidence: MountEvidence) -> str:
     """Return advice on the usual mistakes; a wrong radius is tested by estimating it."""
-    if evidence.radius_mm is not None:
+    if evidence.options.radius_mm is not None:
+        unknown = evidence.options.model_copy(update={"radius_mm": None})
         with suppress(CalibrationError):
-            found = _Calibration(replace(evidence, radius_mm=None)).make_result()
+            found = _Calibration(replace(evidence, options=unknown)).make_result()
             if 2 * sum(pose.reason is None for pose in found.poses) > len(found.poses):
                 return (
                     f"The profiles fit with {found.rms_mm:.3g} mm rms if the sphere has another radius, "
@@ -193,7 +198,7 @@ class _Calibration:
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
         self.captured = captured
-        self.shape = SHAPES[evidence.artefact](evidence.radius_mm)
+        self.shape = SHAPES[evidence.options.artefact](evidence.options.radius_mm)
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
         self.rows = [thin(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
@@ -218,21 +223,21 @@ class _Calibration:
         shapes = [self.shape.find(points, self.rng) for points in self.flat]
         for number, shape in enumerate(shapes):
             if shape is None:
-                self.reasons[number] = f"no {self.evidence.artefact} found in the profile"
+                self.reasons[number] = f"no {self.shape.kind} found in the profile"
         self._require_enough()
         whole = Problem(
             self.profiles,
             _motion(self.evidence),
             self.sheet[:3, 1],
             self.shape,
-            self.evidence.scale,
-            self.evidence.time,
-            self.evidence.axis is not None,
+            self.evidence.options.scale,
+            self.evidence.options.time,
+            self.evidence.options.axis is not None,
         )
         kept = np.array([shape is not None for shape in shapes])
         problem = whole.select_detected(shapes)
         seen = [shape for shape in shapes if shape is not None]
-        towards = None if self.evidence.axis is None else SENSOR_AXES[self.evidence.axis]
+        towards = None if self.evidence.options.axis is None else SENSOR_AXES[self.evidence.options.axis]
         state = start(problem, seen, self.sheet, towards, self.rng)
         misfit = problem.rms_mm(state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
@@ -267,7 +272,7 @@ class _Calibration:
                 off = problem.rms_mm(state)[np.flatnonzero(numbers == number)[0]]
                 self.reasons[number] = f"contradicts the other poses: {off:.3g} mm off"
             else:
-                self.reasons.setdefault(number, f"no {self.evidence.artefact} found where the other poses show it")
+                self.reasons.setdefault(number, f"no {self.shape.kind} found where the other poses show it")
         self._require_fit(used, found)
         empty = [np.zeros(len(each), dtype=bool) for each in self.flat]
         members = [own if shape is None else shape.members for own, shape in zip(empty, shapes, strict=True)]
@@ -278,7 +283,7 @@ class _Calibration:
         usable = poses - len(self.reasons) if numbers is None else len(numbers)
         if usable < needed:
             raise CalibrationError(
-                f"{usable} of {poses} profiles show the {self.evidence.artefact} and agree; at least {needed} are "
+                f"{usable} of {poses} profiles show the {self.shape.kind} and agree; at least {needed} are "
                 "needed. Record more poses, or check artefact, size and units"
             )
 
@@ -295,7 +300,7 @@ class _Calibration:
         self._require_small(float(np.hypot(scatter.pose_mm, scatter.smooth_mm)), state, len(used.points))
         if self.shape.radius_mm is None:
             return
-        free = replace(used, shape=SHAPES[self.evidence.artefact]())
+        free = replace(used, shape=type(self.shape)())
         other = RestrictedEstimate(free, state, estimate.scatter)
         at = free.size - free.scale - free.time - 1
         step, std = float(other.propagate(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
