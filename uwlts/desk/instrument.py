@@ -26,6 +26,7 @@ from uwlts.desk.shown_state import Board, FrameProfile, Picture
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
+from uwlts.hardware.continuous import ScanListeners
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.guided_plan import GuidedPlan
 from uwlts.hardware.guided.record import guide
@@ -450,11 +451,13 @@ class Instrument:
                     stage=stage,
                     resume=resume,
                     overwrite=overwrite,
-                    progress=progress,
-                    report=report,
-                    warn=lambda text: board.say(text, "warning"),
-                    between=self._pause_between_images,
-                    recorded=shown.put,
+                    listeners=ScanListeners(
+                        progress,
+                        report,
+                        warn=lambda text: board.say(text, "warning"),
+                        between=self._pause_between_images,
+                        recorded=shown.put,
+                    ),
                 )
         finally:
             board.phase("stopped", busy=False)

@@ -13,6 +13,7 @@ from typing import Self
 
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import refuse_unsuitable
+from uwlts.hardware.continuous import ScanListeners
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.hardware.scanning import ScanProgress, open_camera, record_scan
@@ -119,10 +120,9 @@ def scan(
             stage=moved,
             resume=resume,
             overwrite=overwrite,
-            progress=progress,
-            report=report,
-            warn=warn,
-            recorded=lambda frame, number: None if page is None else page.start(),
+            listeners=ScanListeners(
+                progress, report, warn, recorded=lambda frame, number: None if page is None else page.start()
+            ),
         )
 
 

@@ -15,6 +15,7 @@ from uwlts.desk.recording_view import LOOK_S, BackgroundView, follow_frames
 from uwlts.desk.shown_state import FrameProfile
 from uwlts.errors import Error, HardwareError
 from uwlts.hardware.camera_interface import CameraDevice
+from uwlts.hardware.continuous import ScanListeners
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan
 from uwlts.hardware.scanning import record_scan
@@ -113,10 +114,8 @@ class ScanService:
             stage.unlock()
         header = plan.header(out.stem)
         with BackgroundView(lambda frame, number: self._show(frame, number, header)) as shown:
-            between, recorded = self._end_if_stopped, shown.put
-            seen = record_scan(
-                plan, out, camera=camera, stage=stage, report=self._report, between=between, recorded=recorded
-            )
+            listeners = ScanListeners(report=self._report, between=self._end_if_stopped, recorded=shown.put)
+            seen = record_scan(plan, out, camera=camera, stage=stage, listeners=listeners)
         return "; ".join([f"wrote {out}", *seen.warnings()])
 
     def _play(self) -> str:

@@ -25,7 +25,7 @@ from uwlts.hardware.scan_plan import Continuous, ScanPlan
 from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.model.stripe import Stripe
 from uwlts.reconstruction.latency import measure_latency
-from uwlts.runtime.progress import ProgressListener
+from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.numbering import unwrap_counts
@@ -69,6 +69,23 @@ class FramePlaces:
         )
 
 
+@dataclass(frozen=True)
+class ScanListeners:
+    """Functions that a scan calls: ``report`` and ``warn`` with lines of text, ``progress`` as in `uwlts.scan`.
+
+    ``between`` is called before every image, with the laser off: it may wait, or end the scan by an exception.
+    ``recorded`` is called with every image that is in the file, and its number; ``counted`` with the stripe of every
+    frame of a continuous scan.
+    """
+
+    progress: ProgressListener = ignore_progress
+    report: Callable[[str], None] = lambda line: None
+    warn: Callable[[str], None] = lambda text: None
+    between: Callable[[], None] = lambda: None
+    recorded: Callable[[Frame, int], None] = lambda frame, number: None
+    counted: Callable[[Stripe], None] = lambda stripe: None
+
+
 def plan_passes(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> list[tuple[float, float]]:
     """Return the start and end of each pass in mm, ramps included; raises RangeError if the stage cannot do it."""
     speed, settings = continuous.speed_mm_per_s, stage.settings
@@ -101,26 +118,18 @@ def _ramp_mm(speed: float, stage: GrblStage) -> float:
 
 def record_continuously(
     plan: ScanPlan,
-    continuous: Continuous,
     out: Path,
     *,
-    sensor: Sensor,
     camera: CameraDevice,
     stage: GrblStage,
     header: CaptureHeader,
     exposure_ms: float,
     overwrite: bool,
-    progress: ProgressListener,
-    report: Callable[[str], None],
-    warn: Callable[[str], None],
-    recorded: Callable[[Frame, int], None],
-    counted: Callable[[Stripe], None],
+    listeners: ScanListeners,
 ) -> FramePlaces:
-    """Record the passes of a plan and assign positions to its frames. The errors are those of `uwlts.desk.scan.scan`.
-
-    ``recorded`` is called with every image that is in the file, and its number; ``counted`` with the stripe of every
-    frame.
-    """
+    """Record the passes of a plan and assign positions to its frames; errors as `uwlts.desk.scan.scan`."""
+    sensor, continuous, warn = header.sensor, plan.continuous, listeners.warn
+    assert continuous is not None
     positions, passes = plan.stage.positions_mm(), plan_passes(plan, continuous, stage)
     rate_hz = continuous.speed_mm_per_s / abs(plan.stage.step_mm)
     if 1e-3 * exposure_ms * rate_hz > _BUSY:
@@ -149,9 +158,9 @@ def record_continuously(
         reader.frame_s = 1e-3 * exposure_ms + together / rate_hz
         reader.gap_s = _GAP_S - continuous.speed_mm_per_s / stage.settings.acceleration_mm_per_s2
         reader.notify = lambda frame, stripe, number: (
-            counted(stripe),
-            progress(min(number + 1, expected), expected),
-            recorded(frame, number),
+            listeners.counted(stripe),
+            listeners.progress(min(number + 1, expected), expected),
+            listeners.recorded(frame, number),
         )
         camera.start(faults="skip")
         thread = threading.Thread(target=reader.run, name="continuous-frames", daemon=True)
@@ -162,7 +171,7 @@ def record_continuously(
                 reader.begin_pass()
                 stage.sweep(end, feed_mm_per_min=feed_mm_per_min, power=plan.laser_power, reported=reader.report)
             reader.end_s = time.monotonic()
-            report("waiting for the last frames")
+            listeners.report("waiting for the last frames")
             thread.join()
         finally:
             reader.ending.set()

@@ -15,7 +15,7 @@ import numpy as np
 from uwlts.errors import DescriptionError, HardwareError
 from uwlts.hardware.aravis import AravisCamera
 from uwlts.hardware.camera_interface import CameraDevice
-from uwlts.hardware.continuous import plan_passes, record_continuously
+from uwlts.hardware.continuous import ScanListeners, plan_passes, record_continuously
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, add_provenance, get_stripe, measure_brightness
@@ -31,7 +31,6 @@ from uwlts.hardware.scan_watch import (
     shows_laser,
 )
 from uwlts.model.sensor import Sensor
-from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.import_.grey_values import subtract_background
@@ -110,17 +109,10 @@ def record_scan(
     stage: GrblStage,
     resume: bool = False,
     overwrite: bool = False,
-    progress: ProgressListener = ignore_progress,
-    report: Callable[[str], None] = lambda line: None,
-    warn: Callable[[str], None] = lambda text: None,
-    between: Callable[[], None] = lambda: None,
-    recorded: Callable[[Frame, int], None] = lambda frame, number: None,
+    listeners: ScanListeners,
 ) -> ScanProgress:
-    """Record a scan with an open camera and a stage that may move. The errors are those of `uwlts.desk.scan.scan`.
-
-    ``between`` is called before every image, with the laser off: it may wait, or end the scan by an exception.
-    ``recorded`` is called with every image that is in the file, and its number.
-    """
+    """Record a scan with an open camera and a stage that may move. The errors are those of `uwlts.desk.scan.scan`."""
+    report, between = listeners.report, listeners.between
     positions_mm = plan.stage.positions_mm()
     shots = list(product(positions_mm, plan.images()))
     images = len(shots) + (len(positions_mm) * len(plan.bracket) if plan.background and "laser" in plan.lights else 0)
@@ -149,25 +141,19 @@ def record_scan(
         plan_passes(plan, plan.continuous, stage)
         rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
         seen = ScanProgress()
-        taking = _Taking(plan, sensor, rig, seen, warn)
+        taking = _Taking(plan, sensor, rig, seen, listeners.warn)
         report("finding the exposures")
         taking.settle_exposures(between)
         report("recording")
         placed = record_continuously(
             plan,
-            plan.continuous,
             out,
-            sensor=sensor,
             camera=camera,
             stage=stage,
             header=header,
             exposure_ms=seen.exposure_ms["laser"],
             overwrite=overwrite,
-            progress=progress,
-            report=report,
-            warn=warn,
-            recorded=recorded,
-            counted=taking.count_stripe,
+            listeners=replace(listeners, counted=taking.count_stripe),
         )
         report(f"{placed}")
         return seen
@@ -179,7 +165,7 @@ def record_scan(
         if begun == len(shots):
             return seen
         rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
-        taking = _Taking(plan, sensor, rig, seen, warn)
+        taking = _Taking(plan, sensor, rig, seen, listeners.warn)
         report("finding the exposures")
         taking.settle_exposures(between)
         report("recording")
@@ -190,8 +176,8 @@ def record_scan(
             kept = taken.seen if isinstance(taken.seen, Stripe) else taken.seen.astype(dtype, copy=False)
             frame = replace(taken, seen=kept, time_s=time.monotonic() - start_s)
             writer.append(frame)
-            progress(done, len(shots))
-            recorded(frame, done - 1)
+            listeners.progress(done, len(shots))
+            listeners.recorded(frame, done - 1)
         # A replay does not know where the stage is.
         if plan.check_steps and not isinstance(camera, ReplayCamera):
             report("checking for lost steps")

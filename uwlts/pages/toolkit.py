@@ -3,7 +3,7 @@
 A page is a Jinja template that extends ``base.html.j2`` and imports what it needs from ``components.html.j2``::
 
     {% extends "base.html.j2" %}
-    {% from "components.html.j2" import tiles, facts, comparison, picture, chart %}
+    {% from "components.html.j2" import tiles, facts, table, picture, chart %}
     {% block title %}Measurement report{% endblock %}
     {% block content %}{{ tiles(key_figures) }} ... {{ chart(cloud) }}{% endblock %}
 
@@ -204,14 +204,6 @@ class Tile:
     value: str
     note: str = ""
     accent: bool = False
-
-
-@dataclass(frozen=True)
-class ComparisonTable:
-    """A table of the ``comparison`` component: columns of values, and rows of words, unit and one value per column."""
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, str, tuple[str, ...]], ...]
 
 
 def make_figure(
