@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.targets.detection.chessboard_grid import count_corners, has_more_corners, remove_doubtful, sample_levels
-from uwlts.targets.detection.lattice import LATTICE_RULE, STEPS
+from uwlts.targets.detection.lattice import LATTICE_RULE, STEPS, local_steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +119,7 @@ class _Corners:
         while frontier:
             asked = []
             for corner in frontier:
-                step_of[corner] = self._local_steps(where[corner], places, step_of[corner])
+                step_of[corner] = local_steps(where[corner], places, self.pixels, step_of[corner])
                 i, j = where[corner]
                 for di, dj in STEPS:
                     if (place := (i + reach * di, j + reach * dj)) not in places:
@@ -148,17 +148,6 @@ class _Corners:
         contrasts = self.contrast[[corner, other]]
         same_phase = np.cos(self.phase[corner] - self.phase[other]) > -_RULE.opposite
         return bool(same_phase and contrasts.max() < _RULE.contrast_ratio * contrasts.min())
-
-    def _local_steps(self, place: tuple[int, int], places: dict[tuple[int, int], int], usual: np.ndarray) -> np.ndarray:
-        """Return steps (2, 2) along i and j at a place: the mean over both neighbours, one neighbour, or ``usual``."""
-        (i, j), steps = place, usual.copy()
-        here = self.pixels[places[place]]
-        for axis, (after, before) in enumerate((((i + 1, j), (i - 1, j)), ((i, j + 1), (i, j - 1)))):
-            ways = [self.pixels[places[after]] - here] if after in places else []
-            ways += [here - self.pixels[places[before]]] if before in places else []
-            if ways:
-                steps[axis] = np.mean(ways, axis=0)
-        return steps
 
 
 def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:

@@ -227,7 +227,7 @@ def _grow_lattice(seed, centres, radii, basis, tree):
     while frontier:
         expected, asked = [], []
         for circle in frontier:
-            steps[circle] = _local_steps(where[circle], places, points, steps[circle])
+            steps[circle] = local_steps(where[circle], places, points, steps[circle])
             i, j = where[circle]
             for di, dj in STEPS:
                 place = (i + reach * di, j + reach * dj)
@@ -258,8 +258,11 @@ def _grow_lattice(seed, centres, radii, basis, tree):
     return places
 
 
-def _local_steps(place, places, points, inherited):
-    """Return the steps along i and j at a place: the mean over both neighbours, one neighbour, or as inherited."""
+def local_steps(place, places, points, inherited):
+    """Return the steps along i and j at a place: the mean over both neighbours, one neighbour, or as inherited.
+
+    Points are arrays (2,) or complex numbers.
+    """
     i, j = place
     here = points[places[place]]
     steps = list(inherited)
