@@ -13,8 +13,14 @@ from uwlts.targets import Target, TargetView
 # The edge of a Gaussian blur s has the slope 0.4 / s times its contrast.
 _SLOPE_TIMES_BLUR = 0.4
 _JUDGED_POINTS = 80  # points for the median sharpness
-# Common points that two images need for a comparison.
-_FEWEST_COMMON = 4
+_FEWEST_COMMON = 4  # common points that two images need for a comparison
+_FEWEST_POINTS = 12  # points of the target in an image, unless it has fewer
+_SMALLEST_SHARE = 0.1  # fraction of the target's points; a target larger than the image is partly visible
+_LARGEST_BLUR_PX = 2.5  # Gaussian blur (standard deviation) of the edges, median over the points
+_SMALLEST_CONTRAST = 0.08  # bright minus dark, median over the points, relative to full scale
+_LARGEST_SATURATED = 0.02  # fraction of the target's pixels at full scale
+_LARGEST_MOTION_PX = 0.5  # shift of the points between two images of one pose, see `measure_shift_px`
+FEWEST_TARGET_LINES = 20  # profile lines with the stripe on the target
 
 
 class LampFault(str):
@@ -27,20 +33,6 @@ class LaserFault(str):
 
 class MotionFault(str):
     """Reason for rejection that disappears when the target is at rest."""
-
-
-@dataclass(frozen=True)
-class QualityLimits:
-    """Limits for accepted images."""
-
-    fewest_points: int = 12  # points of the target in an image, unless it has fewer
-    smallest_share: float = 0.1  # fraction of the target's points; a target larger than the image is partly visible
-    largest_blur_px: float = 2.5  # Gaussian blur (standard deviation) of the edges, median over the points
-    smallest_contrast: float = 0.08  # bright minus dark, median over the points, relative to full scale
-    largest_saturated: float = 0.02  # fraction of the target's pixels, or of the stripe's lines, at full scale
-    largest_motion_px: float = 0.5  # shift of the points between two images of one pose, see `measure_shift_px`
-    smallest_change_px: float = 5.0  # shift of the points from the nearest recorded pose
-    fewest_lines: int = 20  # profile lines with the stripe on the target
 
 
 @dataclass(frozen=True)
@@ -73,9 +65,7 @@ class StripeQuality:
         return len(self.pixels)
 
 
-def judge_target(
-    image: np.ndarray, view: TargetView, target: Target, *, full_dn: int, limits: QualityLimits = QualityLimits()
-) -> TargetQuality:
+def judge_target(image: np.ndarray, view: TargetView, target: Target, *, full_dn: int) -> TargetQuality:
     """Assess an image (H, W) in which the points of ``view`` were found; ``full_dn`` is the value of saturation."""
     count, of_all = len(view.pixels), len(target.indices)
     share = count / of_all
@@ -86,18 +76,18 @@ def judge_target(
     saturated = float(np.mean(image[covered > 0] >= full_dn))
     reasons = {
         f"partial: {count} of {of_all} points found; bring more of the target into the image": (
-            count < min(limits.fewest_points, of_all) or share < limits.smallest_share
+            count < min(_FEWEST_POINTS, of_all) or share < _SMALLEST_SHARE
         ),
-        f"blurred: edges are {blur:.1f} px wide, at most {limits.largest_blur_px:g} are allowed; focus, or change the "
-        "distance": blur > limits.largest_blur_px,
+        f"blurred: edges are {blur:.1f} px wide, at most {_LARGEST_BLUR_PX:g} are allowed; focus, or change the "
+        "distance": blur > _LARGEST_BLUR_PX,
         LampFault(
             f"faint: {100 * contrast:.0f} % of the full scale between bright and dark, at least "
-            f"{100 * limits.smallest_contrast:.0f} % are needed; use more light or a longer lamp_ms"
-        ): contrast < limits.smallest_contrast,
+            f"{100 * _SMALLEST_CONTRAST:.0f} % are needed; use more light or a longer lamp_ms"
+        ): contrast < _SMALLEST_CONTRAST,
         LampFault(
             f"saturated: {100 * saturated:.0f} % of the target's pixels are at the full scale, at most "
-            f"{100 * limits.largest_saturated:.0f} % are allowed; use less light or a shorter lamp_ms"
-        ): saturated > limits.largest_saturated,
+            f"{100 * _LARGEST_SATURATED:.0f} % are allowed; use less light or a shorter lamp_ms"
+        ): saturated > _LARGEST_SATURATED,
     }
     refused = tuple(reason for reason, applies in reasons.items() if applies)
     return TargetQuality(count, share, blur, contrast, saturated, refused)
@@ -146,31 +136,23 @@ def measure_shift_px(one: TargetView, other: TargetView) -> float:
     return float(np.quantile(np.linalg.norm(one.pixels[first] - other.pixels[second], axis=1), 0.9))
 
 
-def judge_motion(before: TargetView, after: TargetView, limits: QualityLimits = QualityLimits()) -> tuple[str, ...]:
+def judge_motion(before: TargetView, after: TargetView) -> tuple[str, ...]:
     """Return a reason if the target moved between two images of one pose; else empty."""
-    way, most = measure_shift_px(before, after), limits.largest_motion_px
+    way, most = measure_shift_px(before, after), _LARGEST_MOTION_PX
     reason = MotionFault(f"moved: the target moved {way:.1f} px between its images, at most {most:g} are allowed")
     return () if way <= most else (reason,)
 
 
-def judge_novelty(
-    view: TargetView, recorded: Sequence[TargetView], limits: QualityLimits = QualityLimits()
-) -> tuple[str, ...]:
-    """Return a reason if a pose is too similar to a recorded one; else empty."""
+def judge_novelty(view: TargetView, recorded: Sequence[TargetView], *, least_px: float = 5.0) -> tuple[str, ...]:
+    """Return a reason if the points are less than ``least_px`` from those of a recorded pose; else empty."""
     ways = [measure_shift_px(view, old) for old in recorded]
-    if not ways or min(ways) >= limits.smallest_change_px:
+    if not ways or min(ways) >= least_px:
         return ()
     return (f"too similar to image {int(np.argmin(ways)) + 1}: differs by {min(ways):.1f} px; move or tilt the target",)
 
 
 def judge_stripe(
-    image: np.ndarray,
-    view: TargetView,
-    target: Target,
-    *,
-    stripe_along: str,
-    full_dn: int,
-    limits: QualityLimits = QualityLimits(),
+    image: np.ndarray, view: TargetView, target: Target, *, stripe_along: str, full_dn: int
 ) -> StripeQuality:
     """Assess a laser image (H, W) of the target.
 
@@ -189,7 +171,7 @@ def judge_stripe(
     clipped = (brightest >= full_dn) & (found | (stripe.status == StripeStatus.SATURATED))
     lit = max(int(found.sum()), int(clipped.sum()), 1)
     saturated, reasons = float(clipped.sum()) / lit, ()
-    if lit >= limits.fewest_lines and saturated > 0.05:
+    if lit >= FEWEST_TARGET_LINES and saturated > 0.05:
         share = f"{100 * saturated:.0f} % of its lines, at most 5 % are allowed"
         reasons = (LaserFault(f"stripe saturated on {share}; shorten laser_ms"),)
     return StripeQuality(pixels[np.array(on_target, dtype=bool)], saturated, reasons)

@@ -6,15 +6,16 @@ The target is shown at the stage's positions or held by hand.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from uwlts.calibration.camera.image_quality import (
+    FEWEST_TARGET_LINES,
     LampFault,
     LaserFault,
     MotionFault,
-    QualityLimits,
     StripeQuality,
     TargetQuality,
     explain_missing_target,
@@ -179,8 +180,9 @@ class PoseJudge:
 
     def __init__(self, setting: Setting, wanted: CompletionLimits, *, full_dn: int):
         self._setting, self._wanted, self._full = setting, wanted, full_dn
-        limits = QualityLimits()
-        self.limits = limits if setting.poses == "free" else replace(limits, smallest_change_px=_STAGE_CHANGE_PX)
+        self.judge_novelty = (
+            judge_novelty if setting.poses == "free" else partial(judge_novelty, least_px=_STAGE_CHANGE_PX)
+        )
 
     def find(self, image: np.ndarray) -> Found:
         """Find and judge the target in a lamp image (H, W)."""
@@ -188,18 +190,13 @@ class PoseJudge:
             view = self._setting.target.detect(image)
         except TargetError as error:
             return Found(image, None, None, (explain_missing_target(image, str(error), full_dn=self._full),))
-        quality = judge_target(image, view, self._setting.target, full_dn=self._full, limits=self.limits)
+        quality = judge_target(image, view, self._setting.target, full_dn=self._full)
         return Found(image, view, quality, quality.reasons)
 
     def stripe(self, image: np.ndarray, view: TargetView) -> StripeQuality:
         """Judge the stripe in a laser image (H, W) on the target in a view."""
         return judge_stripe(
-            image,
-            view,
-            self._setting.target,
-            stripe_along=self._setting.sensor.camera.stripe_along,
-            full_dn=self._full,
-            limits=self.limits,
+            image, view, self._setting.target, stripe_along=self._setting.sensor.camera.stripe_along, full_dn=self._full
         )
 
     def state(self, recorded: Sequence[RecordedPose]) -> State:
@@ -226,7 +223,7 @@ class PoseJudge:
         view, quality = found.usable, found.quality
         if view is None or quality is None:
             return found
-        if reasons := judge_novelty(view, [p.view for p in before.recorded], self.limits):
+        if reasons := self.judge_novelty(view, [p.view for p in before.recorded]):
             return replace(found, reasons=reasons)
         laser = session.take("laser")
         stripe = self.stripe(laser[0], view)
@@ -234,10 +231,10 @@ class PoseJudge:
             laser = session.take("laser")
             stripe = self.stripe(laser[0], view)
         after = self.find(session.take("lamp")[0])
-        reasons = after.reasons if after.usable is None else judge_motion(view, after.usable, self.limits)
+        reasons = after.reasons if after.usable is None else judge_motion(view, after.usable)
         if reasons or stripe.reasons:
             return replace(found, reasons=(*reasons, *stripe.reasons))
-        shown = stripe.lines >= self.limits.fewest_lines
+        shown = stripe.lines >= FEWEST_TARGET_LINES
         pose = RecordedPose(view, stripe.pixels if shown else np.empty((0, 2)), stage_mm)
         try:
             state = self.state([*before.recorded, pose])
@@ -331,7 +328,7 @@ class TargetPhase:
         view = found.usable
         if view is None:
             return found.reasons
-        reasons = judge_novelty(view, known, self._judge.limits)
+        reasons = self._judge.judge_novelty(view, known)
         if reasons or advice is None or describe_missing_sheet(state):
             return reasons
         gain = compute_gain(state, view, estimate_pose(view, state.camera))

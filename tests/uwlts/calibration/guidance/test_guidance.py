@@ -9,7 +9,6 @@ import pytest
 from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lens_of, step_profile, through_window
 from tests.uwlts.drawn_target import drawn_lamp, drawn_laser, target_pose
 from uwlts.calibration.camera.image_quality import (
-    QualityLimits,
     edge_blur_px,
     explain_missing_target,
     judge_motion,
@@ -355,12 +354,6 @@ def test_in_a_medium_the_camera_seems_longer(thesis):
     pixels = cv2.projectPoints(points, cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3], air.matrix(), None)[0][:, 0]
     view = TargetView(pixels, points, np.zeros((len(points), 2), int), {})
     np.testing.assert_allclose(estimate_pose(view, air), pose, atol=1e-4)
-
-
-def test_limits_can_be_chosen(small):
-    image = drawn_lamp(small, PLATE, target_pose(), blur_px=1.5)
-    strict = QualityLimits(largest_blur_px=1.0)
-    assert judge_target(image, PLATE.detect(image), PLATE, full_dn=FULL, limits=strict).reasons
 
 
 # The step standard
