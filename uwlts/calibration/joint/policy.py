@@ -31,8 +31,9 @@ from uwlts.calibration.joint.linearised_estimate import (
 )
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.problem import JointProblem, joint_problem
-from uwlts.calibration.joint.residuals import BENDS, STRETCH
+from uwlts.calibration.joint.residuals import BENDS, STRETCH, STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
+from uwlts.calibration.moved_sheet import doubt_sheet_at_rest
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.model.parameter_keys import LensParameter, ParameterKey, TargetParameter
@@ -55,9 +56,21 @@ def solve_consistently(
     Returns the problem, its estimate, the findings against it, and the changes.
     """
     attempt = _solve_first(gathered, options)
+    # Before images are left out, which may all be from one side of a move.
+    moved = _doubt_sheet_at_rest(attempt.problem.evidence, attempt.result)
     if not options.strict:
         attempt = attempt.improve()
-    return attempt.problem, attempt.result, attempt.against, attempt.said
+    return attempt.problem, attempt.result, attempt.against, (*moved, *attempt.said)
+
+
+def _doubt_sheet_at_rest(evidence: Sequence[Evidence], result: Estimate) -> list[str]:
+    lit = [
+        (piece.sources[part.image], piece.pixels[piece.stripe_pixels(part.image)], part.values)
+        for piece, parts in zip(evidence, result.residuals, strict=True)
+        for part in parts
+        if part.kind == STRIPE
+    ]
+    return doubt_sheet_at_rest(*zip(*lit, strict=True), across=evidence[0].across, unit="px") if lit else []
 
 
 def solve_and_check(problem: JointProblem) -> tuple[Estimate, Findings]:

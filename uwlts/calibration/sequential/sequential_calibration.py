@@ -23,6 +23,7 @@ from uwlts.calibration.capture_evidence import (
     find_air_evidence,
     step_evidence,
 )
+from uwlts.calibration.moved_sheet import doubt_sheet_at_rest
 from uwlts.calibration.sequential.plausibility import doubt_step_height, doubt_target_size
 from uwlts.calibration.sequential.sheet_fit import (
     SheetSolution,
@@ -194,6 +195,15 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     )
     figures, apart = {"camera": camera.figures()}, None
     warnings = [*evidence.warnings, *seen.warnings]
+    rays = stripe_points.points_mm[:, :2] / stripe_points.points_mm[:, 2:]
+    of_image = [stripe_points.image == number for number in range(len(found.stripes))]
+    warnings += doubt_sheet_at_rest(
+        found.names(),
+        [rays[here] for here in of_image],
+        [sheet.residuals_mm[here] for here in of_image],
+        across=1 if sensor.camera.stripe_along == "width" else 0,
+        unit="mm",
+    )
     if seen.lens is not None:
         sheet, apart = _add_image_uncertainty(sheet, seen.lens, found), _angle_between_halves(sheet, seen.lens, found)
         figures["camera"] |= _lens_figures(seen.lens, found)
