@@ -580,6 +580,8 @@ class Uncertainty(Description):
     - ``step_height_mm``: height of a step standard.
     - ``tangential``: the lens's coefficients p1 and p2.
     - ``sheet_thickness``: thickness of the laser sheet, relative.
+    - ``focal_length``: relative error of the focal length, of a camera that was calibrated before. Default: unknown,
+      since lens names are rounded and focusing changes it.
     """
 
     window_distance_mm: NotNegative = 5.0
@@ -600,11 +602,12 @@ class Uncertainty(Description):
     step_height_mm: Positive = 0.01
     tangential: NotNegative = 5e-4
     sheet_thickness: NotNegative = 0.1
+    focal_length: Positive | None = None
 
     def scaled(self, factor: float) -> "Uncertainty":
         """Return all uncertainties multiplied by a factor."""
         rows, columns = self.stretch_by_axis()
-        update = {name: factor * value for name, value in self if name != "target_stretch"}
+        update = {name: factor * value for name, value in self if isinstance(value, float)}
         return self.model_copy(update=update | {"target_stretch": (factor * rows, factor * columns)})
 
     def stretch_by_axis(self) -> tuple[float, float]:

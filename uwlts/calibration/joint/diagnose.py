@@ -42,6 +42,7 @@ _CHECK: dict[SingleParameter, str] = {
     TargetParameter.TWIST: "the target's flatness, or uncertainty.target_bow_mm",
     TargetParameter.STRETCH_X: "the target's spacings, or uncertainty.target_stretch",
     TargetParameter.STRETCH_Y: "the target's spacings, or uncertainty.target_stretch",
+    **dict.fromkeys((LensParameter.F, LensParameter.FX, LensParameter.FY), "the target's spacing, lens and focus"),
     LensParameter.P1: "the lens, or uncertainty.tangential",
     LensParameter.P2: "the lens, or uncertainty.tangential",
 }

@@ -260,6 +260,10 @@ def build_priors(
     for (name, medium), index in zip(gathered.media.items(), gathered.indices(options), strict=True):
         std = medium.index_uncertainty(sensor.laser.wavelength_nm, known)
         priors[MediumIndex(name)] = Prior(index, known.index if options.medium_index else std)
+    if known.focal_length is not None and (window is not None or not gathered.media):
+        focal, aspect = sensor.camera.focal_lengths_px(), options.camera.pixel_aspect
+        keys = (LensParameter.FX, LensParameter.FY) if aspect is None else (LensParameter.F,)
+        priors |= {key: Prior(px, known.focal_length * px) for key, px in zip(keys, focal, strict=False)}
     priors |= {key: Prior(float(value), np.inf) for key, value in zip(SHEET[:3], turns, strict=True)}
     bow, turn = np.radians([known.bow_deg, known.laser_window_tilt_deg])
     priors[SheetParameter.BOW] = Prior(float(np.radians(sensor.laser.bow_deg)), float(bow))

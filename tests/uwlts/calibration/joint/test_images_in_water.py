@@ -84,3 +84,20 @@ def test_larger_uncertainties_are_nowhere_smaller(thesis, in_air):
     assert any("all points of an image count as one" in words for words in result.warnings)
     assert after.keys() == before.keys()
     assert all(std >= (1 - 1e-9) * before[key] for key, std in after.items())
+
+
+@pytest.mark.parametrize(("pitch", "noticed"), [(1.0, False), (1.01, True), (0.99, True)])
+def test_a_wrong_pitch_in_water_contradicts_a_known_focal_length(thesis, pitch, noticed):
+    """1 % are ten standard uncertainties of a focal length that is known to 0.1 %."""
+    noise = Noise(circles_px=0.05, stripe_px=0.15, stage_mm=0.003, rng=np.random.default_rng(70))
+    series = target_series(BUILT, medium=0, positions=np.linspace(-120, 60, 6), noise=noise, columns=7)
+    images = [replace(image, points_mm=pitch * image.points_mm) for image in series.found.images]
+    known = {
+        "camera": {"focal_length_mm": 1.0005 * BUILT.camera.focal_length_mm},
+        "uncertainty": {"focal_length": 1e-3},
+    }
+    evidence = gathered(altered(thesis, known), [replace(series, found=replace(series.found, images=images))])
+    result, against = solve_and_check(joint_problem(evidence, options=OPTIONS))
+    assert any("focal length found" in words for words in against.contradictions) == noticed
+    assert result.std()[LensParameter.F] < 1.1e-3 * BUILT.camera.focal_length_px()
+    assert noticed or not against.all_against()
