@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+NODES = (-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6)
+"""Places and weights of a normal distribution (Gauss-Hermite, exact to the fifth power)."""
 NO_WEIGHT = 1e-9
 """Sum of absolute weights that counts as zero: rounding errors are smaller."""
 
@@ -16,6 +18,9 @@ class BeadProfiles:
     """Linear operators from point heights to profiles on a grid across each of S sections, G places each."""
 
     across_mm: np.ndarray  # (G,); places of the grid across the weld
+    # (n,) each; places of the points across the weld, and the sizes of their footprints across it.
+    places_mm: np.ndarray
+    size_mm: np.ndarray
     sections: int  # number of sections S
     smooth: sparse.csr_array  # (S G, n) sparse; local quadratics through the points
     plates: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -27,6 +32,11 @@ class BeadProfiles:
     def subtract_plates(self, heights: np.ndarray) -> np.ndarray:
         """Return heights (n,) of the points above the plates."""
         return heights - sum(base @ (rows @ heights) for base, rows in self.plates)
+
+    def observe(self, middle: float, height: float, half: float, exponent: int) -> np.ndarray:
+        """Return the heights (n,) that the points measure on a straight bead H (1 - (d / half)^2)^exponent."""
+        parts = [(weight, (self.places_mm - middle + node * self.size_mm) / half) for node, weight in NODES]
+        return sum((part * height * np.maximum(1 - t * t, 0) ** exponent for part, t in parts), np.zeros(1))
 
     def evaluate(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
         """Return the profiles (S, G) for point heights (n,).

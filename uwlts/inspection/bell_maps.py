@@ -23,12 +23,7 @@ from uwlts.fitting.least_squares import MAD_TO_STD, robust_std
 
 @dataclass(frozen=True, kw_only=True)
 class BlemishSearchRule:
-    """Numbers of the search.
-
-    The threshold of an indication follows from the probability of a false alarm. The numbers below were chosen by hand
-    with the reasons stated, not fitted to data. Results with these numbers are checked on the rendered pipes of
-    docs/studies/inspection.py and on the simulated surfaces of tests/uwlts/inspection/test_inspect.py.
-    """
+    """Numbers of the search; the threshold of an indication follows from the probability of a false alarm."""
 
     points_in_smallest: int = 12
     """Points in a disc of the smallest size: at least three profiles, even if points are much denser along profiles."""

@@ -33,12 +33,7 @@ from uwlts.inspection.noisy_extremes import BIAS_FACTOR
 
 @dataclass(frozen=True, kw_only=True)
 class BlemishRule:
-    """Numbers of the measurement of a blemish.
-
-    Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
-    pipes of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py. The edge of
-    a blemish is that of the search (`SEARCH_RULE`).
-    """
+    """Numbers of the measurement of a blemish, whose edge is that of the search (`SEARCH_RULE`)."""
 
     draws: int = 120  # noise draws: three exceed either end of a 95 % interval
     depth_draws: int = 48  # noise draws for the standard deviation of depths, which 48 give to 10 %
@@ -176,7 +171,8 @@ def measure_blemish(
     again: list[dict[str, Any]] = [{"share": 1 - field.footprint_std}] + [{"steps": 0}, {"steps": 2}] * is_rough
     resolved = np.array([field.figures(field.depths(heights, **each), edge, deepest, between) - seen for each in again])
     if wide_depth is not None:
-        resolved = np.vstack([resolved, [wide_depth - seen[0], 0, 0, 0, 0]])
+        changes = wide_depth - seen[0], field.std_of_tips(depths, deepest)
+        resolved = np.vstack([resolved, *([each, 0, 0, 0, 0] for each in changes)])
         # This model has the noise already. Its bias increases with the variance at a single summit, and with the
         # standard deviation in level ground: between 1 and `BIAS_FACTOR` times the increase by the same noise again.
         # Scatter that steep ground adds to it is a misfit of the quadratics, which makes no place deeper.
@@ -318,7 +314,7 @@ class _Field:
     seen: sparse.csr_array
     sharp: sparse.csr_array
     footprint_std: float  # relative standard uncertainty of the squared footprints
-    stride: int  # half a bandwidth in cells
+    bandwidth: float  # radius of the quadratics, mm
     region: np.ndarray  # (G,) bool; cells of the blemish
     gap_mm: float  # distance from all points, from which a place is not seen
 
@@ -355,7 +351,6 @@ class _Field:
         # Beyond a border of the points quadratics would extrapolate.
         widest = float(np.max(measure_spacing(surface.places[near], np.flatnonzero(~ring))))
         region = KDTree(places[~ring]).query(grid)[0] < min(bandwidth, max(search.smallest_mm, widest))
-        stride = max(1, round(0.5 * bandwidth / cell))
         size = surface.footprint_mm[near]
         sharp = seen = _interpolation_rows((places - grid[0]) / cell, shape)
         if np.any(size > 0):
@@ -370,7 +365,9 @@ class _Field:
             outer = fit_biweight(design, heights, far)[0] - plane
         known = surface.places[near], size, grid + middle, shape, cell
         gap = max(search.gap_mm, widest)
-        return cls(near, *known, smooth, design, plane, outer, seen, sharp, surface.footprint_std, stride, region, gap)
+        return cls(
+            near, *known, smooth, design, plane, outer, seen, sharp, surface.footprint_std, bandwidth, region, gap
+        )
 
     def depths(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
         """Return heights (G,) above the undamaged surface for point heights (n,).
@@ -432,6 +429,19 @@ class _Field:
             return f"not sized: {np.count_nonzero(own)} points show it; {SEARCH_RULE.points_in_smallest} are needed"
         return None
 
+    def std_of_tips(self, depths: np.ndarray, deepest: int) -> float:
+        """Return the standard uncertainty of the depth by the unknown form of the deepest place.
+
+        It lies between a cone and a level disc with a kink at its rim, which are as deep as the surface there and a
+        bandwidth away (rectangular distribution, GUM, 4.3.7).
+        """
+        away = np.hypot(*(self.grid - self.grid[deepest]).T)
+        around = self.region & (np.abs(away - self.bandwidth) < 0.5 * self.cell)
+        drop = depths[deepest] - float(np.mean(depths[around])) if around.any() else 0.0
+        r = np.minimum(np.hypot(*(self.places - self.grid[deepest]).T) / self.bandwidth, 1.0)
+        # The difference of both forms: the depth is linear in the heights.
+        return abs(float(self.depths(drop * (r - np.maximum(2 * r - 1, 0)))[deepest])) / np.sqrt(12)
+
     def noise_of_means(self, noise_mm: float) -> np.ndarray:
         """Return the standard deviations (G,) of the smooth surface by the noise of independent points."""
         return noise_mm * np.sqrt(np.asarray(self.smooth.power(2).sum(axis=1)).ravel())
@@ -467,7 +477,7 @@ class _Field:
         """Return the largest depth between cells, from parabolas through the deepest cell and its neighbours."""
         field, at = depths.reshape(self.shape), np.array(np.unravel_index(top, self.shape))
         depth = float(field[tuple(at)])
-        for step in self.stride * np.eye(2, dtype=int):
+        for step in max(1, round(0.5 * self.bandwidth / self.cell)) * np.eye(2, dtype=int):
             if np.all(at - step >= 0) and np.all(at + step < self.shape):
                 before, after = float(field[tuple(at - step)]), float(field[tuple(at + step)])
                 bend = before + after - 2 * float(field[tuple(at)])

@@ -32,11 +32,7 @@ from uwlts.storage.cloud_files import load_cloud
 
 @dataclass(frozen=True, kw_only=True)
 class FlatRule:
-    """Numbers of the inspection of faces, edges, holes and gaps.
-
-    Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
-    scans of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py.
-    """
+    """Numbers of the inspection of faces, edges, holes and gaps."""
 
     fewest_points: int = 200  # fewest points of a cloud, a face or a plate
     off_face: float = 6.0  # largest distance of a point from its face, in standard deviations

@@ -40,8 +40,6 @@ _OFF_SURFACE = 0.35
 diameter, the deepest that codes assess, are 0.3 deep."""
 _MOVED = 0.2
 """Change of the form, in standard deviations of a point, after which the surface is searched again."""
-_ROUGH = 0.25
-"""Part of a hollow covered by hollows in it, from which its ground is rough and it is one finding."""
 _FEWEST_POINTS = 500
 """Fewest points for a search on a pipe's surface."""
 
@@ -297,7 +295,7 @@ def _blemish_features(
         sides = np.ptp((around := unroll_about(indication))[0].places[indication.points], axis=0)
         if not is_explained(indication) and np.min(sides) >= DENT_SHARE * 2 * form.radius_mm:
             whole = search_within(around[0], search, indication)
-            if whole is not None and not whole.is_rough(_ROUGH):
+            if whole is not None:
                 large.append((whole, around[1]))
     taken = np.zeros(len(chosen), bool)
     for whole, middle in large:

@@ -23,11 +23,7 @@ A choice: pipes bent in the yard or dented by handling are less round than new l
 
 @dataclass(frozen=True, kw_only=True)
 class PipeFormRule:
-    """Numbers of the fit of a pipe's form.
-
-    Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
-    pipes of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py.
-    """
+    """Numbers of the fit of a pipe's form."""
 
     start_points: int = 6000  # points for the first cylinder; more points would not change this start
     most_points: int = 150_000  # most points of the fit; with more points the errors common to all of them dominate

@@ -22,10 +22,7 @@ from uwlts.storage.cloud import PointCloud
 
 @dataclass(frozen=True, kw_only=True)
 class PipeWeldRule:
-    """Numbers of the search for welds of a pipe.
-
-    Chosen by hand with the reasons below. Results are checked on the pipes of tests/oracles/pipes.py.
-    """
+    """Numbers of the search for welds of a pipe."""
 
     lengths: int = 36
     """Cells along a weld. A blemish covers a few of them."""
@@ -34,9 +31,9 @@ class PipeWeldRule:
     baseline: float = 0.4
     """Width of the median that gives the height beside a weld, as a fraction of the pipe's extent across the weld."""
     significant: float = 3.0  # least height of a weld in its cells, in standard deviations of a cell
-    lean: float = 0.05
+    lean: float = 0.06
     """Largest inclination of a girth weld's plane, as the change of its place divided by the diameter: a cut of 3
-    deg."""
+    deg, with a margin for the error of the place."""
     toes: float = 1.7
     """Half width of the region that belongs to a weld, divided by that of its bead: it contains the undercuts."""
 
@@ -69,11 +66,13 @@ def find_welds(form: PipeForm, chosen: np.ndarray) -> list[PipeWeld]:
 
     def add(is_girth: bool, across: np.ndarray, length: np.ndarray, ridges: list[tuple[float, float]]) -> None:
         for middle, half in ridges:
-            # Cells are coarse: the points of the bead give its middle.
-            own = np.abs(across - middle) < half
-            middle = float(np.average(across[own], weights=np.maximum(heights[own], 0)))
+            # Cells are coarse: the points of the bead give its middle, and the rest of its inclination.
+            terms = [np.ones(len(across)), *([np.cos(angle), np.sin(angle)] if is_girth else [])]
+            design, own = np.stack(terms, axis=1), np.abs(across - middle) < half
+            weights = np.sqrt(np.maximum(heights[own], 0))
+            fit = np.linalg.lstsq(design[own] * weights[:, None], across[own] * weights, rcond=None)[0]
             off, at = whole.copy(), whole.copy()
-            off[chosen], at[chosen] = across - middle, length
+            off[chosen], at[chosen] = across - design @ fit, length
             found.append(PipeWeld(is_girth, off, at, half))
 
     around = form.radius_mm * angle

@@ -38,3 +38,10 @@ def test_a_finding_cut_by_a_border_says_so(seed: int) -> None:
         record: Any = each.record()
         assert record["values"]["depth"]["high"] is None and record["reason"] == each.reason
     assert sum("not seen whole" in line for line in found.lines()) == 4
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("gouges", 406), ("patch of corrosion", 414)])
+def test_rough_ground_is_one_finding(kind: str, seed: int) -> None:
+    """A smooth surface below it does not follow a gouge or an area of corrosion: nothing is searched for in these."""
+    counts = count_drawn(kind, seed)
+    assert counts["inside"] == counts["values"] == counts["truths"] and not counts["invented"], counts
