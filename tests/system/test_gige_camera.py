@@ -150,12 +150,12 @@ def test_free_running_frames_follow_each_other_past_the_end_of_the_counter(scene
         (lambda served: served.inject("drop", 2), "dropped", "preceded by dropped frames"),
         (lambda served: served.inject("repeat"), "duplicated", "it repeats the previous frame"),
         (lambda served: served.inject("cut"), "short", "incomplete: packets were lost"),
-        (lambda served: served.inject("delay", delay_s=0.3), "late", "more than one frame period"),
+        (lambda served: served.inject("delay", delay_s=0.8), "late", "more than one frame period"),
     ],
 )
 def test_each_fault_of_a_free_running_camera_is_named(served, camera, inject, status, message):
-    # Slow, so that a busy machine does not make frames late.
-    camera.configure(frame_rate_hz=10)
+    # Slow, so that a busy machine makes no frame late by half a period.
+    camera.configure(frame_rate_hz=4)
     camera.start()
     camera.grab(WAIT_S)
     inject(served)
@@ -170,7 +170,7 @@ def test_each_fault_of_a_free_running_camera_is_named(served, camera, inject, st
 
 
 def test_with_skip_faults_are_counted_and_unusable_frames_passed_over(served, camera):
-    camera.configure(frame_rate_hz=10)
+    camera.configure(frame_rate_hz=4)
     camera.start(faults="skip")
     camera.grab(WAIT_S)
     served.inject("cut")
