@@ -30,8 +30,7 @@ from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
 
 
-@dataclass(frozen=True, kw_only=True)
-class FlatRule:
+class _Rule:
     """Numbers of the inspection of faces, edges, holes and gaps."""
 
     fewest_points: int = 200  # fewest points of a cloud, a face or a plate
@@ -55,9 +54,6 @@ class FlatRule:
     edge_lines: int = 4
     """Lines next to an edge without influence on the flatness: by the camera's blur they also show what is beyond."""
     draws: int = 48  # noise draws for the flatness; 48 give a standard deviation to 10 %
-
-
-_RULE = FlatRule()
 
 
 def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
@@ -143,14 +139,14 @@ def inspect_flange(
         try:
             holes.append(_fit_hole(edges))
         except EvaluationError as error:
-            if len(np.unique(edges.frame)) >= _RULE.fewest_images:
+            if len(np.unique(edges.frame)) >= _Rule.fewest_images:
                 notes.append(_note_omission(face, edges.places.mean(axis=0), str(error)))
     if holes:
         largest = max(holes, key=lambda hole: hole.radius_mm)
         bolts = [hole for hole in holes if hole is not largest]
         if bolts:
             usual = float(np.median([hole.radius_mm for hole in bolts]))
-            same = [abs(hole.radius_mm - usual) < _RULE.same_diameter * usual for hole in bolts]
+            same = [abs(hole.radius_mm - usual) < _Rule.same_diameter * usual for hole in bolts]
             notes += [
                 _note_omission(
                     face,
@@ -209,8 +205,8 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     # The edge with the smaller line number comes first.
     sides = edges.places[edges.first], edges.places[~edges.first]
     middle = edges.places.mean(axis=0)
-    if min(map(len, sides)) < _RULE.fewest_edges:
-        raise EvaluationError(f"{min(map(len, sides))} profiles show the gap; at least {_RULE.fewest_edges} are needed")
+    if min(map(len, sides)) < _Rule.fewest_edges:
+        raise EvaluationError(f"{min(map(len, sides))} profiles show the gap; at least {_Rule.fewest_edges} are needed")
     along = np.linalg.svd(np.vstack([side - side.mean(axis=0) for side in sides]))[2][0]
     across = np.array([-along[1], along[0]])
     turn = np.stack([along, across])
@@ -224,10 +220,10 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     sign = np.sign(lines[1][0] - lines[0][0])
     left = np.concatenate([p - d @ line for p, d, line in zip(places, design, lines, strict=True)])
     weights = sign * np.hstack([-rows[0], rows[1]])
-    noise = max(float(np.sqrt(np.sum(left**2) / max(len(left) - 4, 1))), edges.spacing * _RULE.edge_std)
+    noise = max(float(np.sqrt(np.sum(left**2) / max(len(left) - 4, 1))), edges.spacing * _Rule.edge_std)
     random = noise**2 * weights @ weights.T
     # Blur shifts both edges in opposite directions, even if the cloud does not state it.
-    common = np.diag([(2 * _RULE.edge_blur * edges.spacing) ** 2, 0.0])
+    common = np.diag([(2 * _Rule.edge_blur * edges.spacing) ** 2, 0.0])
     order = np.concatenate([np.flatnonzero(edges.first), np.flatnonzero(~edges.first)])
     if edges.patterns is not None:
         moved = weights @ (edges.patterns[:, order] @ across).T
@@ -252,7 +248,7 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     notes = [
         _note_omission(face, each.places.mean(axis=0), f"{number} profiles cross it, fewer than the measured gap")
         for each in found
-        if each is not edges and (number := len(np.unique(each.frame))) >= _RULE.fewest_images
+        if each is not edges and (number := len(np.unique(each.frame))) >= _Rule.fewest_images
     ]
     return _make_inspection("gap", cloud, (feature,), [], notes)
 
@@ -294,17 +290,17 @@ class _Hole:
 def _load_faces(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
     """Return the cloud, read if it is a file; raise EvaluationError if it has too few points."""
     cloud = load_cloud(cloud)
-    if len(cloud) < _RULE.fewest_points:
-        raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_RULE.fewest_points} are needed")
+    if len(cloud) < _Rule.fewest_points:
+        raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_Rule.fewest_points} are needed")
     return cloud
 
 
 def _find_largest_face(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal (3,), towards the sensor, and the points' indices of the plane with most points."""
-    plane, inside = Plane.find(points, towards=TOWARDS_SENSOR, off=_RULE.off_face)
-    if np.count_nonzero(inside) < _RULE.fewest_points:
+    plane, inside = Plane.find(points, towards=TOWARDS_SENSOR, off=_Rule.off_face)
+    if np.count_nonzero(inside) < _Rule.fewest_points:
         raise EvaluationError(
-            f"the largest flat face holds {np.count_nonzero(inside)} points; {_RULE.fewest_points} are needed"
+            f"the largest flat face holds {np.count_nonzero(inside)} points; {_Rule.fewest_points} are needed"
         )
     return plane.normal, np.flatnonzero(inside)
 
@@ -312,9 +308,9 @@ def _find_largest_face(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _estimate_step_height(levels: np.ndarray) -> float:
     """Return the distance of the two most frequent heights."""
     low, high = np.quantile(levels, [0.001, 0.999])
-    count, edges = np.histogram(levels, bins=_RULE.histogram_bins, range=(low, high))
+    count, edges = np.histogram(levels, bins=_Rule.histogram_bins, range=(low, high))
     first = int(np.argmax(count))
-    apart = np.abs(np.arange(len(count)) - first) > _RULE.level_bins
+    apart = np.abs(np.arange(len(count)) - first) > _Rule.level_bins
     if high <= low or not count[apart].any():
         raise EvaluationError("only one face found: the cloud has to show both faces of the step")
     second = int(np.argmax(np.where(apart, count, 0)))
@@ -375,7 +371,7 @@ def _measure_flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> Featu
     """
     inner = _mask_inner_points(cloud, used)
     local = (cloud.points_mm[used] - face.point_mm) @ face.axes[:2].T
-    cell = float(np.ptp(local, axis=0).max()) / _RULE.flat_cells
+    cell = float(np.ptp(local, axis=0).max()) / _Rule.flat_cells
     index = np.unique(np.floor(local / cell).astype(int), axis=0, return_inverse=True)[1].ravel()
     count = np.bincount(index[inner], minlength=int(index.max()) + 1)
     full = count >= max(8, 0.2 * np.median(count))
@@ -393,7 +389,7 @@ def _measure_flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> Featu
     def changed(moves: np.ndarray) -> float:
         return float(np.ptp(found + means(moves))) - value
 
-    drawn = [changed(moves) for moves in noisy.draw(_RULE.draws)]
+    drawn = [changed(moves) for moves in noisy.draw(_Rule.draws)]
     increase, common = max(float(np.mean(drawn)), 0.0), errors.by_patterns(changed)
     flatness, random = max(value - BIAS_FACTOR * increase, 0.0), float(np.hypot(np.std(drawn), increase))
     shared = None if common is None else float(common)
@@ -407,10 +403,10 @@ def _mask_inner_points(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     order = np.lexsort((cloud.line[used], cloud.frame[used]))
     frame, line = cloud.frame[used][order], cloud.line[used][order]
     # Few missing lines are no edge.
-    run = np.cumsum(np.append(0, (np.diff(frame) != 0) | (np.diff(line) >= _RULE.gap_lines)))
+    run = np.cumsum(np.append(0, (np.diff(frame) != 0) | (np.diff(line) >= _Rule.gap_lines)))
     first, last = np.searchsorted(run, run), np.searchsorted(run, run, side="right") - 1
     inner = np.empty(len(used), bool)
-    inner[order] = (line - line[first] >= _RULE.edge_lines) & (line[last] - line >= _RULE.edge_lines)
+    inner[order] = (line - line[first] >= _Rule.edge_lines) & (line[last] - line >= _Rule.edge_lines)
     return inner
 
 
@@ -428,7 +424,7 @@ def _find_gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]
     same = frame[1:] == frame[:-1]
     step = np.linalg.norm(np.diff(local, axis=0), axis=1)
     spacing = float(np.median(step[same & (np.diff(line) == 1)]))
-    at = np.flatnonzero(same & (np.diff(line) >= _RULE.gap_lines) & (step > _RULE.gap_lines * spacing))
+    at = np.flatnonzero(same & (np.diff(line) >= _Rule.gap_lines) & (step > _Rule.gap_lines * spacing))
     if not len(at):
         return []
     beyond = _locate_edges(cloud, own, np.append(0, np.cumsum(~same)), face, spacing)
@@ -473,7 +469,7 @@ def _locate_edges(cloud: PointCloud, own: np.ndarray, row: np.ndarray, face: _Fa
     if not (np.isfinite(bright).all() and (blur > 0).all()):
         return result
     for side, sign in ((0, -1), (1, 1)):
-        inner = np.stack([np.clip(np.arange(len(own)) + sign * k, 0, len(own) - 1) for k in _RULE.plain_lines])
+        inner = np.stack([np.clip(np.arange(len(own)) + sign * k, 0, len(own) - 1) for k in _Rule.plain_lines])
         known = (row[inner] == row).all(axis=0)
         share = bright / np.maximum(np.median(bright[inner], axis=0), 1e-9)
         within = blur * norm.ppf(np.clip(share, 0.02, 0.98))
@@ -487,8 +483,8 @@ def _fit_hole(edges: _Edges) -> _Hole:
 
     EvaluationError if the edge is not round, or too little of the edge is known.
     """
-    if len(edges.places) < _RULE.fewest_edges:
-        raise EvaluationError(f"its edge has {len(edges.places)} points, at least {_RULE.fewest_edges} are needed")
+    if len(edges.places) < _Rule.fewest_edges:
+        raise EvaluationError(f"its edge has {len(edges.places)} points, at least {_Rule.fewest_edges} are needed")
     circle = Circle.fit(edges.places)
     middle, radius = circle.centre_mm, circle.radius_mm
     away = edges.places - middle
@@ -497,18 +493,18 @@ def _fit_hole(edges: _Edges) -> _Hole:
     angle = np.sort(np.degrees(np.arctan2(away[:, 1], away[:, 0])))
     seen = 360 - float(np.max(np.diff(np.append(angle, angle[0] + 360))))
     scatter = float(np.sqrt(np.sum(left**2) / (len(left) - 3)))
-    if scatter > (limit := max(_RULE.roundness * radius, 1.5 * edges.spacing)):
+    if scatter > (limit := max(_Rule.roundness * radius, 1.5 * edges.spacing)):
         raise EvaluationError(
             f"it is not round: its edge scatters about a circle by {scatter:.2g} mm, more than {limit:.2g} mm"
         )
-    if seen < _RULE.hole_arc_deg:
-        raise EvaluationError(f"the cloud shows {seen:.0f} deg of its edge; {_RULE.hole_arc_deg:.0f} deg are needed")
+    if seen < _Rule.hole_arc_deg:
+        raise EvaluationError(f"the cloud shows {seen:.0f} deg of its edge; {_Rule.hole_arc_deg:.0f} deg are needed")
     rows = np.linalg.pinv(np.column_stack([away / distance[:, None], np.ones(len(left))]))
-    random = max(scatter, edges.spacing * _RULE.edge_std) ** 2 * rows @ rows.T
+    random = max(scatter, edges.spacing * _Rule.edge_std) ** 2 * rows @ rows.T
     moved = None
     if edges.patterns is not None:
         moved = np.einsum("mej,ej->me", edges.patterns, away / distance[:, None]) @ rows.T
-    return _Hole(middle, radius, random, moved, edges.points, _RULE.edge_blur * edges.spacing)
+    return _Hole(middle, radius, random, moved, edges.points, _Rule.edge_blur * edges.spacing)
 
 
 def _make_diameter(kind: FeatureKind, name: str, hole: _Hole) -> FeatureValue:
@@ -573,12 +569,12 @@ def _measure_parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum
 
 def _measure_flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], middle: np.ndarray) -> FeatureValue:
     """Return the offset of two plates along the normal at a place between them."""
-    if min(map(len, plates)) < _RULE.fewest_points:
-        raise EvaluationError(f"the smaller plate has {min(map(len, plates))} points; {_RULE.fewest_points} are needed")
+    if min(map(len, plates)) < _Rule.fewest_points:
+        raise EvaluationError(f"the smaller plate has {min(map(len, plates))} points; {_Rule.fewest_points} are needed")
     parts, used, residuals = [], [], []
     for sign, chosen in zip((-1.0, 1.0), plates, strict=True):
         local = (cloud.points_mm[chosen] - face.point_mm) @ face.axes.T
-        near = np.abs(local[:, 2] - np.median(local[:, 2])) < _RULE.off_face * max(
+        near = np.abs(local[:, 2] - np.median(local[:, 2])) < _Rule.off_face * max(
             robust_std(local[:, 2] - np.median(local[:, 2])), 1e-9
         )
         chosen, local = chosen[near], local[near]

@@ -25,8 +25,7 @@ from uwlts.inspection.blemishes import Blemish, NotSignificantError, measure_ble
 from uwlts.inspection.features import FeatureKind, plain_value
 
 
-@dataclass(frozen=True, kw_only=True)
-class NestedRule:
+class _Rule:
     """Numbers of the surface of a large blemish."""
 
     bandwidth: float = 0.35
@@ -51,8 +50,6 @@ class NestedRule:
     significant: float = 3.0  # least height of an indication, in errors of the smooth surface
     worst: float = 0.99  # quantile of these errors: edges cover a few percent of the window, other pits less than one
 
-
-_RULE = NestedRule()
 
 _SMALLEST = 1e-12
 """Lower bound of a scatter, mm, so that rounding of exact heights produces no outliers."""
@@ -96,12 +93,12 @@ class LargeBlemish:
         reach = float(np.max(np.hypot(*(places - middle).T)))
         density = len(self.chosen) / float(np.prod(np.ptp(self.surface.places, axis=0)))
         below = self.height_mm[indication.points] / (np.abs(self.height_mm).max() * np.sign(self.own.height_mm))
-        if np.median(below) < _RULE.rim and len(places) < _RULE.compact * density * np.pi * reach**2:
+        if np.median(below) < _Rule.rim and len(places) < _Rule.compact * density * np.pi * reach**2:
             return True
         elsewhere = np.hypot(*(self.surface.places - middle).T) > reach + 2 * self.largest_mm
-        error = float(np.quantile(self.std_mm[elsewhere], _RULE.worst)) if elsewhere.any() else np.inf
+        error = float(np.quantile(self.std_mm[elsewhere], _Rule.worst)) if elsewhere.any() else np.inf
         significant = abs(indication.height_mm) * self.search.threshold / indication.z
-        return abs(indication.height_mm) < significant + _RULE.significant * error
+        return abs(indication.height_mm) < significant + _Rule.significant * error
 
     def without(self, surface: UnrolledSurface, points: np.ndarray) -> UnrolledSurface:
         """Return the whole surface with the heights of the large one at the given points (N,) bool."""
@@ -144,23 +141,23 @@ def search_within(surface: UnrolledSurface, search: BlemishSearch, large: Indica
     own = surface.places[large.points]
     low, high = own.min(axis=0), own.max(axis=0)
     radius = 0.25 * float(np.sum(high - low))
-    bandwidth = _RULE.bandwidth * radius
+    bandwidth = _Rule.bandwidth * radius
     if 0.5 * bandwidth < search.smallest_mm:
         return None
-    low, high = low - _RULE.window * radius, high + _RULE.window * radius
+    low, high = low - _Rule.window * radius, high + _Rule.window * radius
     chosen = surface.points_between(low, high)
     chosen = chosen[~search.outliers[chosen]]
     names = "places", "heights", "std", "footprint_mm"
     window = replace(surface, **{name: getattr(surface, name)[chosen] for name in names})
     # Twicing: the residuals contain what was smoothed away, and the size of the last correction is its uncertainty.
     smooth = correction = _estimate_surface(window, bandwidth)
-    for _ in range(_RULE.corrections):
+    for _ in range(_Rule.corrections):
         correction = _estimate_surface(replace(window, heights=window.heights - smooth), bandwidth)
         smooth = smooth + correction
     relative = replace(window, heights=window.heights - smooth)
     deep = np.isin(chosen, large.points) & (np.abs(smooth) > 0.5 * float(np.abs(smooth).max()))
     rough, usual = (np.median(np.abs(relative.heights[part])) for part in (deep, search.undamaged[chosen]))
-    if not deep.any() or rough > _RULE.rough * usual:
+    if not deep.any() or rough > _Rule.rough * usual:
         return None
     try:
         found = search_blemishes(relative, false_alarm=search.false_alarm, largest_mm=0.5 * bandwidth)
@@ -173,11 +170,11 @@ def _estimate_surface(window: UnrolledSurface, bandwidth: float) -> np.ndarray:
     """Return the heights (n,) of a surface of local quadratics at the points of a window."""
     tree, places = KDTree(window.places), window.places
     low, high = places.min(axis=0), places.max(axis=0)
-    counts: Any = np.maximum(np.ceil((high - low) / bandwidth * _RULE.nodes).astype(int) + 1, 4)
+    counts: Any = np.maximum(np.ceil((high - low) / bandwidth * _Rule.nodes).astype(int) + 1, 4)
     sides = [np.linspace(a, b, count) for a, b, count in zip(low, high, counts, strict=True)]
     nodes = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
-    near = [thin_evenly(np.array(each, int), _RULE.most_points) for each in tree.query_ball_point(nodes, bandwidth)]
-    known = np.array([len(each) >= _RULE.fewest_points for each in near])
+    near = [thin_evenly(np.array(each, int), _Rule.most_points) for each in tree.query_ball_point(nodes, bandwidth)]
+    known = np.array([len(each) >= _Rule.fewest_points for each in near])
     if not known.any():
         return np.zeros(len(places))
     values = np.full(len(nodes), np.nan)
@@ -199,7 +196,7 @@ def _fit_quadratics(window: UnrolledSurface, nodes: np.ndarray, near: list[np.nd
     design = np.stack([np.ones(u.shape), u, v, u * u, u * v, v * v], axis=-1)
     heights, weights = window.heights[index][..., None], counted.astype(float)
     coefficients = np.zeros((len(nodes), 6, 1))
-    for _ in range(_RULE.reweighted):
+    for _ in range(_Rule.reweighted):
         loaded = (design * weights[..., None]).transpose(0, 2, 1)
         coefficients = np.linalg.pinv(loaded @ design, hermitian=True) @ (loaded @ heights)
         left = np.abs(heights - design @ coefficients)[..., 0]

@@ -20,8 +20,7 @@ from uwlts.inspection.weld import build_bead, measure_bead
 from uwlts.storage.cloud import PointCloud
 
 
-@dataclass(frozen=True, kw_only=True)
-class PipeWeldRule:
+class _Rule:
     """Numbers of the search for welds of a pipe."""
 
     lengths: int = 36
@@ -38,9 +37,6 @@ class PipeWeldRule:
     """Half width of the region that belongs to a weld, divided by that of its bead: it contains the undercuts."""
 
 
-_RULE = PipeWeldRule()
-
-
 @dataclass(frozen=True, eq=False)
 class PipeWeld:
     """Weld of a pipe with N points."""
@@ -54,14 +50,14 @@ class PipeWeld:
     @property
     def covers(self) -> np.ndarray:
         """Mask (N,) of the points on the bead and its toes."""
-        return np.abs(self.across_mm) < _RULE.toes * self.half_mm
+        return np.abs(self.across_mm) < _Rule.toes * self.half_mm
 
 
 def find_welds(form: PipeForm, chosen: np.ndarray) -> list[PipeWeld]:
     """Find the welds around a pipe and along it, among its ``chosen`` (M,) points. NaN places for all others."""
     along, angle, heights = form.along_mm[chosen], form.angle[chosen], form.distance_mm[chosen]
     spacing = float(np.sqrt(np.ptp(along) * form.arc * form.radius_mm / len(chosen)))
-    straight = along - _fit_lean(along, angle, heights, form.radius_mm, _RULE.spacings * spacing)
+    straight = along - _fit_lean(along, angle, heights, form.radius_mm, _Rule.spacings * spacing)
     whole, found = np.full(len(form.angle), np.nan), []
 
     def add(is_girth: bool, across: np.ndarray, length: np.ndarray, ridges: list[tuple[float, float]]) -> None:
@@ -76,11 +72,11 @@ def find_welds(form: PipeForm, chosen: np.ndarray) -> list[PipeWeld]:
             found.append(PipeWeld(is_girth, off, at, half))
 
     around = form.radius_mm * angle
-    add(True, straight, around, _find_ridges(straight, around, heights, _RULE.spacings * spacing))
+    add(True, straight, around, _find_ridges(straight, around, heights, _Rule.spacings * spacing))
     for turn in (0.0, np.pi):
         # The pipe is cut at two places. Ridges in the half far from the cut are taken.
         around = form.radius_mm * (np.mod(angle - turn + np.pi, 2 * np.pi) - np.pi)
-        ridges = _find_ridges(around, along, heights, _RULE.spacings * spacing)
+        ridges = _find_ridges(around, along, heights, _Rule.spacings * spacing)
         quarter = 0.5 * np.pi * form.radius_mm
         add(False, around, along, [each for each in ridges if -quarter <= each[0] < quarter])
     return found
@@ -113,13 +109,13 @@ def _average_cells(
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Return mean heights (A, L) of cells above their surroundings, NaN without points; their origin, and L edges."""
     origin, count = float(across.min()), int(np.ptp(across) / cell) + 1
-    edges = np.linspace(length.min(), length.max(), _RULE.lengths + 1)
-    at = ((across - origin) / cell).astype(int), np.clip(np.searchsorted(edges, length) - 1, 0, _RULE.lengths - 1)
-    flat, shape = np.ravel_multi_index(at, (count, _RULE.lengths)), (count, _RULE.lengths)
-    number = np.bincount(flat, minlength=count * _RULE.lengths).reshape(shape)
-    total = np.bincount(flat, heights, count * _RULE.lengths).reshape(shape)
+    edges = np.linspace(length.min(), length.max(), _Rule.lengths + 1)
+    at = ((across - origin) / cell).astype(int), np.clip(np.searchsorted(edges, length) - 1, 0, _Rule.lengths - 1)
+    flat, shape = np.ravel_multi_index(at, (count, _Rule.lengths)), (count, _Rule.lengths)
+    number = np.bincount(flat, minlength=count * _Rule.lengths).reshape(shape)
+    total = np.bincount(flat, heights, count * _Rule.lengths).reshape(shape)
     mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-    filled, window = np.where(np.isfinite(mean), mean, 0.0), 2 * int(0.5 * _RULE.baseline * count) + 1
+    filled, window = np.where(np.isfinite(mean), mean, 0.0), 2 * int(0.5 * _Rule.baseline * count) + 1
     # SciPy moves the window of a single line by its sorted values, almost independent of its width.
     mean -= np.column_stack([ndimage.median_filter(line, window, mode="nearest") for line in filled.T])
     return mean, origin, edges
@@ -132,8 +128,8 @@ def _find_ridges(across: np.ndarray, length: np.ndarray, heights: np.ndarray, ce
     seen = np.isfinite(mean).sum(axis=1)
     least = np.full(len(mean), -np.inf)
     wide = seen > 0.5 * np.median(seen)
-    least[wide] = np.nanquantile(mean[wide], 1 - _RULE.share, axis=1)
-    labelled: Any = ndimage.label(least > _RULE.significant * std)
+    least[wide] = np.nanquantile(mean[wide], 1 - _Rule.share, axis=1)
+    labelled: Any = ndimage.label(least > _Rule.significant * std)
     found = []
     for number in range(1, labelled[1] + 1):
         own = np.flatnonzero(labelled[0] == number)
@@ -154,14 +150,14 @@ def _fit_lean(along: np.ndarray, angle: np.ndarray, heights: np.ndarray, radius:
     known = np.isfinite(mean).any(axis=0)
     top = np.nan_to_num(mean, nan=-np.inf)
     place = origin + cell * (np.argmax(top, axis=0) + 0.5)
-    counted = known & (top.max(axis=0) > _RULE.significant * std)
-    if np.count_nonzero(counted) < _RULE.share * np.count_nonzero(known):
+    counted = known & (top.max(axis=0) > _Rule.significant * std)
+    if np.count_nonzero(counted) < _Rule.share * np.count_nonzero(known):
         return np.zeros(len(along))
     turn = 0.5 * (edges[1:] + edges[:-1]) / radius
     design = np.column_stack([np.ones(len(turn)), np.cos(turn), np.sin(turn)])
     rows, weights = fit_biweight(design, place, counted)
     level, *lean = rows @ place
     agree = counted & (np.abs(place - design @ np.array([level, *lean])) < 2 * cell) & (weights > 0)
-    if np.hypot(*lean) > _RULE.lean * radius or np.count_nonzero(agree) < _RULE.share * np.count_nonzero(known):
+    if np.hypot(*lean) > _Rule.lean * radius or np.count_nonzero(agree) < _Rule.share * np.count_nonzero(known):
         return np.zeros(len(along))
     return lean[0] * np.cos(angle) + lean[1] * np.sin(angle)

@@ -23,8 +23,7 @@ from uwlts.shapes.cylinder import Cylinder
 from uwlts.storage.cloud import PointCloud
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScannedPartRule:
+class _Rule:
     """Numbers that separate straight pipes from other parts.
 
     Chosen by hand on the parts of tests/oracles/joined_pipes.py with seeds 0 to 11, judged on seeds 100 to 119.
@@ -52,9 +51,6 @@ class ScannedPartRule:
     coarse: float = 0.35  # distance of neighbouring points, divided by the radius, that does not show a pipe
 
 
-_RULE = ScannedPartRule()
-
-
 @dataclass(frozen=True, eq=False)
 class ScannedPart:
     """Straight pipe in a cloud of N points."""
@@ -76,14 +72,14 @@ def find_straight_pipe(cloud: PointCloud, *, largest_ovality: float) -> ScannedP
         raise form
     _refuse_coarse(cloud, form)
     cells, left_out = _Cells.of(form), np.zeros(len(cloud), bool)
-    if np.mean(cells.departing[cells.seen]) > _RULE.covered:
+    if np.mean(cells.departing[cells.seen]) > _Rule.covered:
         form, cells = _fit_envelope(cloud, form, cells)
     bodies = cells.find_bodies()
     notes = [cells.describe(form, region) for region in bodies]
     beside = np.any(bodies, axis=0) if bodies else np.zeros_like(cells.seen)
     rest = cells.seen & ~beside
     risen = rest & cells.departing & (cells.height > 0)
-    if np.count_nonzero(risen) > _RULE.covered * np.count_nonzero(rest):
+    if np.count_nonzero(risen) > _Rule.covered * np.count_nonzero(rest):
         risen = cells.grow(risen)
         covered = np.count_nonzero(risen & cells.seen) / np.count_nonzero(cells.seen)
         high = float(np.nanquantile(cells.height[risen & cells.seen], 0.95))
@@ -115,19 +111,19 @@ class _Cells:
         along, distance, radius = form.along_mm, form.distance_mm, form.radius_mm
         near = np.abs(distance) < FORM_RULE.off_pipe * radius
         area = np.ptp(along) * form.arc * radius
-        side = np.sqrt(_RULE.points_in_cell * area / max(np.count_nonzero(near), 1))
-        shape = [int(np.clip(n / side, 4, _RULE.most_cells)) for n in (np.ptp(along), 2 * np.pi * radius)]
+        side = np.sqrt(_Rule.points_in_cell * area / max(np.count_nonzero(near), 1))
+        shape = [int(np.clip(n / side, 4, _Rule.most_cells)) for n in (np.ptp(along), 2 * np.pi * radius)]
         place = (along - along.min()) / max(np.ptp(along), 1e-9), np.mod(form.angle / (2 * np.pi), 1)
         at = [np.minimum((n * p).astype(int), n - 1) for n, p in zip(shape, place, strict=True)]
         flat = at[0] * shape[1] + at[1]
         count = np.bincount(flat, minlength=shape[0] * shape[1])
         median = _cell_medians(flat, distance, count)
         scatter = MAD_TO_STD * _cell_medians(flat, np.abs(distance - median[flat]), count)
-        full = count >= 0.5 * _RULE.points_in_cell
-        noise = float(np.quantile(scatter[full], _RULE.quiet)) if full.any() else robust_std(distance)
+        full = count >= 0.5 * _Rule.points_in_cell
+        noise = float(np.quantile(scatter[full], _Rule.quiet)) if full.any() else robust_std(distance)
         beyond = np.bincount(flat, distance > FORM_RULE.off_pipe * radius, len(count))
-        high = (beyond >= 3) & (beyond >= _RULE.seed_share * count)
-        off = np.abs(median) > max(_RULE.risen * noise, _RULE.departs * radius)
+        high = (beyond >= 3) & (beyond >= _Rule.seed_share * count)
+        off = np.abs(median) > max(_Rule.risen * noise, _Rule.departs * radius)
         height, high, off = (each.reshape(shape) for each in (median, high, off))
         return cls(flat, height, high, off, noise, distance)
 
@@ -145,10 +141,10 @@ class _Cells:
     def find_bodies(self) -> list[np.ndarray]:
         """Return masks (A, B) of the bodies outside the pipe, with the cells that rise to them."""
         # Between the lines of a coarse scan cells may be empty.
-        risen = self.high | (self.seen & (self.height > _RULE.risen * self.noise))
+        risen = self.high | (self.seen & (self.height > _Rule.risen * self.noise))
         found = []
         for region in _label_around(self.grow(risen)):
-            if np.count_nonzero(region & self.high) >= _RULE.fewest_cells:
+            if np.count_nonzero(region & self.high) >= _Rule.fewest_cells:
                 found.append(region)
         return found
 
@@ -193,14 +189,14 @@ def _label_around(cells: np.ndarray) -> list[np.ndarray]:
 def _fit_envelope(cloud: PointCloud, form: PipeForm, cells: _Cells) -> tuple[PipeForm, _Cells]:
     """Fit the form to the lower envelope of its points; return the first form if the envelope is on no pipe."""
     first = form, cells
-    for _ in range(_RULE.rounds):
-        left_out = form.distance_mm > _RULE.risen * cells.noise
+    for _ in range(_Rule.rounds):
+        left_out = form.distance_mm > _Rule.risen * cells.noise
         try:
             form = refit_pipe(cloud, form, left_out=left_out)
         except EvaluationError:
             return first
         cells = _Cells.of(form)
-        if np.mean(left_out == (form.distance_mm > _RULE.risen * cells.noise)) > 1 - 1e-3:
+        if np.mean(left_out == (form.distance_mm > _Rule.risen * cells.noise)) > 1 - 1e-3:
             break
     # The lower one of two surfaces is the pipe only if no more cells lie below it than below the first form.
     below = [np.count_nonzero(each.departing & (each.height < 0)) for each in (first[1], cells)]
@@ -227,13 +223,13 @@ def _fit_straight(cloud: PointCloud, largest_ovality: float) -> tuple[PipeForm |
 
 def _find_largest_cylinder(points: np.ndarray) -> Cylinder | None:
     """Return the cylinder of a part of the points (N, 3) with which most points agree; None without one."""
-    thinned = thin_evenly(points, _RULE.bend_points)
+    thinned = thin_evenly(points, _Rule.bend_points)
     tree, best, most = KDTree(thinned), None, 0
-    for seed in thin_evenly(np.random.default_rng(0).permutation(thinned), _RULE.starts):
-        near: Any = tree.query(seed, k=max(len(thinned) // _RULE.part, 30))
+    for seed in thin_evenly(np.random.default_rng(0).permutation(thinned), _Rule.starts):
+        near: Any = tree.query(seed, k=max(len(thinned) // _Rule.part, 30))
         try:
             found = Cylinder.fit(thinned[near[1]])
-            for _ in range(_RULE.refits):
+            for _ in range(_Rule.refits):
                 on = np.abs(found.distances_mm(thinned)) < FORM_RULE.off_pipe * found.radius_mm
                 found = Cylinder.fit(thinned[on], axis_start=found.axis)
         except EvaluationError:
@@ -246,42 +242,42 @@ def _find_largest_cylinder(points: np.ndarray) -> Cylinder | None:
 
 def _refuse_coarse(cloud: PointCloud, form: PipeForm) -> None:
     points = cloud.points_mm
-    near: Any = KDTree(points).query(thin_evenly(points, _RULE.bend_points), k=4, workers=-1)
+    near: Any = KDTree(points).query(thin_evenly(points, _Rule.bend_points), k=4, workers=-1)
     apart = float(np.median(near[0][:, 3]))
-    if apart > _RULE.coarse * form.radius_mm:
+    if apart > _Rule.coarse * form.radius_mm:
         raise EvaluationError(
             f"the cloud is too coarse for a pipe: {apart:.3g} mm between its points, on a radius of about "
-            f"{form.radius_mm:.3g} mm; at most {_RULE.coarse * form.radius_mm:.2g} mm are expected"
+            f"{form.radius_mm:.3g} mm; at most {_Rule.coarse * form.radius_mm:.2g} mm are expected"
         )
 
 
 def _refuse_other(form: PipeForm, cells: _Cells, beside: np.ndarray) -> None:
     """Raise EvaluationError for a cone, and for a part with little surface on one pipe."""
     taper = 2 * abs(float(form.coefficients[form.terms.index("along")]))
-    if taper > _RULE.cone * form.radius_mm:
+    if taper > _Rule.cone * form.radius_mm:
         raise EvaluationError(
             f"this is a cone, not a straight pipe: its radius of {form.radius_mm:.4g} mm changes by {taper:.3g} mm"
         )
     bare = np.count_nonzero(cells.seen & ~beside & ~cells.departing) / np.count_nonzero(cells.seen)
-    if bare < _RULE.least_bare:
-        limit = max(_RULE.risen * cells.noise, _RULE.departs * form.radius_mm)
+    if bare < _Rule.least_bare:
+        limit = max(_Rule.risen * cells.noise, _Rule.departs * form.radius_mm)
         raise EvaluationError(
             f"only {100 * bare:.0f} % of the seen surface lies within {limit:.2g} mm of one straight pipe of "
-            f"{2 * form.radius_mm:.4g} mm diameter; {100 * _RULE.least_bare:.0f} % are needed. It may be covered by "
+            f"{2 * form.radius_mm:.4g} mm diameter; {100 * _Rule.least_bare:.0f} % are needed. It may be covered by "
             "growth, or be another part, such as a bend or a reducer: inspect its straight, bare parts"
         )
 
 
 def _refuse_bend(cloud: PointCloud, straight: float) -> None:
     """Raise EvaluationError if a bend (torus) has much less scatter than the ``straight`` form."""
-    points = thin_evenly(cloud.points_mm, _RULE.bend_points)
+    points = thin_evenly(cloud.points_mm, _Rule.bend_points)
     if (found := _fit_torus(points)) is None:
         return
     radius, tube, turn, scatter = found
     bow = radius * (1 - np.cos(min(turn, np.pi) / 2))
     # Spheres, cones and planes give tori that are none: their tubes are wide, or longer than the cloud.
     is_tube = tube < radius and radius * turn < 2 * float(np.linalg.norm(np.ptp(points, axis=0)))
-    if is_tube and scatter < min(_RULE.better * straight, _RULE.bend_scatter * tube) and bow > _RULE.least_bow * tube:
+    if is_tube and scatter < min(_Rule.better * straight, _Rule.bend_scatter * tube) and bow > _Rule.least_bow * tube:
         raise EvaluationError(
             f"this is a bend of radius about {radius:.3g} mm over {np.degrees(turn):.0f} deg, of a pipe of about "
             f"{2 * tube:.4g} mm diameter, not a straight pipe: inspect its straight parts, cut from the cloud"

@@ -37,8 +37,7 @@ from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import load_cloud
 
 
-@dataclass(frozen=True, kw_only=True)
-class WeldRule:
+class _Rule:
     """Numbers of the weld inspection; lengths "in bead widths" are divided by the toe-to-toe width."""
 
     fewest_points: int = 500  # fewest points of a cloud that is inspected
@@ -76,9 +75,6 @@ class WeldRule:
     """Least gap between beads side by side at half their height, as a fraction of their total width."""
 
 
-_RULE = WeldRule()
-
-
 def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: float | None = None) -> Inspection:
     """Measure the highest weld bead of a cloud: height, width, undercut, toe angles and misalignment.
 
@@ -107,9 +103,9 @@ def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: floa
     cloud = load_cloud(cloud)
     if section_mm is not None and not 0 < section_mm < np.inf:
         raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
-    if len(cloud) < _RULE.fewest_points:
+    if len(cloud) < _Rule.fewest_points:
         raise EvaluationError(
-            f"the cloud has {len(cloud)} points; at least {_RULE.fewest_points} are needed for a weld"
+            f"the cloud has {len(cloud)} points; at least {_Rule.fewest_points} are needed for a weld"
         )
     bead, notes = _prepare_bead(cloud, section_mm)
     errors = PointErrors.along_normals(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
@@ -177,11 +173,11 @@ def build_bead(
 
     Raises EvaluationError if the points do not show the plates on both sides of the bead.
     """
-    half, reach = half_mm, half_mm * (1 + 2 * _RULE.plate_width)
+    half, reach = half_mm, half_mm * (1 + 2 * _Rule.plate_width)
     chosen = np.flatnonzero(np.isfinite(local).all(axis=1) & (np.abs(local[:, 1]) < reach))
     along, across, raw = local[chosen].T
-    sides = [across < -_RULE.plate_from * half, across > _RULE.plate_from * half]
-    if min(map(np.count_nonzero, sides)) < _RULE.fewest_beside:
+    sides = [across < -_Rule.plate_from * half, across > _Rule.plate_from * half]
+    if min(map(np.count_nonzero, sides)) < _Rule.fewest_beside:
         raise EvaluationError("the cloud does not show the plates on both sides of the bead")
     design = np.column_stack([np.ones(len(along)), along, across])
     rows = [fit_biweight(design, raw, side)[0] for side in sides]
@@ -189,16 +185,16 @@ def build_bead(
     share = np.clip((across + half) / (2 * half), 0, 1)
     heights = raw - (1 - share) * (design @ (rows[0] @ raw)) - share * (design @ (rows[1] @ raw))
     length, images = float(np.ptp(along)), len(np.unique(cloud.frame[chosen]))
-    count = max(1, len(along) // _RULE.points_in_section)
+    count = max(1, len(along) // _Rule.points_in_section)
     # With several sections per image it would be random which section has points.
-    count = min(count, _RULE.most_sections, images if images > 1 else count)
+    count = min(count, _Rule.most_sections, images if images > 1 else count)
     if section_mm is not None:
         count = max(1, int(length / section_mm))
     section = np.clip(((along - along.min()) / length * count).astype(int), 0, count - 1)
     gap = _typical_gap(across, section)
-    spacing = max(2 * reach * count / len(along), _RULE.gap_spacings * gap)
-    bandwidth = max(_RULE.bandwidth * 2 * half, _RULE.spacings_in_bandwidth * spacing)
-    edge = half * (1 + 2 * _RULE.groove_outside) + bandwidth
+    spacing = max(2 * reach * count / len(along), _Rule.gap_spacings * gap)
+    bandwidth = max(_Rule.bandwidth * 2 * half, _Rule.spacings_in_bandwidth * spacing)
+    edge = half * (1 + 2 * _Rule.groove_outside) + bandwidth
     grid = np.linspace(-edge, edge, int(np.ceil(6 * edge / bandwidth)) + 1)
     smooth = profile_rows(across, section, count, grid, bandwidth)
     part = share[:, None]
@@ -208,14 +204,14 @@ def build_bead(
     parts = [weight * interpolation_rows(across + node * size[:, 1], section, count, grid) for node, weight in NODES]
     seen_rows = sparse.csr_array(sum(parts[1:], parts[0]))
     profiles = BeadProfiles(grid, across, size[:, 1], count, smooth, plates, seen_rows, sharp)
-    beside = np.abs(np.tile(grid, count)) > half * (1 + _RULE.groove_outside)
+    beside = np.abs(np.tile(grid, count)) > half * (1 + _Rule.groove_outside)
     means = profiles.evaluate(raw, steps=0).ravel()[beside]
     expected = np.sqrt(np.asarray(smooth.power(2).sum(axis=1)).ravel()[beside])
     if not np.isfinite(means).any():
         raise EvaluationError(f"none of the {count} sections across the bead has enough points for a profile")
     seen = MAD_TO_STD * float(np.nanmedian(np.abs(means) / expected))
     scatter = _local_scatter(profiles, raw, across, bandwidth)
-    seen = seen * np.maximum(scatter / float(np.median(scatter[np.abs(across) > half * (1 + _RULE.groove_outside)])), 1)
+    seen = seen * np.maximum(scatter / float(np.median(scatter[np.abs(across) > half * (1 + _Rule.groove_outside)])), 1)
     on_bead = np.abs(across) < half
     return Bead(axes, middle, chosen, raw, heights, on_bead, half, length, gap, seen, profiles, footprint_std)
 
@@ -237,11 +233,11 @@ def _local_scatter(profiles: BeadProfiles, raw: np.ndarray, across: np.ndarray, 
     spread = np.full(cell.max() + 1, np.nan)
     for k in range(len(spread)):
         own = off[(cell == k) & whole]
-        if len(own) >= _RULE.fewest_beside:
+        if len(own) >= _Rule.fewest_beside:
             spread[k] = MAD_TO_STD * float(np.median(own))
     if not np.isfinite(spread).any():
         raise EvaluationError(
-            f"no strip of {2 * bandwidth:.2g} mm along the weld has {_RULE.fewest_beside} points of complete sections, "
+            f"no strip of {2 * bandwidth:.2g} mm along the weld has {_Rule.fewest_beside} points of complete sections, "
             "which give the scatter of the points; scan with profiles closer together"
         )
     spread = np.where(np.isfinite(spread), spread, np.nanmedian(spread))
@@ -254,11 +250,11 @@ def _locate_bead(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.
     Returns its axes (3, 3), middle (3,), approximate half width and ends (2,) along it, in mm, and the number of other
     beads.
     """
-    start = fit_robustly(Plane.fit, thin_evenly(points, _RULE.start_points), towards=TOWARDS_SENSOR)
+    start = fit_robustly(Plane.fit, thin_evenly(points, _Rule.start_points), towards=TOWARDS_SENSOR)
     up, heights = start.fit.normal, start.fit.distances_mm(points)
     noise = robust_std(heights - np.median(heights))
     top = float(np.quantile(heights, 0.995))
-    if top < _RULE.significant * noise:
+    if top < _Rule.significant * noise:
         raise EvaluationError(
             f"no bead found: 99.5 % of the points are lower than {top:.3g} mm, with a scatter of {noise:.3g} mm"
         )
@@ -272,12 +268,12 @@ def _locate_bead(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.
     count, edges = np.histogram(across, bins=max(10, int(np.sqrt(len(crown)))))
     filled = np.flatnonzero(count > 0.05 * count.max())
     # Bins between the profile lines may be empty.
-    beads = np.split(filled, np.flatnonzero(np.diff(filled) > 1 + _RULE.bead_gap * len(count)) + 1)
+    beads = np.split(filled, np.flatnonzero(np.diff(filled) > 1 + _Rule.bead_gap * len(count)) + 1)
     best = max(beads, key=lambda own: count[own].sum())
     low, high = edges[best[0]], edges[best[-1] + 1]
     crown = crown[(across >= low) & (across <= high)]
     middle = np.median(crown, axis=0)
-    half = _RULE.width_from_crown * 0.5 * float(high - low)
+    half = _Rule.width_from_crown * 0.5 * float(high - low)
     ends = np.quantile((crown - middle) @ along, [0.005, 0.995])
     return axes, middle, half, ends, len(beads) - 1
 
@@ -304,21 +300,21 @@ def measure_bead(bead: Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, .
     """Return the values, the extent (3,) in mm, and notes on omitted sections and values."""
     profiles = bead.profiles.evaluate(bead.raw_mm)
     tops = _find_tops(bead, profiles)
-    high = tops > _RULE.whole_height * float(np.median(tops[np.isfinite(tops)]))
+    high = tops > _Rule.whole_height * float(np.median(tops[np.isfinite(tops)]))
     whole = np.flatnonzero(high & np.isfinite(tops))
     unseen, low = np.count_nonzero(~np.isfinite(tops)), np.count_nonzero(np.isfinite(tops) & ~high)
     notes = []
     if unseen + low:
         notes.append(
             f"{unseen + low} of {len(tops)} sections are omitted: {unseen} without points on the bead, {low} lower "
-            f"than {100 * _RULE.whole_height:.0f} % of the median height"
+            f"than {100 * _Rule.whole_height:.0f} % of the median height"
         )
     # Single toes are noisy, and unknown next to missing lines: take the median of neighbouring sections.
     toes = _find_toes(bead, profiles, whole)[:, :2]
     if not np.isfinite(toes).any(axis=0).all():
         raise EvaluationError("no section of the bead has points on both flanks without a gap; scan it more densely")
     toes = np.where(np.isfinite(toes), toes, np.nanmedian(toes, axis=0))
-    toes = ndimage.median_filter(toes, (_RULE.sections_of_largest_undercut, 1), mode="reflect")
+    toes = ndimage.median_filter(toes, (_Rule.sections_of_largest_undercut, 1), mode="reflect")
     first = _evaluate_figures(bead, bead.raw_mm, whole, toes)
     for side, groove in zip(("left", "right"), first.grooves, strict=True):
         if lost := np.count_nonzero(~np.isfinite(groove)):
@@ -326,12 +322,12 @@ def measure_bead(bead: Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, .
                 f"the undercut {side} is unknown in {lost} of {len(whole)} sections: profile lines are missing there"
             )
     scattered = replace(errors, single_mm=np.maximum(bead.noise_mm, errors.single_mm))
-    noisy = [_evaluate_figures(bead, bead.raw_mm + moves, whole, toes) for moves in scattered.draw(_RULE.draws)]
+    noisy = [_evaluate_figures(bead, bead.raw_mm + moves, whole, toes) for moves in scattered.draw(_Rule.draws)]
     # Ripples of the crest are no noise: its noise is taken from the draws. Grooves have no ripples.
     of_crest = float(np.median(np.std([each.crest for each in noisy], axis=0)))
     largest = {
-        "largest height": largest_mean([first.crest], _RULE.sections_of_largest_height, noise=of_crest),
-        "largest undercut": largest_mean(first.grooves, _RULE.sections_of_largest_undercut),
+        "largest height": largest_mean([first.crest], _Rule.sections_of_largest_height, noise=of_crest),
+        "largest undercut": largest_mean(first.grooves, _Rule.sections_of_largest_undercut),
     }
 
     def values_of(found: _Figures) -> np.ndarray:
@@ -452,16 +448,16 @@ def _simulate_forms(bead: Bead, seen: np.ndarray, whole: np.ndarray, toes: np.nd
     They are simulated for several p and places: between points at the same places in all sections, a toe is unknown.
     """
     height, width = seen[_NAMES.index("height")], seen[_NAMES.index("width")]
-    places = float(np.mean(toes)) + bead.spacing_mm * np.arange(_RULE.form_places) / _RULE.form_places
-    errors = np.zeros((len(_RULE.exponents) * len(places), len(_NAMES)))
+    places = float(np.mean(toes)) + bead.spacing_mm * np.arange(_Rule.form_places) / _Rule.form_places
+    errors = np.zeros((len(_Rule.exponents) * len(places), len(_NAMES)))
     if not (height > 0 and width > 0):
         return errors
-    for error, (exponent, middle) in zip(errors, product(_RULE.exponents, places), strict=True):
-        low, high = (np.sqrt(1 - share ** (1 / exponent)) for share in (_RULE.flank_low, _RULE.flank_high))
-        steep = (_RULE.flank_high - _RULE.flank_low) / (low - high)
+    for error, (exponent, middle) in zip(errors, product(_Rule.exponents, places), strict=True):
+        low, high = (np.sqrt(1 - share ** (1 / exponent)) for share in (_Rule.flank_low, _Rule.flank_high))
+        steep = (_Rule.flank_high - _Rule.flank_low) / (low - high)
         sizes = np.array([height, width])
-        for _ in range(_RULE.form_fits):
-            half = 0.5 * sizes[1] / (low + _RULE.flank_low / steep)
+        for _ in range(_Rule.form_fits):
+            half = 0.5 * sizes[1] / (low + _Rule.flank_low / steep)
             raw = bead.profiles.observe(middle, sizes[0], half, exponent)
             found = _evaluate_figures(bead, raw, whole, toes).values
             error[:3] = found[0] - sizes[0], found[0] - sizes[0], found[2] - sizes[1]
@@ -473,14 +469,14 @@ def _simulate_forms(bead: Bead, seen: np.ndarray, whole: np.ndarray, toes: np.nd
 def _find_undercuts(bead: Bead, profiles: np.ndarray, toes: np.ndarray, side: int) -> np.ndarray:
     """Return undercut depths (W,) of profiles (W, G) near the toes (W,) of a side; NaN if lines are missing."""
     beyond = (-1.0, 1.0)[side] * (bead.profiles.across_mm - toes[:, None]) / (2 * bead.half_mm)
-    groove = (beyond > -_RULE.groove_inside) & (beyond < _RULE.groove_outside)
+    groove = (beyond > -_Rule.groove_inside) & (beyond < _Rule.groove_outside)
     seen = np.all(np.isfinite(profiles) | ~groove, axis=1) & groove.any(axis=1)
     return np.where(seen, -np.min(np.where(groove, profiles, np.inf), axis=1), np.nan)
 
 
 def _fit_flanks(grid: np.ndarray, profile: np.ndarray, peak: int) -> tuple[float, float, float, float]:
     """Return places of the left and right toe and slopes there, from lines through the lower half of each flank."""
-    low, high = (share * profile[peak] for share in (_RULE.flank_low, _RULE.flank_high))
+    low, high = (share * profile[peak] for share in (_Rule.flank_low, _Rule.flank_high))
     result = []
     for step in (-1, 1):
         k = peak

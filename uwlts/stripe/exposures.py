@@ -7,7 +7,6 @@ place at increasing exposures form a bracket. Their fused image has the grey val
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -18,8 +17,7 @@ from uwlts.model.sensor import LEAST_BRACKET_STEP, MOST_IN_BRACKET, CaptureHeade
 from uwlts.model.stripe import Stripe
 
 
-@dataclass(frozen=True, kw_only=True)
-class FusionRule:
+class _Rule:
     """Numbers of the fusion of several exposures.
 
     Chosen by hand with the reasons below; docs/studies/stripe_brackets.py shows the resulting stripes in rendered
@@ -40,8 +38,6 @@ class FusionRule:
     dark_sigmas: float = 4.0
     """Distance of the background from the median, standard deviations: all but one in 16,000 background pixels."""
 
-
-_RULE = FusionRule()
 
 _MAD_TO_STD = 1.4826
 """Standard deviation of Gaussian noise divided by its median absolute deviation."""
@@ -90,7 +86,7 @@ def group_brackets(capture: BracketImages) -> list[np.ndarray]:
     if len(laser) < 4 or not capture.has_image[laser].all():
         return alone
     stage, pose, exposure = (values[laser] for values in (capture.stage_mm, capture.pose, capture.exposure_ms))
-    moved = np.abs(np.diff(stage)) > _RULE.same_place_mm
+    moved = np.abs(np.diff(stage)) > _Rule.same_place_mm
     moved |= ~np.isclose(pose[1:], pose[:-1], rtol=0.0, atol=1e-9, equal_nan=True).all(axis=(1, 2))
     places = np.split(np.arange(len(laser)), np.flatnonzero(moved) + 1)
     count = len(places[0])
@@ -99,7 +95,7 @@ def group_brackets(capture: BracketImages) -> list[np.ndarray]:
     if any(len(place) != count for place in places[:-1]):
         return alone
     places = [place[np.argsort(exposure[place], kind="stable")] for place in places]
-    steps = [exposure[place[1:]] < _RULE.exposure_slack * LEAST_BRACKET_STEP * exposure[place[:-1]] for place in places]
+    steps = [exposure[place[1:]] < _Rule.exposure_slack * LEAST_BRACKET_STEP * exposure[place[:-1]] for place in places]
     if exposure.min() <= 0 or np.concatenate(steps).any():
         return alone
     return [laser[place] for place in places]
@@ -140,7 +136,7 @@ def fuse_exposures(
     known = (split_clipped(image, full_dn) for image in images)
     pixels = [np.where(clipped, full_dn, values).astype(np.float32) for values, clipped in known]
     offset = _estimate_offset(pixels[0], pixels[-1], float(exposure_ms[-1] / exposure_ms[0]))
-    low, high = (share * (full_dn - offset) for share in (_RULE.roll_off_from, _RULE.roll_off_to))
+    low, high = (share * (full_dn - offset) for share in (_Rule.roll_off_from, _Rule.roll_off_to))
     # From the longest to the shortest exposure: the scale is the product of successive ratios.
     scale, total, weight = 1.0, np.zeros_like(pixels[0]), np.zeros_like(pixels[0])
     for k in range(len(pixels) - 1, -1, -1):
@@ -148,7 +144,7 @@ def fuse_exposures(
         if k < len(pixels) - 1:
             longer = pixels[k + 1] - offset
             scale *= _measure_ratio(
-                signal, longer, float(exposure_ms[k + 1] / exposure_ms[k]), low=_RULE.well_exposed * full_dn, high=low
+                signal, longer, float(exposure_ms[k + 1] / exposure_ms[k]), low=_Rule.well_exposed * full_dn, high=low
             )
         own = np.float32(scale**-2) * (np.clip((high - signal) / (high - low), 0.0, 1.0) if k else 1.0)
         total += own * np.float32(scale) * signal
@@ -159,14 +155,14 @@ def fuse_exposures(
 def _estimate_offset(short: np.ndarray, long: np.ndarray, ratio: float) -> float:
     """Estimate the grey value without light from the background of two images with a ratio of exposures."""
     middle = float(np.median(long))
-    spread = _RULE.dark_sigmas * _MAD_TO_STD * float(np.median(np.abs(long - middle)))
-    dark = np.abs(long - middle) <= max(_RULE.dark_dn, spread)
+    spread = _Rule.dark_sigmas * _MAD_TO_STD * float(np.median(np.abs(long - middle)))
+    dark = np.abs(long - middle) <= max(_Rule.dark_dn, spread)
     return float((ratio * short[dark].mean(dtype=float) - long[dark].mean(dtype=float)) / (ratio - 1.0))
 
 
 def _measure_ratio(short: np.ndarray, long: np.ndarray, stated: float, *, low: float, high: float) -> float:
     """Return the ratio of the light in two images without offset; the stated one if too few pixels are usable."""
     both = (long > low) & (long < high)
-    if np.count_nonzero(both) < _RULE.fewest_pixels:
+    if np.count_nonzero(both) < _Rule.fewest_pixels:
         return stated
     return float(long[both].sum(dtype=float) / max(short[both].sum(dtype=float), 1e-9))

@@ -24,8 +24,7 @@ _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np
 """Largest grey value of each type."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExtractionRule:
+class _Rule:
     """Numbers of the extraction that are not options.
 
     Chosen by hand with the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes.
@@ -41,8 +40,6 @@ class ExtractionRule:
     short_gap: int = 2  # most consecutive lines without a centre inside a stripe, as caused by noise
     warm_lines: int = 200  # lines of the image for `warm_up`: enough for stripes that continue
 
-
-_RULE = ExtractionRule()
 
 # NumPy compares its own integers several times faster than an enumeration.
 _OK = np.uint8(StripeStatus.OK)
@@ -145,11 +142,11 @@ def leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
     # Indices in `found` before which the stripe is interrupted.
     apart = np.abs(place[1:] - place[:-1]) > options.jump_px
     if len(found) < count:
-        apart |= found[1:] - found[:-1] > _RULE.short_gap + 1
+        apart |= found[1:] - found[:-1] > _Rule.short_gap + 1
     breaks = (1 + np.flatnonzero(apart)).tolist()
-    if found[0] > _RULE.short_gap:
+    if found[0] > _Rule.short_gap:
         breaks.append(0)
-    if count - 1 - found[-1] > _RULE.short_gap:
+    if count - 1 - found[-1] > _Rule.short_gap:
         breaks.append(len(found))
     if not breaks:
         return stripe
@@ -167,11 +164,11 @@ def warm_up() -> None:
     """
     options = StripeOptions()
     half = options.half_window_px
-    place, lines = np.arange(8 * half), np.arange(_RULE.warm_lines)[:, None]
+    place, lines = np.arange(8 * half), np.arange(_Rule.warm_lines)[:, None]
     # A stripe, and a dimmer one with gaps beside it.
     beside = 0.3 * (lines % 20 < 10)
     seen = [share * np.exp(-0.5 * np.square((place - at * half) / 2.0)) for share, at in ((1.0, 2), (beside, 5))]
-    image = np.broadcast_to(100.0 * sum(seen), (_RULE.warm_lines, 8 * half)).astype(np.uint8)
+    image = np.broadcast_to(100.0 * sum(seen), (_Rule.warm_lines, 8 * half)).astype(np.uint8)
     # The default method uses all others for some images.
     for method in dict.fromkeys((options.method, *method_names())):
         extract_stripe(image, stripe_along="height", options=replace(options, method=method))
@@ -276,7 +273,7 @@ class _SearchedImage:
     def is_too_wide(self) -> bool:
         """Return True if many lines show a stripe too wide to be measured."""
         good = self.stripe.status == _OK
-        return int(np.count_nonzero((self.wide | self.white) & ~good)) > _RULE.too_wide * int(np.count_nonzero(good))
+        return int(np.count_nonzero((self.wide | self.white) & ~good)) > _Rule.too_wide * int(np.count_nonzero(good))
 
     def find_rivals(self) -> StripeCandidates | None:
         """Return all stripes on lines with two or more stripes; None without such lines.
@@ -310,7 +307,7 @@ class _SearchedImage:
         centre, amplitude[clear] = place_centre(self.options.method, measured)
         place[clear], width[clear] = measured.start + centre.astype(float), measured.sigma * FWHM_PER_SIGMA
         # Matched filter: squared ratio of height and noise, summed over a Gaussian profile.
-        sharp = amplitude[clear] / max(self.noise, _RULE.least_noise)
+        sharp = amplitude[clear] / max(self.noise, _Rule.least_noise)
         certainty[clear] = 0.5 * math.sqrt(math.pi) * measured.kernel_sigma() * sharp**2
         return StripeCandidates(line, place, amplitude, width, certainty, count, along)[np.lexsort((place, line))]
 
@@ -326,7 +323,7 @@ def _search_profiles(
     # Extra blocks at both ends of the lines: the blocks of a window can be cleared without range checks.
     board = np.zeros((high.shape[0] + 2 * MARGIN, high.shape[1]), high.dtype)
     noise = noise_from_contrast(block_contrast(high, low, out=board[MARGIN:-MARGIN]), block)
-    coarse = max(options.threshold_floor, noise * (_RULE.coarse_sigmas - MEDIAN_SURROUNDINGS))
+    coarse = max(options.threshold_floor, noise * (_Rule.coarse_sigmas - MEDIAN_SURROUNDINGS))
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
     left, rules = cv2.transpose(board), search_rules(options, coarse=coarse, fine=fine, clip=clip)
     status, wide, several, peak = search_profiles(profiles, left, rules)

@@ -1,6 +1,5 @@
 """Grid of a chessboard's corners: an array (rows, columns, 2) of pixels with NaN for missing corners."""
 
-from dataclasses import dataclass
 from itertools import product
 
 import cv2
@@ -9,8 +8,7 @@ import numpy as np
 from uwlts.targets.detection.lattice import select_agreeing
 
 
-@dataclass(frozen=True, kw_only=True)
-class GridRule:
+class _Rule:
     """Numbers of the refinement and check of a chessboard's corners.
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
@@ -43,9 +41,6 @@ class GridRule:
     settled_px: float = 1e-4  # change of a corner that ends the refinement, px
 
 
-_RULE = GridRule()
-
-
 def remove_doubtful(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Remove corners (J, I, 2) that differ from their neighbours or are not between four squares."""
     grid = grid.copy()
@@ -67,16 +62,16 @@ def find_chessboard_fault(grey: np.ndarray, board: np.ndarray) -> str | None:
     share = _measure_unevenness(board)
     if share is None:
         return "too few corners are in view"
-    if not share < _RULE.residual:
+    if not share < _Rule.residual:
         return f"its corners deviate from an even grid by {100 * share:.0f} % of a square"
     centres = (board[:-1, :-1] + board[1:, 1:] + board[:-1, 1:] + board[1:, :-1]) / 4
     known = np.isfinite(centres[..., 0])
     levels = np.full(known.shape, np.nan)
-    levels[known] = sample_levels(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _RULE.sigma_px), centres[known])
+    levels[known] = sample_levels(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _Rule.sigma_px), centres[known])
     sign = np.where(np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2, -1.0, 1.0)
     changes = [np.diff(levels, axis=axis) * (sign[1:] if axis == 0 else sign[:, 1:]) for axis in (0, 1)]
     turns = np.concatenate([each[np.isfinite(each)] for each in changes])
-    if len(turns) and (np.sign(turns) == np.sign(np.median(turns))).mean() < _RULE.alternating:
+    if len(turns) and (np.sign(turns) == np.sign(np.median(turns))).mean() < _Rule.alternating:
         return "its squares are not dark and bright in turn"
     return f"the board has more corners than {columns} x {rows}" if has_more_corners(grey, board) else None
 
@@ -86,7 +81,7 @@ def _measure_unevenness(board: np.ndarray) -> float | None:
 
     Each grid is a homography of a part of the board. None if no part has enough corners.
     """
-    size, square, freedom = _RULE.neighbourhood, 0.0, 0
+    size, square, freedom = _Rule.neighbourhood, 0.0, 0
     starts = [range(0, max(length - size, 0) + 1) for length in board.shape[:2]]
     for top, left in product(*starts):
         part = board[top : top + size, left : left + size]
@@ -138,7 +133,7 @@ def _extrapolate_row(rows: np.ndarray) -> np.ndarray:
 def _are_whole(grey: np.ndarray, corners: np.ndarray, before: np.ndarray) -> bool:
     """Return True if the squares beyond a row of corners (K, 2) alternate over their whole width."""
     near, far = (
-        _measure_alternation(grey, corners + reach * (corners - before)) for reach in (_RULE.reaches[-1], _RULE.far)
+        _measure_alternation(grey, corners + reach * (corners - before)) for reach in (_Rule.reaches[-1], _Rule.far)
     )
     return bool(far > near / 2)
 
@@ -163,19 +158,19 @@ def refine_corners(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
     found, sides = np.full_like(grid, np.nan), _side_lengths(grid)
     if not len(sides):
         return found
-    most = int(np.clip(_RULE.window * _RULE.reaches[0] * sides.min(), _RULE.least_window_px, _RULE.most_window_px))
+    most = int(np.clip(_Rule.window * _Rule.reaches[0] * sides.min(), _Rule.least_window_px, _Rule.most_window_px))
     rim = most + 3
-    until = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _RULE.passes, _RULE.settled_px
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _RULE.smoothing_px)
+    until = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _Rule.passes, _Rule.settled_px
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _Rule.smoothing_px)
     levels, _, reaches = _compare_squares(smooth, grid)
     dark, bright = np.sort((levels[:2] + levels[2:]) / 2, axis=0)
     smooth = cv2.copyMakeBorder(smooth, rim, rim, rim, rim, cv2.BORDER_REPLICATE)
     for place in np.argwhere(bright > dark):
         at = tuple(place)
-        half = int(np.clip(_RULE.window * reaches[at] * sides.min(), _RULE.least_window_px, most))
+        half = int(np.clip(_Rule.window * reaches[at] * sides.min(), _Rule.least_window_px, most))
         column, row = nearest = np.rint(grid[at]).astype(int)
         window = smooth[row : row + 2 * rim + 1, column : column + 2 * rim + 1]
-        middle, span = (dark[at] + bright[at]) / 2, _RULE.cut_off * (bright[at] - dark[at])
+        middle, span = (dark[at] + bright[at]) / 2, _Rule.cut_off * (bright[at] - dark[at])
         edges = np.clip((window - middle) / span, -1.0, 1.0).astype(np.float32)
         start = (grid[at] - nearest + rim).astype(np.float32).reshape(1, 1, 2)
         moved = cv2.cornerSubPix(edges, start.copy(), (half, half), (-1, -1), until)
@@ -204,17 +199,17 @@ def _compare_squares(grey: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np
     """
     down, right = (_steps(grid, axis) for axis in (0, 1))
     levels, contrast = np.full((4, *grid.shape[:2]), np.nan), np.zeros(grid.shape[:2])
-    reaches = np.full(grid.shape[:2], _RULE.reaches[0])
+    reaches = np.full(grid.shape[:2], _Rule.reaches[0])
     known = np.isfinite(grid + down + right).all(axis=2)
     at, along, across = grid[known], right[known], down[known]
-    for reach in _RULE.reaches:
+    for reach in _Rule.reaches:
         places = [at + reach * (x * along + y * across) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
         here = np.full_like(levels, np.nan)
         here[:, known] = sample_levels(grey, np.concatenate(places)).reshape(4, -1)
         difference = np.abs(here[0] + here[2] - here[1] - here[3]) / 2
         unlike = np.maximum(np.abs(here[0] - here[2]), np.abs(here[1] - here[3]))
-        alike = (contrast == 0) & (unlike < _RULE.unlike * difference)
-        levels = np.where(alike | (reach == _RULE.reaches[0]), here, levels)
+        alike = (contrast == 0) & (unlike < _Rule.unlike * difference)
+        levels = np.where(alike | (reach == _Rule.reaches[0]), here, levels)
         contrast, reaches = np.where(alike, difference, contrast), np.where(alike, reach, reaches)
     return levels, contrast, reaches
 

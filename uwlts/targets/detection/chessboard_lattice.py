@@ -12,8 +12,7 @@ from uwlts.targets.detection.chessboard_grid import count_corners, has_more_corn
 from uwlts.targets.detection.lattice import LATTICE_RULE, STEPS, local_steps
 
 
-@dataclass(frozen=True, kw_only=True)
-class BoardSearchRule:
+class _Rule:
     """Numbers of the search for a chessboard. Pixels are those of the scaled image.
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
@@ -43,9 +42,6 @@ class BoardSearchRule:
     rim_px: float = 6.0  # least distance of a certainly found corner from the image border, px, minus `ring_px`
 
 
-_RULE = BoardSearchRule()
-
-
 @dataclass(frozen=True)
 class _Corners:
     """Candidates for corners in an image."""
@@ -58,22 +54,22 @@ class _Corners:
     @classmethod
     def from_image(cls, image: np.ndarray) -> "_Corners":
         """Find the candidates in an image (H, W)."""
-        grey = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _RULE.sigma_px)
+        grey = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _Rule.sigma_px)
         along_x, along_y = (cv2.Scharr(grey, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))
         xx, xy = (cv2.Scharr(along_x, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))
         saddle = np.maximum(xy * xy - xx * cv2.Scharr(along_y, cv2.CV_32F, 0, 1), 0.0)
-        side = 2 * int(np.ceil(2 * _RULE.sigma_px)) + 1
+        side = 2 * int(np.ceil(2 * _Rule.sigma_px)) + 1
         highest = (saddle == cv2.dilate(saddle, np.ones((side, side)))) & (saddle > 0)
-        rim = int(_RULE.ring_px) + 2
+        rim = int(_Rule.ring_px) + 2
         highest[:rim], highest[-rim:], highest[:, :rim], highest[:, -rim:] = False, False, False, False
         pixels = np.argwhere(highest)[:, ::-1].astype(np.float64)
-        outer = _harmonics(grey, pixels, _RULE.ring_px)
-        inner = _harmonics(grey, pixels, _RULE.inner_ring * _RULE.ring_px)
+        outer = _harmonics(grey, pixels, _Rule.ring_px)
+        inner = _harmonics(grey, pixels, _Rule.inner_ring * _Rule.ring_px)
         power = np.abs(outer[:, 1:]) ** 2
         share = power[:, 1] / np.maximum(power.sum(axis=1), 1e-9)
         in_phase = np.cos(np.angle(outer[:, 2]) - np.angle(inner[:, 2]))
         contrast = 2.0 * np.abs(outer[:, 2])
-        good = (share > _RULE.two_fold) & (in_phase > _RULE.in_phase) & (contrast > _RULE.contrast)
+        good = (share > _Rule.two_fold) & (in_phase > _Rule.in_phase) & (contrast > _Rule.contrast)
         return cls(pixels[good], contrast[good], np.angle(outer[good, 2]), grey)
 
     def measure_edges(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -83,29 +79,29 @@ class _Corners:
         edge, or if the sectors do not fit neighbouring corners.
         """
         at, way = self.pixels[start], self.pixels[end] - self.pixels[start]
-        across = _RULE.edge_offset * np.stack([-way[:, 1], way[:, 0]], axis=1)
-        places = [at + share * way for share in _RULE.edge_places]
+        across = _Rule.edge_offset * np.stack([-way[:, 1], way[:, 0]], axis=1)
+        places = [at + share * way for share in _Rule.edge_places]
         steps = np.stack(
             [sample_levels(self.grey, each + across) - sample_levels(self.grey, each - across) for each in places]
         )
         contrasts = self.contrast[[start, end]]
         neighbours = (np.sign(steps) == np.sign(steps[0])).all(axis=0)
-        neighbours &= contrasts.max(axis=0) < _RULE.contrast_ratio * contrasts.min(axis=0)
-        neighbours &= np.cos(self.phase[start] - self.phase[end]) < _RULE.opposite
+        neighbours &= contrasts.max(axis=0) < _Rule.contrast_ratio * contrasts.min(axis=0)
+        neighbours &= np.cos(self.phase[start] - self.phase[end]) < _Rule.opposite
         return np.where(neighbours, np.sign(steps[0]) * np.abs(steps).min(axis=0) / contrasts.min(axis=0), 0.0)
 
     def find_seeds(self, tree: KDTree) -> Iterator[tuple[int, np.ndarray]]:
         """Yield corners with edges along two axes, and the steps (2, 2) along these; the clearest corners first."""
-        ends = np.asarray(tree.query(self.pixels, k=min(_RULE.neighbours + 1, len(self.pixels)))[1])[:, 1:]
+        ends = np.asarray(tree.query(self.pixels, k=min(_Rule.neighbours + 1, len(self.pixels)))[1])[:, 1:]
         starts = np.repeat(np.arange(len(ends)), ends.shape[1])
         edges = self.measure_edges(starts, ends.ravel()).reshape(ends.shape)
-        sides = [sign * edges > _RULE.edge_contrast for sign in (1, -1)]
+        sides = [sign * edges > _Rule.edge_contrast for sign in (1, -1)]
         number = np.sum([side.sum(axis=1).clip(max=2) for side in sides], axis=0)
         both = np.flatnonzero(sides[0].any(axis=1) & sides[1].any(axis=1))
         for corner in sorted(both.tolist(), key=lambda c: (-number[c], -self.contrast[c])):
             first, second = (self.pixels[ends[corner, side[corner].argmax()]] - self.pixels[corner] for side in sides)
             turn = first[0] * second[1] - first[1] * second[0]
-            if abs(turn) > _RULE.seed_sine * np.linalg.norm(first) * np.linalg.norm(second):
+            if abs(turn) > _Rule.seed_sine * np.linalg.norm(first) * np.linalg.norm(second):
                 yield corner, np.stack([first, second] if turn > 0 else [second, first])
 
     def grow(self, seed: int, steps: np.ndarray, tree: KDTree) -> dict[tuple[int, int], int]:
@@ -144,10 +140,10 @@ class _Corners:
     def _may_be_neighbours(self, corner: int, other: int, reach: int) -> bool:
         """Return True if a step of one or two may connect two corners in the lattice."""
         if reach == 1:
-            return bool(abs(self.measure_edges(np.array([corner]), np.array([other]))[0]) > _RULE.edge_contrast)
+            return bool(abs(self.measure_edges(np.array([corner]), np.array([other]))[0]) > _Rule.edge_contrast)
         contrasts = self.contrast[[corner, other]]
-        same_phase = np.cos(self.phase[corner] - self.phase[other]) > -_RULE.opposite
-        return bool(same_phase and contrasts.max() < _RULE.contrast_ratio * contrasts.min())
+        same_phase = np.cos(self.phase[corner] - self.phase[other]) > -_Rule.opposite
+        return bool(same_phase and contrasts.max() < _Rule.contrast_ratio * contrasts.min())
 
 
 def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
@@ -158,16 +154,16 @@ def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
     turn.
     """
     best = None
-    for scale in _RULE.scales:
+    for scale in _Rule.scales:
         small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
-        if min(small.shape) < 8 * _RULE.ring_px:
+        if min(small.shape) < 8 * _Rule.ring_px:
             break
         corners = _Corners.from_image(small)
         if len(corners.pixels) < 4:
             continue
         tree, tried, found = KDTree(corners.pixels), set(), {}
         for number, (seed, steps) in enumerate(corners.find_seeds(tree)):
-            if number >= _RULE.most_seeds or len(found) >= columns * rows:
+            if number >= _Rule.most_seeds or len(found) >= columns * rows:
                 break
             if seed not in tried:
                 piece = corners.grow(seed, steps, tree)
@@ -253,14 +249,14 @@ def _place_piece(piece: np.ndarray, columns: int, rows: int, shape: tuple[int, .
 def _is_side(last: np.ndarray, before: np.ndarray, shape: tuple[int, ...]) -> bool:
     """Return True if a row of corners (K, 2) is a side of the board: most of the next ones would be in the image."""
     beyond = (2.0 * last - before)[np.isfinite(last[:, 0]) & np.isfinite(before[:, 0])]
-    rim = _RULE.ring_px + _RULE.rim_px
+    rim = _Rule.ring_px + _Rule.rim_px
     inside = (beyond > rim) & (beyond < np.array(shape[::-1]) - 1 - rim)
     return bool(len(beyond) and inside.all(axis=1).mean() > 0.5)
 
 
 def _harmonics(grey: np.ndarray, pixels: np.ndarray, radius: float) -> np.ndarray:
     """Return Fourier coefficients (N, K) of the grey levels on circles around pixels (N, 2)."""
-    count = _RULE.ring_places
+    count = _Rule.ring_places
     angle = 2.0 * np.pi / count * np.arange(count)
     places = pixels[:, None] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return np.fft.rfft(sample_levels(grey, places.reshape(-1, 2)).reshape(-1, count), axis=1) / count
