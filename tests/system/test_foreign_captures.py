@@ -121,7 +121,10 @@ def captured(path: Path, frames: list[Frame], **rest: object) -> Path:
 
 @pytest.fixture
 def says(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
-    """Run a command line, which must fail with one matching line on standard error and write nothing."""
+    """Run a command line, which must fail with a matching line on standard error and write nothing.
+
+    Only a table of the target's images may follow.
+    """
 
     def check(line: str, words: str) -> None:
         arguments = line.split()
@@ -132,7 +135,8 @@ def says(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
         out, err = capfd.readouterr()
         # On a slow machine, lines of progress precede the message.
         lines = [line for line in err.strip().splitlines() if not re.search(r" after \d+ s$", line)]
-        assert ended.value.code == 2 and len(lines) == 1 and lines[0].startswith("error: "), (out, err)
+        table = [line for line in lines[1:] if re.match(r"image {20,}stage, mm|\S+\.h5, frame \d+ +-?\d", line)]
+        assert ended.value.code == 2 and lines[0].startswith("error: ") and table == lines[1:], (out, err)
         assert re.search(words, lines[0]), lines[0]
         assert not Path(arguments[arguments.index("--out") + 1]).exists()
 

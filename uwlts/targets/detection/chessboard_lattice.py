@@ -115,7 +115,7 @@ class _Corners:
         while frontier:
             asked = []
             for corner in frontier:
-                step_of[corner] = local_steps(where[corner], places, self.pixels, step_of[corner])
+                step_of[corner] = np.array(local_steps(where[corner], places, self.pixels, step_of[corner]))
                 i, j = where[corner]
                 for di, dj in STEPS:
                     if (place := (i + reach * di, j + reach * dj)) not in places:
