@@ -10,7 +10,6 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.placement import LaserPose, laser_pose
 from uwlts.model.sensor import CaptureHeader, Laser, Medium, Sensor
 from uwlts.optics.brightness import sheet_sigma_mm
-from uwlts.radiometry.result import ImageEstimate
 
 PARTICLES = "petzold"
 """Phase function of water whose description states none. The named waters have the same."""
@@ -19,7 +18,7 @@ PARTICLES = "petzold"
 def follow_sensor(
     header: CaptureHeader,
     calibration: Calibration,
-    found: Mapping[str, ImageEstimate],
+    value: Mapping[str, float],
     *,
     reflectance: float,
     sheet_distance_mm: float,
@@ -29,26 +28,32 @@ def follow_sensor(
 ) -> Sensor:
     """Return the described sensor with calibrated lens, window and sheet, and fitted laser, water and detector.
 
-    ``reflectance`` of the surface divides the fitted product. ``sheet_distance_mm`` is the laser's distance from the
-    fitted radius of the sheet. ``attenuation_per_m`` is the attenuation for which the power was fitted. ``dark_e`` is
-    the dark current in electrons during the exposure of the laser images.
+    What is not in ``value``, the determined estimates by name, stays as described. ``reflectance`` of the surface
+    divides the fitted product. ``sheet_distance_mm`` is the laser's distance from the fitted radius of the sheet.
+    ``attenuation_per_m`` is the attenuation for which the power was fitted. ``dark_e`` is the dark current in electrons
+    during the exposure of the laser images.
     """
-    sensor, value = header.sensor, {name: each.value for name, each in found.items()}
-    index = calibration.medium_index(header.medium)
-    power = value["power_reflectance_mw"] / reflectance
-    laser: dict[str, Any] = {"power_mw": power, **_placement(sensor, calibration)}
-    waist = _waist_radius_mm(sensor.laser, value["sheet_radius_mm"], sheet_distance_mm, medium_index=index)
-    laser |= {} if waist is None else {"waist_radius_mm": waist}
+    sensor, laser = header.sensor, _placement(header.sensor, calibration)
     detector: dict[str, Any] = {}
     gain = sensor.detector.gain_dn_per_e()
-    if "gain_dn_per_e" in value and value["gain_dn_per_e"] > 0:
-        # Quantum efficiency and gain have one product in the brightness, which the power contains.
-        power *= gain / value["gain_dn_per_e"]
-        laser["power_mw"], gain = power, value["gain_dn_per_e"]
+    if value.get("gain_dn_per_e", 0.0) > 0:
+        gain = value["gain_dn_per_e"]
         detector["full_well_e"] = sensor.detector.full_scale_dn() / gain
+    if "power_reflectance_mw" in value:
+        # Quantum efficiency and gain have one product in the brightness, which the power contains.
+        laser["power_mw"] = value["power_reflectance_mw"] / reflectance * sensor.detector.gain_dn_per_e() / gain
+    if "sheet_radius_mm" in value:
+        index, radius = calibration.medium_index(header.medium), value["sheet_radius_mm"]
+        waist = _waist_radius_mm(sensor.laser, radius, sheet_distance_mm, medium_index=index)
+        laser |= {} if waist is None else {"waist_radius_mm": waist}
     if "dark_noise_dn" in value:
         detector["read_noise_e"] = math.sqrt(max((value["dark_noise_dn"] / gain) ** 2 - dark_e, 0.0))
-    detector["black_level_dn"] = max(value["background_dn"] - gain * dark_e, 0.0)
+    if "background_dn" in value:
+        detector["black_level_dn"] = max(value["background_dn"] - gain * dark_e, 0.0)
+    medium = header.medium
+    if {"attenuation_per_m", "scattering_per_m"} & value.keys():
+        described = 1e3 * medium.scattering_per_mm(sensor.laser.wavelength_nm)
+        medium = _followed_medium(medium, attenuation_per_m, value.get("scattering_per_m", described))
     exposure = sensor.exposure.model_copy(update={"laser_ms": exposure_ms})
     return sensor.model_copy(
         update={
@@ -57,8 +62,7 @@ def follow_sensor(
             "camera": _calibrated_camera(sensor, calibration),
             "laser": sensor.laser.model_copy(update=laser),
             "detector": sensor.detector.model_copy(update=detector),
-            "media": sensor.media
-            | {header.medium_name: _followed_medium(header.medium, attenuation_per_m, value["scattering_per_m"])},
+            "media": sensor.media | {header.medium_name: medium},
         }
     )
 

@@ -24,17 +24,36 @@ SIGNIFICANT = 3.0
 
 @dataclass(frozen=True)
 class ImageEstimate:
-    """Estimate with its standard uncertainty, unit and meaning."""
+    """Estimate with its standard uncertainty, unit and meaning; not determined if the images contradict its model."""
 
     name: str
     value: float
     std: float
     unit: str
     meaning: str
+    determined: bool = True
 
     def line(self) -> str:
         """Return the estimate as text."""
-        return f"{self.meaning}: {format_value(self.value, self.std)} {self.unit}".rstrip()
+        text = f"{self.meaning}: {format_value(self.value, self.std)} {self.unit}".rstrip()
+        return text if self.determined else f"{text} (not determined)"
+
+
+@dataclass(frozen=True)
+class PartFit:
+    """Fit of the model to a part of the images, which ``names`` of estimates follow from.
+
+    ``misfit`` is the rms of the residuals divided by the largest one that the model explains; ``finding`` states it.
+    """
+
+    part: str
+    misfit: float
+    finding: str
+    names: tuple[str, ...]
+
+    def line(self) -> str:
+        """Return the fit as text."""
+        return f"{self.part}: {self.misfit:.2f}" + (f", not explained: {self.finding}" if self.misfit > 1 else "")
 
 
 @dataclass(frozen=True)
@@ -60,13 +79,14 @@ class EstimateChange:
 class Outlook:
     """Water at a glance for the operator.
 
-    ``attenuation_per_m`` is None if the scan does not determine it. ``reach_mm`` is the depth outside the window to
-    which the stripe is found at the exposure ``exposure_ms``, ``view_mm`` the depth at which the sheet leaves the view.
-    ``advised_exposure_ms`` brings the brightest stripe to the sensor's ``exposure.auto_level``.
+    ``attenuation_per_m`` and ``scattering_per_m`` are None if the scan does not determine them. ``reach_mm`` is the
+    depth outside the window to which the stripe is found at the exposure ``exposure_ms``, ``view_mm`` the depth at
+    which the sheet leaves the view. ``advised_exposure_ms`` brings the brightest stripe to the sensor's
+    ``exposure.auto_level``.
     """
 
     attenuation_per_m: float | None
-    scattering_per_m: float
+    scattering_per_m: float | None
     reach_mm: float
     view_mm: float
     exposure_ms: float
@@ -74,7 +94,9 @@ class Outlook:
 
     def lines(self) -> list[str]:
         """Return the outlook as text."""
-        water = "attenuation not determined by this scan"
+        water, halo = "attenuation not determined by this scan", "not determined by this scan"
+        if self.scattering_per_m is not None:
+            halo = f"{self.scattering_per_m:.2f}/m"
         if self.attenuation_per_m is not None:
             water = f"attenuation {self.attenuation_per_m:.2f}/m"
             if self.attenuation_per_m > 0:
@@ -82,10 +104,7 @@ class Outlook:
         whole = self.reach_mm >= self.view_mm - 1.0
         reach = f"the whole view, {self.view_mm:.0f} mm" if whole else f"{self.reach_mm:.0f} of {self.view_mm:.0f} mm"
         found = f"at {self.exposure_ms:.3g} ms the stripe is found to a depth of {reach}"
-        return [
-            f"water: {water}, scattering {self.scattering_per_m:.2f}/m",
-            f"{found}; use {self.advised_exposure_ms:.3g} ms",
-        ]
+        return [f"water: {water}, scattering {halo}", f"{found}; use {self.advised_exposure_ms:.3g} ms"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -105,6 +124,8 @@ class Radiometry(Brief):
     estimates : tuple of ImageEstimate
     correlation : (P, P) float64
         Correlation of the first P estimates, those of the stripe.
+    parts : tuple of PartFit
+        Fit of each part of the images: light along the stripe, halo, background, and noise of repeated images.
     not_separable : tuple of str
         Quantities that the images do not separate.
     outlook : Outlook
@@ -122,6 +143,7 @@ class Radiometry(Brief):
     reflectance: float
     estimates: tuple[ImageEstimate, ...]
     correlation: np.ndarray
+    parts: tuple[PartFit, ...]
     not_separable: tuple[str, ...]
     outlook: Outlook
     changes: tuple[EstimateChange, ...]
@@ -139,6 +161,8 @@ class Radiometry(Brief):
             *self.outlook.lines(),
             f"from paths of {low:.0f} to {high:.0f} mm in the water:",
             *(f"  {each.line()}" for each in self.estimates),
+            "misfit of each part of the images (up to 1: the model explains it):",
+            *(f"  {each.line()}" for each in self.parts),
             "not separable in these images:",
             *(f"  {text}" for text in self.not_separable),
             *([f"changes since {self.sources.get('compared_with')}:"] if self.changes else []),
@@ -156,6 +180,7 @@ class Radiometry(Brief):
             "reflectance": self.reflectance,
             "estimates": [asdict(each) for each in self.estimates],
             "correlation": self.correlation.tolist(),
+            "parts": [asdict(each) for each in self.parts],
             "not_separable": list(self.not_separable),
             "outlook": asdict(self.outlook),
             "changes": [asdict(each) for each in self.changes],
@@ -177,7 +202,7 @@ class Radiometry(Brief):
             f"{self.sensor.name}: fitted to images by uwlts radiometry, {self.date}",
             f"capture {source['file']}, SHA-256 {source['sha256']}",
             f"calibration {self.sources['calibration']}; reflectance of the surface taken as {self.reflectance:g}",
-            *(each.line() for each in self.estimates),
+            *(each.line() for each in (*self.estimates, *self.parts)),
             *(f"not separable: {text}" for text in self.not_separable),
         ]
         table = _without_none(self.sensor.model_dump(mode="json"))
@@ -211,12 +236,12 @@ def _read(path: str | Path, key: str) -> Any:
 
 
 def compare_estimates(now: Sequence[ImageEstimate], before: Sequence[ImageEstimate]) -> tuple[EstimateChange, ...]:
-    """Return the changes of all estimates that both results have, in combined standard uncertainties."""
-    earlier: Mapping[str, ImageEstimate] = {each.name: each for each in before}
+    """Return the changes of all estimates that both results determine, in combined standard uncertainties."""
+    earlier: Mapping[str, ImageEstimate] = {each.name: each for each in before if each.determined}
     changes = []
     for each in now:
         old = earlier.get(each.name)
-        if old is None:
+        if old is None or not each.determined:
             continue
         std = math.hypot(each.std, old.std)
         moved = each.value - old.value

@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
+from scipy.special import erf
 from scipy.stats import chi2
 
 from uwlts.errors import CaptureError
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.stripe import CaptureStripes
+from uwlts.radiometry.result import PartFit
 from uwlts.runtime.progress import ProgressListener
 from uwlts.storage.capture import Capture
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
@@ -42,6 +45,12 @@ LONGEST_GAP = 8
 _ROUNDS = 5  # of weights, which follow from the fitted variance
 _BINS = 24
 """Bins of the photon transfer."""
+_FEWEST_PIXELS = 50  # of a bin
+_ROUNDING = 1.0 / 12.0
+"""Variance of the rounding to grey values."""
+_TRANSFER_MISFIT, _TRANSFER_LIMIT = 0.05, 1.75
+"""Relative misfit of a variance that the gain's use allows, and the largest rms of deviations in their own standard
+deviations: with 15 bins, one of a million exceeds it by chance."""
 _STILL = 0.99
 """Fraction of the pixels without particles that are kept for the noise."""
 _BAND_PX = 32
@@ -234,6 +243,22 @@ def _measure_run(profiles: np.ndarray, line: np.ndarray, centre_px: np.ndarray, 
     return _Part(values, middle - smooth, light, deviation, clipped)
 
 
+def fit_sigma(place_px: np.ndarray, profile: np.ndarray) -> float:
+    """Return the standard deviation in px of a Gaussian, integrated over pixels, that fits a mean profile best."""
+    held = np.isfinite(profile)
+    x, y = place_px[held], profile[held]
+
+    def misfit(log_sigma: float) -> float:
+        sigma = math.sqrt(2) * math.exp(log_sigma)
+        shape = 0.5 * (erf((x + 0.5) / sigma) - erf((x - 0.5) / sigma))
+        design = np.column_stack([shape, np.ones_like(x)])
+        return float(np.sum((y - design @ np.linalg.lstsq(design, y, rcond=None)[0]) ** 2))
+
+    limits = math.log(0.1), math.log(float(x[-1]))
+    found: Any = minimize_scalar(misfit, bounds=limits, method="bounded")
+    return math.exp(float(found.x))
+
+
 @dataclass(frozen=True)
 class CameraNoise:
     """Noise of the camera: grey values per electron and standard deviation in the dark, with standard uncertainties."""
@@ -242,6 +267,7 @@ class CameraNoise:
     gain_std: float
     dark_dn: float
     dark_std: float
+    fit: PartFit
 
 
 def measure_noise(source: Capture) -> CameraNoise | None:
@@ -251,8 +277,8 @@ def measure_noise(source: Capture) -> CameraNoise | None:
     the images are left out. Returns None without repeated images.
     """
     full_dn = source.header.saturation_dn
-    parts = []
-    for numbers in _repeated(source):
+    parts, repeated = [], _repeated(source)
+    for numbers in repeated:
         images = np.stack([source.image(number) for number in numbers.tolist()]).astype(np.float32)
         # Particles change the mean of a pixel, but seldom its median.
         parts.append(np.stack([np.median(images, axis=0), _still_variance(images)]))
@@ -276,7 +302,9 @@ def measure_noise(source: Capture) -> CameraNoise | None:
             halo = whole[0] * max(background_dn - _dimmest(lines_last, background_dn + dark_dn), 0.0)
             dark = math.sqrt(max(whole[1] - halo, 0.0))
             variance_std = math.hypot(float(std[1]), _HALO_STD * halo)
-            return CameraNoise(whole[0], float(std[0]), dark, variance_std / max(2 * dark, 1e-3))
+            freedom = float(np.mean([len(numbers) - 1 for numbers in repeated]))
+            fit = _judge_transfer(counted.sum(axis=0), background_dn, *whole, freedom)
+            return CameraNoise(whole[0], float(std[0]), dark, variance_std / max(2 * dark, 1e-3), fit)
     return None
 
 
@@ -291,7 +319,7 @@ def _still_variance(images: np.ndarray) -> np.ndarray:
     above = np.maximum(middle - np.median(middle), 1.0)
     cell = np.digitize(above, np.geomspace(2.0, max(float(above.max()), 4.0), _BINS))
     most = np.array([np.median(variance[cell == k]) if (cell == k).any() else 0.0 for k in range(_BINS + 1)])
-    most = np.maximum(most, 1.0 / 12.0) * limit / float(chi2.median(freedom))
+    most = np.maximum(most, _ROUNDING) * limit / float(chi2.median(freedom))
     kept = variance <= most[cell]
     return np.where(kept, variance * _STILL / float(chi2.cdf(limit, freedom + 2)), np.nan)
 
@@ -319,10 +347,28 @@ def _dimmest(mean: np.ndarray, most: float) -> float:
     return min((float(np.nanmean(band)) for band in held), default=float(np.nanmean(dark)))
 
 
+def _judge_transfer(counted: np.ndarray, background_dn: float, gain: float, dark: float, freedom: float) -> PartFit:
+    """Judge the deviations of the variances from the line of the photon transfer; bins as for `_fit_transfer`.
+
+    A variance with f degrees of freedom has the relative standard deviation sqrt(2 / f).
+    """
+    count, means, variances = counted[:, counted[0] > _FEWEST_PIXELS]
+    expected = np.maximum(gain * (means / count - background_dn) + dark + _ROUNDING, 1e-3)
+    rest = variances / count / expected - 1
+    misfit = math.sqrt(np.sum(rest**2 / (2 / (freedom * count) + _TRANSFER_MISFIT**2)) / (len(rest) - 2))
+    largest = 100 * float(np.abs(rest).max())
+    return PartFit(
+        "noise of repeated images",
+        misfit / _TRANSFER_LIMIT,
+        f"variances differ by up to {largest:.0f} % from a line; unsteady laser, particles, or a curved response?",
+        ("dark_noise_dn", "gain_dn_per_e"),
+    )
+
+
 def _fit_transfer(counted: np.ndarray, background_dn: float) -> tuple[float, float] | None:
     """Return gain and variance in the dark, without rounding, by weighted least squares; None if undetermined."""
     count, means, variances = counted
-    held = count > 50
+    held = count > _FEWEST_PIXELS
     if np.count_nonzero(held) < 4:
         return None
     mean, variance = means[held] / count[held] - background_dn, variances[held] / count[held]
@@ -333,4 +379,4 @@ def _fit_transfer(counted: np.ndarray, background_dn: float) -> tuple[float, flo
         root = np.sqrt(count[held]) / np.maximum(expected, 1e-3)
         gain, dark = np.linalg.lstsq(design * root[:, None], variance * root, rcond=None)[0]
         expected = gain * mean + dark
-    return float(gain), float(dark) - 1.0 / 12.0
+    return float(gain), float(dark) - _ROUNDING

@@ -16,7 +16,7 @@ import numpy as np
 from uwlts.errors import CaptureError
 from uwlts.fitting.local_surface import surface_normals
 from uwlts.model.calibration import Calibration
-from uwlts.model.placement import LaserPose
+from uwlts.model.placement import LaserPose, apparent_depth_mm
 from uwlts.model.sensor import Camera, CaptureHeader, Laser, Sensor, Window
 from uwlts.model.stripe import CaptureStripes, stack_pixels
 from uwlts.optics.camera import directions
@@ -127,6 +127,23 @@ def working_f_number(camera: Camera) -> float:
     """Return the f-number for the magnification m at the described focus: N (1 + m)."""
     magnified = camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
     return camera.f_number * (1 + magnified)
+
+
+def defocus_variance(
+    sensor: Sensor, calibration: Calibration, depth_mm: np.ndarray, *, medium_index: float
+) -> np.ndarray:
+    """Return the variance in px² of the described lens's blur across the stripe, for depths (N,) of the surface.
+
+    A disc of radius r has the variance r² / 4. Behind the window, depths appear divided by their index.
+    """
+    camera, window = sensor.camera, calibration.window
+    pupil = 0.5 * camera.focal_length_mm / working_f_number(camera)
+    apparent = depth_mm
+    if window is not None and camera.window.mounted:
+        behind = window.distance_mm, window.thickness_mm
+        apparent = apparent_depth_mm(depth_mm, *behind, glass_index=window.glass_index, medium_index=medium_index)
+    radius = pupil * camera.focal_length_px() * np.abs(1 / apparent - 1 / camera.focus_distance_mm)
+    return radius**2 / 4
 
 
 def _grey_per_radiance(sensor: Sensor, index: float) -> float:

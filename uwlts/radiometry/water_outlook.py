@@ -58,7 +58,7 @@ def outlook(
     advised = exposure * (level - value["background_dn"]) / above
     return Outlook(
         attenuation_per_m=attenuation if determined else None,
-        scattering_per_m=value["scattering_per_m"],
+        scattering_per_m=value["scattering_per_m"] if found["scattering_per_m"].determined else None,
         reach_mm=float(depth[seen].max()) if seen.any() else 0.0,
         view_mm=float(np.nanmax(depth[light.usable])),
         exposure_ms=exposure,

@@ -59,6 +59,17 @@ def test_photon_transfer_of_repeated_images_with_grains():
     assert abs(found.gain / GAIN - 1) < 0.03
     assert abs(found.gain - GAIN) < 5 * found.gain_std
     assert abs(found.dark_dn / DARK_DN - 1) < 0.02
+    assert found.fit.misfit < 1
+
+
+def test_unsteady_laser_contradicts_the_photon_transfer():
+    """Power that changes by 2 % adds (0.02 * 2400)^2 = 2300 to a variance of 960 at the brightest pixels."""
+    scan = drawn(6, np.random.default_rng(10))
+    power = np.array([0.98, 1.02, 0.98, 1.02, 0.98, 1.02])[:, None, None]
+    scan.images = np.rint(BLACK + power * (scan.images - BLACK)).astype(np.uint16)
+    found = measure_noise(cast(Any, scan))
+    assert found is not None
+    assert found.fit.misfit > 1
 
 
 def test_shot_noise_of_the_halo_is_not_noise_in_the_dark():
