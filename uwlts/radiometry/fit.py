@@ -65,11 +65,9 @@ _LEAST_SIGMA_PX = 0.5
 """Least standard deviation of the sheet in the image for which its radius is separable from pixel and blur."""
 _CELL_PX = 6  # of the tail, whose mean residuals are judged; the halo falls by a third there at most
 _GRAINS, _LIGHT_MISFIT = 2.0, 0.03
-"""Largest scatter of the light along the stripe: in that of its grains, and relative for normals and noise.
-
-On the drawn captures 300, 301 and 307 of docs/studies/radiometry.py, and on 300 with another phase function, it is 1.4
-times that of the grains at most. Judged on 302 and 303, also with faults.
-"""
+"""Largest scatter of the light along the stripe: in that of its grains, and relative for normals and noise. Without
+faults it is 1.4 times that of the grains at most (seeds 300, 301 and 307 of docs/studies/radiometry.py). Seeds 302 and
+303, with faults, were looked at before it was chosen."""
 _HALO_MISFIT = 0.05
 """Largest rms of residuals beside the stripe, in the brightest light there; twice the largest on the same captures."""
 _AS_DESCRIBED = np.zeros(2)

@@ -28,7 +28,7 @@ def follow_sensor(
 ) -> Sensor:
     """Return the described sensor with calibrated lens, window and sheet, and fitted laser, water and detector.
 
-    What is not in ``value``, the determined estimates by name, stays as described. ``reflectance`` of the surface
+    Properties without a determined estimate in ``value`` stay as described. ``reflectance`` of the surface
     divides the fitted product. ``sheet_distance_mm`` is the laser's distance from the fitted radius of the sheet.
     ``attenuation_per_m`` is the attenuation for which the power was fitted. ``dark_e`` is the dark current in electrons
     during the exposure of the laser images.

@@ -43,16 +43,13 @@ _MOST_CLIPPED = 0.02
 LONGEST_GAP = 8
 """Longest gap along the stripe, lines, in which centres are interpolated."""
 _ROUNDS = 5  # of weights, which follow from the fitted variance
-_BINS = 24
-"""Bins of the photon transfer."""
+_BINS = 24  # of the photon transfer
 _FEWEST_PIXELS = 50  # of a bin
-_ROUNDING = 1.0 / 12.0
-"""Variance of the rounding to grey values."""
+_ROUNDING = 1.0 / 12.0  # variance of the rounding to grey values
 _TRANSFER_MISFIT, _TRANSFER_LIMIT = 0.05, 1.75
 """Relative misfit of a variance that the gain's use allows, and the largest rms of deviations in their own standard
 deviations: with 15 bins, one of a million exceeds it by chance."""
-_STILL = 0.99
-"""Fraction of the pixels without particles that are kept for the noise."""
+_STILL = 0.99  # fraction of the pixels without particles that are kept for the noise
 _BAND_PX = 32
 """Width of the bands across the stripe. The dimmest is taken as dark; each has thousands of pixels."""
 _HALO_STD = 0.5
