@@ -31,8 +31,7 @@ from uwlts.inspection.features import BIAS_STD, COVERAGE, COVERAGE_FACTOR, SEED,
 from uwlts.inspection.noisy_extremes import BIAS_FACTOR
 
 
-@dataclass(frozen=True, kw_only=True)
-class BlemishRule:
+class _Rule:
     """Numbers of the measurement of a blemish, whose edge is that of the search (`SEARCH_RULE`)."""
 
     draws: int = 120  # noise draws: three exceed either end of a 95 % interval
@@ -76,7 +75,6 @@ class BlemishRule:
     enough for the dozens of peaks of noise in a contour."""
 
 
-_RULE = BlemishRule()
 DENT_SHARE = 0.1
 """Least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits."""
 
@@ -111,7 +109,7 @@ class Blemish:
 
     def with_spacing(self) -> tuple[FeatureValue, ...]:
         """Return the values; length and width are known no better than the spacing of the points at both ends."""
-        both_ends = np.sqrt(2) * _RULE.end_std * self.spacing_mm
+        both_ends = np.sqrt(2) * _Rule.end_std * self.spacing_mm
         more = dict(zip(("length", "width"), both_ends.tolist(), strict=True))
         return tuple(value.widen(random=more[value.name]) if value.name in more else value for value in self.values)
 
@@ -145,16 +143,16 @@ def measure_blemish(
     # Noise of independent points that explains the scatter of local means.
     noise = indication.noise_mm * surface.std[field.near] / surface.usual_std
     rng, own = np.random.default_rng(SEED), errors[field.near]
-    moves = list(replace(own, single_mm=noise).draw(_RULE.draws, rng))
+    moves = list(replace(own, single_mm=noise).draw(_Rule.draws, rng))
     inside = np.arange(len(noise)) < len(indication.points)
-    more = field.scatter_ratio(heights, moves[: _RULE.depth_draws], inside)
+    more = field.scatter_ratio(heights, moves[: _Rule.depth_draws], inside)
     moves = [np.where(inside, more, 1.0) * each for each in moves]
-    by_noise = np.std([field.depths(each) for each in moves[: _RULE.depth_draws]], axis=0, ddof=1)
+    by_noise = np.std([field.depths(each) for each in moves[: _Rule.depth_draws]], axis=0, ddof=1)
     edge = max(SEARCH_RULE.edge_share * depth, SEARCH_RULE.edge_std * float(np.median(by_noise[field.region])))
     seen = field.figures(depths, edge, deepest, between)
     # Errors of simulated blemishes of this size, measured at these points: noise, sampling and smoothing. One of
     # another outline than a bell is its own model.
-    bells = [_Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, p) for p in _RULE.exponents]
+    bells = [_Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, p) for p in _Rule.exponents]
     wrong: list[np.ndarray] = []
     own_heights = field.seen @ np.where(field.region, depths, 0.0)
     for move in moves:
@@ -196,7 +194,7 @@ def measure_blemish(
     kind = FeatureKind.PROTRUSION
     if sign < 0:
         # Joined pits are pits: the deepest hollow counts, whose contour is three half-depth radii long.
-        least = min(length, width, 3 * _RULE.half_depth * local)
+        least = min(length, width, 3 * _Rule.half_depth * local)
         kind = FeatureKind.DENT if least >= DENT_SHARE * diameter_mm else FeatureKind.PIT
     names = ("height" if sign > 0 else "depth", "length", "width", "area", *(("lost area",) if sign < 0 else ()))
     values = [
@@ -253,14 +251,14 @@ def _choose_field(
     depth = float(depths[deepest]) + between
     edge = max(SEARCH_RULE.edge_share * depth, SEARCH_RULE.edge_std * float(np.median(noise[field.region])))
     seen = field.figures(depths, edge, deepest)
-    if local < 0.5 * _RULE.compact * float(np.max(seen[1:3])):
+    if local < 0.5 * _Rule.compact * float(np.max(seen[1:3])):
         return field, local, depth
-    bells = [_Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, p) for p in _RULE.exponents]
+    bells = [_Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, p) for p in _Rule.exponents]
     off = min(np.mean(np.square(depths - bell.depths_at(field.grid))[field.region]) for bell in bells)
     # A correction increases the variance of the noise, by up to four.
-    if off < (_RULE.off_bell * depth) ** 2 + 4 * np.mean(np.square(noise[field.region])):
+    if off < (_Rule.off_bell * depth) ** 2 + 4 * np.mean(np.square(noise[field.region])):
         return field, local, None
-    narrow = _RULE.narrow * search.smallest_mm / _RULE.bandwidth
+    narrow = _Rule.narrow * search.smallest_mm / _Rule.bandwidth
     return _Field.about(surface, search, indication, local_mm=narrow), local, depth
 
 
@@ -326,24 +324,24 @@ class _Field:
         own = surface.places[indication.points]
         low, high = own.min(axis=0), own.max(axis=0)
         radius = 0.25 * float(np.sum(high - low))
-        reach = max(_RULE.ring * radius, 3 * search.smallest_mm)
+        reach = max(_Rule.ring * radius, 3 * search.smallest_mm)
         around = surface.points_between(low - reach, high + reach)
         around = around[search.undamaged[around]]
         away = KDTree(own).query(surface.places[around])[0]
         around, away = around[away <= reach], away[away <= reach]
-        if len(around) < _RULE.fewest_points:
-            raise EvaluationError(f"{len(around)} undamaged points surround it; {_RULE.fewest_points} are needed")
+        if len(around) < _Rule.fewest_points:
+            raise EvaluationError(f"{len(around)} undamaged points surround it; {_Rule.fewest_points} are needed")
         near = np.concatenate([indication.points, around])
         middle = 0.5 * (low + high)
         places, heights = surface.places[near] - middle, surface.heights[near]
         ring = np.arange(len(near)) >= len(indication.points)
         dense = len(indication.points) / max(float(np.prod(high - low)), 1e-9)
         # A noisy radius of the only hollow would add noise.
-        radius = local_mm if local_mm < _RULE.single * radius else radius
-        bandwidth = min(_RULE.bandwidth * radius, float(np.sqrt(_RULE.points / np.pi / dense)))
+        radius = local_mm if local_mm < _Rule.single * radius else radius
+        bandwidth = min(_Rule.bandwidth * radius, float(np.sqrt(_Rule.points / np.pi / dense)))
         bandwidth = max(bandwidth, search.smallest_mm)
-        cell = min(float(np.max(high - low)) / _RULE.cells, 0.5 * bandwidth)
-        cell = max(cell, float(np.sqrt(np.prod(high - low + bandwidth) / _RULE.most_cells)))
+        cell = min(float(np.max(high - low)) / _Rule.cells, 0.5 * bandwidth)
+        cell = max(cell, float(np.sqrt(np.prod(high - low + bandwidth) / _Rule.most_cells)))
         sides = [np.arange(a - cell, b + 2 * cell, cell) for a, b in zip(low - middle, high - middle, strict=True)]
         shape = len(sides[0]), len(sides[1])
         grid = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -361,7 +359,7 @@ class _Field:
         design = np.column_stack([np.ones(len(places)), places])
         plane, outer = fit_biweight(design, heights, ring)[0], np.zeros((3, len(near)))
         far = np.append(np.zeros(len(own), bool), away > 0.5 * reach)
-        if np.count_nonzero(far) >= _RULE.fewest_points:
+        if np.count_nonzero(far) >= _Rule.fewest_points:
             outer = fit_biweight(design, heights, far)[0] - plane
         known = surface.places[near], size, grid + middle, shape, cell
         gap = max(search.gap_mm, widest)
@@ -411,7 +409,7 @@ class _Field:
         top = int(np.argmax(np.where(self.region, smooth, -np.inf)))
         away = np.hypot(*(self.grid - self.grid[top]).T)
         below = smooth < 0.5 * smooth[top] - SEARCH_RULE.edge_std * self.noise_of_means(noise_mm)
-        return float(np.min(away, where=below, initial=float(away.max()))) / _RULE.half_depth
+        return float(np.min(away, where=below, initial=float(away.max()))) / _Rule.half_depth
 
     def find_reason(self, surface: UnrolledSurface, depths: np.ndarray, edge: float, deepest: int) -> str | None:
         """Return why a blemish is not seen whole (places in it or beside it have no points) or not sized, or None."""
@@ -419,7 +417,7 @@ class _Field:
         labels = labelled[0].ravel()
         within = np.union1d(np.flatnonzero((labels == labels[deepest]) & (labels > 0)), [deepest])
         turns = np.arange(8) * np.pi / 4
-        around = _RULE.beyond * self.gap_mm * np.vstack([[0.0, 0.0], np.column_stack([np.cos(turns), np.sin(turns)])])
+        around = _Rule.beyond * self.gap_mm * np.vstack([[0.0, 0.0], np.column_stack([np.cos(turns), np.sin(turns)])])
         probes = (self.grid[within, None] + around).reshape(-1, 2)
         near = surface.points_between(probes.min(axis=0) - 2 * self.gap_mm, probes.max(axis=0) + 2 * self.gap_mm)
         if np.any(KDTree(surface.places[near]).query(probes)[0] > self.gap_mm):
@@ -488,7 +486,7 @@ class _Field:
     @cached_property
     def fine_region(self) -> np.ndarray:
         """Cells of the blemish on the finer grid for contours."""
-        size = [_RULE.subdivision * (n - 1) + 1 for n in self.shape]
+        size = [_Rule.subdivision * (n - 1) + 1 for n in self.shape]
         return np.asarray(ndimage.zoom(self.region.reshape(self.shape), np.divide(size, self.shape), order=0))
 
     def _contoured(self, depths: np.ndarray, edge: float, deepest: int) -> tuple[np.ndarray, np.ndarray, float]:
@@ -496,12 +494,12 @@ class _Field:
 
         The mask is empty if the deepest cell is not within the edge.
         """
-        size = [_RULE.subdivision * (n - 1) + 1 for n in self.shape]
-        top = tuple(_RULE.subdivision * k for k in np.unravel_index(deepest, self.shape))
+        size = [_Rule.subdivision * (n - 1) + 1 for n in self.shape]
+        top = tuple(_Rule.subdivision * k for k in np.unravel_index(deepest, self.shape))
         fine = np.asarray(ndimage.zoom(depths.reshape(self.shape), np.divide(size, self.shape), order=3))
         labelled: Any = ndimage.label(self.fine_region & (fine > edge), structure=np.ones((3, 3)))
         own = (labelled[0] == labelled[0][top]) & (labelled[0][top] > 0)
-        return fine, ndimage.binary_dilation(own, structure=np.ones((3, 3))), self.cell / _RULE.subdivision
+        return fine, ndimage.binary_dilation(own, structure=np.ones((3, 3))), self.cell / _Rule.subdivision
 
     def figures(self, depths: np.ndarray, edge: float, deepest: int, between: float = 0.0) -> np.ndarray:
         """Return the depth of cell ``deepest`` and ``between`` it, length, width, area and lost area within an edge."""
@@ -556,7 +554,7 @@ class _Field:
         # Hollows that no saddle joins are separated by the edge.
         for other in saddles | dict.fromkeys(np.flatnonzero(top == np.arange(len(top))).tolist(), 0.0):
             drop = depths[other] - saddles.get(other, edge)
-            if drop > max((1 - _RULE.saddle) * depths[other], _RULE.saddle_std * std):
+            if drop > max((1 - _Rule.saddle) * depths[other], _Rule.saddle_std * std):
                 kept.append(other)
         return sorted(kept, key=lambda each: -depths[each]) if len(kept) > 1 else []
 
@@ -617,7 +615,7 @@ def _quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidt
     first = np.linalg.solve(normal, np.eye(6)[:, :1])[own, :, 0].T
     values = weight * sum(a * b for a, b in zip(terms, first, strict=True))
     # Quadratics extrapolate badly beside the points.
-    regular &= np.add.reduceat(values * values, starts) < _RULE.most_variance / number[many]
+    regular &= np.add.reduceat(values * values, starts) < _Rule.most_variance / number[many]
     kept, others = regular[own], np.setdiff1d(np.arange(len(grid)), many[regular])
     nearest: Any = tree.query(grid[others], k=3)
     rows = np.concatenate([many[own[kept]], np.repeat(others, 3)])

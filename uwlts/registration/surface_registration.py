@@ -23,8 +23,7 @@ from uwlts.storage.cloud import PointUncertainty, project_image_errors, project_
 _NAMES = "shift along x", "shift along y", "shift along z", "turn about x", "turn about y", "turn about z"
 
 
-@dataclass(frozen=True)
-class SurfaceRegistrationOptions:
+class _Options:
     """Settings of `register_to_surface`.
 
     The history of the values names no data. The reason beside each value follows from the method.
@@ -40,9 +39,6 @@ class SurfaceRegistrationOptions:
     still_mm: float = 1e-5  # step, mm, that ends the iteration: far below any measurable change
     least_variance_mm2: float = 1e-8
     """Lower bound of a point's variance along the normal: (0.1 um) squared, so that weights stay finite."""
-
-
-_OPTIONS = SurfaceRegistrationOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +141,7 @@ def register_to_surface(
     counted = (
         np.arange(len(points_mm)) if datums is None else np.flatnonzero(_select_within(points_mm, datums, reach_mm))
     )
-    chosen = counted[:: max(1, len(counted) // _OPTIONS.most_points)]
+    chosen = counted[:: max(1, len(counted) // _Options.most_points)]
     moved = points_mm[chosen].astype(np.float64)
     known = None if uncertainty is None else uncertainty[chosen]
     image = None if frame is None else frame[chosen]
@@ -157,10 +153,10 @@ def register_to_surface(
         used = np.isfinite(near.distance_mm)
         if datums is not None:
             used &= _select_within(moved, datums, 0.0)
-        if np.count_nonzero(used) < _OPTIONS.fewest_points:
+        if np.count_nonzero(used) < _Options.fewest_points:
             raise EvaluationError(
                 f"{np.count_nonzero(used)} of {len(points_mm)} points lie within {reach_mm:g} mm of the reference"
-                f"{'' if datums is None else ' and within the datums'}; at least {_OPTIONS.fewest_points} are needed. "
+                f"{'' if datums is None else ' and within the datums'}; at least {_Options.fewest_points} are needed. "
                 "Check that both have the same frame and unit"
             )
         rotation = transform[:3, :3]
@@ -168,17 +164,17 @@ def register_to_surface(
         of_reference = np.zeros(np.count_nonzero(used))
         if reference is not None:
             of_reference = project_variance(reference.random_mm2[near.index[used]], near.normals[used])
-        variance = of_reference + _variance_along(known, near.normals @ rotation, _OPTIONS.least_variance_mm2)[used]
+        variance = of_reference + _variance_along(known, near.normals @ rotation, _Options.least_variance_mm2)[used]
         by = _motion_derivatives(moved[used], near.normals[used], middle)
         found = _solve_step(
-            by, near.distance_mm[used], variance, size=_rms_radius(moved, middle), open_share=_OPTIONS.open_share
+            by, near.distance_mm[used], variance, size=_rms_radius(moved, middle), open_share=_Options.open_share
         )
         turn = Rotation.from_rotvec(found.step[3:]).as_matrix()
         change = rigid_transform(turn, middle + found.step[:3] - turn @ middle)
         transform, moved = change @ transform, moved @ change[:3, :3].T + change[:3, 3]
         rounds += 1
         largest = max(np.abs(found.step[:3]).max(), np.abs(found.step[3:]).max() * _rms_radius(moved, middle))
-        if largest < _OPTIONS.still_mm or rounds == _OPTIONS.rounds:
+        if largest < _Options.still_mm or rounds == _Options.rounds:
             break
     normals = near.normals[used]
     cloud_side = _CorrelatedErrors(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from types import ModuleType
 
@@ -13,8 +12,7 @@ from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import WINDOW_RULE, PeakWindow
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScatterRule:
+class _Rule:
     """Numbers of the comparison, chosen for the reasons below.
 
     ``reach``, ``run`` and the use of squares were chosen on the real stripes of docs/results/stripe-methods.md, where
@@ -48,9 +46,6 @@ class ScatterRule:
     """Largest distance of neighbouring centres, as a fraction of the window; other lines belong to two surfaces."""
 
 
-_RULE = ScatterRule()
-
-
 def least_scattered(
     peak: PeakWindow, centre: np.ndarray, first: ModuleType, others: tuple[ModuleType, ...]
 ) -> np.ndarray:
@@ -58,19 +53,19 @@ def least_scattered(
 
     ``peak`` are windows of M lines in their order, with centres (M,) of the preferred method. All methods are compared
     only if that method lacks its advantage over ``first``. Another one is used if it scatters less by
-    `ScatterRule.gain` and ``gain_px``.
+    `_Rule.gain` and ``gain_px``.
     """
     rows = _select_runs(peak.start.size)
     # The median of the lines that are compared, because only their scatter decides; counting is faster than sorting.
-    narrow = np.count_nonzero(peak.sigma[rows[::2]] < _RULE.narrowest)
-    if rows.shape[1] <= 2 * _RULE.reach or 2 * narrow > rows[::2].size:
+    narrow = np.count_nonzero(peak.sigma[rows[::2]] < _Rule.narrowest)
+    if rows.shape[1] <= 2 * _Rule.reach or 2 * narrow > rows[::2].size:
         return centre
     own, (of_first,) = _measure_scatters(peak, centre, (first,), rows[::2])
-    if not of_first <= _RULE.advantage * own:
+    if not of_first <= _Rule.advantage * own:
         return centre
     own, scatters = _measure_scatters(peak, centre, (first, *others), rows)
     best = int(np.argmin(scatters))
-    if not own - scatters[best] > max(_RULE.gain * own, _RULE.gain_px):
+    if not own - scatters[best] > max(_Rule.gain * own, _Rule.gain_px):
         return centre
     return (first, *others)[best].centres(peak)
 
@@ -84,12 +79,12 @@ def _measure_scatters(
     """
     some = peak.select(rows.ravel())
     middle = (some.start + some.middle).reshape(rows.shape).astype(float)
-    jump_px, weights = _RULE.jump * peak.window.shape[1], _residual_weights(_RULE.reach)
+    jump_px, weights = _Rule.jump * peak.window.shape[1], _residual_weights(_Rule.reach)
     scatters = []
     for values in (centre[rows.ravel()], *(other.centres(some) for other in others)):
         place = (some.start + values.astype(float)).reshape(rows.shape)
-        total, count = _sum_squares(middle, place, weights, jump_px, _RULE.largest_px)
-        scatters.append(math.sqrt(total / count) if count >= _RULE.fewest else math.nan)
+        total, count = _sum_squares(middle, place, weights, jump_px, _Rule.largest_px)
+        scatters.append(math.sqrt(total / count) if count >= _Rule.fewest else math.nan)
     return scatters[0], scatters[1:]
 
 
@@ -122,9 +117,9 @@ def _sum_squares(
 @lru_cache(maxsize=16)
 def _select_runs(count: int) -> np.ndarray:
     """Return the indices (R, K) of runs spread over ``count`` lines, or all lines as one run if they are few."""
-    if count <= _RULE.run * _RULE.runs:
+    if count <= _Rule.run * _Rule.runs:
         return np.arange(count)[None]
-    return np.linspace(0, count - _RULE.run, _RULE.runs).astype(np.intp)[:, None] + np.arange(_RULE.run)
+    return np.linspace(0, count - _Rule.run, _Rule.runs).astype(np.intp)[:, None] + np.arange(_Rule.run)
 
 
 @lru_cache

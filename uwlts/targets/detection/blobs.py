@@ -14,8 +14,7 @@ BLOCK_PX = 4
 weights for this side."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class BlobRule:
+class _Rule:
     """Numbers of the search for blobs.
 
     Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
@@ -42,9 +41,6 @@ class BlobRule:
     1.4, 1.6 and 2.0, chosen on 40 drawn plates among specks and judged on 40 others; all but 1.25 do about the same."""
     fewest: int = 4  # fewest blobs of such a family: one cell of a lattice
     most_families: int = 12  # most families after the first one; each costs about as much as the first
-
-
-_RULE = BlobRule()
 
 
 @dataclass(frozen=True)
@@ -92,8 +88,8 @@ def estimate_noise(image):
     """
     counts = np.zeros(8 * np.iinfo(image.dtype).max + 1, np.int64)
     _count_responses(image, counts)
-    lower_part = np.searchsorted(np.cumsum(counts), _RULE.smooth_share * counts.sum())
-    return float(lower_part) / (6 * NormalDist().inv_cdf(0.5 + _RULE.smooth_share / 2))
+    lower_part = np.searchsorted(np.cumsum(counts), _Rule.smooth_share * counts.sum())
+    return float(lower_part) / (6 * NormalDist().inv_cdf(0.5 + _Rule.smooth_share / 2))
 
 
 @compiled
@@ -112,12 +108,12 @@ def _count_responses(image, counts):
 def find_blobs(image, noise):
     """Yield families of elliptic blobs: first the largest of any polarity and size, then all others by their number.
 
-    Each window side in `BlobRule.windows_px` gives a threshold halfway between the mean levels of the local bright and
+    Each window side in `_Rule.windows_px` gives a threshold halfway between the mean levels of the local bright and
     dark pixels. It is one local step of Ridler and Calvard's iteration per pass, and removes uneven lighting. Only
     outer contours are used, which fills holes. Blobs at the image border and small blobs are removed.
 
     The first family contains all blobs of its window and polarity; of equally many, the smaller blobs, because the
-    bright region around each dark circle is also a blob. Other families are similar in size (`BlobRule.size_range`).
+    bright region around each dark circle is also a blob. Other families are similar in size (`_Rule.size_range`).
 
     ``noise`` is the standard deviation of a pixel of the image (H, W). The first family may be empty.
     """
@@ -134,11 +130,11 @@ def find_blobs(image, noise):
     for bright, mask in _local_masks(image, noise):
         blobs = _select_ellipses(mask, bright=bright)
         blobs = blobs[np.argsort(blobs.radii)]
-        while len(blobs) >= _RULE.fewest:
-            first, last = _largest_family(blobs.radii, _RULE.size_range)
+        while len(blobs) >= _Rule.fewest:
+            first, last = _largest_family(blobs.radii, _Rule.size_range)
             families.append(blobs[first:last])
             blobs = blobs[np.delete(np.arange(len(blobs)), slice(first, last))]
-    yield from sorted(families, key=len, reverse=True)[: _RULE.most_families]
+    yield from sorted(families, key=len, reverse=True)[: _Rule.most_families]
 
 
 def _local_masks(image, noise):
@@ -147,13 +143,13 @@ def _local_masks(image, noise):
     A mask is valid until the next one is asked for.
     """
     low, high = np.quantile(image[::4, ::4], (0.001, 0.999))
-    floor = max(_RULE.contrast_over_noise * noise, _RULE.contrast_over_range * (high - low))
+    floor = max(_Rule.contrast_over_noise * noise, _Rule.contrast_over_range * (high - low))
     smooth = cv2.medianBlur(image, 3)
     # All pixels are above -1.
     _, mean = _average_above(smooth, np.full([-(-size // BLOCK_PX) for size in smooth.shape], -1, np.float32))
     sides, wide = np.empty((2, *smooth.shape), np.uint8), np.empty((2, 2, BLOCK_PX * mean.shape[1]), np.float32)
-    for window in _RULE.windows_px:
-        if window > _RULE.windows_px[0] and window > max(image.shape):
+    for window in _Rule.windows_px:
+        if window > _Rule.windows_px[0] and window > max(image.shape):
             break
         threshold, contrast = _estimate_levels(smooth, mean, window)
         _set_sides(smooth, threshold, contrast, np.float32(floor), wide, sides[0], sides[1])
@@ -269,12 +265,12 @@ def _select_ellipses(mask, *, bright, fewest=0):
         ends = np.cumsum(lengths[chosen])
         _outline_moments(np.concatenate([contours[k] for k in chosen])[:, 0], ends, width, height, found)
     # The outline passes through pixel centres: it excludes half a pixel all around, and lines of pixels completely.
-    found = found[(found[:, 1] > 0) & (found[:, 1] + found[:, 0] / 2 >= _RULE.least_area_px)]
+    found = found[(found[:, 1] > 0) & (found[:, 1] + found[:, 0] / 2 >= _Rule.least_area_px)]
     area, covariances = found[:, 1], found[:, 4:] / found[:, 1:2]
     determinant = covariances[:, 0] * covariances[:, 2] - covariances[:, 1] ** 2
     # The uniform disc of radius r has the variance r^2 / 4, so an ellipse has area 4 pi sqrt(det covariance).
     expected = 4 * np.pi * np.sqrt(np.maximum(determinant, 0))
-    like = np.abs(area - expected) <= _RULE.ellipse_departure * expected
+    like = np.abs(area - expected) <= _Rule.ellipse_departure * expected
     centres, shapes = found[like, 2:4] / area[like, None], covariances[like][:, [0, 1, 1, 2]]
     values, vectors = np.linalg.eigh(shapes.reshape(-1, 2, 2))
     semi_axes = 2 * np.sqrt(values) + 0.5
