@@ -1,6 +1,6 @@
 """Verdicts on drawn damaged pipes: no finding is cut short, sized from a stump, split or left out unsaid.
 
-Parts are those of `tests.oracles.damaged_pipes`, with seeds on which no threshold was chosen.
+Parts are those of `tests.oracles.damaged_pipes`. No threshold was chosen with their seeds, except where a test says so.
 """
 
 import math
@@ -42,6 +42,9 @@ def test_a_finding_cut_by_a_border_says_so(seed: int) -> None:
 
 @pytest.mark.parametrize(("kind", "seed"), [("gouges", 406), ("patch of corrosion", 414)])
 def test_rough_ground_is_one_finding(kind: str, seed: int) -> None:
-    """A smooth surface below it does not follow a gouge or an area of corrosion: nothing is searched for in these."""
+    """A smooth surface does not follow a gouge or an area of corrosion: nothing is searched for within these.
+
+    The threshold was chosen with these parts, among others.
+    """
     counts = count_drawn(kind, seed)
     assert counts["inside"] == counts["values"] == counts["truths"] and not counts["invented"], counts

@@ -12,7 +12,7 @@ from uwlts.radiometry.scattering import STEP_PX, HaloKernel, line_spread
 def test_line_spread_of_isotropic_scattering():
     """With p = 1 / (4 pi), the sum over y from -D to D is 2 atan(D / r) / r, with r^2 = x^2 + l^2.
 
-    The trapezoidal rule on logarithmic nodes, a factor of 1.2 apart, has an error below 1 %.
+    The trapezoidal rule on logarithmic nodes with a ratio of 1.2 has an error below 1 %.
     """
     path = 300.0
     distance = np.array([0.1, 1.0, 10.0, 50.0])
@@ -36,8 +36,8 @@ def test_kernel_without_scattering_is_the_gaussian_stripe():
 def test_kernel_is_the_line_spread_of_its_paths():
     """A weak halo is the spread of both paths, per px.
 
-    From 12 px on, the spread changes by 1 % within a cell of 0.5 px at most. Cells that follow the nodes instead of the
-    curve between them, a factor of 1.5 apart, deviate by up to 5 %.
+    From 12 px on, the spread changes by 1 % within a cell of 0.5 px at most. Cells that follow the nodes, with a ratio
+    of 1.5, instead of the curve between them deviate by up to 5 %.
     """
     per_sr, paths = HenyeyGreenstein(0.9).per_sr, ((300.0, 0.4), (250.0, 0.5))
     kernel, b = HaloKernel(per_sr, paths), 1e-8
