@@ -156,12 +156,11 @@ def jackknife(changes: np.ndarray) -> np.ndarray:
 
 def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return derivatives (N, K) of flattened values by central differences with steps (K,); 0 for a zero step."""
-    columns = []
-    for number, size in enumerate(steps):
-        step = np.zeros(len(steps))
-        step[number] = size
-        columns.append((values(at + step) - values(at - step)).ravel() / (2 * size or 1.0))
-    return np.stack(columns, axis=1)
+    columns = [
+        (values(at + step) - values(at - step)).ravel() / (2 * step.sum()) if step.any() else 0.0
+        for step in np.diag(steps)
+    ]
+    return np.stack(np.broadcast_arrays(*columns), axis=1)
 
 
 class FittedShape(Protocol):

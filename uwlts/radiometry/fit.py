@@ -400,13 +400,11 @@ class _Evidence:
         first = max(self.images.width // 2, TAIL_FIRST_PX)
         halo = self._halo(*fitted)[:, first:]
         beside = self.images.tail[:, first:] - fitted[1] - halo
-        noise = robust_std(np.diff(beside, axis=1)) / math.sqrt(2)
+        between = robust_std(np.diff(beside, axis=1))  # neighbouring pixels: noise, times the root of two
         cells = np.array([part.mean(axis=1) for part in np.array_split(beside, halo.shape[1] // _CELL_PX, axis=1)])
         level, brightest = cells.mean(axis=0), float(halo[:, 0].mean())
-
-        def limit(pixels: int) -> float:
-            return math.hypot(_HALO_MISFIT * brightest, noise * math.sqrt(2 / pixels))
-
+        by_noise = between / np.sqrt([_CELL_PX, halo.shape[1]])
+        most_of_shape, most_of_level = np.hypot(_HALO_MISFIT * brightest, by_noise).tolist()
         excess = (np.array(_NAMES) == "scattering_per_m") - 1.0 * (np.array(_NAMES) == "attenuation_per_m")
         shape_dn, level_dn = float(np.std(cells - level)), float(np.std(level))
         return (
@@ -418,13 +416,13 @@ class _Evidence:
             ),
             PartFit(
                 "halo beside the stripe",
-                shape_dn / limit(_CELL_PX),
+                shape_dn / most_of_shape,
                 f"{shape_dn:.3g} DN beside the model, of {brightest:.3g} DN; translucent surface or daylight?",
                 ("power_reflectance_mw", "scattering_per_m", "sheet_radius_mm", "background_dn"),
             ),
             PartFit(
                 "background over the scan",
-                level_dn / limit(halo.shape[1]),
+                level_dn / most_of_level,
                 f"it differs by {level_dn:.3g} DN between parts of the scan; daylight?",
                 ("scattering_per_m", "background_dn"),
             ),

@@ -209,9 +209,6 @@ class CompletionLimits(Description):
         return dict.fromkeys(_FOCAL, self.focal_std_px) | dict.fromkeys(_CENTRE, self.centre_std_px)
 
 
-_USUAL_LIMITS = CompletionLimits()
-
-
 @dataclass(frozen=True, eq=False)
 class State:
     """State of a calibration after the recorded poses."""
@@ -270,7 +267,7 @@ class State:
         return replace(self.showing(pose, view.pixels), known=self.known.with_information(information))
 
 
-def solve_state(recorded: Sequence[RecordedPose], setting: Setting, wanted: CompletionLimits = _USUAL_LIMITS) -> State:
+def solve_state(recorded: Sequence[RecordedPose], setting: Setting, wanted: CompletionLimits) -> State:
     """Solve the calibration with the recorded poses and return its state.
 
     Raises CalibrationError if no pose of the target fits one of its images.

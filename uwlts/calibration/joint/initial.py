@@ -201,6 +201,8 @@ def find_odd_images(series: Series, sensor: Sensor, *, options: CalibrationOptio
     Of many draws of a few images, those that a camera fits best are taken to be right; each other image is added alone.
     """
     solve, images = _camera_solver(series, sensor, options), series.found.images
+    if len(images) <= _DRAWN:
+        return {}
     pinhole, rng = CameraOptions((), sensor.camera.pixel_aspect), np.random.default_rng(0)
 
     def misfit_px(numbers: Iterable[int]) -> float:
@@ -210,7 +212,7 @@ def find_odd_images(series: Series, sensor: Sensor, *, options: CalibrationOptio
 
     draws = rng.permuted(np.tile(np.arange(len(images)), (_DRAWS, 1)), axis=1)[:, :_DRAWN].tolist()
     agree_px, best = min((misfit_px(draw), draw) for draw in draws)
-    if len(images) <= _DRAWN or agree_px > _largest_misfit_px(sensor.camera.focal_length_px()):
+    if agree_px > _largest_misfit_px(sensor.camera.focal_length_px()):
         return {}
     off_px = {name: misfit_px({*best, number}) for number, name in enumerate(series.found.names())}
     return {

@@ -172,8 +172,8 @@ class StoredEstimate:
             frame = inverse @ object_frame(self.parameters.sheet_model(values), laser_axis=axis)
             return np.append(frame[:3, 3], Rotation.from_matrix(frame[:3, :3]).as_rotvec())
 
-        steps = [_FRAME_STEP * isinstance(key, SheetParameter) for key in self.parameters.keys]
-        return differences(moved, self.values, np.array(steps))
+        of_sheet = np.array([isinstance(key, SheetParameter) for key in self.parameters.keys])
+        return differences(moved, self.values, _FRAME_STEP * of_sheet)
 
     def across(self) -> int:
         """Return the pixel coordinate that runs across the stripe."""

@@ -261,7 +261,7 @@ def test_advised_poses_beat_as_many_random_ones(setting):
     wanted = CompletionLimits(focal_std_px=1e-6, centre_std_px=1e-6)
     count = 6
     wished = led(setting, wanted, np.random.default_rng(3), most=count)
-    options = candidates(solve_state([], setting))
+    options = candidates(solve_state([], setting, CompletionLimits()))
     assert len(options) > 20
     stds = []
     for draw in range(12):
@@ -304,7 +304,7 @@ def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
 
 def test_pose_advice_is_in_plain_words(setting):
     near = target_pose(middle_mm=(-60, -40, 330.0))
-    state = solve_state(recorded(setting, [near], np.random.default_rng(0)), setting)
+    state = solve_state(recorded(setting, [near], np.random.default_rng(0)), setting, CompletionLimits())
     far = target_pose(tilt_deg=(25, 0))
     far[:3, 3] = np.array([60.0, 50.0, 450.0]) - far[:3, :3] @ BOARD.points_mm.mean(axis=0)
     words = format_pose_advice(far, state, near)
@@ -317,9 +317,13 @@ def test_pose_advice_is_in_plain_words(setting):
 
 
 def test_what_is_missing_is_said(setting):
-    assert any("0 images, at least 8" in line for line in describe_missing(solve_state([], setting)))
+    assert any(
+        "0 images, at least 8" in line for line in describe_missing(solve_state([], setting, CompletionLimits()))
+    )
     square = [target_pose(middle_mm=(x, 0.0, z)) for x, z in ((-20, 300), (0, 330), (20, 360))]
-    said = " ".join(describe_missing(solve_state(recorded(setting, square, np.random.default_rng(0)), setting)))
+    said = " ".join(
+        describe_missing(solve_state(recorded(setting, square, np.random.default_rng(0)), setting, CompletionLimits()))
+    )
     assert "3 images, at least 8" in said and "% of the image is covered" in said
     assert "never tilted away by 12 deg: the target's right side, left side, lower side, upper side" in said
 
@@ -335,13 +339,18 @@ def test_an_image_that_contradicts_the_others_is_refused_with_its_residual(setti
     rng = np.random.default_rng(2)
     wish = best_pose(state)
     right = RecordedPose(seen(setting, wish.candidate.pose, rng), NO_STRIPE, 9.0)
-    assert judge_residual(state.solution, solve_state([*state.recorded, right], setting).solution) == ()
+    assert (
+        judge_residual(state.solution, solve_state([*state.recorded, right], setting, CompletionLimits()).solution)
+        == ()
+    )
     # A plate that is bent by 1 mm over its width.
     points = BOARD.points_mm
     bent = points - np.column_stack([np.zeros((len(points), 2)), ((points[:, 0] - 60) / 60) ** 2])
     pixels = lens_of(setting.sensor).pixels(bent @ wish.candidate.pose[:3, :3].T + wish.candidate.pose[:3, 3])
     wrong = RecordedPose(replace(right.view, pixels=pixels), NO_STRIPE, 9.0)
-    reasons = judge_residual(state.solution, solve_state([*state.recorded, wrong], setting).solution)
+    reasons = judge_residual(
+        state.solution, solve_state([*state.recorded, wrong], setting, CompletionLimits()).solution
+    )
     assert reasons and reasons[0].startswith("contradicts the others: with it the residual is ")
 
 
