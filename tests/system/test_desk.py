@@ -21,7 +21,7 @@ import uwlts
 from tests import preloaded
 from tests.system.small_board import small_sensor, turned_board
 from tests.system.test_laser_off_attacked import light
-from tests.waiting import within
+from tests.waiting import suspend, within
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
@@ -457,7 +457,7 @@ def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
     off.works("about-scrolled")
     # The listener repeats Ctrl-X until the server has answered the last press: steady light shows that it has.
     light(served.controller)
-    os.kill(desk.process.pid, signal.SIGSTOP)
+    suspend(desk.process.pid)
     try:
         off.works("server-stands-still")
     finally:

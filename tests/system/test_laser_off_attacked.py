@@ -23,7 +23,7 @@ import pytest
 from tests.preloaded import Preloaded
 from tests.system.attacked_page import serve_page
 from tests.system.test_page_access import Browser, Place, asked, cookie
-from tests.waiting import within
+from tests.waiting import suspend, within
 from twin.devices.grbl_controller import GrblController
 from uwlts.desk.laser_listener import HEAD_BYTES, HEAD_S
 from uwlts.hardware.grbl import GrblStage
@@ -161,7 +161,7 @@ class LongLine:
 
 def test_laser_off_does_not_need_the_program(operated):
     controller = operated.controller
-    os.kill(operated.program.pid, signal.SIGSTOP)
+    suspend(operated.program.pid)
     try:
         assert operated.press() == 204
         assert operated.dark_after_s() is not None
@@ -226,7 +226,7 @@ def test_without_its_process_the_page_says_so_and_laser_off_works(operated):
 def test_the_port_is_given_back(operated, stopped):
     """A port that a process keeps open cannot be opened again."""
     if stopped:
-        os.kill(operated.process, signal.SIGSTOP)
+        suspend(operated.process)
     assert operated.go_on() == "closed\n"
     with GrblStage(operated.controller.port) as again:
         assert again.position_mm() == again.position_mm()
