@@ -80,7 +80,6 @@ JOBS: dict[str, str] = {
             ("profile-fit", "--stripe-peak direct"),
             ("quadratic", "--stripe-peak strongest"),
             ("zero-crossing", "--stripe-peak first"),
-            ("learned", "--stripe model=inputs/centroid.onnx"),
         )
     ),
     "moving": f"""

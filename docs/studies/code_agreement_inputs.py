@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 from scipy.spatial.transform import Rotation
 
 import twin
@@ -98,7 +97,6 @@ def main() -> None:
     copy_photographs(checkout / "tests" / "data" / "etna", folder / "photographs")
     write_mounts(folder)
     write_crossing(folder)
-    write_network(folder / "centroid.onnx")
 
 
 def render(folder: Path) -> None:
@@ -163,17 +161,6 @@ def write_crossing(folder: Path) -> None:
             thing.save(folder / name, overwrite=True)
         else:
             getattr(uwlts, write)(folder / name, thing, overwrite=True)
-
-
-def write_network(path: Path) -> None:
-    """Write a network for the stripe method ``learned``: the centroid of bright pixels."""
-    from tests.uwlts.stripe.test_learned import centroid_model
-
-    model = onnx.load(centroid_model(path))
-    # Built for another line length; lines of this sensor have 512 px.
-    (place,) = (each for each in model.graph.initializer if each.name == "place")
-    place.CopyFrom(onnx.numpy_helper.from_array(np.arange(512, dtype=np.float32), "place"))
-    onnx.save(model, path)
 
 
 if __name__ == "__main__":

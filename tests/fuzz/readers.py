@@ -24,7 +24,6 @@ from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_ros_bags import messages, write_ros2
 from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
 from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, BLOCK, COLUMNS, INFO, PROGRAMS
-from tests.uwlts.stripe.test_learned import centroid_model
 from twin.datasets.data_set import load_description as load_data_set
 from twin.design.screening import encode_part, read_parts
 from twin.design.study import load_study
@@ -62,7 +61,6 @@ from uwlts.storage.mesh_file import read_mesh
 from uwlts.storage.mount_files import MountDescription, read_mount, read_profiles
 from uwlts.storage.pose_files import read_poses, read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
-from uwlts.stripe.learned import read_model_of_lines
 
 
 @dataclass(frozen=True)
@@ -507,7 +505,6 @@ READERS = {
         ),
         Reader("tum", ".txt", "lines", _tum, lambda path: read_trajectory(path, pose_format="tum")),
         Reader("covariances", ".csv", "lines", _covariances, read_trajectory),
-        Reader("learned", ".onnx", "bytes", centroid_model, read_model_of_lines),
         Reader("shard-tar", ".tar", "bytes", _shard, _read_shard),
         Reader("card", ".json", "json", _card, _read_card),
         Reader("data-set", ".toml", "toml", _shipped("datasets/stripe-turbid.toml"), load_data_set),

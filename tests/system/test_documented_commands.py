@@ -51,7 +51,7 @@ INSTALL = {"pip install": "make does it", "twin demo": "takes a minute; tests/sy
 HARDWARE = "needs hardware: docs/how-to/scan.md and desk.md run it with the twin"
 ALIGNED_ELSEWHERE = "a pass that can be aligned takes minutes to render: tests/uwlts/alignment/test_align.py runs it"
 NEEDS_ROS = "needs ROS 2: tests/ros_node.py runs it"
-NEEDS_LEARN = "needs the extra learn, with some 1 GB of libraries, and minutes of training"
+
 THREE_VIEWS = {"top.cloud.h5": "pipe.cloud.h5"} | {f"{side}.cloud.h5": f"{side}.cloud.h5" for side in ("left", "right")}
 NO_MOVEMENT = "1,0,0,0,0,1,0,0,0,0,1,0\n" * 3
 PLATES = """
@@ -185,10 +185,6 @@ PAGES_RUN = {
         again=("uwlts calibrate --air", "uwlts calibrate --joint", "uwlts calibrate --water target.h5")
         + ("uwlts certificate calibration.json --before",),
     ),
-    "docs/explanation/learned-stripe.md": Page(
-        instead={"--scenes 80": "--scenes 2"},
-        not_run={"python train.py": NEEDS_LEARN, "python compare.py": NEEDS_LEARN, "uwlts reconstruct": NEEDS_LEARN},
-    ),
     "docs/explanation/light.md": Page(),
     "docs/explanation/tests.md": Page(
         instead={"pytest": f"pytest --collect-only -q {ROOT / 'tests/test_public_api.py'}"}
@@ -275,8 +271,11 @@ PAGES_RUN = {
     ),
     "docs/tutorials/import-foreign-images.md": Page(prepare={"uwlts import photographs": photographs_of_the_page}),
     "docs/tutorials/learn-from-a-data-set.md": Page(
-        instead={"scenes=50": "scenes=4", 'base = "stripe-turbid"': 'base = "stripe-clean"\nsensor = "thesis-small"'},
-        not_run={"example = next(": NEEDS_LEARN, "methods = {": NEEDS_LEARN},
+        instead={
+            "scenes=50": "scenes=4",
+            'base = "stripe-turbid"': 'base = "stripe-clean"\nsensor = "thesis-small"\n'
+            "splits = { train = 0.8, test = 0.2, validation = 0 }",
+        }
     ),
     "docs/tutorials/photographs-to-cloud.md": Page(prepare={"uwlts import target": both_folders_of_the_page}),
     "docs/tutorials/photographs-to-sensor.md": Page(

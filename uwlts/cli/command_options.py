@@ -22,17 +22,12 @@ else:
     # Names of the modules in uwlts.stripe.methods, which are not imported for a command's help.
     _METHODS = Path(__file__).parents[1] / "stripe" / "methods"
     _NAMES = sorted(m.name.replace("_", "-") for m in pkgutil.iter_modules([str(_METHODS)]))
-    MethodName = Literal[(*_NAMES, "learned")]
+    MethodName = Literal[*_NAMES]
 
 STRIPE = Shortcuts(
     "stripe",
     {
-        "method": Annotated[
-            MethodName | None,
-            Parameter(
-                help="Method for the stripe's centre; learned needs --stripe model=FILE.onnx (docs: learned_stripe)."
-            ),
-        ],
+        "method": Annotated[MethodName | None, Parameter(help="Method for the stripe's centre.")],
         "peak": Annotated[
             Literal["direct", "strongest", "first", "last"] | None,
             Parameter(

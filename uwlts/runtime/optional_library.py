@@ -21,7 +21,6 @@ EXTRAS = {
     "clouds": "clouds as LAZ, LAS and E57",
     "cluster": "sweeps on several machines",
     "frames": "results as tables of pandas",
-    "learn": "learned stripes",
     "registration": "the search for initial poses by shape",
     "ros": "ROS bags, and clouds as MCAP",
     "schema": "validation of digital certificates",

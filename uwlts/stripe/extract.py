@@ -13,12 +13,11 @@ from uwlts.model.clipped import has_marks, split_clipped
 from uwlts.model.stripe import Stripe, StripeCandidates, StripeStatus
 from uwlts.stripe.block_contrast import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
 from uwlts.stripe.direct import direct_stripe
-from uwlts.stripe.learned import find_learned
 from uwlts.stripe.low_pass import fit_low_passed
-from uwlts.stripe.methods import amplitudes, method_names, place_centre
-from uwlts.stripe.options import LEARNED, PeakRule, StripeOptions
+from uwlts.stripe.methods import method_names, place_centre
+from uwlts.stripe.options import PeakRule, StripeOptions
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
-from uwlts.stripe.search import MARGIN, SearchRules, mark_rivals, measure_at, search_all, search_profiles, search_rules
+from uwlts.stripe.search import MARGIN, SearchRules, mark_rivals, search_all, search_profiles, search_rules
 
 _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
 """Largest grey value of each type."""
@@ -98,7 +97,7 @@ def extract_candidates(
     """Find up to six stripes on every profile line: of two sheets, or of reflections.
 
     See `extract_stripe` for parameters and errors. Two stripes are both omitted if one overlaps the pixels used for the
-    other. The method "learned" finds one stripe only.
+    other.
     """
     found = _search_image(image, stripe_along, options, background, saturation)
     return found.find_candidates(np.arange(len(found.stripe.status)))
@@ -261,7 +260,7 @@ class _SearchedImage:
     board: np.ndarray  # (B + 2 `MARGIN`, L); contrasts of the blocks
     left: np.ndarray  # (L, B + 2 `MARGIN`); contrasts of the blocks not examined by the search
     noise: float  # standard deviation of a pixel's noise, grey levels
-    rules: SearchRules | None  # None for a network, which finds one stripe only
+    rules: SearchRules
 
     def complete(self, stripe: Stripe) -> Stripe:
         """Return the stripe without its ends, with the centres of `StripeOptions.low_pass` if it is set."""
@@ -280,8 +279,6 @@ class _SearchedImage:
 
         Stripes that cannot be measured are included: their centre is approximate, their width NaN.
         """
-        if self.rules is None:
-            return None
         lines = np.flatnonzero(self.several | self.wide)
         known = (self.stripe.status[lines] != _OK) | self.wide[lines]
         lines = lines[mark_rivals(self.profiles, self.left, lines, known, self.rules)]
@@ -290,11 +287,6 @@ class _SearchedImage:
 
     def find_candidates(self, lines: np.ndarray, *, rivals: bool = False) -> StripeCandidates:
         """Return all stripes on given lines (M,); with ``rivals`` as described in `find_rivals`."""
-        stripe, count, along = self.stripe, len(self.stripe.status), self.stripe.stripe_along
-        if self.rules is None:
-            own = np.intersect1d(lines, stripe.lines)
-            columns = (each[own] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
-            return StripeCandidates(own, *columns, log_likelihood=np.zeros(len(own)), count=count, stripe_along=along)
         board = np.ascontiguousarray(self.board[:, lines].T)
         line, clear, peak = search_all(self.profiles, board, lines, self.rules, fewest=2 if rivals else 1)
         if not rivals:
@@ -309,6 +301,7 @@ class _SearchedImage:
         # Matched filter: squared ratio of height and noise, summed over a Gaussian profile.
         sharp = amplitude[clear] / max(self.noise, _Rule.least_noise)
         certainty[clear] = 0.5 * math.sqrt(math.pi) * measured.kernel_sigma() * sharp**2
+        count, along = len(self.stripe.status), self.stripe.stripe_along
         return StripeCandidates(line, place, amplitude, width, certainty, count, along)[np.lexsort((place, line))]
 
 
@@ -316,8 +309,6 @@ def _search_profiles(
     profiles: np.ndarray, options: StripeOptions, clip: float, along: str, clipped: np.ndarray | None
 ) -> _SearchedImage:
     """Search the profiles (N, L) with one window size; ``clipped`` (N, L) is None if ``clip`` distinguishes pixels."""
-    if options.method == LEARNED:
-        return _search_by_network(profiles, options, clip, along)
     block = options.half_window_px // 2
     high, low = block_extremes(profiles, block)
     # Extra blocks at both ends of the lines: the blocks of a window can be cleared without range checks.
@@ -335,20 +326,6 @@ def _search_profiles(
     columns = peak.start + centre.astype(np.float64), amplitude, peak.sigma * FWHM_PER_SIGMA
     stripe = Stripe.from_lines(np.flatnonzero(status == _OK), *columns, status=status, stripe_along=along)
     return _SearchedImage(stripe, profiles, options, several, wide, white, board, left, noise, rules)
-
-
-def _search_by_network(profiles: np.ndarray, options: StripeOptions, clip: float, along: str) -> _SearchedImage:
-    """Search the profiles (N, L) with a network; height and width are measured at the centres that it gives."""
-    scale = clip if math.isfinite(clip) else max(float(profiles.max()), 1.0)
-    status, centre = find_learned(profiles, options.model, clip=scale)
-    lines = np.flatnonzero(status == _OK)
-    peak = measure_at(profiles, lines, centre[lines], options)
-    amplitude = amplitudes(peak, (centre[lines] - peak.start).astype(np.float32))
-    columns = centre[lines], amplitude, peak.sigma * FWHM_PER_SIGMA
-    stripe = Stripe.from_lines(lines, *columns, status=status, stripe_along=along)
-    stripe = stripe.remove_lines(lines[~((peak.height > 0) & (amplitude > 0))], StripeStatus.AMBIGUOUS)
-    nothing, empty = np.zeros(len(status), bool), np.empty((0, 0))
-    return _SearchedImage(stripe, profiles, options, nothing, nothing, nothing, empty, empty, 0.0, None)
 
 
 def _check_image(image: np.ndarray, *, name: str) -> None:

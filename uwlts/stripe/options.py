@@ -13,9 +13,6 @@ from uwlts.errors import DescriptionError, RangeError
 from uwlts.model.sensor import Sensor
 from uwlts.stripe.methods import method_names
 
-LEARNED = "learned"
-"""Name of the method that uses a trained network."""
-
 
 class PeakRule(StrEnum):
     """Rule that selects one of several stripes on a line. First and last refer to the order of pixels.
@@ -37,10 +34,7 @@ class StripeOptions:
     Attributes
     ----------
     method : str
-        Method that locates the centre of a stripe: one of `uwlts.stripe.method_names`, or "learned". The network in
-        ``model`` both finds and locates the stripe.
-    model : str
-        ONNX file for the method "learned" (`uwlts.stripe.learned`).
+        Method that locates the centre of a stripe: one of `uwlts.stripe.method_names`.
     peak : PeakRule
         Rule for several stripes on a line.
     half_window_px : int
@@ -77,7 +71,6 @@ class StripeOptions:
     """
 
     method: str = "profile-fit"
-    model: str = ""
     peak: PeakRule = PeakRule.DIRECT
     half_window_px: int = 16
     widest_window_px: int = 64
@@ -92,16 +85,11 @@ class StripeOptions:
     low_pass_fit_px: int = 5
 
     def __post_init__(self) -> None:
-        for name, known in (("method", (*method_names(), LEARNED)), ("peak", tuple(PeakRule))):
+        for name, known in (("method", method_names()), ("peak", tuple(PeakRule))):
             value = getattr(self, name)
             if value not in known:
                 raise RangeError(f"{name} is {value!r}; use one of {', '.join(repr(str(k)) for k in known)}")
         object.__setattr__(self, "peak", PeakRule(self.peak))
-        if not isinstance(self.model, str) or bool(self.model) != (self.method == LEARNED):
-            raise RangeError(
-                f"method is {self.method!r} and model {self.model!r}; only the method {LEARNED!r} takes, and "
-                "needs, the ONNX file of a model"
-            )
         for name in ("half_window_px", "widest_window_px", "smoothing_lines", "end_lines", "low_pass_fit_px"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer):

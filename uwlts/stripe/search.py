@@ -181,42 +181,6 @@ def mark_rivals(
     return found
 
 
-def measure_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, options: StripeOptions) -> PeakWindow:
-    """Measure peaks at given centres (M,) on M lines of the profiles (N, L).
-
-    Their height is 0 if there is no peak.
-    """
-    rules = search_rules(options, coarse=0.0, fine=0.0, clip=np.inf)
-    peaks = _allocate_windows(len(lines), rules)
-    peaks.start[:] = np.rint(centre).astype(np.intp) - rules.half - rules.block // 2
-    _measure_lines(profiles, lines, *_make_buffers(peaks), rules, peaks)
-    return peaks
-
-
-@compiled
-def _measure_lines(
-    profiles: np.ndarray,
-    lines: np.ndarray,
-    kernel: np.ndarray,
-    pixels: np.ndarray,
-    smooth: np.ndarray,
-    rules: SearchRules,
-    peaks: PeakWindow,
-) -> None:
-    """Fill the windows that start at ``peaks.start``."""
-    size, border = smooth.size, kernel.size // 2
-    for m in range(lines.size):
-        window = pixels[border : border + size]
-        cut_window(profiles, lines[m], peaks.start[m], window)
-        filter_window(pixels, kernel, smooth)
-        peak = measure_peak(smooth, peaks.start[m], profiles.shape[0], rules)
-        peaks.middle[m], peaks.sigma[m], peaks.reach[m] = peak.middle, peak.sigma, peak.reach
-        peaks.base[m], peaks.slope[m] = peak.base, peak.slope
-        peaks.height[m] = peak.height if peak.closed else np.float32(0.0)
-        for k in range(size):
-            peaks.window[m, k] = window[k]
-
-
 @compiled
 def _search_lines(
     profiles: np.ndarray,
