@@ -23,7 +23,7 @@ from tests.uwlts.storage.test_capture import a_header, interrupted, record, smal
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_ros_bags import messages, write_ros2
 from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
-from tests.uwlts.storage.test_vendor_files import ATTRIBUTES, BLOCK, COLUMNS, INFO, PROGRAMS
+from tests.uwlts.storage.test_vendor_files import BLOCK
 from twin.datasets.data_set import load_description as load_data_set
 from twin.design.screening import encode_part, read_parts
 from twin.design.study import load_study
@@ -42,7 +42,7 @@ from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.hardware.guided.guided_plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
 from uwlts.model.artefacts import read_artefact
-from uwlts.model.library import library_folder, load_sensor, read_table, validate_description
+from uwlts.model.library import library_folder, load_sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.acceptance_page import acceptance_page
 from uwlts.report.certificate import check_certificate, make_certificate
@@ -58,8 +58,8 @@ from uwlts.storage.import_.centre_lines import read_profiles as read_centre_line
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
 from uwlts.storage.mesh_file import read_mesh
-from uwlts.storage.mount_files import MountDescription, read_mount, read_profiles
-from uwlts.storage.pose_files import read_poses, read_trajectory
+from uwlts.storage.mount_files import read_mount, read_profiles
+from uwlts.storage.pose_files import read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
 
 
@@ -170,11 +170,6 @@ def _foreign(path: Path) -> None:
     write_cloud(path, some_cloud())
 
 
-def _gocator(path: Path) -> None:
-    rows = "0,0,5,0,0,0,80,10.5,Z,1.5,,3.5\n0,0,5,0,0,0,80,10.5,I,7,8,9\n"
-    path.write_text(f"{INFO}Profile\n{ATTRIBUTES.format(0)}{COLUMNS},-0.5,0,0.5\n{rows}End\n")
-
-
 def _verification(path: Path) -> None:
     record = {"format": "uwlts-verification", "version": 1, "calibration": "a", "date": "2026-01-02T03:04:05+00:00"}
     path.write_text(json.dumps(record | {"capture": "a.h5", "passed": True, "lines": ["diameter: 50 mm"]}))
@@ -184,10 +179,6 @@ def _verified(path: Path) -> None:
     describe_verification(
         path.with_name(path.name.replace(".verification", "")), nominal_calibration(load_sensor("thesis"))
     )
-
-
-def _mount_description(path: Path) -> None:
-    path.write_text('profiles = "p.csv"\nposes = "q.csv"\nradius_mm = 20.0\npose_format = "euler-ZYX-deg"\n')
 
 
 def _las(path: Path) -> None:
@@ -449,26 +440,8 @@ READERS = {
         ),
         Reader("cloud-laz", ".laz", "bytes", _foreign, read_cloud),
         Reader("cloud-laz-1.2", ".laz", "bytes", _old_laz, read_cloud),
-        Reader("cloud-gocator", ".csv", "lines", _gocator, read_cloud),
-        *(
-            Reader(
-                f"poses-{robot}",
-                ".src",
-                "lines",
-                lambda path, robot=robot: path.write_text(PROGRAMS[robot][0]),
-                lambda path, robot=robot: read_poses(path, pose_format=robot),
-            )
-            for robot in PROGRAMS
-        ),
         Reader("cloud-block", ".csv", "lines", _text(BLOCK.format(";") + "X;Y;Z\n" + 12 * "1,5;2;3\n"), read_cloud),
         Reader("verification", ".verification.json", "json", _verification, _verified),
-        Reader(
-            "mount-description",
-            ".toml",
-            "toml",
-            _mount_description,
-            lambda path: validate_description(MountDescription, read_table(path), path),
-        ),
         Reader("sensor", ".toml", "toml", _shipped("sensors/thesis.toml"), load_sensor),
         Reader("sensor-shown", ".toml", "toml", _shipped("sensors/thesis.toml"), describe),
         Reader("scene", ".toml", "toml", _shipped("spheres.toml"), load_scene),

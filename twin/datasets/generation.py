@@ -35,9 +35,7 @@ if TYPE_CHECKING:
 
 MOST_ATTEMPTS = 20
 """Largest number of draws of a scene until the sensor can measure it; more indicate an error in the description."""
-_OUTPUT = re.compile(
-    rf"({'|'.join(SPLITS)})-\d{{6}}\.tar|coco-({'|'.join(SPLITS)})\.json|{re.escape(CARD)}|{re.escape(PLAN)}"
-)
+_OUTPUT = re.compile(rf"({'|'.join(SPLITS)})-\d{{6}}\.tar|{re.escape(CARD)}|{re.escape(PLAN)}")
 
 
 def dataset(

@@ -54,7 +54,9 @@ def examine(
             findings += part()
         except ImportError as error:
             findings.append(
-                Finding("examination", "missing", f"a part was left out: {error}", "repair the libraries named above")
+                Finding(
+                    "examination", "missing", f"a part was left out: {error}", "install again the library that failed"
+                )
             )
     progress(len(parts), len(parts))
     return findings

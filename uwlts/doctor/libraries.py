@@ -1,7 +1,6 @@
 """Findings about Python, the required libraries, and the optional ones."""
 
 import platform
-import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
@@ -13,9 +12,6 @@ from uwlts.doctor.machine import Finding
 from uwlts.runtime.optional_library import EXTRAS, pip_install, read_requirements
 
 _ABSENT = "not installed"
-_LOAD_S = 120  # for all libraries, from a slow disk
-# The last printed name is that of the module that did not load, by an error or by ending the process.
-_LOAD = "import importlib, sys\nfor name in sys.argv[1:]: print(name, flush=True); importlib.import_module(name)"
 
 
 def examine() -> list[Finding]:
@@ -34,7 +30,7 @@ def examine_python(wanted: str) -> Finding:
 
 
 def examine_required(requirements: Sequence[str]) -> list[Finding]:
-    """Examine whether libraries are installed in a suitable version, and can be imported.
+    """Examine whether libraries are installed in a suitable version.
 
     Returns one finding for all libraries without a fault, and one for every other.
     """
@@ -43,9 +39,7 @@ def examine_required(requirements: Sequence[str]) -> list[Finding]:
     findings = [Finding("required libraries", "ok", good)] if good else []
     for requirement, _, fault in examined:
         if fault:
-            force = ["--force-reinstall", "--no-deps"] if "does not load" in fault else []
-            advice = pip_install([*force, str(requirement)])
-            findings.append(Finding(requirement.name, "missing", fault, advice))
+            findings.append(Finding(requirement.name, "missing", fault, pip_install([str(requirement)])))
     return findings
 
 
@@ -74,39 +68,4 @@ def _examine_requirements(requirements: Iterable[Requirement]) -> list[tuple[Req
         except metadata.PackageNotFoundError:
             fault = _ABSENT
         states.append((requirement, version, fault))
-    broken = _load_faults([requirement.name for requirement, _, fault in states if not fault])
-    for k, (requirement, version, _) in enumerate(states):
-        if requirement.name in broken:
-            states[k] = requirement, version, f"{version} does not load: {broken[requirement.name]}"
     return states
-
-
-def _load_faults(names: Sequence[str]) -> dict[str, str]:
-    """Return why libraries cannot be imported, by name; tested in a separate process, which a library may crash."""
-    modules = {module: name for name in names for module in _modules(name)}
-    faults, waiting = {}, list(modules)
-    while waiting:
-        command = [sys.executable, "-c", _LOAD, *waiting]
-        try:
-            trial = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_LOAD_S)
-        except subprocess.TimeoutExpired:
-            return faults | {modules[waiting[0]]: f"it, or one after it, takes more than {_LOAD_S} s"}
-        if trial.returncode == 0:
-            break
-        begun = [line for line in trial.stdout.splitlines() if line in waiting]
-        said = trial.stderr.strip().splitlines() or [f"the process ended with status {trial.returncode}"]
-        faults[modules[begun[-1]]] = said[-1]
-        waiting = waiting[len(begun) :]
-    return faults
-
-
-def _modules(name: str) -> list[str]:
-    """Return the module names of a library, such as serial for pyserial."""
-    usual = name.lower().replace("-", "_")
-    files = [file.parts for file in metadata.files(name) or ()]
-    packages = {parts[0] for parts in files if len(parts) == 2 and parts[1] == "__init__.py"}
-    if files and not any(parts[-1].endswith((".py", ".so", ".pyd")) and ".." not in parts for parts in files):
-        return []  # a shared library, which is not imported
-    if usual in packages or not packages:
-        return [usual]
-    return sorted(package for package in packages if not package.startswith("_"))

@@ -42,7 +42,6 @@ _DESCRIPTIONS = (
     ("scene", {"motion"}, "twin simulate"),
     ("plan of a scan", {"title", "stage", "sensor"}, "uwlts scan"),
     ("description of a folder of images", {"stage", "sensor"}, "uwlts import"),
-    ("description of a mount's calibration", {"profiles", "poses"}, "uwlts mount"),
     ("order of a report", {"datum"}, "uwlts findings-report --order"),
     ("order of a report", {"client"}, "uwlts findings-report --order"),
     ("order of a report", {"limits"}, "uwlts findings-report --order"),

@@ -21,8 +21,8 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import ImageError
 from uwlts.model.calibration import Calibration
 from uwlts.pages.cloud_figure import AZIMUTH_DEG, ELEVATION_DEG, STOPS, CloudField, colour_limit_mm, view_direction
-from uwlts.pages.numbers import entries_of, format_to_scale, number_list, split_name, unit_for, unit_of
-from uwlts.pages.toolkit import BLUE, INK, RED, make_figure, new_figure, plain_text, typeset_number
+from uwlts.pages.numbers import entries_of, number_list, split_name, unit_for, unit_of
+from uwlts.pages.toolkit import BLUE, INK, make_figure, new_figure, plain_text
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
@@ -38,20 +38,9 @@ PLAIN = "#5d82a8"
 """Colour of points in a cloud without deviations."""
 ORANGE = "#ff7800"
 """Colour of stripe centres."""
-PALE = "#9dbad6"
-"""Colour of bars."""
-
 SHORT_LIST = 3
 """Lists of residuals up to this length are written into tables; longer ones are drawn."""
 
-# Bins of a histogram.
-_BINS = 81
-# Standard deviations that a histogram shows: a normal distribution has all but 6 of 100,000 points within 4.
-_SHOWN_STD = 4.0
-# Intervals along the stripe.
-_INTERVALS = 120
-# Fewest points for the mean and scatter of an interval.
-_LEAST_IN_INTERVAL = 5
 # Residuals within this ratio are drawn as dots: bars, which start at zero, would all look the same.
 _FLAT = 1.2
 # Fraction of a surface's points within the colour range.
@@ -250,81 +239,6 @@ def _shown_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
     )
     first = int(np.argmax(np.convolve(np.nan_to_num(amplitude), np.ones(count), mode="valid")))
     return stripe.lines[(stripe.lines >= first) & (stripe.lines < first + count)]
-
-
-@check_arguments
-def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
-    """Draw the distribution of a cloud's deviations, and the normal distribution with its mean and deviation.
-
-    Raises
-    ------
-    NothingToDrawError
-        No point of the cloud has a deviation.
-    """
-    _, finite = _select_evaluated(cloud)
-    if not len(finite):
-        raise NothingToDrawError("no point of the cloud has a deviation: evaluate it first")
-    ax = _axes(ax)
-    mean, std = float(finite.mean()), float(finite.std())
-    unit, factor = unit_for(std)
-    reach = max(_SHOWN_STD * std, 1e-9)
-    counts, edges = np.histogram(finite, bins=_BINS, range=(mean - reach, mean + reach))
-    middles, width = (edges[1:] + edges[:-1]) / 2, 2 * reach / _BINS
-    beyond = len(finite) - int(counts.sum())
-    label = f"points; {beyond:,} of {len(finite):,} outside" if beyond else "points"
-    ax.stairs(counts, factor * edges, fill=True, color=PALE, label=label)
-    if std > 0:
-        normal = len(finite) * width / (std * np.sqrt(2 * np.pi)) * np.exp(-0.5 * ((middles - mean) / std) ** 2)
-        ax.plot(factor * middles, normal, color=INK, linewidth=1.2, label="normal distribution")
-    shown = [typeset_number(format_to_scale(factor * value, factor * std)) for value in (mean, std)]
-    ax.axvline(factor * mean, color=RED, linewidth=1.2, label=f"mean {shown[0]} {unit}")
-    for sign, text in ((-1, f"standard deviation {shown[1]} {unit}"), (1, None)):
-        ax.axvline(factor * (mean + sign * std), color=RED, linewidth=1.2, linestyle=":", label=text)
-    ax.set(xlabel=f"deviation / {unit}", ylabel="points per bin", ylim=(0, 1.45 * float(counts.max())))
-    ax.legend(loc="upper left", fontsize=8, ncols=2)
-    return ax
-
-
-@check_arguments
-def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
-    """Draw mean and scatter of a cloud's deviations over all images, in short intervals of Y.
-
-    Raises
-    ------
-    NothingToDrawError
-        No interval has enough points.
-    """
-    points, deviation = _select_evaluated(cloud)
-    y = points[:, 1]
-    edges = np.linspace(y.min(), y.max(), _INTERVALS + 1) if len(y) else np.zeros(_INTERVALS + 1)
-    place = np.clip(np.searchsorted(edges, y, side="right") - 1, 0, _INTERVALS - 1)
-    count = np.bincount(place, minlength=_INTERVALS)
-    enough = count >= _LEAST_IN_INTERVAL
-    # Points with the same Y do not form a profile.
-    if edges[0] == edges[-1] or not enough.any():
-        raise NothingToDrawError("too few points of the cloud have a deviation: evaluate it first")
-    ax = _axes(ax)
-    mean = np.bincount(place, deviation, _INTERVALS)[enough] / count[enough]
-    square = np.bincount(place, deviation**2, _INTERVALS)[enough] / count[enough]
-    std = np.sqrt(np.maximum(square - mean**2, 0))
-    unit, factor = unit_for(float(deviation.std()))
-    # Keep gaps of the stripe in the curve.
-    middles, curves = (edges[1:] + edges[:-1]) / 2, np.full((2, _INTERVALS), np.nan)
-    curves[:, enough] = factor * np.array([mean, std])
-    low, high = curves[0] - curves[1], curves[0] + curves[1]
-    ax.fill_between(middles, low, high, color=PALE, alpha=0.6, linewidth=0, label="mean ± standard deviation")
-    ax.plot(middles, curves[0], color=BLUE, linewidth=1.5, label=f"mean of {edges[1] - edges[0]:.2g} mm along Y")
-    ax.axhline(0, color=INK, linewidth=0.8)
-    ax.set(xlabel="Y, along the stripe / mm", ylabel=f"deviation / {unit}")
-    ax.legend(loc="upper left", fontsize=8, ncols=2, bbox_to_anchor=(0, 1.14))
-    return ax
-
-
-def _select_evaluated(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (N, 3) with a deviation, and their deviations (N,)."""
-    deviation = np.full(len(cloud), np.nan) if cloud.deviation_mm is None else cloud.deviation_mm.astype(np.float64)
-    known = np.isfinite(deviation)
-    return cloud.points_mm[known], deviation[known]
 
 
 @dataclass(frozen=True)

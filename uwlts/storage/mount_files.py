@@ -13,7 +13,7 @@ from uwlts.errors import DescriptionError
 from uwlts.files.json_files import read_model
 from uwlts.files.reading import log_warnings, natural_key
 from uwlts.files.writing import hash_file
-from uwlts.model.library import read_table, validate_description
+from uwlts.model.library import validate_description
 from uwlts.model.mount import FORMAT, VERSION, Mount
 from uwlts.model.sensor import Description, Positive, Table
 from uwlts.storage.cloud_files import is_cloud, read_cloud
@@ -62,13 +62,6 @@ class MountOptions(Description):
         return self
 
 
-class MountDescription(MountOptions):
-    """Description of a mount's calibration in a TOML file; paths are relative to its folder."""
-
-    profiles: str
-    poses: str
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MountEvidence:
     """Profiles in mm, NaN for missing points, and the platform's poses (M, 4, 4): one per profile, or a trajectory."""
@@ -90,26 +83,14 @@ def read_mount_evidence(
     profile_times_s: np.ndarray | None,
     pose_times_s: np.ndarray | None,
 ) -> MountEvidence:
-    """Read and check profiles and poses from arrays or files; poses are None with a TOML description of the profiles.
+    """Read and check profiles and poses from arrays or files.
 
     ``options`` are the given ones of `MountOptions`. Times (N,) belong to arrays. Raises DescriptionError if profiles
     and poses do not match, or one of them is not valid.
     """
     digests: dict[str, str] = {}
     names: list[str] | None = None
-    if isinstance(profiles, str | Path) and Path(profiles).suffix == ".toml":
-        path = Path(profiles)
-        if poses is not None:
-            raise DescriptionError(f"{path} names the poses already: leave the other ones out")
-        if options:
-            raise DescriptionError(
-                f"{path} describes the artefact, the formats and the unknowns: leave out "
-                f"{', '.join(f'`{name}`' for name in options)}, or change the file"
-            )
-        described = validate_description(MountDescription, read_table(path), path)
-        profiles, poses, chosen = path.parent / described.profiles, path.parent / described.poses, described
-    else:
-        chosen = validate_description(MountOptions, options, "what is given")
+    chosen = validate_description(MountOptions, options, "what is given")
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):

@@ -15,7 +15,6 @@ from pyarrow import csv
 from uwlts.errors import DescriptionError, Error
 from uwlts.files.reading import read_bytes, shorten
 from uwlts.files.writing import hash_file
-from uwlts.storage.gocator_csv import is_gocator_csv, read_gocator_csv
 
 Unit = Literal["mm", "m"]
 MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
@@ -190,9 +189,6 @@ def read_number_table(path: Path, digests: dict[str, str] | None = None, *, name
     if digests is not None:
         digests[path.name] = hash_file(path)
     content = _decode_wide(content, path)
-    if is_gocator_csv(content):
-        columns, notes = read_gocator_csv(content, path)
-        return NumberTable(path, columns, dict.fromkeys("xyz", "mm"), notes=notes)
     comments, block, header, unit_row, lines = _split_lines(content, path)
     delimiter, comma = _separators(lines[0])
     count = len(_cells(lines[0], delimiter))

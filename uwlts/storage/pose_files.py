@@ -3,22 +3,21 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
-from uwlts.files.reading import log_warnings, read_bytes
-from uwlts.files.writing import hash_file, write_atomically
+from uwlts.files.reading import log_warnings
+from uwlts.files.writing import write_atomically
 from uwlts.model.calibration import is_rigid
 from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
-from uwlts.storage.number_tables import MM_PER_UNIT, ROTATION_NAMES, NumberTable, Unit, read_number_table
+from uwlts.storage.number_tables import ROTATION_NAMES, NumberTable, Unit, read_number_table
 from uwlts.storage.ros_bags import read_bag_poses
 
 PoseFormat = str
-"""matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg, angle-rad,
-abb, kuka, ur."""
+"""matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg,
+angle-rad."""
 SAVED_FORMAT = "quaternion-xyzw"
 """Format of `Trajectory.save`."""
 FARTHEST_MM = 1e7
@@ -27,48 +26,8 @@ FARTHEST_MM = 1e7
 _COMPASS = ("north", "east", "down")
 _ROUNDED = 2e-3
 """Deviation from a rigid matrix or a unit quaternion when numbers have three decimals."""
-# Possessive, as backtracking in long runs of digits or blanks would take minutes.
-_N, _NEXT = r"([+-]?(?:\d++(?:\.\d*+)?+|\.\d++)(?:[eE][+-]?\d++)?+)", r"\s*+,\s*+"
-
-
-class _RobotProgram(NamedTuple):
-    """Poses in the text of a robot's program: their form and pattern, format, unit, and the start of a comment."""
-
-    form: str
-    pattern: re.Pattern[str]
-    pose_format: str
-    unit: Unit
-    comment: str
-
-
-_ROBOTS = {
-    # ABB RAPID: robtarget
-    "abb": _RobotProgram(
-        "[[x, y, z], [q1, q2, q3, q4], ...]",
-        re.compile(rf"\[\s*+\[\s*+{_NEXT.join([_N] * 3)}\s*+\]{_NEXT}\[\s*+{_NEXT.join([_N] * 4)}\s*+\]"),
-        "quaternion-wxyz",
-        "mm",
-        "!",
-    ),
-    # KUKA KRL: POS, E6POS or FRAME; A, B and C turn about the moved z, y and x.
-    "kuka": _RobotProgram(
-        "{X .., Y .., Z .., A .., B .., C ..}",
-        re.compile(r"\b" + _NEXT.join(rf"{axis}\s*+[=:]?+\s*+{_N}" for axis in "XYZABC"), re.IGNORECASE),
-        "euler-ZYX-deg",
-        "mm",
-        ";",
-    ),
-    # Universal Robots, URScript
-    "ur": _RobotProgram(
-        "p[x, y, z, rx, ry, rz]", re.compile(rf"\bp\s*+\[\s*+{_NEXT.join([_N] * 6)}\s*+\]"), "rotvec-rad", "m", "#"
-    ),
-}
-_MOST_PROGRAM_BYTES = 64 * 2**20  # hours of a robot's path
 _EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
-_FORMATS = (
-    "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg, "
-    "abb, kuka, ur (text of robot programs)"
-)
+_FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
 _FEWEST_POSES, _ALTERNATING, _RETURNED, _LEAST_JUMP_MM, _REACH_MM = 10, 0.2, 0.3, 0.1, 300.0
 """Two sources: least number of poses, share that jumps, largest distance after it relative to the jump, smallest jump,
 and lever of rotations. Of independent noise along one axis, 14 % jump, in a plane 6 %."""
@@ -95,9 +54,6 @@ def read_poses(
     single column ``angle-deg`` or ``angle-rad`` is the angle of a rotary table that turns the object about its z axis:
     the poses are those of the sensor's side relative to the object.
 
-    With the formats ``abb``, ``kuka`` and ``ur`` the file is text of a robot's program, whose poses are read in order
-    (`_ROBOTS`).
-
     Names decide the order of columns where they say it: x, y, z; qw, qx, qy, qz; roll, pitch, yaw or rx, ry, rz. Units
     in names (``x_m``, ``yaw [deg]``) are obeyed; without them positions are in ``unit``, by default mm.
 
@@ -107,34 +63,8 @@ def read_poses(
         Names or their units contradict the format or ``unit``, or the number of columns is wrong. Numbers are not
         finite, matrices not rigid, quaternions not of unit length, or angles in rad look like degrees.
     """
-    if pose_format in _ROBOTS:
-        return _read_program(Path(path), pose_format, unit, digests), None
     table = read_number_table(Path(path), digests, named=False)
     return _poses(table, pose_format, unit)
-
-
-def _read_program(path: Path, robot: str, unit: Unit | None, digests: dict[str, str] | None) -> np.ndarray:
-    """Read the poses (P, 4, 4) in mm in the text of a robot's program; raises DescriptionError without any."""
-    program = _ROBOTS[robot]
-    if unit not in (None, program.unit):
-        raise DescriptionError(
-            f"the poses of the format {robot} are in {program.unit}, but the unit {unit} was given: omit it"
-        )
-    lines = (line.partition(program.comment)[0] for line in _read_lines(path, digests))
-    rows = np.array([[float(each) for each in found] for found in program.pattern.findall("\n".join(lines))])
-    if not len(rows):
-        raise DescriptionError(f"{path} has no pose in the form of {robot} ({program.form})")
-    poses = poses_from_rows(rows, program.pose_format, path)
-    poses[:, :3, 3] *= MM_PER_UNIT[program.unit]
-    return poses
-
-
-def _read_lines(path: Path, digests: dict[str, str] | None) -> list[str]:
-    """Read the lines of a text in any encoding that contains ASCII, and note its digest."""
-    content = read_bytes(path, most_bytes=_MOST_PROGRAM_BYTES, error=DescriptionError, called="poses")
-    if digests is not None:
-        digests[path.name] = hash_file(path)
-    return [line.decode("latin-1") for line in content.splitlines()]
 
 
 def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit | None = None) -> Trajectory:
@@ -157,8 +87,6 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
             covariance = covariance * units[:, None] * units
         rows[:, :3] *= 1e3
         return _trajectory(path, times, poses_from_rows(rows, "quaternion-xyzw", path), covariance)
-    if pose_format in _ROBOTS:
-        raise DescriptionError(f"{path}: poses of the format {pose_format} have no times, which a trajectory needs")
     table = read_number_table(path, named=False)
     if pose_format == "tum":
         if len(table.columns) != 8:

@@ -4,7 +4,6 @@ import base64
 import gzip
 import json
 import math
-import re
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -67,12 +66,8 @@ def test_plots_have_units_on_their_axes():
         ("window", "errors_mm"),
         ("window", "image_distances_mm"),
     ]
-    flat = [
-        plot.deviation_histogram(cloud),
-        plot.along_stripe(cloud),
-        *(plot.residuals(calibration, which=each) for each in lists),
-    ]
-    counts = {"points per bin", "image", ""}
+    flat = [plot.residuals(calibration, which=each) for each in lists]
+    counts = {"image", ""}
     titles = [title for ax in flat for title in (ax.get_xlabel(), ax.get_ylabel())]
     assert all(title in counts or title.split(" / ")[-1] in ("mm", "µm", "px") for title in titles)
     solid = plot.cloud(cloud)
@@ -144,11 +139,10 @@ def test_pyplot_shows_plots_and_no_figures_of_pages():
     rng = np.random.default_rng(0)
     cloud = PointCloud(rng.normal(size=(30, 3)), np.ones(30), np.zeros(30, int), np.arange(30))
     cloud = replace(cloud, deviation_mm=rng.normal(size=30))
-    for draw in (plot.cloud, plot.deviation_histogram):
-        ax = draw(cloud)
-        assert pyplot.get_fignums() == [ax.figure.number]
-        figure_svg(ax)
-        assert pyplot.get_fignums() == []
+    ax = plot.cloud(cloud)
+    assert pyplot.get_fignums() == [ax.figure.number]
+    figure_svg(ax)
+    assert pyplot.get_fignums() == []
 
 
 def test_the_cloud_is_decimated_and_decoded_to_a_small_step():
@@ -174,18 +168,6 @@ def test_the_cloud_is_decimated_and_decoded_to_a_small_step():
     for column, exact in zip(values, [*shown.points_mm.T, shown.values], strict=True):
         assert np.nanmax(np.abs(column - exact)) <= 0.5001 * np.ptp(exact[np.isfinite(exact)]) / 16382
         assert np.array_equal(np.isnan(column), np.isnan(exact))
-
-
-def test_the_histogram_counts_every_point_once():
-    deviation = np.r_[np.random.default_rng(2).normal(0.01, 0.002, 5000), 0.1, np.nan]
-    nothing = np.zeros(len(deviation), int)
-    cloud = PointCloud(np.zeros((len(deviation), 3)), nothing, nothing, nothing, deviation_mm=deviation)
-    ax = plot.deviation_histogram(cloud)
-    (bars,) = ax.patches
-    beyond = int(re.search(r"(\d+) of 5,001 outside", bars.get_label()).group(1))
-    assert beyond >= 1 and bars.get_data().values.sum() == 5001 - beyond
-    with pytest.raises(ValueError, match="evaluate it first"):
-        plot.deviation_histogram(replace(cloud, deviation_mm=None))
 
 
 def test_colours_are_symmetric_and_end_at_the_limit():

@@ -74,15 +74,14 @@ def calibrate_mount(
     ----------
     profiles
         Folder with one CSV file (columns x and z) for each pose, or one CSV file with a column pose. A cloud whose
-        frames are the poses, or a description of everything (.toml; docs: mount files). With a
-        calibration: a capture of the artefact, or of a target in images with the laser off. Or one array for each pose
-        in the order along the profile, mm, NaN for missing points: (N, 2) with x along the profile and z, or (N, 3)
-        with x, y, z in the sensor's frame.
+        frames are the poses. With a calibration: a capture of the artefact, or of a target in images with the laser
+        off. Or one array for each pose in the order along the profile, mm, NaN for missing points: (N, 2) with x along
+        the profile and z, or (N, 3) with x, y, z in the sensor's frame.
     poses
         CSV file with the pose of the platform in the base frame for each profile or target image, or
         ``T_base_platform`` (P, 4, 4), mm. Default: the poses of the capture.
     artefact_kind
-        Artefact in the profiles: a sphere or a plane. Default: a sphere, unless the description names the other.
+        Artefact in the profiles: a sphere or a plane. Default: a sphere.
     radius_mm
         Radius of the sphere. Default: it is estimated.
     calibration
@@ -90,8 +89,7 @@ def calibrate_mount(
         propagated to the mount.
     pose_format
         matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved axes),
-        euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table; abb, kuka
-        or ur for text of robot programs.
+        euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table.
     profile_unit
         Unit of the profiles; by default that in the names of columns, else mm.
     pose_unit
@@ -126,8 +124,7 @@ def calibrate_mount(
     >>> mount = uwlts.calibrate_mount("profiles", "poses.csv", pose_format="quaternion-wxyz", radius_mm=19.05)
     >>> mount.transform(), mount.std()
     """
-    filed = isinstance(poses, str | Path) or (poses is None and calibration is None)
-    if not filed and (pose_format != "matrix" or pose_unit is not None):
+    if not isinstance(poses, str | Path) and (pose_format != "matrix" or pose_unit is not None):
         raise DescriptionError("`pose_format` and `pose_unit` describe a file of poses; there is none: leave them out")
     if profile_unit is not None and (calibration is not None or not isinstance(profiles, str | Path)):
         raise DescriptionError("`profile_unit` describes files of profiles; these are in mm: leave it out")

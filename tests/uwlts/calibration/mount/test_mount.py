@@ -268,22 +268,18 @@ def test_the_command_reads_another_makers_files(tmp_path, rng, capsys, monkeypat
     assert len(mount.inputs) == 16 and json.loads(out.read_text())["format"] == "uwlts-mount"
 
 
-def described(folder, campaign: Campaign, *, pose_format: str):
-    """Write a description of the campaign's files, with poses whose angles are about moved axes."""
+def files_of(folder, campaign: Campaign):
+    """Write the campaign as a table of profiles, and one of poses whose angles are about moved axes."""
     rows = [(n, *p) for n, profile in enumerate(campaign.profiles) for p in profile.tolist()]
     np.savetxt(folder / "all.csv", rows, delimiter="\t", header="pose\tx\tz", comments="")
     angles = Rotation.from_matrix(campaign.poses[:, :3, :3]).as_euler("ZYX", degrees=True)
     np.savetxt(folder / "poses.txt", np.column_stack([campaign.poses[:, :3, 3], angles]), header="KUKA: X Y Z A B C")
-    text = f'profiles = "all.csv"\nposes = "poses.txt"\npose_format = "{pose_format}"\nradius_mm = 20.0\n'
-    (folder / "mount.toml").write_text(text)
-    return folder / "mount.toml"
+    return folder / "all.csv", folder / "poses.txt"
 
 
-def test_a_description_names_everything(tmp_path, rng):
-    description = described(tmp_path, sphere_campaign(rng), pose_format="euler-ZYX-deg")
-    within(uwlts.calibrate_mount(description))
-    with pytest.raises(DescriptionError, match="leave out `artefact`, `pose_unit`, or change the file"):
-        uwlts.calibrate_mount(description, artefact_kind="plane", pose_unit="m")
+def test_one_table_holds_all_profiles(tmp_path, rng):
+    files = files_of(tmp_path, sphere_campaign(rng))
+    within(uwlts.calibrate_mount(*files, pose_format="euler-ZYX-deg", radius_mm=20.0))
     with pytest.raises(DescriptionError, match="`profile_unit` describes files of profiles"):
         uwlts.calibrate_mount([np.zeros((20, 2))], np.eye(4)[None], profile_unit="m")
 
@@ -292,7 +288,8 @@ def test_a_description_names_everything(tmp_path, rng):
 def test_a_wrong_format_of_poses_is_named(tmp_path, rng):
     """As slow as the inverse poses of `test_usual_mistakes_are_named`."""
     with pytest.raises(CalibrationError, match="their format .Euler angles about moved axes, such as ZYX"):
-        uwlts.calibrate_mount(described(tmp_path, sphere_campaign(rng), pose_format="euler-zyx-deg"))
+        files = files_of(tmp_path, sphere_campaign(rng))
+        uwlts.calibrate_mount(*files, pose_format="euler-zyx-deg", radius_mm=20.0)
 
 
 TURN = Rotation.from_euler("zyx", [0.3, -0.2, 0.5])
