@@ -468,7 +468,8 @@ class _OperatorPage:
                 with ui.row().classes("w-full items-center no-wrap gap-2 text-sm"):
                     address = f"files/{quote(file.name)}"
                     ui.link(file.name, address).props("download").classes("grow break-all font-mono download")
-                    ui.label(f"{file.kind}, {_size_text(file.size)}").classes("text-xs text-slate-500")
+                    size = f"{file.size / 1e6:.1f} MB" if file.size >= 1e5 else f"{file.size / 1e3:.1f} kB"
+                    ui.label(f"{file.kind}, {size}").classes("text-xs text-slate-500")
                     name = file.name
                     if file.kind == "report":
                         ui.link("open", address, new_tab=True)
@@ -505,7 +506,3 @@ class _OperatorPage:
 def _addresses(plan: ScanPlan) -> tuple[str, str]:
     """Return the addresses of the camera and the stage."""
     return plan.camera or "", plan.stage.port or ""
-
-
-def _size_text(size: int) -> str:
-    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"

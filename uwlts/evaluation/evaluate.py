@@ -11,7 +11,7 @@ from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError, describe_problems
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
-from uwlts.evaluation.figures import Figure, FigureKey, FigureUncertainty, Quantity, doubt_points, figure_keys
+from uwlts.evaluation.figures import Figure, FigureKey, FigureUncertainty, Quantity, figure_keys
 from uwlts.evaluation.truth_comparison import Count, StoredResult, TruthComparison, compare_with_truth
 from uwlts.files.json_files import EDITED, read_model, write_model
 from uwlts.fitting.least_squares import fit_rigid_transform
@@ -25,6 +25,9 @@ from uwlts.storage.truth import Truth, TruthHeader, read_truth, scene_digest, tr
 
 TOLERANCE_MM = 0.010
 """Tolerance for points from perfect images and true parameters (tests/system/test_campaign.py)."""
+MOST_STRANGE = 0.3
+"""Largest fraction of points that do not belong to an artefact without a warning. Chosen by hand: above edges and
+stands, and below one half, that of two scans in one."""
 FORMAT = "uwlts-evaluation"
 VERSION = 1  # of the file format
 
@@ -50,7 +53,12 @@ class ArtefactFigures(StoredResult):
 
     def doubts(self) -> list[str]:
         """Return a warning if many of the points do not belong to the artefact."""
-        return doubt_points(self.kind, self.strange_share)
+        if self.strange_share <= MOST_STRANGE:
+            return []
+        return [
+            f"{100 * self.strange_share:.0f} % of the points do not belong to the artefact ({self.kind}): remove other "
+            "surfaces, or check whether all images are of one scan"
+        ]
 
     @model_serializer(mode="wrap")
     def _verdict_last(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -144,16 +152,6 @@ class Evaluation(Brief, StoredResult):
     def step_height(self) -> Figure:
         """Height of the step."""
         return self.all_of(Quantity.HEIGHT_ERROR)[0]
-
-    @property
-    def probing_error(self) -> Figure:
-        """Probing error of the worst sphere."""
-        return self.all_of(Quantity.PROBING_ERROR)[0]
-
-    @property
-    def range_error(self) -> Figure:
-        """Range of the deviations from the plane."""
-        return self.all_of(Quantity.RANGE_ERROR)[0]
 
     @property
     def std(self) -> Figure:

@@ -16,10 +16,6 @@ from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereS
 TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
 """Direction from a surface to the sensor in the object coordinate system."""
 
-MOST_STRANGE = 0.3
-"""Largest fraction of points that do not belong to an artefact without a warning. Chosen by hand: above edges and
-stands, and below one half, that of two scans in one."""
-
 
 class Quantity(StrEnum):
     """Kind of a figure; PE, RE and SSE are the probing, range and sphere spacing errors of VDI/VDE 2634."""
@@ -169,6 +165,7 @@ class ArtefactEvaluation(ABC):
     points_used: int
     points_rejected: int
     deviation_mm: np.ndarray
+    points_excluded: int = 0  # of the artefact, by its description
 
     @property
     def rejected_share(self) -> float:
@@ -177,17 +174,8 @@ class ArtefactEvaluation(ABC):
 
     @property
     def points_total(self) -> int:
-        """Number of points of the cloud."""
-        return len(self.deviation_mm)
-
-    @property
-    def strange_share(self) -> float:
-        """Fraction of the cloud's points that do not belong to the artefact."""
-        return 1 - (self.points_used + self.points_rejected) / self.points_total
-
-    def doubts(self) -> list[str]:
-        """Return a warning if many of the points do not belong to the artefact."""
-        return doubt_points(self.kind, self.strange_share)
+        """Number of points of the cloud, without those that the artefact's description excludes."""
+        return len(self.deviation_mm) - self.points_excluded
 
     @property
     def within_vdi_outliers(self) -> bool:
@@ -230,16 +218,6 @@ class ArtefactEvaluation(ABC):
             "vdi_range_mm": self.vdi_range_mm,
             "within_vdi_outliers": self.within_vdi_outliers,
         }
-
-
-def doubt_points(kind: str, strange_share: float) -> list[str]:
-    """Return a warning if many of the points do not belong to the artefact of a kind."""
-    if strange_share <= MOST_STRANGE:
-        return []
-    return [
-        f"{100 * strange_share:.0f} % of the points do not belong to the artefact ({kind}): remove other surfaces, "
-        "or check whether all images are of one scan"
-    ]
 
 
 def spread_mm(residuals_mm: np.ndarray) -> float:

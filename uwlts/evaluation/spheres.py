@@ -123,13 +123,15 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard) -> SphereEval
         variance = direction @ (free_1.covariance + free_2.covariance)[:3, :3] @ direction
         by_known = float(np.linalg.norm(known_2.centre_mm - known_1.centre_mm)) - calibrated
         spacings.append(SpacingResult(spacing, spacing - calibrated, by_known, float(np.sqrt(variance))))
+    counts = sum(each.points_used for each in spheres), sum(each.points_rejected for each in spheres)
     return SphereEvaluation(
         artefact=artefact,
-        points_used=sum(sphere.points_used for sphere in spheres),
-        points_rejected=sum(sphere.points_rejected for sphere in spheres),
+        points_used=counts[0],
+        points_rejected=counts[1],
         deviation_mm=deviation,
         spheres=tuple(spheres),
         spacings=tuple(spacings),
+        points_excluded=sum(len(sphere.members) for sphere in found) - sum(counts),
     )
 
 

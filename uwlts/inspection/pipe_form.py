@@ -222,7 +222,7 @@ def pipe_features(
         raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
     count = max(1, int(length / section_mm)) if section_mm else FORM_RULE.most_sections
     edges = low + length * np.arange(count + 1) / count
-    terms = _section_terms(form)
+    terms = ("1", "cos", "sin", "cos 2", "sin 2") if form.is_seen_round else ("1",)
     raw = form.distance_mm + _evaluate_terms(form.along_mm, form.angle, form.scale_mm, form.terms, form.coefficients)
     notes: list[str] = []
     for start, end in pairwise(edges):
@@ -376,10 +376,6 @@ def _terms(arc: float) -> tuple[str, ...]:
     if arc >= FORM_RULE.whole_arc:
         terms += ["cos 3", "sin 3", "cos 4", "sin 4"]
     return tuple(terms)
-
-
-def _section_terms(form: PipeForm) -> tuple[str, ...]:
-    return ("1", "cos", "sin", "cos 2", "sin 2") if form.is_seen_round else ("1",)
 
 
 def _design(along_mm: np.ndarray, angle: np.ndarray, scale: float, terms: tuple[str, ...]) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError, RangeError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
+from uwlts.evaluation.evaluate import ArtefactFigures
 from uwlts.evaluation.figure_uncertainty import figure_uncertainties
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.artefacts import parse_artefact
@@ -135,8 +136,8 @@ def verify(
     Raises
     ------
     EvaluationError
-        The capture names no artefact with a calibrated size, or does not show it. There is neither a limit nor a joint
-        calibration, which states the uncertainty of the measurement.
+        The capture names no artefact with a calibrated size, or does not show it, or shows it on too few of its points.
+        There is neither a limit nor a joint calibration, which states the uncertainty of the measurement.
     RangeError
         The limit is not positive.
     CalibrationError, CaptureError
@@ -154,6 +155,9 @@ def verify(
         cloud = reconstruct(scan, calibration)
         not_shown = find_undetectable_errors(artefact.kind, scan.stage_mm, scan.header.stage_direction)
     evaluation = evaluate_cloud(cloud, artefact)
+    counts = ArtefactFigures.model_validate(evaluation.as_dict())
+    if doubts := counts.doubts():
+        raise EvaluationError(f"nothing is verified: {doubts[0]}")
     known = figure_uncertainties(cloud, evaluation)
     verdicts = tuple(
         Verdict(
@@ -169,9 +173,11 @@ def verify(
     )
     if not verdicts:
         raise EvaluationError(f"the artefact '{artefact.kind}' has no calibrated size; add one to its description")
-    share = f"{100 * evaluation.strange_share:.1f} % of the points do not belong to the artefact"
-    remarks = (*(evaluation.doubts() or [share]), *not_shown)
-    return Verification(verdicts, remarks, scan.path.name, calibration_digest(calibration))
+    share = (
+        f"{100 * counts.strange_share:.1f} % of the points do not belong to the artefact; "
+        f"{100 * evaluation.rejected_share:.1f} % of its own are outliers (VDI/VDE 2634 allows 0.3 %)"
+    )
+    return Verification(verdicts, (share, *not_shown), scan.path.name, calibration_digest(calibration))
 
 
 _ACROSS = 0.1
@@ -186,8 +192,8 @@ def find_undetectable_errors(kind: str, stage_mm: np.ndarray, direction: Vector)
     x, y, z = direction
     if len(np.unique(stage_mm)) < 2 or np.hypot(y, z) > _ACROSS * abs(x):
         return ()
+    travel = "" if kind == "spheres" else "; and a wrong travel of the stage or missing images, which spheres show"
     return (
         f"not shown by the sizes of an artefact ({kind}): what mirrors the cloud, such as a reversed stage, files in "
-        "reverse order, or mirrored images; and single images that were exchanged. Check once with an object with "
-        "lettering",
+        f"reverse order, or mirrored images{travel}. Check once with an object with lettering",
     )

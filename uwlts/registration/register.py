@@ -288,7 +288,9 @@ def register(
     >>> found = uwlts.register(["top.cloud.h5", "left.cloud.h5", "right.cloud.h5"])
     >>> found.cloud.save("pipe.cloud.h5")
     """
-    names = tuple(_scan_name(each, number) for number, each in enumerate(clouds))
+    names = tuple(
+        f"scan {number}" if isinstance(each, PointCloud) else Path(each).stem for number, each in enumerate(clouds, 1)
+    )
     scans = [load_cloud(each, unit=unit) for each in clouds]
     if isinstance(poses, str | os.PathLike):
         poses = read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0]
@@ -483,7 +485,3 @@ def _checked_poses(poses: np.ndarray | None, count: int) -> np.ndarray:
 
 def _size(cloud: PointCloud) -> float:
     return float(np.linalg.norm(np.ptp(cloud.points_mm, axis=0)))
-
-
-def _scan_name(cloud: PointCloud | str | os.PathLike[str], number: int) -> str:
-    return f"scan {number + 1}" if isinstance(cloud, PointCloud) else Path(cloud).stem

@@ -145,6 +145,8 @@ def test_the_cap_leaves_the_limb_out():
     # Evenly spread over the cap: the fraction of points within 45 of 75 deg, +- 4 sqrt(6000 p q).
     expected = 6000 * (1 - np.cos(np.radians(45))) / (1 - np.cos(np.radians(75)))
     assert result.spheres[0].points_used == pytest.approx(expected, abs=160)
+    # The limb belongs to the artefact, although it is not evaluated.
+    assert result.points_used + result.points_rejected == pytest.approx(result.points_total, rel=0.01)
     with pytest.raises(EvaluationError, match="Increase cap_angle_deg"):
         evaluate_cloud(cloud_of(points), DUMBBELL.model_copy(update={"cap_angle_deg": 2.0}))
 

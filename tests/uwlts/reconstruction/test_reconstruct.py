@@ -366,3 +366,32 @@ def test_a_repeated_image_is_reported(tmp_path, path):
     twice = reconstruct(write(tmp_path / "twice.h5", lasers=4 * (True,), shown=(0, 1, 1, 2)), CALIBRATION)
     (warning,) = twice.warnings
     assert "the stripe in 1 of 4 images is exactly that in the image before, such as in image 2" in warning
+
+
+RISING = tuple(range(21))
+
+
+@pytest.mark.parametrize(
+    ("shown", "strange"),
+    [
+        (RISING, None),
+        (
+            (*RISING[:9], 10, 9, *RISING[11:]),
+            "2 of 21 images is not between those of its neighbours, such as in image 9:",
+        ),
+        ((*RISING[:9], 40, *RISING[10:]), "1 of 21 images is not between those of its neighbours, such as in image 9:"),
+        ((*RISING[:9], *range(30, 42)), None),  # the edge of a step
+        ((*RISING[:12], *reversed(RISING[2:11])), None),  # a ridge
+        ((0, 3, 1, 5, 2, 4, 1) * 3, None),  # a surface that is rough from image to image
+    ],
+)
+def test_images_that_do_not_fit_between_their_neighbours_are_reported(tmp_path, shown, strange):
+    found = reconstruct(write(tmp_path / "scan.h5", lasers=len(shown) * (True,), shown=shown), CALIBRATION).warnings
+    assert len(found) == (strange is not None)
+    assert strange is None or strange in found[0]
+
+
+def test_the_index_of_other_water_is_reported_in_the_cloud(path):
+    own = CALIBRATION.medium_index(FRESH)
+    assert reconstruct(path, CALIBRATION, index=own + 0.0009).warnings == []
+    assert f"not that of the medium, {own:.5g}" in reconstruct(path, CALIBRATION, index=own + 0.0011).warnings[0]
