@@ -86,9 +86,7 @@ class DriftModel:
         Machine Learning, 2006, section 4.2).
         """
         a = np.asarray(t) / self.correlation
-        if self.smooth:
-            return 2 * a - 3 + (3 + a) * np.exp(-a)
-        return 2 * (a + np.expm1(-a))
+        return 2 * a - 3 + (3 + a) * np.exp(-a) if self.smooth else 2 * (a + np.expm1(-a))
 
     def candidates(self) -> list[DriftModel]:
         """Return the drift with each candidate for the rates and each fraction of a random walk."""

@@ -135,9 +135,7 @@ def _make_field(each: AnalysisField, files: dict[str, list[str]]) -> Any:
     if each.file_kind or each.choices:
         made = ui.select(_options(each, files), label=each.label, clearable=not each.required, multiple=each.several)
         return made.props("dense use-chips" if each.several else "dense")
-    if each.switch:
-        return ui.checkbox(each.label)
-    return NumberField(each.label).props("dense")
+    return ui.checkbox(each.label) if each.switch else NumberField(each.label).props("dense")
 
 
 def _files_by_kind(folder: Path) -> dict[str, list[str]]:

@@ -328,9 +328,7 @@ def _spectral_moment(z: np.ndarray, axis: int, cell: float) -> float:
     """Return the root second spectral moment, 1/mm: standard deviation of the slope of a unit-variance field."""
     step = np.diff(z, axis=axis)
     step = step[np.isfinite(step)]
-    if len(step) < 10:
-        return 0.0
-    return robust_std(step) / cell
+    return 0.0 if len(step) < 10 else robust_std(step) / cell
 
 
 @dataclass(frozen=True)

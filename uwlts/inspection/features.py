@@ -180,9 +180,7 @@ class FeatureValue:
 
     def as_bound(self) -> FeatureValue:
         """Return the value as a bound: at least its lower end, or for a remaining wall at most its upper end."""
-        if self.name == "remaining wall":
-            return replace(self, low=-math.inf)
-        return replace(self, high=math.inf)
+        return replace(self, low=-math.inf) if self.name == "remaining wall" else replace(self, high=math.inf)
 
     @property
     def bound(self) -> tuple[str, float] | None:

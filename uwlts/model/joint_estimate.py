@@ -126,6 +126,7 @@ class CaptureSource(_Stored):
     medium: str | None = None
     window: bool | None = None
     offset_px: tuple[int, int] | None = None
+    black_level: float | None = None
     temperature_c: float | None = None
     salinity_g_kg: float | None = None
     target: Table | None = None

@@ -3,6 +3,7 @@
 from uwlts.errors import CalibrationError
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
+from uwlts.model.joint_estimate import Origin
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Camera, CaptureHeader
 
@@ -83,6 +84,10 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
             f"only one of {source} and the calibration states the images' offset on the image sensor "
             "(offset_px): check that it is the same"
         )
+    level, sources = header.provenance.get("black_level"), Origin.model_validate(calibration.provenance).captures()
+    if isinstance(level, int | float) and (known := {source.black_level for source in sources} - {None, level}):
+        there = ", ".join(f"{each:g}" for each in known)
+        warnings.append(f"{source} has the camera's black level {level:g}, its calibration {there}: set it as before")
     return warnings
 
 

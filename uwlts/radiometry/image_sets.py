@@ -59,9 +59,7 @@ def open_image_set(source: str | Path, *, stripe: StripeSettings = None) -> Imag
     path = Path(source)
     if (path / CARD).is_file():
         return _open_data_set(path, stripe)
-    if path.suffix.lower() in CAPTURES:
-        return _open_capture(path, stripe)
-    return _open_files(path, stripe)
+    return _open_capture(path, stripe) if path.suffix.lower() in CAPTURES else _open_files(path, stripe)
 
 
 def _open_data_set(folder: Path, stripe: StripeSettings) -> ImageSet:

@@ -417,7 +417,8 @@ def describe_source(capture: Capture) -> CaptureSource:
         known |= {"offset_px": list(offset)}
     if medium.kind in ("fresh", "sea"):
         known |= {"temperature_c": medium.temperature_c, "salinity_g_kg": medium.salinity_g_kg}
-    known |= {key: thing for key in ("target", "artefact") if (thing := getattr(header, key)) is not None}
+    own = {"target": header.target, "artefact": header.artefact, "black_level": header.provenance.get("black_level")}
+    known |= {key: thing for key, thing in own.items() if thing is not None}
     identity: Table = {"file": capture.path.name, "name": header.name, "sha256": hash_file(capture.path)}
     counts: Table = {"lamp_images": len(capture) - laser, "laser_images": laser}
     return CaptureSource.model_validate(identity | counts | known)

@@ -238,6 +238,18 @@ def test_another_camera_is_refused(path, camera, message):
         check_fits(capture.header, other, source=path.name)
 
 
+def test_another_black_level_than_that_of_the_calibration_is_reported(tmp_path):
+    def fits(here, there):
+        with Capture(write(tmp_path / f"{here}.h5", provenance={"black_level": here})) as capture:
+            assert describe_source(capture).in_file().get("black_level") == here
+            source = {"file": "a.h5", "sha256": "0", "black_level": there}
+            known = CALIBRATION.model_copy(update={"provenance": {"air_captures": [source]}})
+            return check_fits(capture.header, known, source="scan")
+
+    assert fits(None, 4.0) == fits(4.0, 4.0) == fits(5.0, None) == []
+    assert fits(64.0, 4.0) == ["scan has the camera's black level 64, its calibration 4: set it as before"]
+
+
 def test_images_from_another_place_of_the_image_sensor_are_refused(path, tmp_path):
     """Cropped images of the same size have another principal point."""
     cropped = small_sensor()
