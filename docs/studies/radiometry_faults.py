@@ -52,13 +52,16 @@ def draw_fault(name: str, seed: int, folder: Path, *, turn_deg: float) -> Fault:
             grey = np.interp(place / half, (-1, 1), rng.permutation((0.5, 1.0)))
             cv2.imwrite(str(folder / f"doubles-{seed}.png"), np.tile(np.round(65535 * grey).astype(np.uint16), (8, 1)))
             return Fault(surface=f"texture = '{folder.resolve()}/doubles-{seed}.png'", mean_grey=0.75)
-        case "daylight":
-            return Fault(light=f"[lamp]\nambient_w_per_m2 = {10 ** rng.uniform(0.0, 2.0)}")
-        case "translucent":
-            return Fault(surface=f"mean_free_path_mm = {10 ** rng.uniform(-0.7, 0.3)}")
-        case "mottle":
+        case "daylight" | "weak daylight":
+            low, high = (-2.0, 0.0) if name.startswith("weak") else (0.0, 2.0)
+            return Fault(light=f"[lamp]\nambient_w_per_m2 = {10 ** rng.uniform(low, high)}")
+        case "translucent" | "weakly translucent":
+            low, high = (-1.3, -0.7) if name.startswith("weak") else (-0.7, 0.3)
+            return Fault(surface=f"mean_free_path_mm = {10 ** rng.uniform(low, high)}")
+        case "mottle" | "weak mottle":
             lengths = 10 ** rng.uniform(-0.3, 1.0)
-            return Fault(surface=f"mottle = {rng.uniform(0.1, 0.4)}\nmottle_mm = {lengths}", reflectance=0.5)
+            low, high = (0.02, 0.1) if name.startswith("weak") else (0.1, 0.4)
+            return Fault(surface=f"mottle = {rng.uniform(low, high)}\nmottle_mm = {lengths}", reflectance=0.5)
     raise ValueError(name)
 
 
@@ -67,8 +70,11 @@ FAULTS = {
     "phase function": "another phase function (Henyey and Greenstein, Fournier and Forand)",
     "reflectance": "reflectance that doubles over the scan",
     "daylight": "daylight of 1 to 100 W/m²",
+    "weak daylight": "daylight of 0.01 to 1 W/m²",
     "translucent": "translucent surface, mean free path 0.2 to 2 mm",
+    "weakly translucent": "translucent surface, mean free path 0.05 to 0.2 mm",
     "mottle": "mottle of 10 to 40 %, 0.5 to 10 mm long",
+    "weak mottle": "mottle of 2 to 10 %, 0.5 to 10 mm long",
 }
 
 
