@@ -289,12 +289,19 @@ def _delimit(
     have too few points.
     """
     noise, reach, step = float(maps[0].noise_at(peak.place[None])[0]), 3.0 * peak.radius, max(smallest, peak.radius / 4)
+    first: tuple[np.ndarray, _Region] | None = None
     while True:
         near = np.array(tree.query_ball_point(peak.place, reach), int)
         taken, near = near[~undamaged[near] & ~outliers[near]], near[undamaged[near]]
         places, heights = surface.places[near] - peak.place, surface.heights[near]
         grown = _grow_region(places, heights, surface.places[taken] - peak.place, peak, noise, reach, step)
-        if not grown.cut or len(near) == np.count_nonzero(undamaged):
+        if not grown.cut and first is None:
+            first = near, grown
+        # A blemish of the largest size may be larger still.
+        if not (grown.cut or (grown.is_within and peak.radius == maps[-1].radius)):
+            break
+        if len(near) == np.count_nonzero(undamaged):
+            near, grown = first or (near, grown)
             break
         reach *= SEARCH_RULE.enlargement
     points = near[grown.inside]
@@ -307,11 +314,12 @@ def _delimit(
 
 
 class _Region(NamedTuple):
-    """Mask (n,) of the points in a region, whether it is cut by the window's edge, and whether it is a rest."""
+    """Region of a peak in a window of n points."""
 
-    inside: np.ndarray
-    cut: bool
-    is_rest: bool
+    inside: np.ndarray  # (n,) bool; points of the region
+    cut: bool  # whether the window's edge cuts it
+    is_rest: bool  # whether it is the rest of another one
+    is_within: bool  # whether its surroundings depart by more than its edge, as within a larger blemish
 
 
 def _grow_region(
@@ -329,7 +337,8 @@ def _grow_region(
             f"{np.count_nonzero(ring)} undamaged points surround it; {2 * SEARCH_RULE.fewest_points} are needed"
         )
     base = np.column_stack([np.ones(len(places)), places])
-    left = heights - base @ (fit_biweight(base, heights, ring)[0] @ heights)
+    plane = fit_biweight(base, heights, ring)[0] @ heights
+    left = heights - base @ plane
     side = int(np.ceil(2 * reach / step)) + 1
     cells, other = (np.floor((each + reach) / step).astype(int) for each in (places, taken))
     flat = cells[:, 0] * side + cells[:, 1]
@@ -355,4 +364,5 @@ def _grow_region(
     top = float(np.max(mean, where=region, initial=0.0))
     saddle = float(np.max(mean, where=region & beside, initial=0.0))
     is_rest = touches and saddle >= SEARCH_RULE.saddle * top
-    return _Region(wide[cells[:, 0], cells[:, 1]] | (away < SEARCH_RULE.core * peak.radius), cut, is_rest)
+    is_within = np.sign(peak.height) * plane[0] > SEARCH_RULE.edge_share * top
+    return _Region(wide[cells[:, 0], cells[:, 1]] | (away < SEARCH_RULE.core * peak.radius), cut, is_rest, is_within)

@@ -273,7 +273,12 @@ class _Bell:
 
     @classmethod
     def resembling(cls, seen: np.ndarray, edge: float, middle: np.ndarray, radius: float, exponent: int) -> _Bell:
-        """Return a bell with the measured depth, and length and width at an edge; ``radius`` instead of zero sizes."""
+        """Return a bell with the measured depth, and length and width at an edge; ``radius`` instead of zero sizes.
+
+        NotSignificantError if the depth is not positive.
+        """
+        if seen[0] <= 0:
+            raise NotSignificantError("it does not depart from its surroundings in this direction")
         rim = float(np.sqrt(1 - min(edge / seen[0], 0.99) ** (1 / exponent)))
         half = np.where(seen[1:3] > 0, 0.5 * seen[1:3] / rim, radius)
         return cls(middle, half, float(seen[0]), exponent)
