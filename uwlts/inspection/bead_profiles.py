@@ -81,18 +81,22 @@ def profile_rows(
 
 
 def interpolation_rows(across: np.ndarray, section: np.ndarray, count: int, grid: np.ndarray) -> sparse.csr_array:
-    """Return rows (n, S G) that interpolate profiles at places (n,) of given sections.
-
-    Cubic convolution, exact for quadratics (Keys 1981, Eq. 15).
-    """
-    cell = (across - grid[0]) / (grid[1] - grid[0])
-    at = np.floor(cell).astype(int)[:, None] + np.arange(-1, 3)
-    away = np.abs(cell[:, None] - at)
-    weight = np.where(away <= 1, (1.5 * away - 2.5) * away**2 + 1, ((-0.5 * away + 2.5) * away - 4) * away + 2)
-    weight = np.where((at >= 0) & (at < len(grid)), weight, 0.0)
-    columns = section[:, None] * len(grid) + np.clip(at, 0, len(grid) - 1)
-    rows = np.repeat(np.arange(len(across)), 4)
+    """Return rows (n, S G) that interpolate profiles at places (n,) of given sections."""
+    at, weight = cubic_weights((across - grid[0]) / (grid[1] - grid[0]), len(grid))
+    columns, rows = section[:, None] * len(grid) + at, np.repeat(np.arange(len(across)), 4)
     return sparse.csr_array((weight.ravel(), (rows, columns.ravel())), shape=(len(across), count * len(grid)))
+
+
+def cubic_weights(cells: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return four nodes (n, 4) of a grid beside places (n,) in cells, and their weights, zero beyond the border.
+
+    Cubic convolution, exact for quadratics (Keys, IEEE Transactions on Acoustics, Speech and Signal Processing 29,
+    1981, Eq. 15).
+    """
+    at = np.floor(cells).astype(int)[:, None] + np.arange(-1, 3)
+    away = np.abs(cells[:, None] - at)
+    weight = np.where(away <= 1, (1.5 * away - 2.5) * away**2 + 1, ((-0.5 * away + 2.5) * away - 4) * away + 2)
+    return np.clip(at, 0, length - 1), np.where((at >= 0) & (at < length), weight, 0.0)
 
 
 def _quadratic_row(u: np.ndarray) -> np.ndarray | None:

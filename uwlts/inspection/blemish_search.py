@@ -295,8 +295,7 @@ def _delimit(
         taken, near = near[~undamaged[near] & ~outliers[near]], near[undamaged[near]]
         places, heights = surface.places[near] - peak.place, surface.heights[near]
         grown = _grow_region(places, heights, surface.places[taken] - peak.place, peak, noise, reach, step)
-        if not grown.cut and first is None:
-            first = near, grown
+        first = first or (None if grown.cut else (near, grown))
         # A blemish of the largest size may be larger still.
         if not (grown.cut or (grown.is_within and peak.radius == maps[-1].radius)):
             break

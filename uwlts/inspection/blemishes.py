@@ -25,6 +25,7 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import fit_biweight
 from uwlts.fitting.point_spacing import measure_spacing
 from uwlts.fitting.propagation import PointErrors
+from uwlts.inspection.bead_profiles import NODES, cubic_weights
 from uwlts.inspection.bell_maps import SEARCH_RULE, UnrolledSurface
 from uwlts.inspection.blemish_search import BlemishSearch, Indication
 from uwlts.inspection.features import BIAS_STD, COVERAGE, COVERAGE_FACTOR, SEED, FeatureKind, FeatureValue, plain_value
@@ -78,12 +79,8 @@ class _Rule:
 DENT_SHARE = 0.1
 """Least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits."""
 
-_NODES = [
-    (np.sqrt(3.0) * np.array([a, b]), (2 / 3 if a == 0 else 1 / 6) * (2 / 3 if b == 0 else 1 / 6))
-    for a in (-1, 0, 1)
-    for b in (-1, 0, 1)
-]
-"""Places and weights of a normal distribution in two dimensions (Gauss-Hermite, exact to the fifth power)."""
+_NODES = [(np.array([a, b]), u * v) for a, u in NODES for b, v in NODES]
+"""Places and weights of a normal distribution in two dimensions."""
 
 
 class NotSignificantError(EvaluationError):
@@ -273,10 +270,7 @@ class _Bell:
 
     @classmethod
     def resembling(cls, seen: np.ndarray, edge: float, middle: np.ndarray, radius: float, exponent: int) -> _Bell:
-        """Return a bell with the measured depth, and length and width at an edge; ``radius`` instead of zero sizes.
-
-        NotSignificantError if the depth is not positive.
-        """
+        """Return a bell of the measured figures at an edge, or NotSignificantError; ``radius`` replaces zero sizes."""
         if seen[0] <= 0:
             raise NotSignificantError("it does not depart from its surroundings in this direction")
         rim = float(np.sqrt(1 - min(edge / seen[0], 0.99) ** (1 / exponent)))
@@ -584,22 +578,11 @@ def _measure_section(profile: np.ndarray, edge: float, cell: float) -> tuple[flo
 
 
 def _interpolation_rows(places: np.ndarray, shape: tuple[int, int]) -> sparse.csr_array:
-    """Return rows (n, G) that interpolate a grid at places (n, 2) in cells, and are zero beyond its border.
-
-    Cubic convolution, exact for quadratics (Keys, IEEE Transactions on Acoustics, Speech and Signal Processing 29,
-    1981, Eq. 15).
-    """
-    first = np.floor(places).astype(int)
-    steps = np.arange(-1, 3)
-    away = np.abs((places - first)[:, :, None] - steps)
-    weight = np.where(away <= 1, (1.5 * away - 2.5) * away**2 + 1, ((-0.5 * away + 2.5) * away - 4) * away + 2)
-    at = first[:, :, None] + steps
-    weight = np.where((at >= 0) & (at < np.array(shape)[:, None]), weight, 0.0)
-    at = np.clip(at, 0, np.array(shape)[:, None] - 1)
-    columns = (at[:, 0, :, None] * shape[1] + at[:, 1, None, :]).reshape(len(places), -1)
-    values = (weight[:, 0, :, None] * weight[:, 1, None, :]).reshape(len(places), -1)
-    rows = np.repeat(np.arange(len(places)), columns.shape[1])
-    return sparse.csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(places), shape[0] * shape[1]))
+    """Return rows (n, G) that interpolate a grid at places (n, 2) in cells, and are zero beyond its border."""
+    (first, along), (second, around) = (cubic_weights(place, n) for place, n in zip(places.T, shape, strict=True))
+    columns = (first[:, :, None] * shape[1] + second[:, None, :]).ravel()
+    values, rows = (along[:, :, None] * around[:, None, :]).ravel(), np.repeat(np.arange(len(places)), 16)
+    return sparse.csr_array((values, (rows, columns)), shape=(len(places), shape[0] * shape[1]))
 
 
 def _quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidth: float) -> sparse.csr_array:

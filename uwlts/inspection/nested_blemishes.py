@@ -39,10 +39,6 @@ class _Rule:
     reweighted: int = 15  # reweighted fits of a quadratic; the corrections refine them further
     corrections: int = 2
     """Corrections of the surface for what was smoothed away: one leaves 0.04 mm at the bottom of a bell 7 mm deep."""
-    rim: float = 0.3
-    """Height of the dent's surface, as a fraction of its largest, below which long indications follow its rim."""
-    compact: float = 0.3
-    """Least part of the circle around an indication that its points fill if it does not follow a rim."""
     rough: float = 1.5
     """Scatter about the smooth surface where it is deep, divided by that beside it, above which the ground is rough: a
     gouge or an area of corrosion is one finding. Of docs/studies/inspection_verdicts.py, seeds 0 to 6 and 600 to 609,
@@ -91,16 +87,11 @@ class LargeBlemish:
     def is_form(self, indication: Indication) -> bool:
         """Return whether an indication of the window belongs to the form of the large one.
 
-        It follows its rim, or is not significant if its height contains the errors of a smooth surface elsewhere: those
-        at sharp edges.
+        It is not significant if its height contains the errors of a smooth surface elsewhere: those at sharp edges.
         """
         places = self.surface.places[indication.points]
         middle = places.mean(axis=0)
         reach = float(np.max(np.hypot(*(places - middle).T)))
-        density = len(self.chosen) / float(np.prod(np.ptp(self.surface.places, axis=0)))
-        below = self.height_mm[indication.points] / (np.abs(self.height_mm).max() * np.sign(self.own.height_mm))
-        if np.median(below) < _Rule.rim and len(places) < _Rule.compact * density * np.pi * reach**2:
-            return True
         elsewhere = np.hypot(*(self.surface.places - middle).T) > reach + 2 * self.largest_mm
         error = float(np.quantile(self.std_mm[elsewhere], _Rule.worst)) if elsewhere.any() else np.inf
         significant = abs(indication.height_mm) * self.search.threshold / indication.z

@@ -273,14 +273,12 @@ def _blemish_features(
         """Add the blemish, or a note and return False; ``points`` are those of the indication."""
         try:
             blemish = measured_by()
-        except NotSignificantError as error:
-            notes.append(_note_indication(cloud, chosen[points], indication.height_mm, f"is omitted: {error}"))
-            return False
         except EvaluationError as error:
-            if any(np.isin(points, whole.own.points).all() and indication is not whole.own for whole, _ in large):
+            inside = any(np.isin(points, w.own.points).all() and w.own is not indication for w, _ in large)
+            if inside or isinstance(error, NotSignificantError):
                 notes.append(_note_indication(cloud, chosen[points], indication.height_mm, f"is omitted: {error}"))
-                return False
-            add_unsized(points, indication.height_mm, 0.0, str(error))
+            else:
+                add_unsized(points, indication.height_mm, 0.0, str(error))
             return False
         measured.append((blemish, middle, indication.false_alarm))
         return True
