@@ -296,7 +296,6 @@ def _delimit(
         places, heights = surface.places[near] - peak.place, surface.heights[near]
         grown = _grow_region(places, heights, surface.places[taken] - peak.place, peak, noise, reach, step)
         first = first or (None if grown.cut else (near, grown))
-        # A blemish of the largest size may be larger still.
         if not (grown.cut or (grown.is_within and peak.radius == maps[-1].radius)):
             break
         if len(near) == np.count_nonzero(undamaged):
@@ -318,7 +317,7 @@ class _Region(NamedTuple):
     inside: np.ndarray  # (n,) bool; points of the region
     cut: bool  # whether the window's edge cuts it
     is_rest: bool  # whether it is the rest of another one
-    is_within: bool  # whether its surroundings depart by more than its edge, as within a larger blemish
+    is_within: bool  # whether its surroundings depart by more than its edge: a blemish of the largest size is larger
 
 
 def _grow_region(

@@ -181,6 +181,11 @@ def measure_blemish(
     # A tail may reach beyond the surroundings: it is corrected by as much as it is uncertain.
     without_bias[0] = np.hypot(without_bias[0], tail)
     random = np.hypot(without_bias, BIAS_STD * bias)
+    reason = field.find_reason(surface, depths, edge, deepest)
+    if reason:
+        # Between few points, or beside them, the surface is unknown: no bound is beyond the deepest point.
+        above = (heights - field.design @ (field.plane @ heights) - COVERAGE_FACTOR * noise)[inside]
+        random[0] = max(random[0], (plain[0] - float(above.max())) / COVERAGE_FACTOR)
 
     def changed(pattern: np.ndarray) -> np.ndarray:
         """Return the change of all figures by a pattern of height errors."""
@@ -213,8 +218,6 @@ def measure_blemish(
     if beneath_mm is not None:
         # On a slope the deepest place of both surfaces together is not that of the blemish.
         beneath = field.find_total(heights, sign * beneath_mm[field.near]) - float(seen[0])
-    level = float(np.sqrt(2) * np.median(by_noise[field.region]))
-    reason = field.find_reason(surface, depths, edge, deepest)
     if reason:
         values = [value if value.name == "edge depth" else value.as_bound() for value in values]
     return Blemish(
@@ -224,7 +227,7 @@ def measure_blemish(
         extent,
         indication.points,
         field.trace_outline(depths, edge, deepest),
-        field.grid[field.find_hollows(depths, edge, std=level)],
+        field.grid[field.find_hollows(depths, edge, std=float(np.sqrt(2) * np.median(by_noise[field.region])))],
         measure_spacing(surface.places[field.near], np.flatnonzero(inside)),
         reason,
         beneath,

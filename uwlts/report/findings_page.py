@@ -283,7 +283,7 @@ def _page(
         made=made,
         tiles=[tile for tile in _tiles(whole, parts) if tile.accent],
         facts=_facts(order, cloud, sources, found),
-        conclusion=_conclude(listed, order),
+        conclusion=_conclude(listed, order, found),
         findings=_finding_rows(listed, found, cloud, order) if listed else None,
         all_values=_rows(parts),
         whole=[(each.name, [_value_row(value) for value in each.values]) for each in whole],
@@ -332,15 +332,15 @@ def _facts(
     return [(name, str(text or "not stated")) for name, text in stated.items()]
 
 
-def _conclude(listed: Sequence[Feature], order: FindingOrder) -> tuple[str, str]:
-    """Return the most severe verdict, and the numbers of findings by verdict as a sentence."""
+def _conclude(listed: Sequence[Feature], order: FindingOrder, found: Inspection) -> tuple[str, str]:
+    """Return the most severe verdict, and the numbers of findings by verdict and of points without any as text."""
     verdicts = [judge_feature(each, order.limits)[0] for each in listed]
     words = "exceed the limit", "undecided", "within the limit", "without a limit"
     counts = [f"{verdicts.count(each)} {word}" for each, word in zip(VERDICTS, words, strict=True) if each in verdicts]
     worst = min(verdicts, key=VERDICTS.index, default=VERDICTS[-1])
-    if not listed:
-        return worst, "No finding."
-    return worst, f"{len(listed)} findings: {', '.join(counts)}."
+    said = f"{len(listed)} findings: {', '.join(counts)}." if listed else "No finding."
+    omitted = round(100 * float(np.mean(np.isnan(found.deviation_mm)))) if found.kind == "pipe" else 0
+    return worst, f"{said} {omitted} % of the points are not inspected." if omitted else said
 
 
 def _finding_rows(
@@ -419,8 +419,6 @@ def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
     if walls:
         least = min(walls, key=lambda value: value.value)
         tiles.append(Tile("least remaining wall", f"{format_interval(least)} {least.unit}", accent=True))
-    if whole and whole[0].kind == FeatureKind.PIPE and not parts:
-        tiles.append(Tile("pits, dents, protrusions", "none found", accent=True))
     for each in whole[:1]:
         for value in each.values[:5]:
             if not value.name.startswith("axis"):

@@ -11,7 +11,14 @@ from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.bead_profiles import interpolation_rows, profile_rows
 from uwlts.inspection.bell_maps import UnrolledSurface
 from uwlts.inspection.blemish_search import search_blemishes
-from uwlts.inspection.blemishes import _Bell, _interpolation_rows, _measure_section, _quadratic_rows, measure_blemish
+from uwlts.inspection.blemishes import (
+    NotSignificantError,
+    _Bell,
+    _interpolation_rows,
+    _measure_section,
+    _quadratic_rows,
+    measure_blemish,
+)
 from uwlts.inspection.features import FeatureValue
 
 
@@ -89,6 +96,8 @@ def test_a_paraboloid_has_its_sizes_at_an_edge() -> None:
         np.testing.assert_allclose(sharp.depths_at(at), 0.5)
     again = _Bell.resembling(bell.figures(0.5), 0.5, bell.middle, 1.0, 1)
     np.testing.assert_allclose(again.figures(0.5)[:4], expected[:4], rtol=1e-4)
+    with pytest.raises(NotSignificantError, match="does not depart"):
+        _Bell.resembling(np.array([-0.1, 1.0, 1.0, 1.0, 1.0]), 0.01, bell.middle, 1.0, 2)
 
 
 def test_a_section_ends_where_it_crosses_the_edge() -> None:

@@ -40,7 +40,7 @@ def test_a_finding_cut_by_a_border_says_so(seed: int) -> None:
     assert sum("not seen whole" in line for line in found.lines()) == 4
 
 
-@pytest.mark.parametrize(("kind", "seed"), [("gouges", 406), ("patch of corrosion", 414)])
+@pytest.mark.parametrize(("kind", "seed"), [("gouges", 406), ("gouges", 609), ("patch of corrosion", 414)])
 def test_rough_ground_is_one_finding(kind: str, seed: int) -> None:
     """A smooth surface does not follow a gouge or an area of corrosion: nothing is searched for within these.
 
@@ -48,3 +48,10 @@ def test_rough_ground_is_one_finding(kind: str, seed: int) -> None:
     """
     counts = count_drawn(kind, seed)
     assert counts["inside"] == counts["values"] == counts["truths"] and not counts["invented"], counts
+
+
+@pytest.mark.parametrize("seed", [603, 607])
+def test_a_dent_is_one_finding(seed: int) -> None:
+    """At the end of scan 603 the dent's smooth surface errs; the dent of 607 covers 100 of 116 mm of its pipe."""
+    counts = count_drawn("dent of 2 to 15 % of the diameter", seed)
+    assert counts["inside"] == counts["values"] == 1 and not counts["invented"], counts
