@@ -337,7 +337,7 @@ class Inspection(Brief, RecordFile):
     def lines(self) -> list[str]:
         """Return the inspection as text, one line per feature."""
         lines = [
-            f"{each.title:16}{', '.join(value.text() for value in each.values)}"
+            f"{each.title:15} {', '.join(value.text() for value in each.values)}"
             + (f"; {each.reason}" if each.reason else "")
             for each in self.features
         ]

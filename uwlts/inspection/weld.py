@@ -443,7 +443,7 @@ def _evaluate_figures(
 
 
 def _simulate_forms(bead: Bead, seen: np.ndarray, whole: np.ndarray, toes: np.ndarray) -> np.ndarray:
-    """Return the errors (E, 9) of values at straight beads H (1 - t^2)^p that give the seen height H and width.
+    """Return the errors (E, 9) of values at straight beads H (1 - t^2)^p without undercut of the seen height and width.
 
     They are simulated for several p and places: between points at the same places in all sections, a toe is unknown.
     """
@@ -460,7 +460,7 @@ def _simulate_forms(bead: Bead, seen: np.ndarray, whole: np.ndarray, toes: np.nd
             half = 0.5 * sizes[1] / (low + _Rule.flank_low / steep)
             raw = bead.profiles.observe(middle, sizes[0], half, exponent)
             found = _evaluate_figures(bead, raw, whole, toes).values
-            error[:3] = found[0] - sizes[0], found[0] - sizes[0], found[2] - sizes[1]
+            error[:6] = *(found[[0, 0, 2]] - sizes[[0, 0, 1]]), *found[3:5], found[3:5].max()
             error[6:8] = found[6:8] - 180 + float(np.degrees(np.arctan(steep * sizes[0] / half)))
             sizes = np.maximum(sizes + seen[[0, 2]] - found[[0, 2]], 0.5 * sizes)
     return np.nan_to_num(errors)
