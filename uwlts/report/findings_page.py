@@ -335,10 +335,9 @@ def _facts(
 def _conclude(listed: Sequence[Feature], order: FindingOrder, found: Inspection) -> tuple[str, str]:
     """Return the most severe verdict, and the numbers of findings by verdict and of points without any as text."""
     verdicts = [judge_feature(each, order.limits)[0] for each in listed]
-    words = "exceed the limit", "undecided", "within the limit", "without a limit"
-    counts = [f"{verdicts.count(each)} {word}" for each, word in zip(VERDICTS, words, strict=True) if each in verdicts]
+    counts = [f"{verdicts.count(each)} × {each}" for each in VERDICTS if each in verdicts]
     worst = min(verdicts, key=VERDICTS.index, default=VERDICTS[-1])
-    said = f"{len(listed)} findings: {', '.join(counts)}." if listed else "No finding."
+    said = f"Findings: {', '.join(counts)}." if listed else "No finding."
     omitted = round(100 * float(np.mean(np.isnan(found.deviation_mm)))) if found.kind == "pipe" else 0
     return worst, f"{said} {omitted} % of the points are not inspected." if omitted else said
 

@@ -11,8 +11,11 @@ from tests.uwlts.comparison.test_surface_mesh import NOISE_MM
 from uwlts.cli import app
 from uwlts.errors import EvaluationError, OutputError, SetupError
 from uwlts.files.writing import hash_file
+from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.model.artefacts import SphereStandard
 from uwlts.pages import toolkit
+from uwlts.report.findings_order import FindingOrder
+from uwlts.report.findings_page import _conclude
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 
 DEPTH_MM = 1.5
@@ -77,6 +80,15 @@ def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
     for part in ("GUM", "VDI/VDE 2634", "ASME B31G", "Traceability", record["sources"][0]["sha256"]):
         assert part in text
     assert (folder / "report.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize(("omitted", "more"), [(0, ""), (50, " 25 % of the points are not inspected.")])
+def test_the_conclusion_says_how_much_is_not_inspected(omitted, more):
+    """A pipe without findings, of which a second body covers a quarter."""
+    found = Inspection("pipe", (), np.where(np.arange(200) < omitted, np.nan, 0.0), np.zeros(200))
+    assert _conclude([], FindingOrder(), found) == ("no limit", "No finding." + more)
+    pit = Feature(FeatureKind.PIT, "pit 1", (), np.zeros(3), np.eye(3), np.zeros(3), np.arange(3))
+    assert _conclude([pit, pit], FindingOrder(), found) == ("no limit", "Findings: 2 × no limit." + more)
 
 
 def test_foreign_calibrations_and_missing_browsers_are_refused(folder, tmp_path, monkeypatch):
