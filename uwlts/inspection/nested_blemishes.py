@@ -67,7 +67,7 @@ class LargeBlemish:
     def explains(self, other: Indication) -> bool:
         """Return whether an indication of the first search is the large one, its rim, or was searched for again.
 
-        A rim departs from its surroundings in the other direction, but hardly from the undamaged surface.
+        A rim departs from its surroundings in the other direction, but not from the undamaged surface.
         """
         if other is self.own:
             return True
@@ -161,7 +161,7 @@ def search_within(surface: UnrolledSurface, search: BlemishSearch, large: Indica
         found = search_blemishes(relative, false_alarm=share * search.false_alarm, largest_mm=0.5 * bandwidth)
     except EvaluationError:
         return None
-    # Where the search of the whole surface finds it undamaged, a departure is one from the smooth surface only.
+    # Points that the search of the whole surface calls undamaged depart from the smooth surface only.
     real = [each for each in found.indications if np.mean(search.undamaged[chosen[each.points]]) < 0.5]
     found = replace(found, indications=tuple(real))
     return LargeBlemish(large, chosen, relative, smooth, np.abs(correction), found, 0.5 * bandwidth)

@@ -52,6 +52,6 @@ def test_rough_ground_is_one_finding(kind: str, seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [603, 607])
 def test_a_dent_is_one_finding(seed: int) -> None:
-    """At the end of scan 603 the dent's smooth surface errs; the dent of 607 covers 100 of 116 mm of its pipe."""
+    """The smooth surface of 603 is wrong at the end of the scan; the dent of 607 covers 100 of 116 mm of its pipe."""
     counts = count_drawn("dent of 2 to 15 % of the diameter", seed)
     assert counts["inside"] == counts["values"] == 1 and not counts["invented"], counts
