@@ -355,9 +355,12 @@ def measure_bead(bead: Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, .
     ]
     resolved = np.nan_to_num(np.array(resolution) - seen)
     # Where points are far apart, smoothing widens the bead: the middle of the errors on beads of known forms is
-    # subtracted, and their largest distance from it belongs to the uncertainty, as the form is unknown.
+    # subtracted, and their largest distance from it belongs to the uncertainty, as the form is unknown. The groove that
+    # smoothing gives a sound toe is not subtracted from an undercut, which need not have it.
     of_forms = _simulate_forms(bead, seen, whole, toes)
     form, spread = 0.5 * (of_forms.max(axis=0) + of_forms.min(axis=0)), 0.5 * np.ptp(of_forms, axis=0)
+    grooves = np.array(["undercut" in name for name in _NAMES])
+    form[grooves], spread[grooves] = 0.0, of_forms.max(axis=0)[grooves]
     fixed = np.sqrt((BIAS_STD * bias) ** 2 + (BIAS_STD * form) ** 2 + spread**2 + np.sum(resolved**2, axis=0))
     plain = np.where(extremes, np.maximum(seen - bias - form, 0), seen - form)
     common = errors.by_patterns(

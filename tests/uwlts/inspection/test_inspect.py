@@ -481,6 +481,21 @@ def test_a_weld_is_measured(undercut, offset):
     assert np.abs(weld.axes[0]) == pytest.approx([1, 0, 0], abs=0.02)
 
 
+@pytest.mark.parametrize("undercut", [0.0, 0.1, 0.8])
+def test_undercuts_of_few_points_across_are_within_their_intervals(undercut):
+    """The 160 points of a profile are 0.5 mm apart: smoothing lowers the groove of 0.8 mm by 0.05 mm."""
+    cloud = flat_scan(
+        np.random.default_rng(12),
+        lambda x, y: weld_height(x, y, undercut=undercut, offset=0.0),
+        everywhere,
+        along=(-15, 15, 1.0),
+        across=(-40, 40, 160),
+    )
+    weld = uwlts.inspect_weld(cloud).features[0]
+    for name in ("undercut left", "undercut right", "largest undercut"):
+        assert weld[name].low <= undercut <= weld[name].high, weld[name]
+
+
 def test_a_weld_of_few_profiles_far_apart_is_refused():
     """Sections of 3 mm with profiles 4 mm apart: many have no points, and no strip along the weld has 50."""
     cloud = flat_scan(
