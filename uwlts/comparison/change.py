@@ -28,7 +28,7 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.point_spacing import choose_disc_diameter, number_cubes
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
-from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface
+from uwlts.registration.surface_registration import Registration, SurfaceSample, register_to_surface
 from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, rotate_covariances, rounding_std_mm
 from uwlts.storage.cloud_files import load_cloud
 from uwlts.storage.pose_files import Unit
@@ -172,7 +172,7 @@ class SurfaceChange(Brief):
                 "middle_mm": found.middle_mm.tolist(),
                 "open_directions": list(found.open_directions),
                 "rms_mm": found.rms_mm,
-                "points": found.points,
+                "patches": found.counted,
             },
         }
 
@@ -369,9 +369,12 @@ def _compare_with_points(
         surface, depths = _restrict_to_seen(points[chosen], surface, deep_mm=deep, apart_mm=apart)
     if register:
         target = surface.points_mm
-        normals = fit_local_normals(target, target, disc_mm=disc) if surface.normals is None else surface.normals
-        sampled = SampledSurface(target, normals, uncertainty=other, frame=surface.frame)
-        found = register_to_surface(points, sampled, reach_mm=deep, uncertainty=known, frame=new.frame, datums=datums)
+        found = register_to_surface(
+            SurfaceSample(points, known, new.frame),
+            SurfaceSample(target, other, surface.frame),
+            reach_mm=deep,
+            datums=datums,
+        )
         points, known = _move_points(points, known, found)
         if other is not None:
             # The registration follows systematic errors of the reference.
@@ -421,8 +424,11 @@ def _compare_with_shape(
         followed = [found.moves_mm(step, points, normals) for step in found.by_cloud]
         known = replace(known, patterns_mm=known.patterns_mm + np.array(followed, np.float32))
     elif found is None and register:
+        near = placed.nearest(points, reach_mm=deep)
+        below = points - near.distance_mm[:, None] * near.normals
+        target = SurfaceSample(below[np.isfinite(near.distance_mm)])
         found = moved = register_to_surface(
-            points, placed, reach_mm=deep, uncertainty=known, frame=new.frame, datums=datums
+            SurfaceSample(points, known, new.frame), target, reach_mm=deep, datums=datums
         )
         points, known = _move_points(points, known, found)
     spread, apart = _thin_points(points, disc / 2)

@@ -116,14 +116,6 @@ class PlacedShape:
     radius_mm: float  # radius; 0 for a plane
     registration: Registration | None = None  # uncertainty of a fitted shape; None for a given one
 
-    @property
-    def uncertainty(self) -> None:
-        """Return None, because a shape has no points."""
-
-    @property
-    def frame(self) -> None:
-        """Return None, because a shape has no images."""
-
     def nearest(self, points_mm: np.ndarray, *, reach_mm: float = np.inf) -> Nearest:
         """Return signed distances and normals of points (N, 3), positive outwards or along a plane's normal."""
         away, direction = points_mm - self.point_mm, self.direction
@@ -135,7 +127,7 @@ class PlacedShape:
             length = np.linalg.norm(away, axis=1)
             normals, distance = away / np.maximum(length, 1e-300)[:, None], length - self.radius_mm
         distance = np.where(np.abs(distance) <= reach_mm, distance, np.nan)
-        return Nearest(distance, normals, np.zeros(len(distance), np.intp))
+        return Nearest(distance, normals)
 
     def note_misfit(self, places_mm: np.ndarray, distance_mm: np.ndarray, variance_mm2: np.ndarray) -> str:
         """Return a note if most of a surface departs from this fitted shape; empty otherwise.

@@ -45,7 +45,7 @@ _FACING = 0.15
 
 LEAST_INFORMATION = 5.0
 """Least information on a determined motion, relative to the information that noise of the normals alone produces."""
-_ROUNDING = 1e-9
+ROUNDING = 1e-9
 """Least information above rounding noise, relative to the information on the best determined motion."""
 
 
@@ -422,16 +422,18 @@ def slope_information(
     return sum((by.T @ (noise[:, None] * by) for by in parts), np.zeros(()))
 
 
-def decompose_motions(information: np.ndarray, of_slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def decompose_motions(
+    information: np.ndarray, of_slopes: np.ndarray, *, least_share: float = ROUNDING
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Decompose motions into independent ones, ordered by information relative to that of slope noise.
 
-    A motion with less than `LEAST_INFORMATION` is undetermined.
+    A motion is undetermined with less than `LEAST_INFORMATION`, or than ``least_share`` of the best determined one.
 
     ``information`` and ``of_slopes`` (K, K) are those of the distances and of slope noise (`slope_information`).
     Returns the relative information (K,), ascending; the motions (K, K) in columns, orthonormal in the metric; and the
     metric (K, K), the regularised slope information.
     """
-    rounding = _ROUNDING / LEAST_INFORMATION * float(np.linalg.eigvalsh(information)[-1])
+    rounding = least_share / LEAST_INFORMATION * float(np.linalg.eigvalsh(information)[-1])
     metric = of_slopes + max(rounding, np.finfo(float).tiny) * np.eye(len(information))
     values, vectors = eigh(information, metric)
     return values, vectors, metric

@@ -7,7 +7,7 @@ share a calibration of the sensor or mount share its errors. The prior correlate
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, pairwise, permutations
@@ -20,6 +20,7 @@ from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import biweight, rms_distance, robust_std
 from uwlts.fitting.patches import (
     LEAST_INFORMATION,
+    ROUNDING,
     PatchDistances,
     Patches,
     decompose_motions,
@@ -34,7 +35,7 @@ FEWEST_OF_PAIR = 12
 """Least number of patches of a usable overlap: two for each of the six parameters of a rigid motion."""
 _OWN_PART = 1e-4
 """Variance of each amplitude that is independent in every scan: 1 % of its errors change with temperature and load."""
-NARROWER = 0.8
+_NARROWER = 0.8
 """Factor on the matching distance from one round to the next."""
 _PAIR_REACH = 4.0
 """Matching distance in the first round of a pair fit (unit: patch radius); a search is accurate to about one radius."""
@@ -42,6 +43,14 @@ _PAIR_ROUNDS = 12
 """Rounds of a pair fit; after seven the matching distance is one patch radius."""
 _LEAST_SPREAD = 0.05
 """Lower bound of the scatter relative to noise that is not stated: exact surfaces agree better than their patches."""
+ROUNDS = 60
+"""Largest number of rounds towards each other; 20 rounds narrow the matching distance a hundredfold."""
+_REFITS = 12
+"""Largest number of further rounds, with surfaces fitted again at each distance."""
+_SETTLED = 0.1
+"""Step, in standard uncertainties, below which a pose is settled: it would add 0.5 % to the standard uncertainty."""
+_STILL_MM = 1e-5
+"""Rms shift of the points, mm, that ends the iteration: far below any measurable change."""
 _SPHERE_REACH = 0.25
 """Largest distance between the centres of one sphere in two scans, relative to its diameter."""
 
@@ -104,11 +113,12 @@ class JointRegistration:
         start_std: tuple[float, float] | None,
         sphere_mm: float | None,
         shared: Sequence[dict[str, np.ndarray]] | None = None,
+        least_share: float = ROUNDING,
     ) -> None:
         self.patches, self.markers, self.start = patches, markers, poses
         self.poses = poses.copy()
         self.patterns = [np.zeros(len(each.patterns_mm)) for each in patches]
-        self.start_std, self.sphere_mm = start_std, sphere_mm
+        self.start_std, self.sphere_mm, self.least_share = start_std, sphere_mm, least_share
         self.local_middles = np.array([each.places_mm.mean(axis=0) for each in patches])
         self._start_middles_mm = self.middles_mm
         self.sizes = np.array([rms_distance(each.places_mm, each.places_mm.mean(axis=0)) for each in patches])
@@ -195,7 +205,7 @@ class JointRegistration:
         within = np.linalg.solve(beside, normal[count:, :count])
         reduced = normal[:count, :count] - normal[:count, count:] @ within
         reduced = (reduced + reduced.T) / 2
-        values, vectors, metric = decompose_motions(reduced, spurious)
+        values, vectors, metric = decompose_motions(reduced, spurious, least_share=self.least_share)
         known = values > LEAST_INFORMATION
         ways, strengths = vectors[:, known], values[known]
         open_ways = np.linalg.qr(vectors[:, np.logical_not(known)])[0]
@@ -381,6 +391,55 @@ class JointRegistration:
         return np.hstack([(self.middles_mm - self._start_middles_mm)[1:], turned]).ravel()
 
 
+def approach(
+    joint: JointRegistration, reach_mm: float, names: Sequence[str], progress: Callable[[int], None] = lambda done: None
+) -> float:
+    """Move the poses until they rest, with less and less matching distance; return the last one.
+
+    It starts at ``reach_mm`` and ends at two patch radii. ``progress`` is called with the number of rounds done. Raises
+    EvaluationError if a scan overlaps no other one.
+    """
+    least = 2 * max(each.radius_mm for each in joint.patches)
+    reach = max(reach_mm, least)
+    for done in range(ROUNDS):
+        pairs = joint.collect_evidence(joint.measure_distances(reach))
+        joint.require_connected(list(pairs), names)
+        step = joint.solve(list(pairs.values())).step
+        joint.move(step)
+        progress(done + 1)
+        moved = step[: joint.unknown_poses] / joint.units[: joint.unknown_poses]
+        if reach <= least and np.abs(moved).max() < _STILL_MM:
+            break
+        reach = max(_NARROWER * reach, least)
+    return reach
+
+
+def settle(
+    joint: JointRegistration, reach_mm: float, names: Sequence[str]
+) -> tuple[dict[tuple[int, int], PatchDistances], dict[tuple[int, int], PairEvidence], PoseSolution, np.ndarray]:
+    """Move the poses until they are settled; return distances, evidence, the last solution, and its covariance (U, U).
+
+    Raises EvaluationError if a further step would move a pose by more than its standard uncertainty.
+    """
+    rounds = 0
+    while True:
+        distances = joint.measure_distances(reach_mm, refit=True)
+        pairs = joint.collect_evidence(distances)
+        joint.require_connected(list(pairs), names)
+        solution = joint.solve(list(pairs.values()))
+        covariance = joint.covariance(list(pairs.values()), solution)
+        moves = joint.largest_move(solution, covariance)
+        if moves < _SETTLED or (rounds == _REFITS and moves <= 1):
+            return distances, pairs, solution, covariance
+        if rounds == _REFITS:
+            raise EvaluationError(
+                f"the registration does not converge: the next round would move a scan by {moves:.2g} standard "
+                "uncertainties. Give more accurate initial poses, or scans with more overlap"
+            )
+        joint.move(solution.step)
+        rounds += 1
+
+
 def fit_pair(source: Patches, target: Patches, start: np.ndarray) -> tuple[np.ndarray, PatchDistances] | None:
     """Fit the pose (4, 4) that moves ``source`` onto ``target``; return it and the remaining distances.
 
@@ -393,7 +452,7 @@ def fit_pair(source: Patches, target: Patches, start: np.ndarray) -> tuple[np.nd
         if not (pairs := joint.collect_evidence(joint.measure_distances(reach))):
             return None
         joint.move(joint.solve(list(pairs.values())).step)
-        reach = max(NARROWER * reach, source.radius_mm)
+        reach = max(_NARROWER * reach, source.radius_mm)
     pairs = joint.collect_evidence(joint.measure_distances(reach))
     if not pairs or len(joint.solve(list(pairs.values())).open_directions):
         return None

@@ -18,17 +18,19 @@ import numpy as np
 from uwlts.argument_types import check_arguments
 from uwlts.errors import EvaluationError
 from uwlts.files.reading import log_warnings
-from uwlts.fitting.patches import PatchDistances, surface_patches
+from uwlts.fitting.patches import surface_patches
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Table
 from uwlts.model.short_text import Brief
 from uwlts.registration.coarse_registration import estimate_coarse_poses
 from uwlts.registration.joint_registration import (
     FEWEST_OF_PAIR,
-    NARROWER,
+    ROUNDS,
     JointRegistration,
     PairEvidence,
     PoseSolution,
+    approach,
+    settle,
 )
 from uwlts.registration.marker_spheres import find_markers
 from uwlts.registration.merging import merge_clouds
@@ -39,13 +41,6 @@ from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import PoseFormat, read_poses, write_poses
 from uwlts.storage.repeated_points import find_repeated
 
-_ROUNDS = 60  # largest number; 20 rounds narrow the search radius a hundredfold
-_REFITS = 12
-"""Largest number of further rounds, with surfaces fitted again at each distance."""
-_SETTLED = 0.1
-"""Step, in standard uncertainties, below which a pose is settled: it would add 0.5 % to the standard uncertainty."""
-_STILL_MM = 1e-5
-"""Rms shift of the points, mm, that ends the iteration: far below any measurable change."""
 _SMALLEST = 1e-6
 """Smallest length in mm or angle in deg that is accepted, and the reciprocal of the largest: others are slips."""
 _REACH = 0.05
@@ -303,7 +298,7 @@ def register(
     if (start_std_mm is None) != (start_std_deg is None):
         raise EvaluationError("the uncertainty of the initial poses needs both start_std_mm and start_std_deg")
     scans = _omit_shared_points(scans, names)
-    steps = len(scans) + _ROUNDS
+    steps = len(scans) + ROUNDS
     patches = []
     for number, (name, scan) in enumerate(zip(names, scans, strict=True)):
         try:
@@ -320,22 +315,10 @@ def register(
     std = None if start_std_mm is None or start_std_deg is None else (start_std_mm, float(np.radians(start_std_deg)))
     shared = [{} if scan.uncertainty is None else scan.uncertainty.shared for scan in scans]
     joint = JointRegistration(patches, markers, start, start_std=std, sphere_mm=sphere_mm, shared=shared)
-    least = 2 * max(each.radius_mm for each in patches)
-    reach = least if search else reach_mm or _REACH * float(np.median([_size(scan) for scan in scans]))
-    for done in range(_ROUNDS):
-        pairs = joint.collect_evidence(joint.measure_distances(reach))
-        joint.require_connected(list(pairs), names)
-        step = joint.solve(list(pairs.values())).step
-        joint.move(step)
-        progress(len(scans) + done + 1, steps)
-        if (
-            reach <= least
-            and np.abs(step[: joint.unknown_poses] / joint.units[: joint.unknown_poses]).max() < _STILL_MM
-        ):
-            break
-        reach = max(NARROWER * reach, least)
+    reach = 0.0 if search else reach_mm or _REACH * float(np.median([_size(scan) for scan in scans]))
+    reach = approach(joint, reach, names, lambda done: progress(len(scans) + done, steps))
     progress(steps, steps)
-    distances, pairs, solution, known = _settle(joint, reach, names)
+    distances, pairs, solution, known = settle(joint, reach, names)
     amounts = np.concatenate(joint.patterns)
     covariance = np.zeros((6 * len(scans),) * 2)
     covariance[6:, 6:] = known[: joint.unknown_poses, : joint.unknown_poses]
@@ -370,32 +353,6 @@ def _omit_shared_points(scans: Sequence[PointCloud], names: Sequence[str]) -> li
             scan = replace(scan.select(~repeated), warnings=[*scan.warnings, warning])
         result.append(scan)
     return result
-
-
-def _settle(
-    joint: JointRegistration, reach: float, names: Sequence[str]
-) -> tuple[dict[tuple[int, int], PatchDistances], dict[tuple[int, int], PairEvidence], PoseSolution, np.ndarray]:
-    """Move the poses until they are settled; return distances, evidence, the last solution, and its covariance (U, U).
-
-    Raises EvaluationError if a further step would move a pose by more than its standard uncertainty.
-    """
-    rounds = 0
-    while True:
-        distances = joint.measure_distances(reach, refit=True)
-        pairs = joint.collect_evidence(distances)
-        joint.require_connected(list(pairs), names)
-        solution = joint.solve(list(pairs.values()))
-        covariance = joint.covariance(list(pairs.values()), solution)
-        moves = joint.largest_move(solution, covariance)
-        if moves < _SETTLED or (rounds == _REFITS and moves <= 1):
-            return distances, pairs, solution, covariance
-        if rounds == _REFITS:
-            raise EvaluationError(
-                f"the registration does not converge: the next round would move a scan by {moves:.2g} standard "
-                "uncertainties. Give more accurate initial poses, or scans with more overlap"
-            )
-        joint.move(solution.step)
-        rounds += 1
 
 
 def _pair_fit(

@@ -17,7 +17,7 @@ from uwlts.comparison.ideal_shapes import IdealCylinder, IdealPlane, IdealSphere
 from uwlts.comparison.local_means import ComparisonOptions
 from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
 from uwlts.fitting.point_spacing import number_cubes
-from uwlts.registration.surface_registration import SampledSurface, register_to_surface
+from uwlts.registration.surface_registration import SurfaceSample, register_to_surface
 from uwlts.storage.cloud import STEP, WATER, PointCloud, PointUncertainty
 from uwlts.storage.ply import read_ply
 
@@ -262,9 +262,9 @@ def test_nothing_is_claimed_beyond_the_reference_or_of_shared_noise():
 
 
 def test_too_far_apart_is_refused():
-    points = np.random.default_rng(0).uniform(0, 10, (200, 3)) * [1, 1, 0]
+    points = np.random.default_rng(0).uniform(0, 10, (2000, 3)) * [1, 1, 0]
     with pytest.raises(EvaluationError, match="same frame and unit"):
-        register_to_surface(points + [0, 0, 50], SampledSurface(points, np.tile([0, 0, 1.0], (200, 1))), reach_mm=2)
+        register_to_surface(SurfaceSample(points + [0, 0, 50]), SurfaceSample(points), reach_mm=2)
 
 
 @pytest.fixture(scope="module")

@@ -121,8 +121,8 @@ def test_undetermined_motions_are_translations_and_rotations_about_axes():
 def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):
     """Two rounds from poses that are wrong by 2 mm, where some ten are needed."""
     scans, _, wrong = views(np.random.default_rng(SEED), radius=pitted)
-    monkeypatch.setattr("uwlts.registration.register._ROUNDS", 1)
-    monkeypatch.setattr("uwlts.registration.register._REFITS", 1)
+    monkeypatch.setattr("uwlts.registration.joint_registration.ROUNDS", 1)
+    monkeypatch.setattr("uwlts.registration.joint_registration._REFITS", 1)
     with pytest.raises(EvaluationError, match="does not converge: the next round would move a scan by"):
         uwlts.register(scans, poses=wrong)
 
