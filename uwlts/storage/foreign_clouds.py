@@ -133,8 +133,7 @@ def _write_e57(aside: Path, cloud: PointCloud, colours: Colours, path: Path) -> 
         columns |= dict(zip(COLOURS, colours.T, strict=True))
     if all(numbers.min() >= 0 and numbers.max() < 2**16 for numbers in (cloud.frame, cloud.line)):
         columns |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
-    further = _uncertainty_columns(cloud)
-    write_e57(aside, cloud.points_mm, columns, to=path, time_s=cloud.time_s, further=further)
+    write_e57(aside, cloud.points_mm, columns, to=path)
 
 
 FORMATS = {

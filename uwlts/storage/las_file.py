@@ -148,7 +148,7 @@ def _las_middle(low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
     if not reach <= _REACH_M:
         raise OutputError(
             f"the cloud reaches {reach:.9g} m from its middle, LAZ in steps of {LAZ_STEP_M:g} m "
-            f"only {_REACH_M:.0f} m: write PLY or E57"
+            f"only {_REACH_M:.0f} m: write PLY or HDF5"
         )
     return middle
 

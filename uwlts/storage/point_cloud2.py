@@ -132,7 +132,7 @@ def mcap_content(cloud: PointCloud) -> bytes:
     if (farthest := float(np.abs(cloud.points_mm).max())) > FARTHEST_SINGLE_MM:
         raise OutputError(
             f"the cloud reaches {farthest:.6g} mm from the origin, where the 32-bit numbers of MCAP are coarser than a "
-            "micrometre: write HDF5, PLY, E57 or LAZ, or move the cloud"
+            "micrometre: write HDF5, PLY or LAZ, or move the cloud"
         )
     names = "mcap.writer", "rosbags.typesys"
     mcap, typesys = (optional_library(each, needed_by="MCAP", extra="ros") for each in names)

@@ -225,7 +225,7 @@ def test_what_is_none_is_refused(tmp_path: Path, name: str, message: str):
 
 
 @pytest.mark.parametrize("name", ["a.xyz", "a.ply", "a.las", "a.laz", "a.e57"])
-@pytest.mark.parametrize(("mark", "share"), [(-99.9999, 0.2), (0.0, 0.01), (1e5, 0.003)])
+@pytest.mark.parametrize(("mark", "share"), [(-99.9999, 0.2), (0.0, 0.01), (1.5e4, 0.003)])
 def test_a_height_that_recurs_beyond_chance_is_doubted(tmp_path, name, mark, share):
     """Points without a height have that of the mark, which is outside the others or between them."""
     rng, marked = np.random.default_rng(9), int(share * 5000)
@@ -240,7 +240,7 @@ def test_a_height_that_recurs_beyond_chance_is_doubted(tmp_path, name, mark, sha
     points[rows, 2] = mark
     (said,) = (each for each in warnings() if "have exactly" in each)
     assert said.startswith(f"{marked} of 5000 points have exactly z = ")
-    # Half a step of 32-bit numbers in m below 128 m.
+    # More than half a step of 32-bit numbers in m below 16 m.
     assert float(said.split(" = ")[1].split(":")[0]) == pytest.approx(mark, abs=4e-3)
     points[:, 2] = np.round(points[:, 2] / 10) * 10
     assert not any("have exactly" in each for each in warnings())

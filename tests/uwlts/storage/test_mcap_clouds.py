@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import laspy
 import numpy as np
-import pye57
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -14,7 +13,6 @@ from rosbags.typesys import Stores, get_typestore
 import uwlts
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 from uwlts.storage.cloud_files import write_cloud
-from uwlts.storage.e57_file import write_e57
 
 FIELDS = ("x", "y", "z", "intensity", "frame", "line", "time")
 NUMBERS = {5: "<i4", 7: "<f4", 8: "<f8"}
@@ -104,45 +102,6 @@ def test_laz_has_time_image_and_covariance(cloud, tmp_path):
     assert_same(cloud, table | {a: (1e-3 * cloud.points_mm)[:, k] for k, a in enumerate("xyz")})
 
 
-def test_e57_has_time_image_and_covariance(cloud, tmp_path):
-    write_cloud(tmp_path / "a.e57", cloud)
-    names = {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ", "intensity": "intensity"}
-    names |= {"frame": "columnIndex", "line": "rowIndex", "time": "timeStamp"}
-    names |= {name: f"uwlts:{name}" for name in (f"cov_{'xyz'[i]}{'xyz'[j]}_mm2" for i, j in PAIRS)}
-    table = {name: np.zeros(len(cloud), np.float64) for name in names}
-    with pye57.E57(str(tmp_path / "a.e57")) as file:
-        header, buffers = file.get_header(0), pye57.libe57.VectorSourceDestBuffer()
-        for name, field in names.items():
-            buffers.append(pye57.libe57.SourceDestBuffer(file.image_file, field, table[name], len(cloud), True, True))
-        assert header.points.reader(buffers).read() == len(cloud)
-        start = file.data3d[0]["acquisitionStart"]["dateTimeValue"].value()
-        assert file.image_file.extensionsPrefix(1) == "uwlts"
-    assert table["time"].min() >= 0
-    assert_same(cloud, table | {"time": start + table["time"]})
-
-
-def test_e57_gives_its_times_back(cloud, tmp_path):
-    for number, times in enumerate((cloud.time_s, cloud.time_s - 1.7e9 - 0.3, None)):
-        path = tmp_path / f"{number}.e57"
-        write_cloud(path, replace(cloud, time_s=times))
-        again = uwlts.read(path)
-        np.testing.assert_allclose(again.points_mm, cloud.points_mm, atol=2e-5)
-        assert (again.time_s is None) == (times is None)
-        if times is not None:
-            # Whole seconds and a fraction as doubles: the difference and the sum round by 2e-16 of a few seconds.
-            np.testing.assert_allclose(again.time_s, times, rtol=0, atol=1e-14)
-
-
-def test_e57_times_that_are_marked_invalid_are_not_known(cloud, tmp_path):
-    columns = {"isTimeStampInvalid": (np.arange(len(cloud)) % 7 == 0).astype(np.uint8)}
-    write_e57(tmp_path / "a.e57", cloud.points_mm, columns, to=tmp_path / "a.e57", time_s=cloud.time_s)
-    assert uwlts.read(tmp_path / "a.e57").time_s is None
-    columns = {"cartesianInvalidState": columns["isTimeStampInvalid"]}
-    write_e57(tmp_path / "b.e57", cloud.points_mm, columns, to=tmp_path / "b.e57", time_s=cloud.time_s)
-    placed = np.arange(len(cloud)) % 7 > 0
-    np.testing.assert_array_equal(uwlts.read(tmp_path / "b.e57").time_s, cloud.time_s[placed])
-
-
 def test_ply_has_time_image_and_covariance(cloud, tmp_path):
     cloud.save(tmp_path / "a.full.ply")
     again = uwlts.read(tmp_path / "a.full.ply")
@@ -160,11 +119,12 @@ def test_times_before_zero_are_refused(cloud, tmp_path):
 
 def test_far_clouds_keep_their_micrometres(cloud, tmp_path):
     far = replace(cloud, points_mm=cloud.points_mm + [5e6, 0, 0], uncertainty=None)
-    write_cloud(tmp_path / "a.e57", far)
-    # 64 bits at 5 km.
-    np.testing.assert_allclose(uwlts.read(tmp_path / "a.e57").points_mm, far.points_mm, atol=2e-9)
-    with pytest.raises(uwlts.Error, match="coarser than a micrometre"):
-        write_cloud(tmp_path / "a.mcap", far)
+    write_cloud(tmp_path / "a.laz", far)
+    # Half a step of 0.1 um.
+    np.testing.assert_allclose(uwlts.read(tmp_path / "a.laz").points_mm, far.points_mm, atol=6e-5)
+    for name in ("a.mcap", "a.e57"):
+        with pytest.raises(uwlts.Error, match="coarser than a micrometre"):
+            write_cloud(tmp_path / name, far)
 
 
 def test_mcap_gives_points_times_and_images_back(cloud, tmp_path):
