@@ -634,6 +634,32 @@ def test_who_looks_closer_sees_all_points_there(desk, page):
 
 
 @pytest.mark.slow
+def test_a_second_operator_and_a_reload_leave_a_scan_alone(desk, page, chromium, served):
+    """Both pages control the same scan, and both say what happens."""
+    scanning(page)
+    with watched(chromium.new_page()) as other:
+        other.set_default_timeout(SLOW_MS)
+        other.goto(desk.operator_address)
+        shows(other, "of 60")
+        for name, button in (("Scan", "start"), ("Stage", "home")):
+            tab(other, name)
+            assert other.get_by_role("button", name=button, exact=True).is_disabled()
+        page.reload()
+        shows(page, "of 60")
+        tab(other, "Scan")
+        press(other, "pause")
+        says(page, "paused, the laser is off")
+        assert dark(served)
+        tab(page, "Scan")
+        press(page, "resume")
+        says(other, "wrote scan.h5")
+        with Capture(desk.folder / "scan.h5") as scan:
+            assert len(scan) == 60
+        press(other, "start")
+        says(page, "scan.h5 exists")
+
+
+@pytest.mark.slow
 def test_ctrl_c_ends_a_scan_in_the_dark(desk, page, served):
     scanning(page)
     assert desk.end()[0] == 0

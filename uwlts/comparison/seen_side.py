@@ -42,9 +42,7 @@ def orient_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     result = faces.copy()
     result[turn] = faces[turn][:, ::-1]
     corners = vertices[result] - vertices[faces].mean(axis=(0, 1))
-    if (count == 2).all() and np.linalg.det(corners).sum() < 0:
-        return result[:, ::-1]
-    return result
+    return result[:, ::-1] if (count == 2).all() and np.linalg.det(corners).sum() < 0 else result
 
 
 def select_seen_side(

@@ -83,9 +83,7 @@ class PageAccess:
             if parts.scheme not in ("http", "https") or parts.netloc.lower() not in own:
                 return f"requests of other sites ({origin}) are refused"
         sites, modes = headers.getlist("Sec-Fetch-Site"), headers.getlist("Sec-Fetch-Mode")
-        if foreign & set(sites) and modes != ["navigate"]:
-            return "requests of other sites are refused"
-        return None
+        return "requests of other sites are refused" if foreign & set(sites) and modes != ["navigate"] else None
 
     def _is_own(self, host: str) -> bool:
         """Return whether a Host, with or without port, is this page's; port forwarding may change the port."""

@@ -20,6 +20,7 @@ from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.propagation import jackknife
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
+from uwlts.model.media import water_absorption_per_m
 from uwlts.model.phase_functions import PetzoldAverage, PhaseFunction
 from uwlts.model.sensor import CaptureHeader
 from uwlts.optics.fitness import check_fits
@@ -70,6 +71,9 @@ faults it is 1.4 times that of the grains at most (seeds 300, 301 and 307 of doc
 303, with faults, were looked at before it was chosen."""
 _HALO_MISFIT = 0.05
 """Largest rms of residuals beside the stripe, in the brightest light there; twice the largest on the same captures."""
+_MOST_COLOUR_PER_M, _COLOUR_PER_NM = 39.0, 0.014
+"""Absorption at 380 nm beyond that of water, and its decrease. The brownest of 20 Finnish and Estonian lakes has 19.5/m
+(Sipelgas et al. 2003, Hydrology Research 34:361); twice as much leaves room for particles. At 635 nm it is 1.1/m."""
 _AS_DESCRIBED = np.zeros(2)
 _FAN_STD = 0.1
 """Standard uncertainty of the described power along the fan, relative, at its edges: line lasers are specified so."""
@@ -235,6 +239,7 @@ class _Evidence:
     distance_mm: float
     path_mm: float
     dark_e: float
+    natural_per_m: tuple[float, float]
     nodes: np.ndarray
     tails: CubicSpline
     within: CubicSpline
@@ -289,6 +294,7 @@ class _Evidence:
             * float(np.median(images.exposure_ms))
             * detector.dark_current_e_per_s
             * detector.dark_current_growth(),
+            natural_per_m=_natural_absorption(header),
             nodes=nodes,
             tails=CubicSpline(nodes, np.array(tails), axis=1),
             within=CubicSpline(nodes, np.array(within), axis=1),
@@ -405,7 +411,9 @@ class _Evidence:
         level, brightest = cells.mean(axis=0), float(halo[:, 0].mean())
         by_noise = between / np.sqrt([_CELL_PX, halo.shape[1]])
         most_of_shape, most_of_level = np.hypot(_HALO_MISFIT * brightest, by_noise).tolist()
-        excess = (np.array(_NAMES) == "scattering_per_m") - 1.0 * (np.array(_NAMES) == "attenuation_per_m")
+        difference = (np.array(_NAMES) == "attenuation_per_m") - 1.0 * (np.array(_NAMES) == "scattering_per_m")
+        absorption, (least, most) = difference @ whole, self.natural_per_m
+        excess = max(least - absorption, absorption - most, 0.0)
         shape_dn, level_dn = float(np.std(cells - level)), float(np.std(level))
         return (
             PartFit(
@@ -427,9 +435,10 @@ class _Evidence:
                 ("scattering_per_m", "background_dn"),
             ),
             PartFit(
-                "scattering as a part of attenuation",
-                max(excess @ whole, 0.0) / (SIGNIFICANT * math.sqrt(excess @ covariance @ excess)),
-                "it is above the attenuation; translucent surface, or another reflectance with the path?",
+                "absorption of the water",
+                excess / (SIGNIFICANT * math.sqrt(difference @ covariance @ difference)),
+                f"attenuation less scattering is {absorption:.2g}/m, in natural water {least:.2g} to {most:.2g}/m; "
+                "translucent surface, or another reflectance with the path?",
                 ("power_reflectance_mw", "attenuation_per_m", "scattering_per_m", "background_dn"),
             ),
         )
@@ -443,6 +452,14 @@ def _phase(header: CaptureHeader) -> Callable[[np.ndarray], np.ndarray]:
         if part.phase.name != "molecular":
             particles = part.phase
     return particles.per_sr
+
+
+def _natural_absorption(header: CaptureHeader) -> tuple[float, float]:
+    """Return the least and largest absorption of natural water, 1/m; of a medium with a described absorption, any."""
+    if header.medium.kind not in ("fresh", "sea") or header.medium.absorption_per_m is not None:
+        return 0.0, math.inf
+    pure = water_absorption_per_m(wavelength_nm=header.sensor.laser.wavelength_nm)
+    return pure, pure + _MOST_COLOUR_PER_M * math.exp(-_COLOUR_PER_NM * (header.sensor.laser.wavelength_nm - 380.0))
 
 
 def _fit_robustly(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

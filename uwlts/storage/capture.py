@@ -171,9 +171,7 @@ def _what_is_wrong(error: Exception) -> str:
     """Return HDF5's message about a file that it cannot open; the two most frequent ones in plain English."""
     if found := re.search(r"truncated file: eof = (\d+).*stored_eof = (\d+)", str(error)):
         return f"it has {int(found[1]):,} of its {int(found[2]):,} bytes; copy it again"
-    if "file signature not found" in str(error):
-        return "it is not an HDF5 file"
-    return f"HDF5 reports: {error}"
+    return "it is not an HDF5 file" if "file signature not found" in str(error) else f"HDF5 reports: {error}"
 
 
 class Capture(AbstractContextManager["Capture"]):

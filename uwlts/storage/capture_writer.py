@@ -96,12 +96,12 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
         with self._storage():
             refuse_unsuitable(self.path, overwrite=overwrite, endings=CAPTURES)
-            if self._part.exists() and not (resume or overwrite):
-                raise OutputError(
-                    f"{self._part} is left from an interrupted run; give `resume` to continue it or `overwrite`"
-                )
             if self._part.exists():
                 _lock(self._part).close()
+                if not (resume or overwrite):
+                    raise OutputError(
+                        f"{self._part} is left from an interrupted run; give `resume` to continue it or `overwrite`"
+                    )
             with self._open_part() if resume and self._part.exists() else nullcontext(()) as unfinished:
                 self._begin(unfinished)
             # Without a lock, so that readers cannot stop a running recording.
@@ -295,8 +295,11 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         with self._locked, self._storage():
+            empty = len(self) == 0
             self._file.close()
-            if kind is None:
+            if kind is not None and empty:
+                self._part.unlink()
+            elif kind is None:
                 if self._plan is not None:
                     forget_plan(self._part)
                 _truncate(self._part)

@@ -87,9 +87,7 @@ def _count(numbers: np.ndarray) -> Counted | None:
     values, occurrences = np.unique(steps, return_counts=True)
     step = int(values[np.argmax(occurrences)])
     in_time = numbers[-1] >= 10 ** (_OF_CLOCK - 1) and numbers[-1] // 100 > numbers[0] // 100
-    if (steps % step).any() or (in_time and (numbers % 100 < 60).all()):
-        return None
-    return Counted(numbers, step)
+    return None if (steps % step).any() or (in_time and (numbers % 100 < 60).all()) else Counted(numbers, step)
 
 
 def name_gaps(names: Sequence[str], counted: Counted | None) -> list[str]:

@@ -96,9 +96,7 @@ def group_brackets(capture: BracketImages) -> list[np.ndarray]:
         return alone
     places = [place[np.argsort(exposure[place], kind="stable")] for place in places]
     steps = [exposure[place[1:]] < _Rule.exposure_slack * LEAST_BRACKET_STEP * exposure[place[:-1]] for place in places]
-    if exposure.min() <= 0 or np.concatenate(steps).any():
-        return alone
-    return [laser[place] for place in places]
+    return alone if exposure.min() <= 0 or np.concatenate(steps).any() else [laser[place] for place in places]
 
 
 def fuse_brackets(capture: BracketImages) -> Iterator[tuple[int, np.ndarray | Stripe, float]]:

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 import uwlts
 from uwlts.model.phase_functions import HenyeyGreenstein, PetzoldAverage
-from uwlts.radiometry.fit import _NAMES, _Evidence
+from uwlts.radiometry.fit import _NAMES, _Evidence, _natural_absorption
 from uwlts.radiometry.followed_sensor import follow_sensor
 from uwlts.radiometry.scattering import STEP_PX, HaloKernel
 from uwlts.radiometry.stripe_images import BLOCKS, GROUP_LINES, TAIL_PX, StripeImages
@@ -20,6 +20,8 @@ from uwlts.radiometry.stripe_images import BLOCKS, GROUP_LINES, TAIL_PX, StripeI
 NODES = np.array([0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 1.0, 2.0, 6.0])
 B, C, BACKGROUND, WIDTH, GROUPS = 0.3, 0.9, 70.0, 21, 400
 GRAIN, NOISE_DN = 0.1, 0.3
+NATURAL = (0.301, 1.399)
+"""Absorption of pure water at 635 nm (Pope and Fry), and with 39/m of colour at 380 nm, less by exp(-0.014 / nm)."""
 PATHS = ((320.0, 0.4), (420.0, 0.5))
 
 
@@ -61,7 +63,7 @@ def draw(rng: np.random.Generator, phase: type = PetzoldAverage) -> _Evidence:
     known = [np.repeat(each[None], BLOCKS, axis=0) for each in halos(PetzoldAverage)]
     return _Evidence(
         images=images, sheet_per_px=np.ones(BLOCKS), blur_var=np.zeros(BLOCKS), model=model, fan=fan, paths=paths,
-        distance_mm=400.0, path_mm=750.0, dark_e=0.0, nodes=NODES,
+        distance_mm=400.0, path_mm=750.0, dark_e=0.0, natural_per_m=NATURAL, nodes=NODES,
         tails=CubicSpline(NODES, known[0], axis=1), within=CubicSpline(NODES, known[1], axis=1),
     )  # fmt: skip
 
@@ -103,6 +105,19 @@ def test_what_is_not_assumed_does_not_fit():
     assert water > 1 > max(others)
     light, _, background, _ = misfits(add_light(evidence, rng.normal(0.0, 1.5, (BLOCKS, 1))))
     assert background > 1 > light
+
+
+def test_a_reflectance_with_the_path_shows_if_no_natural_water_absorbs_so_much():
+    """The light doubles or halves over the 260 mm of path: the attenuation changes by ln 2 / 0.26 m = 2.7/m."""
+    sensor = uwlts.load_sensor("thesis-small")
+    headers: list[Any] = [SimpleNamespace(sensor=sensor, medium=sensor.medium(name)) for name in ("water", "air")]
+    water, air = map(_natural_absorption, headers)
+    assert water == pytest.approx(NATURAL, abs=2e-3) and air == (0.0, math.inf)
+    evidence = draw(np.random.default_rng(6))
+    doubled = 2 ** ((evidence.paths - 750) / 260)
+    for change in (doubled, 1 / doubled):
+        light, *_, absorption = misfits(add_light(evidence, np.zeros(()), change))
+        assert absorption > 1 > light
 
 
 def test_another_phase_function_is_not_noticed_from_the_halo():

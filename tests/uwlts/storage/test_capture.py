@@ -354,6 +354,12 @@ def test_a_plan_is_kept_while_it_is_not_fulfilled(tmp_path: Path):
     assert b"secret" not in path.read_bytes()
 
 
+def test_a_recording_without_a_frame_leaves_nothing(tmp_path: Path):
+    with pytest.raises(KeyboardInterrupt), CaptureWriter(tmp_path / "a.h5", a_header(), dtype=np.uint8):
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_two_recordings_at_a_time_are_refused(tmp_path: Path):
     """Otherwise the second writer would mistake the part of the first for an interrupted one."""
     path = tmp_path / "a.h5"
@@ -362,10 +368,11 @@ def test_two_recordings_at_a_time_are_refused(tmp_path: Path):
         code = (
             "import sys, numpy as np\n"
             "from tests.uwlts.storage.test_capture import *\n"
-            "CaptureWriter(sys.argv[1], a_header(), dtype=np.uint8, resume=sys.argv[2] == 'resume', overwrite=True)"
+            "how = {each: True for each in sys.argv[2:]}\n"
+            "CaptureWriter(sys.argv[1], a_header(), dtype=np.uint8, **how)"
         )
-        for how in ("resume", "overwrite"):
-            second = subprocess.run([sys.executable, "-c", code, path, how], capture_output=True, text=True, cwd=ROOT)
+        for how in (["resume"], ["overwrite"], []):
+            second = subprocess.run([sys.executable, "-c", code, path, *how], capture_output=True, text=True, cwd=ROOT)
             assert "another process is writing" in second.stderr
         writer.append(a_frame(1))
     with Capture(path) as capture:
