@@ -1,6 +1,6 @@
 """Radiometry where an assumption does not hold: what is said, and which values are wrong in silence.
 
-python -m docs.studies.radiometry_faults [SEEDS] [--first 505] [--folder FOLDER] [--write]
+python -m docs.studies.radiometry_faults [SEEDS] [--first 500] [--folder FOLDER] [--write]
 """
 
 import math
@@ -125,7 +125,7 @@ def measure(name: str, seed: int, folder: Path) -> Outcome:
     return Outcome(tuple(part.part for part in found.parts if part.misfit > 1), states)
 
 
-def main(seeds: int = 5, *, first: int = 505, folder: Path | None = None, write: bool = False) -> None:
+def main(seeds: int = 5, *, first: int = 500, folder: Path | None = None, write: bool = False) -> None:
     """Print how often each fault is said, and each value right or wrong in silence."""
     with TemporaryDirectory() as temporary:
         place = Path(temporary) if folder is None else folder

@@ -57,9 +57,7 @@ _ROUNDS = 3  # between tail and brightness, which depend little on each other
 _SCATTERING_STD = 0.04
 """Relative standard uncertainty of the scattering coefficient by the model of the halo, for a known phase function.
 
-Both relative uncertainties were chosen on the drawn captures 0 to 11 of docs/studies/radiometry.py, and are judged on
-others.
-"""
+Both relative uncertainties were chosen on the captures 0 to 11 of docs/studies/radiometry.py, and judged on others."""
 _WIDTH_STD = 0.01
 """Relative standard uncertainty of the sheet's radius by the neglected light that is scattered by less than a pixel."""
 _LEAST_SIGMA_PX = 0.5
@@ -67,8 +65,7 @@ _LEAST_SIGMA_PX = 0.5
 _CELL_PX = 6  # of the tail, whose mean residuals are judged; the halo falls by a third there at most
 _GRAINS, _LIGHT_MISFIT = 2.0, 0.03
 """Largest scatter of the light along the stripe: in that of its grains, and relative for normals and noise. Without
-faults it is 1.4 times that of the grains at most (seeds 300, 301 and 307 of docs/studies/radiometry.py). Seeds 302 and
-303, with faults, were looked at before it was chosen."""
+faults it is 1.4 times that of the grains at most (docs/studies/radiometry.py, seeds 300 to 307; judged on 500 on)."""
 _HALO_MISFIT = 0.05
 """Largest rms of residuals beside the stripe, in the brightest light there; twice the largest on the same captures."""
 _MOST_COLOUR_PER_M, _COLOUR_PER_NM = 39.0, 0.014
@@ -156,7 +153,10 @@ def fit_radiometry(
         whole, covariance = evidence.estimate_with_covariance()
         with nullcontext() if repeats is None else open_capture(repeats) as again:
             noise = measure_noise(scan if again is None else again)
-        parts = (*evidence.judge(whole, covariance), *([] if noise is None else [noise.fit]))
+        parts = (
+            *evidence.judge(whole, covariance, _natural_absorption(scan.header)),
+            *([] if noise is None else [noise.fit]),
+        )
         doubtful = {name for part in parts if part.misfit > 1 for name in part.names}
         log_warnings(scan.path.name, [f"the fit of its {part.line()}" for part in parts if part.misfit > 1])
         determined = math.sqrt(covariance[1, 1]) < _KNOWN_ATTENUATION and "attenuation_per_m" not in doubtful
@@ -239,7 +239,6 @@ class _Evidence:
     distance_mm: float
     path_mm: float
     dark_e: float
-    natural_per_m: tuple[float, float]
     nodes: np.ndarray
     tails: CubicSpline
     within: CubicSpline
@@ -294,7 +293,6 @@ class _Evidence:
             * float(np.median(images.exposure_ms))
             * detector.dark_current_e_per_s
             * detector.dark_current_growth(),
-            natural_per_m=_natural_absorption(header),
             nodes=nodes,
             tails=CubicSpline(nodes, np.array(tails), axis=1),
             within=CubicSpline(nodes, np.array(within), axis=1),
@@ -394,8 +392,8 @@ class _Evidence:
         )  # fmt: skip
         return float(found.x), background_and_misfit(float(found.x))[0]
 
-    def judge(self, whole: np.ndarray, covariance: np.ndarray) -> tuple[PartFit, ...]:
-        """Judge the fit of light along the stripe, halo and background, and the sense of the water, for `_NAMES`."""
+    def judge(self, whole: np.ndarray, covariance: np.ndarray, natural: tuple[float, float]) -> tuple[PartFit, ...]:
+        """Judge the fit of light along the stripe, halo and background, and the absorption, for `_NAMES`."""
         value = dict(zip(_NAMES, whole.tolist(), strict=True))
         fitted = value["scattering_per_m"], value["background_dn"]
         rest = _fit_robustly(*self._brightness(*fitted))[1]
@@ -411,9 +409,8 @@ class _Evidence:
         level, brightest = cells.mean(axis=0), float(halo[:, 0].mean())
         by_noise = between / np.sqrt([_CELL_PX, halo.shape[1]])
         most_of_shape, most_of_level = np.hypot(_HALO_MISFIT * brightest, by_noise).tolist()
-        difference = (np.array(_NAMES) == "attenuation_per_m") - 1.0 * (np.array(_NAMES) == "scattering_per_m")
-        absorption, (least, most) = difference @ whole, self.natural_per_m
-        excess = max(least - absorption, absorption - most, 0.0)
+        less = (np.array(_NAMES) == "attenuation_per_m") - 1.0 * (np.array(_NAMES) == "scattering_per_m")
+        absorption, (least, most) = less @ whole, natural
         shape_dn, level_dn = float(np.std(cells - level)), float(np.std(level))
         return (
             PartFit(
@@ -436,7 +433,7 @@ class _Evidence:
             ),
             PartFit(
                 "absorption of the water",
-                excess / (SIGNIFICANT * math.sqrt(difference @ covariance @ difference)),
+                max(least - absorption, absorption - most, 0.0) / (SIGNIFICANT * math.sqrt(less @ covariance @ less)),
                 f"attenuation less scattering is {absorption:.2g}/m, in natural water {least:.2g} to {most:.2g}/m; "
                 "translucent surface, or another reflectance with the path?",
                 ("power_reflectance_mw", "attenuation_per_m", "scattering_per_m", "background_dn"),

@@ -41,8 +41,7 @@ _NOISE_SAMPLED = 100_000
 _BESIDE_NOISE, _BESIDE_OTHERS, _USUAL = 2.0, 5.0, 0.9
 """Strange distance of a stripe from where its neighbours let expect it, in standard deviations of centres, and in the
 largest of the usual fraction of images. Chosen on ten scans of thesis-small, at most 0.4 of the noise, and on exchanged
-images of spheres, from 2.4. Of 300 drawn surfaces that are rough along the stage alone, 5 are reported. Five scans
-rendered later have at most 0.3."""
+images of spheres, from 2.4. Of 300 drawn surfaces that are rough along the stage alone, 5 are reported."""
 
 
 def reconstruct(
@@ -277,10 +276,10 @@ def reconstruct_stripes(
 
 
 def _doubt_images(stripes: CaptureStripes, *, by_stage: bool) -> list[str]:
-    """Return warnings of images with exactly the stripe of the one before, which noise does not allow.
+    """Return warnings of images with exactly the stripe of the one before, and of those out of place if ``by_stage``.
 
-    If the stage moves the sensor, also of images that are out of place. On most lines, their stripe is neither between
-    those of its neighbours nor on the straight line through the two images before or after, as at a ridge.
+    On most lines, their stripe is neither between those of its neighbours nor on the straight line through the two
+    images before or after, as at a ridge.
     """
     first = np.flatnonzero(np.diff(stripes.frame)) + 1
     frames = stripes.frame[np.append(0, first)]

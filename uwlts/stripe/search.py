@@ -363,9 +363,7 @@ def _window_offset(peak: Peak, size: int, rules: SearchRules) -> int:
     to_end = np.float32(0.5 * (size - 1))
     offset = peak.middle - to_end
     outside = abs(offset) + peak.reach > to_end - WINDOW_RULE.flank + np.float32(0.5)
-    if (outside or not peak.closed) and peak.height >= rules.fine:
-        return int(np.rint(offset))
-    return 0
+    return int(np.rint(offset)) if (outside or not peak.closed) and peak.height >= rules.fine else 0
 
 
 @compiled_inline

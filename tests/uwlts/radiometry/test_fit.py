@@ -63,7 +63,7 @@ def draw(rng: np.random.Generator, phase: type = PetzoldAverage) -> _Evidence:
     known = [np.repeat(each[None], BLOCKS, axis=0) for each in halos(PetzoldAverage)]
     return _Evidence(
         images=images, sheet_per_px=np.ones(BLOCKS), blur_var=np.zeros(BLOCKS), model=model, fan=fan, paths=paths,
-        distance_mm=400.0, path_mm=750.0, dark_e=0.0, natural_per_m=NATURAL, nodes=NODES,
+        distance_mm=400.0, path_mm=750.0, dark_e=0.0, nodes=NODES,
         tails=CubicSpline(NODES, known[0], axis=1), within=CubicSpline(NODES, known[1], axis=1),
     )  # fmt: skip
 
@@ -72,7 +72,7 @@ def misfits(evidence: _Evidence) -> list[float]:
     """Return the misfits of light, halo, background and water; the estimates have 5 % and 0.05."""
     whole = evidence.estimate(np.ones(BLOCKS, bool))
     std = np.hypot(0.05 * whole, 0.05)
-    return [part.misfit for part in evidence.judge(whole, np.diag(std**2))]
+    return [part.misfit for part in evidence.judge(whole, np.diag(std**2), NATURAL)]
 
 
 def add_light(evidence: _Evidence, tail: np.ndarray, stripe: np.ndarray | float = 1.0) -> _Evidence:

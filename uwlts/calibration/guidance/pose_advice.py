@@ -152,9 +152,7 @@ def place_words(x: float, y: float) -> str:
     across = "left" if x < 0.4 else "right" if x > 0.6 else ""
     if 0.4 <= y <= 0.6:
         return across or "middle"
-    if across:
-        return f"{'upper' if y < 0.4 else 'lower'} {across}"
-    return "top" if y < 0.4 else "bottom"
+    return f"{'upper' if y < 0.4 else 'lower'} {across}" if across else ("top" if y < 0.4 else "bottom")
 
 
 def tilts_rad(pose: np.ndarray) -> tuple[float, float]:

@@ -131,12 +131,10 @@ def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple
 def _on_plane(
     points: np.ndarray, seen: np.ndarray, to_base: np.ndarray, normal: np.ndarray, sheet: np.ndarray
 ) -> np.ndarray | None:
-    """Move points along the sheet's z axis onto the plane through ``seen``; None if it is too steep to be visible."""
+    """Move points along the sheet's z axis onto the plane through ``seen``; None if it is steeper than 60 deg."""
     inside, down = normal @ to_base, sheet[:3, 2]
     steep = float(inside @ down)
-    if abs(steep) < 0.5:  # 60 deg
-        return None
-    return points - np.outer((points - seen) @ inside / steep, down)
+    return None if abs(steep) < 0.5 else points - np.outer((points - seen) @ inside / steep, down)  # 60 deg
 
 
 def require_determined(covariance: np.ndarray, weak: Sequence[str], advised: NextPose | None = None) -> None:
