@@ -49,6 +49,10 @@ test test-full: style
 	-@$(WITH_BROWSER)
 	@# Nothing runs beside the tests: many check times, also on a slow machine.
 	@$(PYTHON) -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS); failed=$$?; \
+	if [ $$failed = 1 ]; then \
+		echo "Tests that failed run once more, alone. Who passes only now depends on what runs beside it:"; \
+		$(PYTHON) -m pytest -v --last-failed --maxfail=4 $(PYTEST_OPTIONS); failed=$$?; \
+	fi; \
 	for name in $(AFTERWARDS); do $(BY_ITSELF) $$name || failed=$$?; done; exit $$failed
 
 # Compiled loops are kept apart: both environments would replace those of the other.

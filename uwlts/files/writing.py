@@ -15,6 +15,8 @@ from uwlts.argument_types import refuse_input
 from uwlts.errors import OutputError
 from uwlts.files.reading import open_regular, shorten
 
+_incomplete: set[Path] = set()
+
 
 @contextmanager
 def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
@@ -35,6 +37,7 @@ def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -
     target = Path(os.path.realpath(path))
     _require_suitable(target, overwrite=overwrite)
     aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
+    _incomplete.add(aside)
     try:
         # Not tempfile, whose files are private (mode 0600): the finished file would be, too.
         os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -48,6 +51,13 @@ def write_atomically(path: str | os.PathLike[str], *, overwrite: bool = False) -
     except OSError as error:
         raise OutputError(_cannot_write(target, error)) from error
     finally:
+        aside.unlink(missing_ok=True)
+        _incomplete.discard(aside)
+
+
+def remove_incomplete() -> None:
+    """Remove the temporary files of this process, before it ends regardless of the threads that write them."""
+    for aside in tuple(_incomplete):
         aside.unlink(missing_ok=True)
 
 

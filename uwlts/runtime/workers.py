@@ -27,6 +27,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.errors import Error, SetupError
+from uwlts.files.writing import remove_incomplete
 from uwlts.runtime.interrupts import preserve_interrupts
 from uwlts.runtime.optional_library import pip_install, read_requirements
 
@@ -39,7 +40,7 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEX
 _STARTING = threading.Lock()  # the environment belongs to all threads
 
 _GRACE_S = 5.0
-"""Time for a stopped process to clean up its files; afterwards it removes incomplete ones."""
+"""Time for a stopped process to clean up; afterwards its incomplete files are removed and it ends."""
 _LEAVE_S = 5.0
 """Further time, for a busy machine, before the process is killed."""
 
@@ -383,6 +384,7 @@ def _end_when_stopped(signals: socket.socket) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
             break
     time.sleep(_GRACE_S)
+    remove_incomplete()
     os._exit(1)
 
 

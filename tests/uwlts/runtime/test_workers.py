@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -46,13 +47,11 @@ def linger(folder, job, send):
 
 
 def hold_on(job, send):
-    """Wait regardless of requests to stop."""
-    send(job)
-    while True:
-        try:
-            time.sleep(60)
-        except KeyboardInterrupt:
-            send("no")
+    """Wait, also after a request to stop."""
+    with suppress(KeyboardInterrupt):
+        send(job)
+        time.sleep(60)
+    time.sleep(60)
 
 
 @pytest.fixture(autouse=True)
