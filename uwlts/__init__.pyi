@@ -26,6 +26,7 @@ from .optics.design_table import design as design
 from .optics.nominal import nominal as nominal
 from .radiometry.fit import fit_radiometry as fit_radiometry
 from .radiometry.result import Radiometry as Radiometry
+from .recalibration.recalibrate import recalibrate as recalibrate
 from .reconstruction.reconstruct import reconstruct as reconstruct
 from .reconstruction.verify import verify as verify
 from .registration.register import register as register

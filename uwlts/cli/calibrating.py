@@ -130,6 +130,30 @@ def refresh(
     wrote([*changes, *advice_lines(found.calibration)], found.warnings, path)
 
 
+@command_from(app, uwlts, "recalibrate", job="Calibrate", shortcuts=STRIPE)
+def recalibrate(
+    call: Call,
+    *,
+    out: Annotated[
+        Path | None, a_file(".json"), Parameter(help="Calibration to write. Without it, the passes only check the old one.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Example: uwlts recalibrate a.h5 b.h5 c.h5 --calibration old.json --poses passes.csv --pose-std-mm 0.01
+    --pose-std-deg 0.005 --out new.json
+
+    The exit code is 1, and no calibration is written, if the passes contradict each other or the old calibration.
+    """
+    found = call()
+    show(found.lines())
+    warn(*found.doubts)
+    if found.doubts:
+        sys.exit(1)
+    if out is not None:
+        found.calibration.save(out, overwrite=overwrite)
+        wrote([], [], out)
+
+
 @command_from(app, uwlts, "calibrate_polynomials", job="Calibrate", shortcuts=STRIPE)
 def polynomials(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) -> None:
     """Example: uwlts polynomials --captures target-water.h5 --out polynomials.json"""

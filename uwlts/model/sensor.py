@@ -580,6 +580,8 @@ class Uncertainty(Description):
     - ``step_height_mm``: height of a step standard.
     - ``tangential``: the lens's coefficients p1 and p2.
     - ``sheet_thickness``: thickness of the laser sheet, relative.
+    - ``sheet_offset_mm``, ``sheet_turn_deg``: position and directions of the sheet as built, where no image determines
+      them (`uwlts recalibrate` from a description).
     - ``focal_length``: relative error of the focal length, of a camera that was calibrated before. Default: unknown,
       since lens names are rounded and focusing changes it.
     """
@@ -602,6 +604,8 @@ class Uncertainty(Description):
     step_height_mm: Positive = 0.01
     tangential: NotNegative = 5e-4
     sheet_thickness: NotNegative = 0.1
+    sheet_offset_mm: Positive = 2.0
+    sheet_turn_deg: Positive = 0.5
     focal_length: Positive | None = None
 
     def scaled(self, factor: float) -> "Uncertainty":

@@ -171,19 +171,13 @@ def point_uncertainty(
     pose = of_sensor[:, :3, :3]
     posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
     pose_of = np.where(posed, pose, np.eye(3))
-    found = require_joint(calibration).covariance_matrix()
-    root = np.zeros((len(known.covariance), 1 + len(found)))
-    # Variance added by the medium's index: its drift, or its full variance in a medium without calibration.
-    root[:, 0] = np.sqrt(np.maximum(np.diag(known.covariance) - np.pad(np.diag(found), (0, len(root) - len(found))), 0))
-    root[: len(found), 1:] = CovarianceRoot.from_covariance(found).root
     by_stage_alone = ~posed[:, 0, 0]
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
-    by_stage = np.vstack([stage_components(known, calibration, header, root), np.zeros(3)])
-    root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
+    root, by_stage = independent_components(known, calibration, header)
     frame_by = -known.frame_by if mount_by is None else _rotate_to_sensor(mount_by, header)
     rigid = frame_by @ root[: frame_by.shape[1]]
-    rigid[0, -1] = _window_shift_std_mm(sensor) if mount_by is None else 0.0
+    rigid[0, -1] = window_shift_std_mm(sensor) if mount_by is None else 0.0
     exact = partial(_derivatives, known, root, rigid)
     of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
     key = None if digest is None else ("uncertainty", digest, known.view, *of_estimate)
@@ -274,7 +268,24 @@ def _fill_errors(
             sums[m, n, 0], sums[m, n, 1], sums[m, n, 2] = value[0, 1 + m], value[1, 1 + m], value[2, 1 + m]
 
 
-def _window_shift_std_mm(sensor: Sensor) -> float:
+def independent_components(
+    known: StoredEstimate, calibration: Calibration, header: CaptureHeader
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the independent error components of an estimate and a stage.
+
+    They are changes of the parameters (P, M) and shifts (M, 3) of a point per mm of stage travel, in the OCS. The first
+    is the additional error of the medium's index, by its drift or in a medium without calibration. The last ones change
+    no parameter.
+    """
+    found = require_joint(calibration).covariance_matrix()
+    root = np.zeros((len(known.covariance), 1 + len(found)))
+    root[:, 0] = np.sqrt(np.maximum(np.diag(known.covariance) - np.pad(np.diag(found), (0, len(root) - len(found))), 0))
+    root[: len(found), 1:] = CovarianceRoot.from_covariance(found).root
+    by_stage = np.vstack([stage_components(known, calibration, header, root), np.zeros(3)])
+    return np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))]), by_stage
+
+
+def window_shift_std_mm(sensor: Sensor) -> float:
     """Return the standard uncertainty of the sheet's offset from the laser's axis by the tilt of the laser's window.
 
     A plate of thickness t and index n that is tilted by a small angle shifts a ray by t (1 - 1 / n) times that angle.

@@ -1,0 +1,289 @@
+"""Recalibration of drawn sensors by rendered passes over scenes without an artefact, against the rendered truth.
+
+    python -m docs.studies.recalibration --seeds 0-9 --out runs/recalibration.csv
+
+Each campaign draws a sensor, its water, its stage and the errors of the poses from the sensor's table [uncertainty],
+renders three passes (40 mm along Y, 60 mm lower) over one of five scenes, and recalibrates the described sensor. Lengths
+are those between the true points of one profile (along Y), and of profiles in the highest and the lowest pass (along Z),
+both in the sensor's coordinates and scaled to 100 mm.
+"""
+
+import csv
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from cyclopts import App
+from scipy.spatial.transform import Rotation
+
+import twin
+import uwlts
+from twin.scene.description import Scene
+from uwlts.model.library import load_sensor, merge_tables, validate_description
+from uwlts.model.placement import laser_pose
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import open_capture
+from uwlts.storage.truth import read_truth, truth_path
+
+POSE_MM, POSE_DEG = 0.01, 0.005
+PASSES = {"reference": (0.0, 0.0, 0.0), "shifted": (40.0, 0.0, 0.0), "lower": (0.0, 60.0, 0.0)}
+"""Shift along Y and along Z, mm, and turn about Z, deg."""
+TURNED = {"0": (0.0, 0.0, 0.0), "90": (0.0, 0.0, 90.0), "180": (0.0, 0.0, 180.0), "lower": (0.0, 60.0, 0.0)}
+FAULTS = ("none", "scene moved", "pose scale", "warmer", "mirrored")
+UNCERTAINTY = {
+    "window_distance_mm": 5.0,
+    "window_tilt_deg": 0.3,
+    "focal_length": 5e-4,
+    "temperature_k": 5.0,
+    "drift_k": 0.2,
+    "sheet_offset_mm": 1.0,
+    "sheet_turn_deg": 0.3,
+    "stage_scale": 1e-4,
+    "stage_alignment_deg": 0.3,
+    "stage_position_mm": 0.005,
+}
+"""As built by a drawing."""
+
+
+def describe_sensor() -> Sensor:
+    """Return the described sensor."""
+    plain = load_sensor("thesis-small")
+    table = merge_tables(
+        plain.model_dump(exclude_none=True),
+        {"name": "drawn", "uncertainty": UNCERTAINTY, "media": {"water": {"temperature_c": 15.0}}},
+    )
+    return validate_description(Sensor, table, "drawn")
+
+
+def draw_sensor(sensor: Sensor, rng: np.random.Generator) -> Sensor:
+    """Return a sensor as it may be built."""
+    known, camera, laser, pose = sensor.uncertainty, sensor.camera, sensor.laser, laser_pose(sensor)
+    window, glass = camera.window, laser.window
+
+    def near(value: float, std: float) -> float:
+        return float(value + std * rng.standard_normal())
+
+    turn = np.radians(known.sheet_turn_deg) * rng.standard_normal(2)
+    rotation = Rotation.from_rotvec(turn[0] * pose.fan + turn[1] * pose.axis).as_matrix()
+    middle = np.array([0.0, 0.0, 317.0])
+    origin = rotation @ (pose.origin_mm - middle) + middle + near(0.0, known.sheet_offset_mm) * pose.normal
+    axis = rotation @ pose.axis
+    changes = {
+        "camera": {
+            "focal_length_mm": near(camera.focal_length_mm, (known.focal_length or 0.0) * camera.focal_length_mm),
+            "window": {
+                "distance_mm": near(window.distance_mm, known.window_distance_mm),
+                "tilt_x_deg": near(0.0, known.window_tilt_deg),
+                "tilt_y_deg": near(0.0, known.window_tilt_deg),
+                "thickness_mm": near(window.thickness_mm, known.glass_thickness_mm),
+                "glass": near(window.index(laser.wavelength_nm), known.glass_index),
+            },
+        },
+        "laser": {
+            "origin_mm": origin.tolist(),
+            "axis": axis.tolist(),
+            "roll_deg": near(laser.roll_deg, 0.0),
+            "bow_deg": near(laser.bow_deg, known.bow_deg),
+            "window": {"tilt_x_deg": near(glass.tilt_x_deg, 0.0)},
+        },
+    }
+    table = sensor.model_dump(exclude_none=True)
+    del table["laser"]["baseline_mm"], table["laser"]["triangulation_angle_deg"]
+    return validate_description(Sensor, merge_tables(table, changes), "drawn")
+
+
+def draw_scene(rng: np.random.Generator, kind: int) -> list[dict[str, object]]:
+    """Return objects of one of five kinds: sea floor, corroded pipe, flange, weld, and rubble of shapes."""
+    seed, turn = int(rng.integers(2**31)), float(rng.uniform(-20, 20))
+    match kind:
+        case 0:
+            return [{"kind": "seabed", "width_mm": 240.0, "height_mm": 260.0, "seed": seed, "reflectance": 0.3}]
+        case 1:
+            pipe = {
+                "kind": "pitted_pipe",
+                "diameter_mm": 110.0,
+                "length_mm": 180.0,
+                "pits": 30,
+                "pit_diameter_mm": 14.0,
+            }
+            pipe |= {
+                "pit_depth_mm": 3.0,
+                "seed": seed,
+                "position_mm": [0.0, 0.0, 40.0],
+                "rotation_deg": [0.0, 0.0, turn],
+            }
+            return [pipe | {"reflectance": 0.4}]
+        case 2:
+            flange = {"kind": "flange", "outer_diameter_mm": 165.0, "bore_diameter_mm": 62.0, "thickness_mm": 18.0}
+            flange |= {"bolt_circle_mm": 125.0, "holes": 4, "hole_diameter_mm": 18.0, "bolts": 2, "flatness_mm": 0.2}
+            return [flange | {"reflectance": 0.4, "rotation_deg": [turn, 10.0, 0.0]}]
+        case 3:
+            weld = {"kind": "weld", "plate_mm": [120.0, 160.0], "beads": 3, "spacing_mm": 30.0, "along": "x"}
+            weld |= {"length_mm": 110.0, "width_mm": 14.0, "height_mm": 4.0, "ripple_pitch_mm": 8.0}
+            return [weld | {"ripple_height_mm": 0.4, "finish": "painted", "rotation_deg": [turn, 12.0, 15.0]}]
+        case _:
+            balls = [
+                {"kind": "sphere", "diameter_mm": float(rng.uniform(25, 60)), "finish": "painted"}
+                | {
+                    "position_mm": [
+                        float(rng.uniform(-45, 45)),
+                        float(rng.uniform(-60, 60)),
+                        float(rng.uniform(20, 40)),
+                    ]
+                }
+                for _ in range(12)
+            ]
+            floor = {"kind": "seabed", "width_mm": 240.0, "height_mm": 260.0, "seed": seed, "reflectance": 0.3}
+            return [floor | {"position_mm": [0.0, 0.0, 40.0]}, *balls]
+
+
+def passes_of(turned: bool) -> dict[str, np.ndarray]:
+    """Return the nominal poses (4, 4) of the sensor in the scene's frame, by name."""
+    poses = {}
+    for name, (along_y, lower, deg) in (TURNED if turned else PASSES).items():
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("z", deg, degrees=True).as_matrix()
+        pose[:3, 3] = (0.0, along_y, lower)
+        poses[name] = pose
+    return poses
+
+
+def record(seed: int, folder: Path, *, turned: bool = False, fault: str = "none") -> tuple[list[Path], np.ndarray]:
+    """Render the passes of a campaign; return the captures and their stated poses (K, 4, 4)."""
+    rng = np.random.default_rng([2026, seed])
+    sensor = describe_sensor()
+    built = draw_sensor(sensor, rng)
+    warmer = float(rng.normal(0.0, sensor.uncertainty.temperature_k))
+    objects, count = draw_scene(rng, seed % 5), 61
+    scale = rng.normal(0.0, sensor.uncertainty.stage_scale)
+    lean = np.tan(np.radians(sensor.uncertainty.stage_alignment_deg)) * rng.standard_normal(2)
+    captures, stated = [], []
+    for number, (name, pose) in enumerate(passes_of(turned).items()):
+        stated.append(pose)
+        error = np.eye(4)
+        error[:3, :3] = Rotation.from_rotvec(POSE_DEG * rng.standard_normal(3), degrees=True).as_matrix()
+        error[:3, 3] = POSE_MM * rng.standard_normal(3)
+        scaled = pose.copy()
+        scaled[:3, 3] *= 1.0 + scale + (1e-3 if fault == "pose scale" else 0.0)
+        true = error @ scaled
+        if fault == "scene moved" and number == 1:
+            true[:3, 3] += 0.1 * np.array([0.6, 0.0, 0.8])
+        whole = np.linalg.inv(true)
+        media = {
+            key: each
+            if each.kind == "air"
+            else each.warmer_by(warmer + (5.0 if fault == "warmer" and number == 1 else 0.0))
+            for key, each in built.media.items()
+        }
+        position = np.linspace(-45.0, 45.0, count)
+        off = scale * position + sensor.uncertainty.stage_position_mm * rng.standard_normal(count)
+        table = {
+            "title": "passes",
+            "medium": "water",
+            "motion": {
+                "start_mm": -45.0,
+                "step_mm": 1.5,
+                "count": count,
+                "direction": [1.0, *lean.tolist()],
+                "nominal_direction": [1.0, 0.0, 0.0],
+                "position_errors_mm": off.tolist(),
+            },
+            "objects": objects,
+            "placements": {
+                "standoff": {
+                    "position_mm": whole[:3, 3].tolist(),
+                    "rotation_deg": Rotation.from_matrix(whole[:3, :3]).as_euler("xyz", degrees=True).tolist(),
+                }
+            },
+        }
+        out = folder / f"{seed}-{name}.h5"
+        twin.simulate(
+            validate_description(Scene, table, "passes"),
+            out=out,
+            sensor=sensor,
+            as_built=built.model_copy(update={"media": media}),
+            seed=seed * 10 + number,
+            spp=8,
+            water="clear",
+        )
+        captures.append(out)
+    return captures, np.array(stated)
+
+
+def measure(captures: list[Path], found: uwlts.Calibration) -> dict[str, float]:
+    """Return the mean errors, mm, of lengths along Y and Z, scaled to 100 mm, against the true points."""
+    parts = []
+    for path in (captures[0], captures[-1]):
+        with open_capture(path) as capture:
+            truth = read_truth(truth_path(path))[1]
+            cloud = uwlts.reconstruct(capture, found, with_uncertainty=False)
+            travel = capture.stage_mm[cloud.frame][:, None] * np.array(found.stage_direction_of((1.0, 0.0, 0.0)))
+        pose = truth.pose[cloud.frame]
+        true = np.einsum("nji,nj->ni", pose[:, :3, :3], truth.point_mm[cloud.frame, cloud.line] - pose[:, :3, 3])
+        good = np.isfinite(true).all(axis=1) & (truth.crossings[cloud.frame, cloud.line] == 1)
+        parts.append((cloud.points_mm[good] - travel[good], true[good]))
+    (high, high_true), (low, low_true) = parts
+    lower, upper = (high_true[:, 1] < q for q in np.quantile(high_true[:, 1], [0.1, 0.9]))
+    upper = ~upper
+    along_y = np.mean(high[upper], axis=0)[1] - np.mean(high[lower], axis=0)[1]
+    true_y = np.mean(high_true[upper], axis=0)[1] - np.mean(high_true[lower], axis=0)[1]
+    along_z = np.mean(low, axis=0)[2] - np.mean(high, axis=0)[2]
+    true_z = np.mean(low_true, axis=0)[2] - np.mean(high_true, axis=0)[2]
+    return {"Y": 100.0 * (along_y - true_y) / true_y, "Z": 100.0 * (along_z - true_z) / true_z}
+
+
+app = App(help=__doc__)
+
+
+@app.default
+def main(*, seeds: str = "0-9", turned: bool = False, fault: str = "none", out: Path | None = None) -> None:
+    """Run campaigns and print one line for each."""
+    first, last = map(int, seeds.split("-"))
+    rows = []
+    for seed in range(first, last + 1):
+        with tempfile.TemporaryDirectory() as folder:
+            captures, poses = record(seed, Path(folder), turned=turned, fault=fault)
+            if fault == "mirrored":
+                poses = poses.copy()
+                poses[1, :3, 3] *= -1.0
+            described = Path(folder) / "described.toml"
+            import tomli_w
+
+            described.write_text(tomli_w.dumps(describe_sensor().model_dump(exclude_none=True)))
+            try:
+                found = uwlts.recalibrate(captures, described, poses=poses, pose_std_mm=POSE_MM, pose_std_deg=POSE_DEG)
+            except uwlts.Error as error:
+                print(seed, "refused:", error, flush=True)
+                continue
+            before, after = (
+                measure(captures, each)
+                for each in (
+                    uwlts.recalibration.as_built.as_built(describe_sensor(), describe_sensor().media["water"]),
+                    found.calibration,
+                )
+            )
+            for each in found.lengths:
+                ratio = after[each.axis] / each.after_mm
+                rows.append(
+                    [seed, each.axis, before[each.axis], each.before_mm, after[each.axis], each.after_mm, ratio]
+                )
+                print(
+                    seed, each.axis, "before %.3f (%.3f) after %.4f (%.4f) ratio %.2f" % tuple(rows[-1][2:]), flush=True
+                )
+            print(
+                seed,
+                "cells",
+                found.cells,
+                "spread %.2f" % found.spread,
+                *found.doubts,
+                *found.advice(),
+                sep="\n  ",
+                flush=True,
+            )
+    if out is not None:
+        with out.open("w", newline="") as file:
+            csv.writer(file).writerows([["seed", "axis", "before", "stated", "after", "stated", "ratio"], *rows])
+
+
+if __name__ == "__main__":
+    app()

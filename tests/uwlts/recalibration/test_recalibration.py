@@ -1,0 +1,290 @@
+"""Recalibration from passes over a drawn surface, whose images follow from Fermat's principle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tomli_w
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from tests.system.in_process import uwlts
+from tests.uwlts.joint_views import seen
+from twin.scene.campaign import replace_values
+from uwlts.calibration.joint.stored_estimate import read_stored_estimate
+from uwlts.errors import CalibrationError
+from uwlts.model.library import load_sensor
+from uwlts.model.placement import camera_from_object
+from uwlts.model.sensor import CaptureHeader
+from uwlts.model.stripe import Coordinates
+from uwlts.recalibration.as_built import as_built
+from uwlts.recalibration.pass_estimate import Motion, Pass, PassProblem, solve_passes
+from uwlts.recalibration.recalibrate import summarise
+from uwlts.reconstruction.point_uncertainty import independent_components
+from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.capture import Frame
+from uwlts.storage.capture_writer import CaptureWriter
+from uwlts.storage.pose_files import write_poses
+
+SENSOR = replace_values(
+    load_sensor("thesis-small"),
+    uncertainty={"window_distance_mm": 5.0, "focal_length": 5e-4, "temperature_k": 5.0, "sheet_offset_mm": 1.0},
+    media={"water": {"temperature_c": 15.0}},
+)
+WATER = SENSOR.media["water"]
+MOTION = Motion(pose_mm=0.01, pose_rad=np.radians(0.005), pose_scale=5e-5, image_mm=0.003)
+TRAVEL = np.linspace(-45.0, 45.0, 46)
+NOISE_PX = 0.1
+SHIFTED = {"first": (0.0, 0.0, 0.0), "shifted": (40.0, 0.0, 0.0), "lower": (0.0, 60.0, 0.0)}
+TURNED = {"0": (0.0, 0.0, 0.0), "90": (0.0, 0.0, 90.0), "180": (0.0, 0.0, 180.0), "lower": (0.0, 60.0, 0.0)}
+
+
+HEADER = CaptureHeader(
+    name="pass", sensor=SENSOR, medium_name="water", medium=WATER, stage_direction=(1.0, 0.0, 0.0), saturation_dn=255
+)
+
+
+def draw_sensor(rng):
+    """Return a sensor whose window, lens, sheet and water deviate as its description states."""
+    known, camera, laser = SENSOR.uncertainty, SENSOR.camera, SENSOR.laser
+    window = camera.window
+    of_window = {
+        "distance_mm": window.distance_mm + known.window_distance_mm * rng.normal(),
+        "tilt_x_deg": known.window_tilt_deg * rng.normal(),
+        "tilt_y_deg": known.window_tilt_deg * rng.normal(),
+    }
+    # The sheet turns about the point on the camera's axis, which moves along it by the sheet's offset.
+    angle = np.radians(laser.triangulation_angle_deg + known.sheet_turn_deg * rng.normal())
+    straight = np.radians(laser.triangulation_angle_deg)
+    depth = (laser.baseline_mm + known.sheet_offset_mm * rng.normal() / np.cos(straight)) / np.tan(straight)
+    built = replace_values(
+        SENSOR,
+        camera={
+            "focal_length_mm": camera.focal_length_mm * (1 + known.focal_length * rng.normal()),
+            "window": of_window,
+        },
+        laser={
+            "baseline_mm": float(depth * np.tan(angle)),
+            "triangulation_angle_deg": float(np.degrees(angle)),
+            "roll_deg": known.sheet_turn_deg * rng.normal(),
+        },
+    )
+    return built, WATER.warmer_by(known.temperature_k * rng.normal())
+
+
+def draw_surface(rng):
+    """Return the height of a surface over x and y, a sum of waves of 45 to 160 mm."""
+    length, angle, phase = rng.uniform(45, 160, 12), rng.uniform(0, 2 * np.pi, 12), rng.uniform(0, 2 * np.pi, 12)
+    by_x, by_y = 2 * np.pi / length * np.array([np.cos(angle), np.sin(angle)])
+
+    def height(x, y):
+        waves = np.sin(np.multiply.outer(x, by_x) + np.multiply.outer(y, by_y) + phase)
+        return 60.0 * (waves @ (length / length.sum()))
+
+    return height
+
+
+def pose_of(along_y, lower, turn_deg):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
+    pose[:3, 3] = (0.0, along_y, lower)
+    return pose
+
+
+def record(built, water, height, pose, rng, name, *, moved_mm=0.0):
+    """Return a pass with stated and true pose: the points of the sheet on the surface, and their noisy pixels."""
+    error = np.eye(4)
+    error[:3, :3] = Rotation.from_rotvec(MOTION.pose_rad * rng.normal(size=3)).as_matrix()
+    error[:3, 3] = MOTION.pose_mm * rng.normal(size=3) + moved_mm * np.array([0.6, 0.0, 0.8])
+    true = error @ pose
+    frame, across = np.repeat(np.arange(len(TRAVEL)), 110), np.tile(np.linspace(-70.0, 70.0, 110), len(TRAVEL))
+    travel = (TRAVEL + MOTION.image_mm * rng.normal(size=len(TRAVEL)))[frame]
+    local = np.column_stack([travel, across, np.zeros_like(across)])
+    for _ in range(100):
+        world = local @ true[:3, :3].T + true[:3, 3]
+        local[:, 2] += 0.5 * (height(world[:, 0], world[:, 1]) - world[:, 2])
+    on_sheet = local - travel[:, None] * [1.0, 0.0, 0.0]
+    ocs = camera_from_object(built)
+    wavelength = built.laser.wavelength_nm
+    pixels = seen(built, on_sheet @ ocs[:3, :3].T + ocs[:3, 3], index=water.refractive_index(wavelength), window=True)
+    pixels[:, 1] += NOISE_PX * rng.normal(size=len(pixels))
+    camera = built.camera
+    inside = (pixels > 2).all(axis=1) & (pixels < [camera.width_px - 3, camera.height_px - 3]).all(axis=1)
+    line, centre, frame = pixels[inside, 0], pixels[inside, 1], frame[inside]
+    poses = np.repeat(pose[None], len(TRAVEL), axis=0)
+    return Pass(name, frame, line, centre, np.full(len(line), NOISE_PX), np.zeros((len(line), 3)), TRAVEL[frame], poses)
+
+
+def campaign(seed, motions, *, moved_mm=0.0, warmer_k=0.0, motion=MOTION):
+    """Return a drawn sensor with its water, and the passes over a drawn surface as a problem.
+
+    ``moved_mm`` and ``warmer_k`` are undeclared changes before the second pass.
+    """
+    rng = np.random.default_rng([61, seed])
+    built, water = draw_sensor(rng)
+    height = draw_surface(rng)
+    passes = [
+        record(
+            built,
+            water.warmer_by(warmer_k * (number == 1)),
+            height,
+            pose_of(*pose),
+            rng,
+            name,
+            moved_mm=moved_mm * (number == 1),
+        )
+        for number, (name, pose) in enumerate(motions.items())
+    ]
+    prior = as_built(SENSOR, WATER)
+    known = read_stored_estimate(prior, SENSOR, WATER)
+    root, by_stage = independent_components(known, prior, HEADER)
+    drift = WATER.index_per_kelvin(SENSOR.laser.wavelength_nm) * SENSOR.uncertainty.drift_k
+    problem = PassProblem(passes, known, root, by_stage, np.array([1.0, 0.0, 0.0]), 0.0, drift, motion, np.zeros(3))
+    return built, water, problem
+
+
+def solve(problem):
+    return summarise(problem, solve_passes(problem, size_mm=9.0), problem.known.calibration, (1.0, 0.0, 0.0))
+
+
+def measure(built, water, calibration):
+    """Return the lengths of 100 mm along Y and Z that a calibration measures in images of the true sensor."""
+    ocs, index = camera_from_object(built), water.refractive_index(built.laser.wavelength_nm)
+    ends = np.array([[0.0, -50, 20], [0, 50, 20], [0, 0, -30], [0, 0, 70]]) @ ocs[:3, :3].T + ocs[:3, 3]
+    pixels = seen(built, ends, index=index, window=True)
+    known = read_stored_estimate(calibration, SENSOR, WATER)
+    points = known.triangulate(pixels[:, 0], pixels[:, 1])[0]
+    return np.linalg.norm(points[1::2] - points[::2], axis=1)
+
+
+def errors(seed, motions):
+    """Return the errors (2,) of lengths along Y and Z divided by the stated uncertainties, and the result."""
+    built, water, problem = campaign(seed, motions)
+    found = solve(problem)
+    stated = np.array([each.after_mm for each in found.lengths])
+    return (measure(built, water, found.calibration) - 100.0) / stated, found
+
+
+@pytest.mark.parametrize("motions", [SHIFTED, TURNED], ids=["shifted", "turned"])
+def test_passes_over_an_unknown_surface_replace_a_target(motions):
+    relative, found = errors(0, motions)
+    assert not found.doubts
+    for each in found.lengths:
+        assert each.before_mm > 0.5
+        assert each.after_mm < 0.05
+    assert (np.abs(relative) < 3.5).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motions", [SHIFTED, TURNED], ids=["shifted", "turned"])
+def test_lengths_err_as_stated(motions):
+    relative, doubted = [], 0
+    for seed in range(100, 112):
+        own, found = errors(seed, motions)
+        relative.append(own)
+        doubted += bool(found.doubts)
+    # Two lengths of 12 campaigns: chi-squared with 24 degrees of freedom is between 9 and 46 in 99 of 100 studies.
+    assert 9 < np.sum(np.square(relative)) < 46
+    # One in twenty is doubted by chance: four or more of twelve in 1 of 400 studies.
+    assert doubted < 4
+
+
+def test_derivatives_are_those_of_the_points():
+    *_, problem = campaign(1, SHIFTED)
+    some = replace(problem, passes=[replace_points(each, slice(None, None, 400)) for each in problem.passes])
+    start = 0.3 * np.random.default_rng(2).normal(size=some.unknowns)
+    none = [np.zeros(len(each.line)) for each in some.passes]
+    placed = some.place(start, none)
+    for column in range(some.unknowns):
+        step = 1e-3 * np.eye(some.unknowns)[column]
+        moved = (some.place(start + step, none).places_mm - some.place(start - step, none).places_mm) / 2e-3
+        scale = 1e-4 + np.abs(moved).max()
+        assert np.abs(placed.by_unknowns[:, :, column] - moved).max() < 0.02 * scale, column
+
+
+def replace_points(each, some):
+    """Return a pass with some of its points."""
+    names = ("frame", "line", "centre_px", "noise_px", "beside_mm", "travel_mm")
+    return replace(each, **{name: getattr(each, name)[some] for name in names})
+
+
+def test_one_pass_finds_nothing_and_asks_for_another():
+    *_, problem = campaign(3, {"only": (0.0, 0.0, 0.0)})
+    found = solve(problem)
+    for each in found.lengths:
+        assert each.after_mm > 0.8 * each.before_mm
+    assert found.next_passes[0].after < 0.7 * found.next_passes[0].before
+
+
+def test_the_advised_pass_gives_what_was_expected():
+    two = dict(list(SHIFTED.items())[:2])
+    *_, problem = campaign(4, two)
+    expected = next(each.after for each in solve(problem).next_passes if each.candidate.words == "move 60 mm closer")
+    *_, problem = campaign(4, SHIFTED)
+    given = np.sqrt(np.mean([each.after_mm**2 for each in solve(problem).lengths]))
+    assert given == pytest.approx(expected, rel=0.3)
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 10))])
+def test_a_scene_that_moved_is_named(seed):
+    *_, problem = campaign(seed, SHIFTED, moved_mm=0.1)
+    assert any("shifted" in doubt or "contradict" in doubt for doubt in solve(problem).doubts)
+
+
+def test_warmer_water_in_one_pass_is_named():
+    *_, problem = campaign(5, SHIFTED, warmer_k=8.0)
+    assert solve(problem).doubts
+
+
+def test_passes_without_overlap_are_refused():
+    *_, problem = campaign(6, {"first": (0.0, 0.0, 0.0), "far": (300.0, 0.0, 0.0)})
+    with pytest.raises(CalibrationError, match="two passes"):
+        solve(problem)
+
+
+def write_capture(path, each):
+    """Write a pass as a capture of a 3D camera, with independent noise on each line of the sensor."""
+    camera = SENSOR.camera
+    with CaptureWriter(path, HEADER, dtype=np.uint8, centre_lines=True) as writer:
+        for number, position in enumerate(TRAVEL):
+            own = each.frame == number
+            centre = np.full(camera.width_px, np.nan)
+            order = np.argsort(each.line[own])
+            line = each.line[own][order]
+            inner = np.arange(int(line[0]) + 1, int(line[-1]))
+            # Not across parts outside the image.
+            inner = inner[np.diff(line)[np.searchsorted(line, inner) - 1] < 10.0]
+            centre[inner] = CubicSpline(line, each.centre_px[own][order])(inner)
+            centre += NOISE_PX * np.random.default_rng(number).normal(size=len(centre))
+            stripe = Coordinates().stripe(centre, stripe_along="width", length_px=camera.height_px)
+            writer.append(Frame(stripe, float(position), True, 1.0, float(number)))
+
+
+def test_the_command_writes_a_calibration_only_without_doubts(tmp_path, monkeypatch):
+    monkeypatch.setitem(globals(), "NOISE_PX", 0.0)
+    built, water, problem = campaign(7, SHIFTED)
+    monkeypatch.undo()
+    for each in problem.passes:
+        write_capture(tmp_path / f"{each.name}.h5", each)
+    description, poses = tmp_path / "sensor.toml", tmp_path / "poses.csv"
+    description.write_text(tomli_w.dumps(SENSOR.model_dump(exclude_none=True)), encoding="utf-8")
+    write_poses(poses, np.array([pose_of(*pose) for pose in SHIFTED.values()]))
+    names = [str(tmp_path / f"{name}.h5") for name in SHIFTED]
+    command = ["recalibrate", *names, "--calibration", str(description), "--poses", str(poses)]
+    command += ["--pose-std-mm", "0.01", "--pose-std-deg", "0.005", "--out", str(tmp_path / "new.json")]
+    done = uwlts(*command)
+    assert done.returncode == 0, done.stderr
+    found = read_calibration(tmp_path / "new.json")
+    assert np.abs(measure(built, water, found) - 100.0).max() < 0.15
+    write_poses(
+        poses,
+        np.array([pose_of(*pose) @ pose_of(0.2 * (name == "shifted"), 0, 0) for name, pose in SHIFTED.items()]),
+        overwrite=True,
+    )
+    (tmp_path / "new.json").unlink()
+    doubted = uwlts(*command)
+    assert doubted.returncode == 1
+    assert "shifted.h5 does not fit the others" in doubted.stderr
+    assert not (tmp_path / "new.json").exists()
+    write_poses(poses, np.array([np.eye(4)] * 2), overwrite=True)
+    assert "2 poses are given for 3 passes" in uwlts(*command).stderr

@@ -1,0 +1,105 @@
+"""The next pass: a motion of the sensor relative to the scene, and the uncertainty of lengths that it would leave."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwlts.calibration.joint.observability import project_sheet_points
+from uwlts.fitting.next_observation import Candidate, CovarianceRoot, Forecast, eliminate_others, rank_candidates
+from uwlts.model.calibration import rigid_transform
+from uwlts.recalibration.pass_estimate import OF_PASS, Pass, PassProblem, PassSolution
+
+_SHIFTS = (0.2, 0.4, 0.6)
+"""Shifts along the stripe, relative to the width of the scene in that direction."""
+_LIFTS_MM = (20.0, 40.0, 60.0, 80.0)
+_TURNS_DEG = (90.0, 180.0)
+_ROLLS_DEG = (15.0, 30.0)
+_LEAST_OVERLAP = 0.3
+"""Smallest fraction of the cells that a candidate must see, so that poses and surface stay connected."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NextPass(Candidate):
+    """A further pass with its pose (4, 4) in the common frame."""
+
+    pose: np.ndarray
+
+
+def rank_passes(problem: PassProblem, solution: PassSolution, lengths: np.ndarray) -> list[Forecast[NextPass]]:
+    """Return the effect of further passes on lengths with derivatives (L, U), the most helpful one first."""
+    known = CovarianceRoot.from_covariance(solution.covariance)
+    return rank_candidates(known, lengths, _candidates(problem, solution))
+
+
+def _candidates(problem: PassProblem, solution: PassSolution) -> Iterator[NextPass]:
+    cells = solution.cells
+    places, normals = np.array([cell.middle_mm for cell in cells]), np.array([cell.normal for cell in cells])
+    # The information and the mean row of all passes in a cell, and a typical pass's information.
+    weight = np.array([np.sum(1 / cell.std**2) for cell in cells])
+    each = weight / np.array([len(cell.passes) for cell in cells])
+    rows = np.array([cell.mean_row for cell in cells])
+    first = problem.passes[0]
+    for words, pose in _motions(first.pose[len(first.pose) // 2], places):
+        seen = _see(problem, solution, pose, places)
+        if seen is None or np.count_nonzero(seen[1]) < _LEAST_OVERLAP * len(cells):
+            continue
+        placed, there = seen
+        count = problem.unknowns
+        by = np.einsum("ni,niu->nu", normals[there], placed)
+        added = np.zeros((len(by), len(by[0])))
+        added[:, : problem.of_sensor] = by[:, : problem.of_sensor]
+        added[:, count:] = by[:, count:]
+        added[:, :count] -= rows[there]
+        information = (added.T / (1 / each[there] + 1 / weight[there]) / solution.spread**2) @ added
+        information[count:, count:] += np.eye(len(information) - count)
+        yield NextPass(words=words, information=eliminate_others(information, count), pose=pose)
+
+
+def _motions(start: np.ndarray, places: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Iterate over motions as text and their poses (4, 4), from the pose of the first pass."""
+    axes, middle = start[:3, :3], places.mean(axis=0)
+    width = float(np.ptp((places - middle) @ axes[:, 1]))
+    for part in _SHIFTS:
+        for sign in (1, -1):
+            far = sign * round(part * width, -1) or sign * 5.0
+            yield f"shift {far:+.0f} mm along Y", rigid_transform(np.eye(3), far * axes[:, 1]) @ start
+    for far in _LIFTS_MM:
+        yield f"move {far:.0f} mm farther away", rigid_transform(np.eye(3), -far * axes[:, 2]) @ start
+        yield f"move {far:.0f} mm closer", rigid_transform(np.eye(3), far * axes[:, 2]) @ start
+    turns = [(f"turn by {deg:.0f} deg about Z", deg * axes[:, 2]) for deg in _TURNS_DEG]
+    turns += [
+        (f"roll by {sign * deg:+.0f} deg about X", sign * deg * axes[:, 0]) for deg in _ROLLS_DEG for sign in (1, -1)
+    ]
+    for words, vector in turns:
+        rotation = Rotation.from_rotvec(vector, degrees=True).as_matrix()
+        yield f"{words}, about the middle of the scene", rigid_transform(rotation, middle - rotation @ middle) @ start
+
+
+def _see(
+    problem: PassProblem, solution: PassSolution, pose: np.ndarray, places: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return derivatives (n, 3, U + `OF_PASS`) of the places that a pass would see, and their mask (N,)."""
+    known = problem.moved(solution.amplitudes)
+    direction = problem.stage_direction(solution.amplitudes)
+    local = (places - pose[:3, 3]) @ pose[:3, :3]
+    travel = local[:, 0] / direction[0]
+    pixels = project_sheet_points(known, (local - travel[:, None] * direction)[:, 1:])
+    camera = known.calibration.camera
+    inside = np.isfinite(pixels).all(axis=1) & (pixels >= 0).all(axis=1)
+    inside &= (pixels[:, 0] < camera.width_px - 1) & (pixels[:, 1] < camera.height_px - 1)
+    if not inside.any():
+        return None
+    across, chosen = known.across(), pixels[inside]
+    count = int(inside.sum())
+    none = np.zeros(count)
+    frame, beside = np.zeros(count, int), np.zeros((count, 3))
+    extra = Pass("", frame, chosen[:, 1 - across], chosen[:, across], none, beside, travel[inside], pose[None])
+    start = np.append(solution.amplitudes[: problem.of_sensor], np.zeros(OF_PASS))
+    placed = replace(problem, passes=[extra]).place(start, [none])
+    shared = problem.of_sensor
+    result = np.zeros((count, 3, problem.unknowns + OF_PASS))
+    result[:, :, :shared] = placed.by_unknowns[:, :, :shared]
+    result[:, :, problem.unknowns :] = placed.by_unknowns[:, :, shared:]
+    return result, inside

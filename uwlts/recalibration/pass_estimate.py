@@ -1,0 +1,269 @@
+"""Joint estimate of a sensor's errors, of the poses of passes and of the water's index in each, from their overlaps.
+
+All unknowns are amplitudes with a mean of zero and a variance of one before the passes: independent errors of the
+calibration and of the stage (`independent_components`), the scale of the poses, and for each pass the errors of its
+pose and the change of the water's index. Each round reconstructs the passes with the moved calibration.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwlts.calibration.joint.stored_estimate import StoredEstimate
+from uwlts.calibration.sequential.sheet_fit import object_frame
+from uwlts.errors import CalibrationError
+from uwlts.fitting.least_squares import biweight
+from uwlts.model.calibration import Calibration
+from uwlts.recalibration.surface_cells import Cell, PassPoints, divide, observe
+
+_ROUNDS = 30  # largest number; eight to twelve are usual
+_FREE_ROUNDS = 6
+"""Rounds with new cells and outliers; the passes then agree within their noise."""
+_SETTLED = 0.05
+"""Step in standard uncertainties that ends the iteration: it would add 0.1 % to the standard uncertainty."""
+OF_PASS = 7
+"""Unknowns of a pass: shift, rotation, index."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """Stripe centres (N,) of one pass, with all that places their points.
+
+    ``beside_mm`` (N, 3) are shifts of the points to the origin of their light in the OCS. ``travel_mm`` (N,) is the
+    position of the stage, and ``frame`` (N,) the image. ``pose`` (F, 4, 4) transforms the OCS of each image, with the
+    stage at zero, to the common frame.
+    """
+
+    name: str
+    frame: np.ndarray
+    line: np.ndarray
+    centre_px: np.ndarray
+    noise_px: np.ndarray
+    beside_mm: np.ndarray
+    travel_mm: np.ndarray
+    pose: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Stated standard uncertainties of the motion.
+
+    ``pose_mm`` and ``pose_rad`` are those of each pass's pose, along and about each axis, ``pose_scale`` is that of all
+    poses' distances, and ``image_mm`` that of each position along the stage.
+    """
+
+    pose_mm: float
+    pose_rad: float
+    pose_scale: float
+    image_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class PassSolution:
+    """Amplitudes (U,), their covariance (U, U), and the information (U, U) of the passes alone.
+
+    ``cells`` are the observed parts of the surface with ``weights``. ``spread`` is the scatter of the passes' distances
+    relative to their stated noise, at least 1.
+    """
+
+    amplitudes: np.ndarray
+    covariance: np.ndarray
+    cells: list[Cell]
+    weights: np.ndarray
+    points: PassPoints
+    spread: float
+    rounds: int
+
+
+@dataclass(frozen=True, eq=False)
+class PassProblem:
+    """Passes with a calibration as prior knowledge.
+
+    ``root`` (P, M) are changes of the parameters and ``by_stage`` (M, 3) shifts per mm of travel by the independent
+    components; the last one is a shift of the OCS along X by ``window_shift_mm``. ``direction`` (3,) is that of the
+    stage before. ``drift`` is the standard uncertainty of the index in each pass. ``middle_mm`` (3,) is the position
+    from which the poses' scale counts.
+    """
+
+    passes: Sequence[Pass]
+    known: StoredEstimate
+    root: np.ndarray
+    by_stage: np.ndarray
+    direction: np.ndarray
+    window_shift_mm: float
+    drift: float
+    motion: Motion
+    middle_mm: np.ndarray
+
+    @property
+    def of_sensor(self) -> int:
+        """Number of unknowns that all passes share: components and the scale of poses."""
+        return self.root.shape[1] + 1
+
+    @property
+    def unknowns(self) -> int:
+        """Number of all unknowns."""
+        return self.of_sensor + OF_PASS * len(self.passes)
+
+    def of_pass(self, number: int) -> slice:
+        """Return the columns of a pass: shift, rotation, index."""
+        start = self.of_sensor + OF_PASS * number
+        return slice(start, start + OF_PASS)
+
+    def moved(self, amplitudes: np.ndarray) -> StoredEstimate:
+        """Return the estimate with changed parameters (U,), and its covariance before."""
+        values = self.known.values + self.root @ amplitudes[: self.root.shape[1]]
+        return replace(self.known, values=values, calibration=move_calibration(self.known, values))
+
+    def stage_direction(self, amplitudes: np.ndarray) -> np.ndarray:
+        """Return the shift (3,) per mm of travel in the OCS."""
+        return self.direction + self.by_stage.T @ amplitudes[: self.root.shape[1]]
+
+    def place(self, amplitudes: np.ndarray, corrections_px: Sequence[np.ndarray]) -> PassPoints:
+        """Return the points of all passes with derivatives, from corrected stripe centres.
+
+        Raises CalibrationError if a centre gives no point.
+        """
+        known = self.moved(amplitudes)
+        rigid = -known.frame_by @ self.root
+        rigid[0, -1] += self.window_shift_mm
+        direction, index_key = self.stage_direction(amplitudes), known.parameters.index_key
+        parts, first = [], 0
+        for number, each in enumerate(self.passes):
+            columns = self.of_pass(number)
+            shift, turn, water = np.split(amplitudes[columns], [3, 6])
+            estimate = known
+            if known.view.medium is not None:
+                place = known.parameters.places[index_key(known.view.medium)]
+                values = known.values + self.drift * water[0] * np.eye(len(known.values))[place]
+                estimate = replace(known, values=values)
+            found = estimate.triangulate(each.line, each.centre_px + corrections_px[number])
+            if found is None:
+                raise CalibrationError(f"{each.name}: the passes lead to a calibration that gives no point")
+            points, by = found
+            local = np.zeros((len(points), 3, self.unknowns))
+            parts_of = self.root.shape[1]
+            local[:, :, :parts_of] = by[:, :, 1:] @ self.root
+            local[:, :, :parts_of] += rigid[:3] + np.cross(rigid[3:].T, points[:, None]).swapaxes(1, 2)
+            local[:, :, :parts_of] += each.travel_mm[:, None, None] * self.by_stage.T
+            if known.view.medium is not None:
+                local[:, :, columns.stop - 1] = self.drift * by[:, :, 1 + place]
+            points = points + each.beside_mm + each.travel_mm[:, None] * direction
+            points[:, 0] += self.window_shift_mm * amplitudes[parts_of - 1]
+            rotation, origin = each.pose[each.frame, :3, :3], each.pose[each.frame, :3, 3]
+            from_middle = self.motion.pose_scale * (origin - self.middle_mm)
+            places = np.einsum("nij,nj->ni", rotation, points) + origin + amplitudes[parts_of] * from_middle
+            moved = rotation @ local
+            by_px = np.einsum("nij,nj->ni", rotation, by[:, :, 0])
+            along = rotation @ direction
+            moved[:, :, parts_of] = from_middle
+            # Errors of a pose turn about the middle of its points.
+            middle = places.mean(axis=0)
+            turned = Rotation.from_rotvec(self.motion.pose_rad * turn).as_matrix()
+            places = (places - middle) @ turned.T
+            moved[:, :, columns.start : columns.start + 3] = self.motion.pose_mm * np.eye(3)
+            moved[:, :, columns.start + 3 : columns.start + 6] = self.motion.pose_rad * np.cross(
+                np.eye(3)[None], places[:, None]
+            ).swapaxes(1, 2)
+            places = places + middle + self.motion.pose_mm * shift
+            of_images = self.motion.image_mm * along * (np.ptp(each.travel_mm) > 0)
+            parts.append(
+                PassPoints(
+                    places,
+                    np.full(len(places), number),
+                    moved,
+                    by_px,
+                    corrections_px[number],
+                    each.noise_px,
+                    of_images,
+                    first + each.frame,
+                )
+            )
+            first += len(each.pose)
+        return PassPoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+
+def move_calibration(known: StoredEstimate, values: np.ndarray) -> Calibration:
+    """Return the calibration with other values (P,) of the estimate's parameters; its record of evidence is kept."""
+    parameters = known.parameters
+    sheet = parameters.sheet_model(values)
+    frame = object_frame(sheet, laser_axis=parameters.sheet.axis)
+    return known.calibration.model_copy(
+        update={
+            "camera": parameters.camera(values),
+            "window": parameters.window_model(values),
+            "sheet": sheet,
+            "camera_from_object": tuple(map(tuple, frame.tolist())),
+        }
+    )
+
+
+def solve_passes(problem: PassProblem, *, size_mm: float) -> PassSolution:
+    """Solve for the amplitudes from cells of a size, and return them with their covariance.
+
+    Raises CalibrationError if the passes do not overlap or the iteration does not converge.
+    """
+    amplitudes = np.zeros(problem.unknowns)
+    corrections = [np.zeros(len(each.line)) for each in problem.passes]
+    ends = np.cumsum([len(each.line) for each in problem.passes])[:-1]
+    spread, step = 1.0, np.zeros(problem.unknowns)
+    cell_of = weights = np.empty(0)
+    for done in range(_ROUNDS):
+        points = problem.place(amplitudes, corrections)
+        if done < _FREE_ROUNDS:
+            cell_of = divide(points.places_mm, size_mm)
+        cells = observe(points, cell_of, spread, keep=done > _FREE_ROUNDS)
+        if done == _FREE_ROUNDS:
+            # Points and weights stay, so that the iteration converges.
+            cell_of = np.full(len(points.number), -1)
+            for number, cell in enumerate(cells):
+                cell_of[cell.some] = number
+            squares = np.array([cell.offset_square for cell in cells])
+            weights = biweight(np.sqrt(squares / max(float(np.median(squares)), 1e-12)))
+            # Birge's ratio: the disagreement of passes relative to their noise.
+            spread = max(1.0, float(np.sqrt(np.mean(squares[weights > 0]))))
+        elif done < _FREE_ROUNDS:
+            weights = np.ones(len(cells))
+        total = np.eye(problem.unknowns)
+        gradient = amplitudes.copy()
+        for cell, weight in zip(cells, weights, strict=True):
+            total += weight * cell.rows.T @ cell.rows
+            gradient += weight * cell.rows.T @ cell.residuals
+        step = -np.linalg.solve(total, gradient)
+        amplitudes = amplitudes + step
+        corrections = np.split(_correct(cells, points, step), ends)
+        if done > _FREE_ROUNDS and np.max(np.abs(step) / np.sqrt(np.diag(np.linalg.inv(total)))) < _SETTLED:
+            break
+    else:
+        raise CalibrationError(
+            f"the passes do not converge: the last step was {np.abs(step).max():.2g} prior standard uncertainties; give "
+            "better poses or a better calibration"
+        )
+    covariance = _covariance(cells, weights, total, points)
+    return PassSolution(amplitudes, covariance, cells, weights, points, spread, done + 1)
+
+
+def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.ndarray:
+    """Return the corrections (N,) of all stripe centres after a step: their part of the remaining residuals."""
+    corrections = np.zeros(len(points.number))
+    for cell in cells:
+        left = (cell.residuals + cell.rows @ step) * cell.std
+        variance = (cell.by_px * points.noise_px[cell.some]) ** 2
+        of_centre = variance / np.maximum(variance + (cell.images * cell.std) ** 2, 1e-30)
+        corrections[cell.some] = -of_centre * left / cell.by_px
+    return corrections
+
+
+def _covariance(cells: Sequence[Cell], weights: np.ndarray, total: np.ndarray, points: PassPoints) -> np.ndarray:
+    """Return the covariance (U, U): noise, positions of images that many cells share, and prior knowledge."""
+    inverse = np.linalg.inv(total)
+    of_images = np.zeros((int(points.image.max()) + 1, len(total)))
+    spread = np.eye(len(total))
+    for cell, weight in zip(cells, weights, strict=True):
+        own = np.sqrt(np.maximum(1.0 - cell.images**2, 0.0))
+        rows = weight * cell.rows
+        spread += (rows * own[:, None]).T @ (rows * own[:, None])
+        np.add.at(of_images, points.image[cell.some], rows * cell.images[:, None])
+    return inverse @ (spread + of_images.T @ of_images) @ inverse

@@ -1,0 +1,178 @@
+"""Observations of an unknown surface by several passes, without the surface's own parameters.
+
+The surface is divided into cells. In each, all passes together determine a second-order surface, which is eliminated by
+orthogonal projection, so that only the disagreement of the passes remains. An unknown surface that all passes share is
+unbiased, whereas the distance from a surface that one pass determines correlates with its noise. Normals and
+derivatives are taken at observations that are corrected for their residuals (Gauss-Helmert model: Pope, Some pitfalls
+to be avoided in the iterative adjustment of nonlinear problems, 1972).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from uwlts.errors import CalibrationError
+from uwlts.fitting.least_squares import MAD_TO_STD
+
+_FEWEST = 8
+"""Least number of points of a pass in a cell: two more than a second-order surface has coefficients."""
+_OUTLIER = 5.0
+"""Distance from a pass's own surface, in robust standard deviations, beyond which a point is left out."""
+_ROUGHEST = 5.0
+"""Largest scatter about the passes' own surfaces relative to the median cell: cells on edges exceed it."""
+
+
+@dataclass(frozen=True, eq=False)
+class PassPoints:
+    """Points of all passes (N) in the common frame, at corrected observations.
+
+    ``places_mm`` (N, 3), ``number`` (N,) is that of the pass, ``by_unknowns`` (N, 3, U), ``by_px`` (N, 3) and
+    ``correction_px`` (N,) of the stripe centre. ``noise_px`` (N,) is its standard deviation, ``image_mm`` (N, 3) the
+    shift by one standard deviation of the image's position, and ``image`` (N,) the number of the image.
+    """
+
+    places_mm: np.ndarray
+    number: np.ndarray
+    by_unknowns: np.ndarray
+    by_px: np.ndarray
+    correction_px: np.ndarray
+    noise_px: np.ndarray
+    image_mm: np.ndarray
+    image: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One cell: its points ``some`` (n,), ``normal`` (3,) and ``middle_mm`` (3,) of its surface.
+
+    ``rows`` (n, U) and ``residuals`` (n,) are whitened, without the surface; ``mean_row`` (U,) is the mean derivative
+    of the height. ``by_px`` (n,) are the derivatives of the height by the stripe centre, ``std`` (n,) its standard
+    deviations, and ``images`` (n,) the whitened effects of the images' positions. ``scatter`` is the ratio of the
+    heights' scatter to the stated noise, at least 1. ``offset_square`` is the mean square of the whitened disagreement
+    of the passes.
+    """
+
+    some: np.ndarray
+    normal: np.ndarray
+    middle_mm: np.ndarray
+    rows: np.ndarray
+    mean_row: np.ndarray
+    residuals: np.ndarray
+    by_px: np.ndarray
+    std: np.ndarray
+    images: np.ndarray
+    scatter: float
+    offset_square: float
+    passes: tuple[int, ...]
+
+
+def divide(places_mm: np.ndarray, size_mm: float) -> np.ndarray:
+    """Return the cell (N,) of each point: the nearest of points on the surface that are about ``size_mm`` apart.
+
+    Cells border on each other across the surface, never along it: a border along it would select points by their noise.
+    """
+    cubes = np.floor(places_mm / size_mm).astype(np.int64)
+    _, owner = np.unique(cubes, axis=0, return_inverse=True)
+    owner = owner.ravel()
+    for _ in range(2):
+        counts = np.bincount(owner)
+        means = np.column_stack([np.bincount(owner, column) / np.maximum(counts, 1) for column in places_mm.T])
+        owner = KDTree(means[counts > 0]).query(places_mm)[1]
+    return owner
+
+
+def observe(points: PassPoints, cell_of: np.ndarray, spread: float, *, keep: bool) -> list[Cell]:
+    """Return the usable cells; ``spread`` multiplies all stated noise.
+
+    ``cell_of`` (N,) is -1 for points without a cell. With ``keep``, all other points are used.
+
+    Raises CalibrationError if no cell has two passes.
+    """
+    order = np.argsort(cell_of, kind="stable")[np.count_nonzero(cell_of < 0) :]
+    starts = np.flatnonzero(np.r_[True, np.diff(cell_of[order]) > 0])
+    fewest = min(2, len(np.unique(points.number)))
+    cells = [_observe(points, some, spread, fewest=fewest, keep=keep) for some in np.split(order, starts[1:])]
+    found = [cell for cell in cells if cell is not None]
+    if not found:
+        raise CalibrationError(
+            "no part of the surface is seen by two passes with enough points: overlap the passes, or give the right "
+            "poses"
+        )
+    most = _ROUGHEST * float(np.median([cell.scatter for cell in found]))
+    return [cell for cell in found if keep or cell.scatter <= most]
+
+
+def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int, keep: bool) -> Cell | None:
+    """Return a cell with the points ``some`` (n,), or None if fewer than ``fewest`` passes have enough points in it.
+
+    Without ``keep``, outliers are left out.
+    """
+    numbers, counts = np.unique(points.number[some], return_counts=True)
+    enough = numbers[counts >= _FEWEST]
+    if len(enough) < fewest:
+        return None
+    some = some[np.isin(points.number[some], enough)]
+    for _ in range(2):
+        middle = points.places_mm[some].mean(axis=0)
+        about = points.places_mm[some] - middle
+        axes = np.linalg.eigh(about.T @ about)[1]
+        u, v, w = (about @ axes[:, ::-1]).T
+        size = max(float(np.abs(u).max()), 1e-9)
+        surface = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v]) / size ** np.array([0, 1, 1, 2, 2, 2])
+        number = points.number[some]
+        # Offset and slopes of all passes but one, so that their disagreement is no scatter.
+        own = np.hstack(
+            [np.empty((len(some), 0)), *(surface[:, :3] * (number == each)[:, None] for each in enough[1:])]
+        )
+        shape = np.linalg.lstsq(surface, w, rcond=None)[0] / size ** np.array([0, 1, 1, 2, 2, 2])
+        slope_u, slope_v = shape[1] + 2 * shape[3] * u + shape[4] * v, shape[2] + shape[4] * u + 2 * shape[5] * v
+        up = axes[:, 0] - slope_u[:, None] * axes[:, 2] - slope_v[:, None] * axes[:, 1]
+        by_px = np.einsum("ni,ni->n", up, points.by_px[some])
+        by_image = np.einsum("ni,ni->n", up, points.image_mm[some])
+        std = spread * np.sqrt((by_px * points.noise_px[some]) ** 2 + by_image**2)
+        height = (w - by_px * points.correction_px[some]) / std
+        design = np.hstack([surface, own]) / std[:, None]
+        left = height - design @ np.linalg.lstsq(design, height, rcond=None)[0]
+        freedom = len(some) - design.shape[1]
+        if freedom < _FEWEST:
+            return None
+        robust = MAD_TO_STD * float(np.median(np.abs(left))) * np.sqrt(len(some) / freedom)
+        good = keep | (np.abs(left) <= _OUTLIER * max(robust, 1.0))
+        if good.all():
+            break
+        some = some[good]
+        if min(np.count_nonzero(points.number[some] == each) for each in enough) < _FEWEST:
+            return None
+    else:
+        return None
+    scatter = max(float(np.sqrt(np.sum(left**2) / freedom)), 1.0)
+    std = std * scatter
+    height, columns = height / scatter, surface / std[:, None]
+    base = np.linalg.qr(columns)[0]
+    rows = np.einsum("ni,niu->nu", up, points.by_unknowns[some]) / std[:, None]
+    mean_row = (rows / std[:, None]).sum(axis=0) / np.sum(std**-2.0)
+
+    def without_surface(values: np.ndarray) -> np.ndarray:
+        return values - base @ (base.T @ values)
+
+    residuals = without_surface(height)
+    # Passes with their own offsets and slopes have less disagreement left.
+    apart = np.linalg.qr(without_surface(own / std[:, None]))[0]
+    offset_square = float(np.sum((apart.T @ residuals) ** 2)) / max(apart.shape[1], 1)
+    # Heights along the mean normal, so that rows of another pass refer to the same direction.
+    length, normal = float(np.linalg.norm(up.mean(axis=0))), up.mean(axis=0)
+    return Cell(
+        some,
+        normal / length,
+        middle,
+        without_surface(rows),
+        mean_row / length,
+        residuals,
+        by_px,
+        std,
+        by_image / std,
+        scatter,
+        offset_square,
+        tuple(enough.tolist()),
+    )
