@@ -1,27 +1,31 @@
 """Recalibration of drawn sensors by rendered passes over scenes without an artefact, against the rendered truth.
 
-    python -m docs.studies.recalibration --seeds 0-9 --out runs/recalibration.csv
+    python -m docs.studies.recalibration --first 100 --count 10 --kinds shifted,turned --write
+    python -m docs.studies.recalibration --first 200 --count 5 --kinds "scene moved"
 
 Each campaign draws a sensor, its water, its stage and the errors of the poses from the sensor's table [uncertainty],
-renders three passes (40 mm along Y, 60 mm lower) over one of five scenes, and recalibrates the described sensor. Lengths
-are those between the true points of one profile (along Y), and of profiles in the highest and the lowest pass (along Z),
-both in the sensor's coordinates and scaled to 100 mm.
+renders passes over one of five scenes, and recalibrates the described sensor. Lengths are those between the mean true
+points of two parts of a pass (along Y) and of two passes (along Z), in the sensor's coordinates, scaled to 100 mm.
 """
 
-import csv
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import tomli_w
 from cyclopts import App
 from scipy.spatial.transform import Rotation
 
 import twin
 import uwlts
+from docs.studies.result_tables import publish, table
 from twin.scene.description import Scene
 from uwlts.model.library import load_sensor, merge_tables, validate_description
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Sensor
+from uwlts.recalibration.as_built import as_built
 from uwlts.storage.capture import open_capture
 from uwlts.storage.truth import read_truth, truth_path
 
@@ -29,7 +33,9 @@ POSE_MM, POSE_DEG = 0.01, 0.005
 PASSES = {"reference": (0.0, 0.0, 0.0), "shifted": (40.0, 0.0, 0.0), "lower": (0.0, 60.0, 0.0)}
 """Shift along Y and along Z, mm, and turn about Z, deg."""
 TURNED = {"0": (0.0, 0.0, 0.0), "90": (0.0, 0.0, 90.0), "180": (0.0, 0.0, 180.0), "lower": (0.0, 60.0, 0.0)}
-FAULTS = ("none", "scene moved", "pose scale", "warmer", "mirrored")
+FAULTS = ("scene moved", "pose scale", "warmer", "mirrored")
+HEAD = ["passes", "campaigns", "100 mm along", "before, mm", "stated", "after, mm", "stated", "error / stated"]
+HEAD += ["within 2 stated", "doubted"]
 UNCERTAINTY = {
     "window_distance_mm": 5.0,
     "window_tilt_deg": 0.3,
@@ -197,6 +203,9 @@ def record(seed: int, folder: Path, *, turned: bool = False, fault: str = "none"
             },
         }
         out = folder / f"{seed}-{name}.h5"
+        captures.append(out)
+        if out.exists():
+            continue
         twin.simulate(
             validate_description(Scene, table, "passes"),
             out=out,
@@ -206,7 +215,6 @@ def record(seed: int, folder: Path, *, turned: bool = False, fault: str = "none"
             spp=8,
             water="clear",
         )
-        captures.append(out)
     return captures, np.array(stated)
 
 
@@ -223,8 +231,8 @@ def measure(captures: list[Path], found: uwlts.Calibration) -> dict[str, float]:
         good = np.isfinite(true).all(axis=1) & (truth.crossings[cloud.frame, cloud.line] == 1)
         parts.append((cloud.points_mm[good] - travel[good], true[good]))
     (high, high_true), (low, low_true) = parts
-    lower, upper = (high_true[:, 1] < q for q in np.quantile(high_true[:, 1], [0.1, 0.9]))
-    upper = ~upper
+    low_y, high_y = np.quantile(high_true[:, 1], [0.1, 0.9])
+    lower, upper = high_true[:, 1] < low_y, high_true[:, 1] > high_y
     along_y = np.mean(high[upper], axis=0)[1] - np.mean(high[lower], axis=0)[1]
     true_y = np.mean(high_true[upper], axis=0)[1] - np.mean(high_true[lower], axis=0)[1]
     along_z = np.mean(low, axis=0)[2] - np.mean(high, axis=0)[2]
@@ -232,57 +240,57 @@ def measure(captures: list[Path], found: uwlts.Calibration) -> dict[str, float]:
     return {"Y": 100.0 * (along_y - true_y) / true_y, "Z": 100.0 * (along_z - true_z) / true_z}
 
 
+def run(seed: int, folder: Path, *, turned: bool, fault: str) -> dict[str, Any]:
+    """Return ``rows`` of axis, error and stated uncertainty before and after, mm, and the ``doubts`` of a campaign."""
+    captures, poses = record(seed, folder, turned=turned, fault=fault)
+    if fault == "mirrored":
+        poses[1, 1, 3] *= -1.0
+    sensor, described = describe_sensor(), folder / "described.toml"
+    described.write_text(tomli_w.dumps(sensor.model_dump(exclude_none=True)), encoding="utf-8")
+    try:
+        found = uwlts.recalibrate(captures, described, poses=poses, pose_std_mm=POSE_MM, pose_std_deg=POSE_DEG)
+    except uwlts.Error as error:
+        return {"rows": [], "doubts": (f"refused: {error}",)}
+    before, after = (measure(captures, each) for each in (as_built(sensor, sensor.media["water"]), found.calibration))
+    rows = [(each.axis, before[each.axis], each.before_mm, after[each.axis], each.after_mm) for each in found.lengths]
+    return {"rows": rows, "doubts": found.doubts}
+
+
+def summarise(kind: str, results: list[dict[str, Any]]) -> list[list[str]]:
+    """Return a row for each axis of a kind of campaigns."""
+    cells = []
+    for axis in "YZ":
+        own = np.array([row[1:] for result in results for row in result["rows"] if row[0] == axis]).reshape(-1, 4)
+        rms = np.sqrt(np.mean(own**2, axis=0))
+        ratio = own[:, 2] / own[:, 3]
+        inside = np.mean(np.abs(ratio) < 2.0)
+        doubted = sum(bool(result["doubts"]) for result in results)
+        cells.append(
+            [kind, str(len(results)), axis, f"{rms[0]:.3f}", f"{rms[1]:.3f}", f"{rms[2]:.3f}", f"{rms[3]:.3f}"]
+            + [f"{np.sqrt(np.mean(ratio**2)):.2f}", f"{100 * inside:.0f} %", f"{doubted} of {len(results)}"]
+        )
+    return cells
+
+
 app = App(help=__doc__)
 
 
 @app.default
-def main(*, seeds: str = "0-9", turned: bool = False, fault: str = "none", out: Path | None = None) -> None:
-    """Run campaigns and print one line for each."""
-    first, last = map(int, seeds.split("-"))
+def main(
+    *, first: int = 0, count: int = 10, kinds: str = "shifted", keep: Path | None = None, write: bool = False
+) -> None:
+    """Run campaigns of kinds (shifted, turned, or a fault), print each, and publish the table."""
     rows = []
-    for seed in range(first, last + 1):
-        with tempfile.TemporaryDirectory() as folder:
-            captures, poses = record(seed, Path(folder), turned=turned, fault=fault)
-            if fault == "mirrored":
-                poses = poses.copy()
-                poses[1, :3, 3] *= -1.0
-            described = Path(folder) / "described.toml"
-            import tomli_w
-
-            described.write_text(tomli_w.dumps(describe_sensor().model_dump(exclude_none=True)))
-            try:
-                found = uwlts.recalibrate(captures, described, poses=poses, pose_std_mm=POSE_MM, pose_std_deg=POSE_DEG)
-            except uwlts.Error as error:
-                print(seed, "refused:", error, flush=True)
-                continue
-            before, after = (
-                measure(captures, each)
-                for each in (
-                    uwlts.recalibration.as_built.as_built(describe_sensor(), describe_sensor().media["water"]),
-                    found.calibration,
-                )
-            )
-            for each in found.lengths:
-                ratio = after[each.axis] / each.after_mm
-                rows.append(
-                    [seed, each.axis, before[each.axis], each.before_mm, after[each.axis], each.after_mm, ratio]
-                )
-                print(
-                    seed, each.axis, "before %.3f (%.3f) after %.4f (%.4f) ratio %.2f" % tuple(rows[-1][2:]), flush=True
-                )
-            print(
-                seed,
-                "cells",
-                found.cells,
-                "spread %.2f" % found.spread,
-                *found.doubts,
-                *found.advice(),
-                sep="\n  ",
-                flush=True,
-            )
-    if out is not None:
-        with out.open("w", newline="") as file:
-            csv.writer(file).writerows([["seed", "axis", "before", "stated", "after", "stated", "ratio"], *rows])
+    for kind in kinds.split(","):
+        results = []
+        for seed in range(first, first + count):
+            with tempfile.TemporaryDirectory() if keep is None else nullcontext(str(keep / kind / str(seed))) as folder:
+                Path(folder).mkdir(parents=True, exist_ok=True)
+                fault = kind if kind in FAULTS else "none"
+                results.append(run(seed, Path(folder), turned=kind == "turned", fault=fault))
+            print(kind, seed, results[-1], flush=True)
+        rows += summarise(kind, results)
+    publish({"recalibration by passes": table(HEAD, rows)}, write=write)
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ MAKE = {"make ": "`make test-full` runs this test, and demo, bench, docs and che
 INSTALL = {"pip install": "make does it", "twin demo": "takes a minute; tests/system/test_campaign.py runs it"}
 HARDWARE = "needs hardware: docs/how-to/scan.md and desk.md run it with the twin"
 ALIGNED_ELSEWHERE = "a pass that can be aligned takes minutes to render: tests/uwlts/alignment/test_align.py runs it"
+PASSES_ELSEWHERE = "passes take minutes to render: tests/uwlts/recalibration recalibrates drawn ones by the command"
 NEEDS_ROS = "needs ROS 2: tests/ros_node.py runs it"
 
 THREE_VIEWS = {"top.cloud.h5": "pipe.cloud.h5"} | {f"{side}.cloud.h5": f"{side}.cloud.h5" for side in ("left", "right")}
@@ -249,6 +250,7 @@ PAGES_RUN = {
         instead={"stripe-turbid --scenes 200": "stripe-clean --scenes 1", "scenes = 40": "scenes = 2"},
     ),
     "docs/how-to/make-a-mesh.md": Page(given=THREE_VIEWS | {"merged.cloud.h5": "pipe.cloud.h5"}),
+    "docs/how-to/recalibrate-by-passes.md": Page(not_run={"uwlts recalibrate": PASSES_ELSEWHERE}),
     "docs/how-to/register-scans.md": Page(given=THREE_VIEWS, texts={"start.csv": NO_MOVEMENT}),
     "docs/how-to/ros.md": Page(not_run={"pip install": NEEDS_ROS, "uwlts ros": NEEDS_ROS}),
     "docs/how-to/scan-from-a-vehicle.md": Page(

@@ -135,12 +135,13 @@ def recalibrate(
     call: Call,
     *,
     out: Annotated[
-        Path | None, a_file(".json"), Parameter(help="Calibration to write. Without it, the passes only check the old one.")
+        Path | None,
+        a_file(".json"),
+        Parameter(help="Calibration to write. Without it, the passes only check the old one."),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Example: uwlts recalibrate a.h5 b.h5 c.h5 --calibration old.json --poses passes.csv --pose-std-mm 0.01
-    --pose-std-deg 0.005 --out new.json
+    """Example: uwlts recalibrate a.h5 b.h5 old.json --poses poses.csv --pose-std-mm 0.01 --pose-std-deg 0.005
 
     The exit code is 1, and no calibration is written, if the passes contradict each other or the old calibration.
     """

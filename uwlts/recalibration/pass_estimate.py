@@ -1,8 +1,8 @@
 """Joint estimate of a sensor's errors, of the poses of passes and of the water's index in each, from their overlaps.
 
-All unknowns are amplitudes with a mean of zero and a variance of one before the passes: independent errors of the
-calibration and of the stage (`independent_components`), the scale of the poses, and for each pass the errors of its
-pose and the change of the water's index. Each round reconstructs the passes with the moved calibration.
+All unknowns are amplitudes with a mean of zero and a variance of one before the passes. All passes share the
+independent errors of calibration and stage (`independent_components`), and the scale of the poses. Each pass has the
+errors of its pose, and a change of the water's index. Each round reconstructs the passes with the moved calibration.
 """
 
 from collections.abc import Sequence
@@ -50,8 +50,8 @@ class Pass:
 class Motion:
     """Stated standard uncertainties of the motion.
 
-    ``pose_mm`` and ``pose_rad`` are those of each pass's pose, along and about each axis, ``pose_scale`` is that of all
-    poses' distances, and ``image_mm`` that of each position along the stage.
+    ``pose_mm`` and ``pose_rad`` are those of each pass's pose, along and about each axis. ``pose_scale`` is that of the
+    scale of all poses, and ``image_mm`` that of each position along the stage.
     """
 
     pose_mm: float
@@ -74,7 +74,6 @@ class PassSolution:
     weights: np.ndarray
     points: PassPoints
     spread: float
-    rounds: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,16 +128,15 @@ class PassProblem:
         known = self.moved(amplitudes)
         rigid = -known.frame_by @ self.root
         rigid[0, -1] += self.window_shift_mm
-        direction, index_key = self.stage_direction(amplitudes), known.parameters.index_key
+        direction, medium = self.stage_direction(amplitudes), known.view.medium
+        # In air no index drifts.
+        place = 0 if medium is None else known.parameters.places[known.parameters.index_key(medium)]
         parts, first = [], 0
         for number, each in enumerate(self.passes):
             columns = self.of_pass(number)
             shift, turn, water = np.split(amplitudes[columns], [3, 6])
-            estimate = known
-            if known.view.medium is not None:
-                place = known.parameters.places[index_key(known.view.medium)]
-                values = known.values + self.drift * water[0] * np.eye(len(known.values))[place]
-                estimate = replace(known, values=values)
+            values = known.values + self.drift * water[0] * np.eye(len(known.values))[place]
+            estimate = replace(known, values=values)
             found = estimate.triangulate(each.line, each.centre_px + corrections_px[number])
             if found is None:
                 raise CalibrationError(f"{each.name}: the passes lead to a calibration that gives no point")
@@ -148,8 +146,7 @@ class PassProblem:
             local[:, :, :parts_of] = by[:, :, 1:] @ self.root
             local[:, :, :parts_of] += rigid[:3] + np.cross(rigid[3:].T, points[:, None]).swapaxes(1, 2)
             local[:, :, :parts_of] += each.travel_mm[:, None, None] * self.by_stage.T
-            if known.view.medium is not None:
-                local[:, :, columns.stop - 1] = self.drift * by[:, :, 1 + place]
+            local[:, :, columns.stop - 1] = self.drift * by[:, :, 1 + place]
             points = points + each.beside_mm + each.travel_mm[:, None] * direction
             points[:, 0] += self.window_shift_mm * amplitudes[parts_of - 1]
             rotation, origin = each.pose[each.frame, :3, :3], each.pose[each.frame, :3, 3]
@@ -238,11 +235,11 @@ def solve_passes(problem: PassProblem, *, size_mm: float) -> PassSolution:
             break
     else:
         raise CalibrationError(
-            f"the passes do not converge: the last step was {np.abs(step).max():.2g} prior standard uncertainties; give "
-            "better poses or a better calibration"
+            f"the passes do not converge: the last step was {np.abs(step).max():.2g} prior standard uncertainties; "
+            "give better poses or a better calibration"
         )
     covariance = _covariance(cells, weights, total, points)
-    return PassSolution(amplitudes, covariance, cells, weights, points, spread, done + 1)
+    return PassSolution(amplitudes, covariance, cells, weights, points, spread)
 
 
 def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.ndarray:

@@ -1,8 +1,6 @@
 """Recalibration of a sensor by overlapping passes over an unknown scene, with known motions between them."""
 
-import os
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,7 +27,7 @@ from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px, ind
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.progress import ProgressListener, ignore_progress
 from uwlts.storage.calibration_file import read_calibration
-from uwlts.storage.capture import Capture, open_capture, sensor_poses
+from uwlts.storage.capture import Capture, open_captures, sensor_poses
 from uwlts.storage.number_tables import Unit
 from uwlts.storage.pose_files import PoseFormat, read_poses
 from uwlts.stripe import StripeSettings, find_stripes
@@ -48,7 +46,7 @@ _FALSE_ALARM = 0.05
 _POOR_FIT = 2.0
 """Disagreement of passes relative to their noise above which the surface is not the same in all passes."""
 _DETERMINED = 0.5
-"""Least share of a prior variance that the passes remove in a direction whose deviation is tested."""
+"""Least fraction of a prior variance that the passes remove in a direction whose deviation is tested."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class ParameterChange:
 
     @property
     def determined(self) -> bool:
-        """Whether the passes halve the standard uncertainty."""
+        """True if the passes halve the standard uncertainty."""
         return self.std < 0.5 * self.std_before
 
     def line(self) -> str:
@@ -122,7 +120,7 @@ class Recalibrated(Brief):
         ]
         lines += [each.line() for each in self.parameters if each.determined]
         if kept := [each.key.quantity.words for each in self.parameters if not each.determined]:
-            lines.append(f"known from before, as these passes hardly determine them: {', '.join(kept)}")
+            lines.append(f"not determined by these passes, known from before: {', '.join(kept)}")
         lines += self.advice()
         return lines
 
@@ -137,12 +135,12 @@ class Recalibrated(Brief):
 
 
 def recalibrate(
-    passes: Sequence[Capture | str | os.PathLike[str]],
-    calibration: Calibration | str | os.PathLike[str],
+    passes: Sequence[Capture | str | Path],
+    calibration: Calibration | str | Path,
     *,
     pose_std_mm: float,
     pose_std_deg: float,
-    poses: np.ndarray | str | os.PathLike[str] | None = None,
+    poses: np.ndarray | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
     pose_unit: Unit | None = None,
     stripe: StripeSettings = None,
@@ -195,16 +193,14 @@ def recalibrate(
     for name, std in (("pose_std_mm", pose_std_mm), ("pose_std_deg", pose_std_deg)):
         if not std > 0:
             raise RangeError(f"`{name}` is {std:g}; expected a positive number")
-    if isinstance(poses, str | os.PathLike):
-        poses = read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0]
-    if not passes:
-        raise CaptureError("no passes are given; a recalibration needs two or more")
-    if poses is not None and len(poses) != len(passes):
-        raise CaptureError(f"{len(poses)} poses are given for {len(passes)} passes: give one for each, in their order")
-    with ExitStack() as opened:
-        scans = [
-            opened.enter_context(open_capture(each if isinstance(each, Capture) else Path(each))) for each in passes
-        ]
+    given = (
+        read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0] if isinstance(poses, str | Path) else poses
+    )
+    if given is not None and len(given) != len(passes):
+        raise CaptureError(f"{len(given)} poses are given for {len(passes)} passes: give one for each, in their order")
+    with open_captures(passes) as scans:
+        if not scans:
+            raise CaptureError("no passes are given; a recalibration needs two or more")
         header = scans[0].header
         for scan in scans[1:]:
             if scan.header.sensor != header.sensor or scan.header.medium != header.medium:
@@ -212,15 +208,15 @@ def recalibrate(
         if isinstance(calibration, Calibration):
             prior = calibration
         elif Path(calibration).suffix == ".toml":
-            prior = as_built(load_sensor(Path(calibration)), header.medium)
+            prior = as_built(load_sensor(calibration), header.medium)
         else:
-            prior = read_calibration(Path(calibration))
+            prior = read_calibration(calibration)
         require_joint(prior)
         for scan in scans:
             check_fits(scan.header, prior, source=scan.path.name)
         gathered = []
         for number, scan in enumerate(scans):
-            gathered.append(_gather(scan, prior, None if poses is None else poses[number], stripe))
+            gathered.append(_gather(scan, prior, None if given is None else given[number], stripe))
             progress(number + 1, len(scans) + 1)
     known = read_stored_estimate(prior, header.sensor, header.medium)
     root, by_stage = independent_components(known, prior, header)
@@ -271,7 +267,7 @@ def _gather(scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: 
         raise CalibrationError(f"{scan.path.name}: a stripe centre gives no point with this calibration")
     rotation, origin = of_images[kept.frame, :3, :3], of_images[kept.frame, :3, 3]
     direction = np.array(prior.stage_direction_of(scan.header.stage_direction))
-    # What `reconstruct` adds to the centre of the sheet: the origin of the light, and motion during the exposure.
+    # `reconstruct` adds the shift to the origin of the light, and motion during the exposure.
     beside = np.einsum("nji,nj->ni", rotation, points - origin) - found[0] - travel[:, None] * direction
     even = np.linalg.norm(beside, axis=1) < _SHIFTED * noise * np.linalg.norm(found[1][:, :, 0], axis=1)
     common = np.eye(4) if pose is None else pose
@@ -322,10 +318,11 @@ def _lengths(
     problem: PassProblem, solution: PassSolution, moved: StoredEstimate
 ) -> tuple[tuple[LengthUncertainty, ...], np.ndarray]:
     """Return the uncertainties of lengths along Y and Z, and their derivatives (2, U) by all amplitudes."""
-    local = [
-        np.array(moved.triangulate(each.line[::97], each.centre_px[::97])[0])
-        for each in problem.passes  # type: ignore[index]
-    ]
+    local = []
+    for each in problem.passes:
+        found_points = moved.triangulate(each.line[::97], each.centre_px[::97])
+        assert found_points is not None
+        local.append(found_points[0])
     middle = np.median(np.vstack(local), axis=0)[1:]
     half, found = np.eye(2) * _LENGTH_MM / 2, []
     while not found:
@@ -395,12 +392,10 @@ def _build(
     number = moved.view.medium
     if number is not None and number < len(media):
         media[number] = KnownMedium(medium=media[number].medium, index=index)
+    way = problem.stage_direction(solution.amplitudes)
+    way = tuple((way / np.linalg.norm(way)).tolist())
     stages = tuple(
-        KnownStage(
-            described=each.described, direction=tuple(_unit(problem.stage_direction(solution.amplitudes)).tolist())
-        )
-        if np.allclose(each.described, described)
-        else each
+        KnownStage(described=each.described, direction=way) if np.allclose(each.described, described) else each
         for each in prior.stages
     )
     estimate = joint.model_copy(
@@ -417,15 +412,6 @@ def _build(
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "recalibrated": {"digest": calibration_digest(prior), "passes": [each.name for each in problem.passes]},
     }
-    return replace_media(moved.calibration, tuple(media)).model_copy(
-        update={"joint": estimate, "provenance": provenance, "stages": stages}
+    return moved.calibration.model_copy(
+        update={"media": tuple(media), "joint": estimate, "provenance": provenance, "stages": stages}
     )
-
-
-def replace_media(calibration: Calibration, media: tuple[KnownMedium, ...]) -> Calibration:
-    """Return a calibration with other media."""
-    return calibration.model_copy(update={"media": media})
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector)
