@@ -45,7 +45,7 @@ _FALSE_ALARM = 0.05
 """Probability of a doubt about right passes, by all tests together."""
 _POOR_FIT = 2.0
 """Disagreement of passes relative to their noise above which the surface is not the same in all passes."""
-_DETERMINED = 0.5
+_DETERMINED = 0.01
 """Least fraction of a prior variance that the passes remove in a direction whose deviation is tested."""
 
 

@@ -28,7 +28,13 @@ from uwlts.storage.pose_files import write_poses
 
 SENSOR = replace_values(
     load_sensor("thesis-small"),
-    uncertainty={"window_distance_mm": 5.0, "focal_length": 5e-4, "temperature_k": 5.0, "sheet_offset_mm": 1.0},
+    uncertainty={
+        "window_distance_mm": 5.0,
+        "focal_length": 5e-4,
+        "temperature_k": 5.0,
+        "sheet_offset_mm": 1.0,
+        "drift_k": 0.2,
+    },
     media=load_sensor("thesis-small").media | {"water": Medium(kind="fresh", temperature_c=15.0)},
 )
 WATER = SENSOR.media["water"]
