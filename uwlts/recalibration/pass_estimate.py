@@ -62,17 +62,14 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class PassSolution:
-    """Amplitudes (U,), their covariance (U, U), and the information (U, U) of the passes alone.
+    """Amplitudes (U,) with their covariance (U, U), and the observed parts of the surface.
 
-    ``cells`` are the observed parts of the surface with ``weights``. ``spread`` is the scatter of the passes' distances
-    relative to their stated noise, at least 1.
+    ``spread`` is the scatter of the passes' distances relative to their stated noise, at least 1.
     """
 
     amplitudes: np.ndarray
     covariance: np.ndarray
     cells: list[Cell]
-    weights: np.ndarray
-    points: PassPoints
     spread: float
 
 
@@ -239,7 +236,7 @@ def solve_passes(problem: PassProblem, *, size_mm: float) -> PassSolution:
             "give better poses or a better calibration"
         )
     covariance = _covariance(cells, weights, total, points)
-    return PassSolution(amplitudes, covariance, cells, weights, points, spread)
+    return PassSolution(amplitudes, covariance, cells, spread)
 
 
 def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.ndarray:
