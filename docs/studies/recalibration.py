@@ -214,6 +214,7 @@ def record(seed: int, folder: Path, *, turned: bool = False, fault: str = "none"
             seed=seed * 10 + number,
             spp=8,
             water="clear",
+            overwrite=True,
         )
     return captures, np.array(stated)
 

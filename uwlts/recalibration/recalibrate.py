@@ -164,7 +164,7 @@ def recalibrate(
         of its points.
     poses : (K, 4, 4) or path, optional
         Pose of the sensor in each pass, as the transform from its OCS (stage at zero) to a common frame: an array or a
-        table. By default the frames have poses, all in one frame.
+        table. By default the frames have poses, all in one frame; a single pass needs none.
     pose_format, pose_unit
         As for `reconstruct`.
     stripe
@@ -199,6 +199,8 @@ def recalibrate(
     )
     if given is not None and len(given) != len(passes):
         raise CaptureError(f"{len(given)} poses are given for {len(passes)} passes: give one for each, in their order")
+    if given is None and len(passes) == 1:
+        given = np.eye(4)[None]
     with open_captures(passes) as scans:
         if not scans:
             raise CaptureError("no passes are given; a recalibration needs two or more")
@@ -213,8 +215,6 @@ def recalibrate(
         else:
             prior = read_calibration(calibration)
         require_joint(prior)
-        for scan in scans:
-            check_fits(scan.header, prior, source=scan.path.name)
         gathered = []
         for number, scan in enumerate(scans):
             gathered.append(_gather(scan, prior, None if given is None else given[number], stripe))
@@ -242,6 +242,7 @@ def recalibrate(
 
 def _gather(scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: StripeSettings) -> Pass:
     """Return the stripe centres of a capture, with the noise of each and the place of each image."""
+    check_fits(scan.header, prior, source=scan.path.name)
     of_frames = sensor_poses(scan)
     posed = np.isfinite(of_frames).all(axis=(1, 2))
     if pose is None and not posed[scan.laser_on].all():
@@ -271,7 +272,6 @@ def _gather(scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: 
     # `reconstruct` adds the shift to the origin of the light, and motion during the exposure.
     beside = np.einsum("nji,nj->ni", rotation, points - origin) - found[0] - travel[:, None] * direction
     even = np.linalg.norm(beside, axis=1) < _SHIFTED * noise * np.linalg.norm(found[1][:, :, 0], axis=1)
-    common = np.eye(4) if pose is None else pose
     return Pass(
         scan.path.name,
         kept.frame[even],
@@ -280,7 +280,7 @@ def _gather(scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: 
         noise[even],
         beside[even],
         travel[even],
-        common @ of_images,
+        of_images if pose is None else pose @ of_images,
     )
 
 
