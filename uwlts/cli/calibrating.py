@@ -141,7 +141,7 @@ def recalibrate(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Example: uwlts recalibrate a.h5 b.h5 old.json --poses poses.csv --pose-std-mm 0.01 --pose-std-deg 0.005
+    """Example: uwlts recalibrate a.h5 b.h5 --calibration old.json --poses p.csv --pose-std-mm 0.01 --pose-std-deg 0.005
 
     The exit code is 1, and no calibration is written, if the passes contradict each other or the old calibration.
     """

@@ -112,8 +112,8 @@ class Recalibrated(Brief):
     def lines(self) -> list[str]:
         """Return a summary as text."""
         lines = [
-            f"{self.cells} parts of the surface in two or more passes; their distances scatter {self.spread:.2f} "
-            "times as much as their noise (at least 1)"
+            f"{self.cells} parts of the surface; the passes' distances scatter {self.spread:.2f} times as much as "
+            "their noise (at least 1)"
         ]
         lines += [
             f"100 mm along {each.axis}: standard uncertainty {each.before_mm:.3f} mm before, {each.after_mm:.3f} mm now"
