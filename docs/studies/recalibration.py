@@ -40,7 +40,7 @@ UNCERTAINTY = {
     "window_distance_mm": 5.0,
     "window_tilt_deg": 0.3,
     "focal_length": 5e-4,
-    "temperature_k": 5.0,
+    "temperature_k": 3.0,
     "drift_k": 0.2,
     "sheet_offset_mm": 1.0,
     "sheet_turn_deg": 0.3,
