@@ -249,7 +249,9 @@ def run(seed: int, folder: Path, *, turned: bool, fault: str) -> dict[str, Any]:
     sensor, described = describe_sensor(), folder / "described.toml"
     described.write_text(tomli_w.dumps(sensor.model_dump(exclude_none=True)), encoding="utf-8")
     try:
-        found = uwlts.recalibrate(captures, described, poses=poses, pose_std_mm=POSE_MM, pose_std_deg=POSE_DEG)
+        found = uwlts.recalibrate(
+            captures, calibration=described, poses=poses, pose_std_mm=POSE_MM, pose_std_deg=POSE_DEG
+        )
     except uwlts.Error as error:
         return {"rows": [], "doubts": (f"refused: {error}",)}
     before, after = (measure(captures, each) for each in (as_built(sensor, sensor.media["water"]), found.calibration))

@@ -49,7 +49,7 @@ def _required(app: App, command: str, option: str) -> list[str]:
     words = []
     for argument in app[command].assemble_argument_collection():
         if argument.required and argument.name != option:
-            name = "x.h5" if argument.name == "--out" else "x"
+            name = "x.h5" if argument.name == "--out" else "1" if argument.hint is float else "x"
             words += [name] if argument.field_info.is_positional else [argument.name, name]
     return words
 

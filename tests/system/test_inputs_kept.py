@@ -52,7 +52,7 @@ def _arguments(program: str, name: str, given: dict[str, Path]) -> list[str]:
     for each, parameter in inspect.signature(function).parameters.items():
         required = parameter.default is inspect.Parameter.empty
         if each in given or (required and parameter.kind is not inspect.Parameter.VAR_POSITIONAL):
-            value = str(given.get(each, "other"))
+            value = str(given.get(each, "1" if "float" in str(parameter.annotation) else "other"))
             by_name = parameter.kind is inspect.Parameter.KEYWORD_ONLY
             words += [f"--{each.replace('_', '-')}", value] if by_name else [value]
     has_overwrite = "overwrite" in inspect.signature(function).parameters

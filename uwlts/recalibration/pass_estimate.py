@@ -47,7 +47,7 @@ class Pass:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class MotionUncertainty:
     """Stated standard uncertainties of the motion.
 
     ``pose_mm`` and ``pose_rad`` are those of each pass's pose, along and about each axis. ``pose_scale`` is that of the
@@ -90,7 +90,7 @@ class PassProblem:
     direction: np.ndarray
     window_shift_mm: float
     drift: float
-    motion: Motion
+    motion: MotionUncertainty
     middle_mm: np.ndarray
 
     @property

@@ -119,22 +119,21 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         axes = np.linalg.eigh(about.T @ about)[1]
         u, v, w = (about @ axes[:, ::-1]).T
         size = max(float(np.abs(u).max()), 1e-9)
-        surface = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v]) / size ** np.array([0, 1, 1, 2, 2, 2])
-        number = points.number[some]
+        u, v = u / size, v / size
+        surface = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
         # Offset and slopes of all passes but one, so that their disagreement is no scatter.
-        own = np.hstack(
-            [np.empty((len(some), 0)), *(surface[:, :3] * (number == each)[:, None] for each in enough[1:])]
-        )
-        shape = np.linalg.lstsq(surface, w, rcond=None)[0] / size ** np.array([0, 1, 1, 2, 2, 2])
+        others = points.number[some, None] == enough[1:]
+        own = (others[:, :, None] * surface[:, None, :3]).reshape(len(some), -1)
+        shape = np.linalg.lstsq(surface, w, rcond=None)[0] / size
         slope_u, slope_v = shape[1] + 2 * shape[3] * u + shape[4] * v, shape[2] + shape[4] * u + 2 * shape[5] * v
         up = axes[:, 0] - slope_u[:, None] * axes[:, 2] - slope_v[:, None] * axes[:, 1]
         by_px = np.einsum("ni,ni->n", up, points.by_px[some])
         by_image = np.einsum("ni,ni->n", up, points.image_mm[some])
         std = spread * np.sqrt((by_px * points.noise_px[some]) ** 2 + by_image**2)
         height = (w - by_px * points.correction_px[some]) / std
-        design = np.hstack([surface, own]) / std[:, None]
-        left = height - design @ np.linalg.lstsq(design, height, rcond=None)[0]
-        freedom = len(some) - design.shape[1]
+        base = np.linalg.qr(np.hstack([surface, own]) / std[:, None])[0]
+        left = height - base @ (base.T @ height)
+        freedom = len(some) - base.shape[1]
         if freedom < _FEWEST:
             return None
         robust = MAD_TO_STD * float(np.median(np.abs(left))) * np.sqrt(len(some) / freedom)
@@ -148,31 +147,22 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         return None
     scatter = max(float(np.sqrt(np.sum(left**2) / freedom)), 1.0)
     std = std * scatter
-    height, columns = height / scatter, surface / std[:, None]
-    base = np.linalg.qr(columns)[0]
+    height, shared, apart = height / scatter, base[:, :6], base[:, 6:]
     rows = np.einsum("ni,niu->nu", up, points.by_unknowns[some]) / std[:, None]
     mean_row = (rows / std[:, None]).sum(axis=0) / np.sum(std**-2.0)
-
-    def without_surface(values: np.ndarray) -> np.ndarray:
-        return values - base @ (base.T @ values)
-
-    residuals = without_surface(height)
-    # Passes with their own offsets and slopes have less disagreement left.
-    apart = np.linalg.qr(without_surface(own / std[:, None]))[0]
-    offset_square = float(np.sum((apart.T @ residuals) ** 2)) / max(apart.shape[1], 1)
     # Heights along the mean normal, so that rows of another pass refer to the same direction.
     length, normal = float(np.linalg.norm(up.mean(axis=0))), up.mean(axis=0)
     return Cell(
         some,
         normal / length,
         middle,
-        without_surface(rows),
+        rows - shared @ (shared.T @ rows),
         mean_row / length,
-        residuals,
+        height - shared @ (shared.T @ height),
         by_px,
         std,
         by_image / std,
         scatter,
-        offset_square,
+        float(np.sum((apart.T @ height) ** 2)) / max(apart.shape[1], 1),
         tuple(enough.tolist()),
     )
