@@ -240,13 +240,14 @@ def solve_passes(problem: PassProblem, *, size_mm: float) -> PassSolution:
 
 
 def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.ndarray:
-    """Return the corrections (N,) of all stripe centres after a step: their part of the remaining residuals."""
+    """Return the corrections (N,) of all stripe centres after a step: their part of the remaining residuals.
+
+    On rough surfaces, most of a residual is no error of the centre.
+    """
     corrections = np.zeros(len(points.number))
     for cell in cells:
-        left = (cell.residuals + cell.rows @ step) * cell.std
-        variance = (cell.by_px * points.noise_px[cell.some]) ** 2
-        of_centre = variance / np.maximum(variance + (cell.images * cell.std) ** 2, 1e-30)
-        corrections[cell.some] = -of_centre * left / cell.by_px
+        left = (cell.residuals + cell.rows @ step) / cell.std
+        corrections[cell.some] = -cell.by_px * points.noise_px[cell.some] ** 2 * left
     return corrections
 
 
