@@ -240,10 +240,7 @@ def solve_passes(problem: PassProblem, *, size_mm: float) -> PassSolution:
 
 
 def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.ndarray:
-    """Return the corrections (N,) of all stripe centres after a step: their part of the remaining residuals.
-
-    On rough surfaces, most of a residual is no error of the centre.
-    """
+    """Return the corrections (N,) of all stripe centres after a step: their part of the residuals."""
     corrections = np.zeros(len(points.number))
     for cell in cells:
         left = (cell.residuals + cell.rows @ step) / cell.std
