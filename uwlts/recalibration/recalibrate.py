@@ -247,7 +247,7 @@ def _gather(scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: 
     """Return the stripe centres of a capture, with the noise of each and the place of each image."""
     check_fits(scan.header, prior, source=scan.path.name)
     of_frames = sensor_poses(scan)
-    posed = np.isfinite(of_frames).all(axis=(1, 2))
+    posed = np.asarray(np.isfinite(of_frames).all(axis=(1, 2)))
     if pose is None and not posed[scan.laser_on].all():
         raise CaptureError(f"{scan.path.name} has no poses of its images: give the pose of each pass (`poses`)")
     stripes = find_stripes(scan, options=stripe)

@@ -78,7 +78,7 @@ def divide(places_mm: np.ndarray, size_mm: float) -> np.ndarray:
     for _ in range(2):
         counts = np.bincount(owner)
         means = np.column_stack([np.bincount(owner, column) / np.maximum(counts, 1) for column in places_mm.T])
-        owner = KDTree(means[counts > 0]).query(places_mm)[1]
+        owner = np.asarray(KDTree(means[counts > 0]).query(places_mm)[1])
     return owner
 
 
