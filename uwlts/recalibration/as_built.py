@@ -3,12 +3,11 @@
 import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import DISTORTION
-from uwlts.calibration.joint.parameters import SHEET, DescribedSheet, window_values
+from uwlts.calibration.joint.parameters import SHEET, DescribedSheet, Prior, fan_priors, window_priors
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownMedium
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey
-from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.nominal import nominal_calibration
 
@@ -27,43 +26,34 @@ def as_built(sensor: Sensor, medium: Medium) -> Calibration:
         )
     plain = nominal_calibration(sensor)
     assert plain.window is not None
-    known, camera, pose = sensor.uncertainty, plain.camera, laser_pose(sensor)
-    glass = sensor.laser.window
-    outer = glass.distance_mm + glass.thickness_mm if glass.mounted else 0.0
-    middle = np.array(plain.camera_from_object)[:3, 3]
-    sheet = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + outer * pose.axis)
-    tilt, focal = np.tan(np.radians(known.window_tilt_deg)), known.focal_length or _FOCAL
-    turn = float(np.radians(known.sheet_turn_deg))
+    known, camera, sheet = sensor.uncertainty, plain.camera, DescribedSheet.from_sensor(sensor)
+    turn, focal = float(np.radians(known.sheet_turn_deg)), known.focal_length or _FOCAL
     index = medium.refractive_index(sensor.laser.wavelength_nm)
-    entries: dict[ParameterKey, tuple[float, float]] = {LensParameter.F: (camera.fx_px, focal * camera.fx_px)}
-    distortion = camera.parameters()
-    entries |= {
-        key: (distortion[key.text], known.tangential)
+    priors: dict[ParameterKey, Prior] = {LensParameter.F: Prior(camera.fx_px, focal * camera.fx_px)}
+    described = camera.parameters()
+    priors |= {
+        key: Prior(described[key.text], known.tangential)
         for key in LensParameter
-        if key.text in DISTORTION and distortion[key.text] != 0.0
+        if key.text in DISTORTION and described[key.text] != 0.0
     }
-    std = (known.window_distance_mm, tilt, tilt, known.glass_thickness_mm, known.glass_index)
-    entries |= {key: (value, each) for (key, value), each in zip(window_values(plain.window).items(), std, strict=True)}
-    entries[MediumIndex("medium")] = (index, medium.index_uncertainty(sensor.laser.wavelength_nm, known))
-    turned = float(np.arcsin(glass.normal()[0])) if glass.mounted else 0.0
-    values = (0.0, 0.0, 0.0, float(np.radians(sensor.laser.bow_deg)), turned)
-    bow, window = np.radians([known.bow_deg, known.laser_window_tilt_deg if glass.mounted else 0.0])
-    spread = (turn, turn, known.sheet_offset_mm, bow, window)
-    entries |= {key: (value, each) for key, value, each in zip(SHEET, values, spread, strict=True)}
-    entries = {key: pair for key, pair in entries.items() if pair[1] > 0}
-    found = np.array([*entries.values()])
+    priors |= window_priors(plain.window, known)
+    priors[MediumIndex("medium")] = Prior(index, medium.index_uncertainty(sensor.laser.wavelength_nm, known))
+    placed = (turn, turn, known.sheet_offset_mm)
+    priors |= {key: Prior(0.0, std) for key, std in zip(SHEET[:3], placed, strict=True)} | fan_priors(sensor, wet=True)
+    entries = {key: prior for key, prior in priors.items() if prior.std > 0}
+    std = tuple(prior.std for prior in entries.values())
     joint = JointEstimate(
         parameters=tuple(entries),
-        values=tuple(found[:, 0].tolist()),
-        std=tuple(found[:, 1].tolist()),
-        std_before=tuple(found[:, 1].tolist()),
-        covariance=tuple(map(tuple, np.diag(found[:, 1] ** 2).tolist())),
+        values=tuple(prior.mean for prior in entries.values()),
+        std=std,
+        std_before=std,
+        covariance=tuple(map(tuple, np.diag(np.square(std)).tolist())),
         nominal_sheet=sheet.nominal(),
         scatter_px={},
         residual_count=0,
         outlier_count=0,
     )
-    model = sheet.model(np.array(values))
+    model = sheet.model(np.array([priors[key].mean if key in priors else 0.0 for key in SHEET]))
     return plain.model_copy(
         update={"media": (KnownMedium(medium=medium, index=index),), "sheet": model, "joint": joint}
     )

@@ -15,21 +15,14 @@ from uwlts.calibration.capture_evidence import (
     find_air_evidence,
     step_evidence,
 )
-from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, window_values
+from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, fan_priors, window_priors
 from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, common_sensor, sources_of
 from uwlts.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, parse_artefact
 from uwlts.model.calibration import WindowModel
-from uwlts.model.parameter_keys import (
-    LensParameter,
-    MediumIndex,
-    ParameterKey,
-    SheetParameter,
-    StageParameter,
-    StepHeight,
-)
+from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Medium, Sensor, Uncertainty
 from uwlts.optics.brightness import fit_brightness_slopes, select_sharp_lines
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -252,11 +245,7 @@ def build_priors(
     sensor, known = gathered.sensor, gathered.sensor.uncertainty
     priors: dict[ParameterKey, Prior] = {}
     if window is not None:
-        tilt = float(np.tan(np.radians(known.window_tilt_deg)))
-        std = (known.window_distance_mm, tilt, tilt, known.glass_thickness_mm, known.glass_index)
-        priors |= {
-            key: Prior(value, each) for (key, value), each in zip(window_values(window).items(), std, strict=True)
-        }
+        priors |= window_priors(window, known)
     for (name, medium), index in zip(gathered.media.items(), gathered.indices(options), strict=True):
         std = medium.index_uncertainty(sensor.laser.wavelength_nm, known)
         priors[MediumIndex(name)] = Prior(index, known.index if options.medium_index else std)
@@ -265,10 +254,7 @@ def build_priors(
         keys = (LensParameter.FX, LensParameter.FY) if aspect is None else (LensParameter.F,)
         priors |= {key: Prior(px, known.focal_length * px) for key, px in zip(keys, focal, strict=False)}
     priors |= {key: Prior(float(value), np.inf) for key, value in zip(SHEET[:3], turns, strict=True)}
-    bow, turn = np.radians([known.bow_deg, known.laser_window_tilt_deg])
-    priors[SheetParameter.BOW] = Prior(float(np.radians(sensor.laser.bow_deg)), float(bow))
-    if gathered.media and sensor.laser.window.mounted:
-        priors[SheetParameter.WINDOW_TURN] = Prior(float(np.arcsin(sensor.laser.window.normal()[0])), float(turn))
+    priors |= fan_priors(sensor, wet=bool(gathered.media))
     if gathered.scans:
         priors |= dict.fromkeys(SLOPES, Prior(0.0, known.stage_lean()))
     if options.poses != "free" or gathered.scans:

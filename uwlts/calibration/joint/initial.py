@@ -111,7 +111,7 @@ class SeriesStart:
                 moved = piece.shifts_mm[:, None] * piece.placement.direction(np.empty(0))
                 at = seen_by.on_target(piece.pixels, local, moved)
                 points.append((at - moved) @ cv2.Rodrigues(local[:3])[0].T + local[3:6])
-        pose, glass = laser_pose(self.sensor), self.sensor.laser.window
+        pose = laser_pose(self.sensor)
         sheet = fit_sheet(
             np.vstack(points),
             nominal_normal=pose.normal,
@@ -119,11 +119,9 @@ class SeriesStart:
             largest_rejected=_LARGEST_REJECTED,
         ).model
         normal, along = np.array(sheet.normal), sheet.normal @ pose.normal
-        middle = camera_from_object(self.sensor)[:3, 3]
-        outer = glass.distance_mm + glass.thickness_mm if glass.mounted else 0.0
-        described = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + outer * pose.axis)
+        described = DescribedSheet.from_sensor(self.sensor)
         turns = (normal @ pose.axis / along, normal @ pose.fan / along)
-        return described, np.array([*turns, sheet.offset_mm - normal @ middle])
+        return described, np.array([*turns, sheet.offset_mm - normal @ described.middle_mm])
 
 
 def estimate_series_start(

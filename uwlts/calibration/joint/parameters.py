@@ -9,6 +9,8 @@ from uwlts.errors import CalibrationError
 from uwlts.model.calibration import CameraModel, FanModel, SheetModel, WindowModel
 from uwlts.model.joint_estimate import NominalSheet
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey, SheetParameter, WindowParameter
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.sensor import Sensor, Uncertainty
 from uwlts.optics.camera import directions, image_derivatives, project_through_window
 from uwlts.optics.sheet import behind_window_mm, fan_distances, sheet_surface
 from uwlts.optics.window import RayDerivatives, tilt_direction, trace_derivatives
@@ -45,6 +47,22 @@ def window_values(window: WindowModel) -> dict[ParameterKey, float]:
     slope_x, slope_y, _ = (np.array(window.normal) / window.normal[2]).tolist()
     values = (window.distance_mm, slope_x, slope_y, window.thickness_mm, window.glass_index)
     return dict(zip(WINDOW, values, strict=True))
+
+
+def window_priors(window: WindowModel, known: Uncertainty) -> dict[ParameterKey, Prior]:
+    """Return prior knowledge of the camera's window as described, in the order of its parameters."""
+    tilt = float(np.tan(np.radians(known.window_tilt_deg)))
+    std = (known.window_distance_mm, tilt, tilt, known.glass_thickness_mm, known.glass_index)
+    return {key: Prior(value, each) for (key, value), each in zip(window_values(window).items(), std, strict=True)}
+
+
+def fan_priors(sensor: Sensor, *, wet: bool) -> dict[ParameterKey, Prior]:
+    """Return prior knowledge of the fan's bow and, if it is seen in a medium, of the turn of the laser's window."""
+    bow, turn = np.radians([sensor.uncertainty.bow_deg, sensor.uncertainty.laser_window_tilt_deg]).tolist()
+    priors: dict[ParameterKey, Prior] = {SheetParameter.BOW: Prior(float(np.radians(sensor.laser.bow_deg)), bow)}
+    if wet and sensor.laser.window.mounted:
+        priors[SheetParameter.WINDOW_TURN] = Prior(float(np.arcsin(sensor.laser.window.normal()[0])), turn)
+    return priors
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +117,14 @@ class DescribedSheet:
     middle_mm: np.ndarray
     apex_mm: np.ndarray
     pivot_mm: np.ndarray
+
+    @classmethod
+    def from_sensor(cls, sensor: Sensor) -> "DescribedSheet":
+        """Return the sheet of a sensor's description; it turns about the intersection of the camera's axis with it."""
+        pose, glass = laser_pose(sensor), sensor.laser.window
+        outer = glass.distance_mm + glass.thickness_mm if glass.mounted else 0.0
+        middle = camera_from_object(sensor)[:3, 3]
+        return cls(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + outer * pose.axis)
 
     @classmethod
     def from_description(cls, nominal: NominalSheet) -> "DescribedSheet":
