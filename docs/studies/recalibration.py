@@ -160,7 +160,7 @@ def record(seed: int, folder: Path, *, turned: bool = False, fault: str = "none"
     sensor = describe_sensor()
     built = draw_sensor(sensor, rng)
     warmer = float(rng.normal(0.0, sensor.uncertainty.temperature_k))
-    objects, count = draw_scene(rng, seed % 5), 31
+    objects, count = draw_scene(rng, seed % 5), 61
     scale = rng.normal(0.0, sensor.uncertainty.stage_scale)
     lean = np.tan(np.radians(sensor.uncertainty.stage_alignment_deg)) * rng.standard_normal(2)
     captures, stated = [], []
@@ -188,7 +188,7 @@ def record(seed: int, folder: Path, *, turned: bool = False, fault: str = "none"
             "medium": "water",
             "motion": {
                 "start_mm": -45.0,
-                "step_mm": 3.0,
+                "step_mm": 1.5,
                 "count": count,
                 "direction": [1.0, *lean.tolist()],
                 "nominal_direction": [1.0, 0.0, 0.0],

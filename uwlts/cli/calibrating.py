@@ -147,7 +147,7 @@ def recalibrate(
     """
     found = call()
     show(found.lines())
-    warn(*found.doubts)
+    warn(*found.warnings, *found.doubts)
     if found.doubts:
         sys.exit(1)
     if out is not None:

@@ -15,7 +15,9 @@ from uwlts.calibration.joint.stored_estimate import StoredEstimate
 from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import CalibrationError
 from uwlts.fitting.least_squares import biweight
+from uwlts.model.artefacts import Artefact
 from uwlts.model.calibration import Calibration
+from uwlts.recalibration.known_lengths import KnownLengths, measure_known_lengths
 from uwlts.recalibration.surface_cells import Cell, PassPoints, divide, observe
 
 _ROUNDS = 30  # largest number; eight to twelve are usual
@@ -64,13 +66,16 @@ class MotionUncertainty:
 class PassSolution:
     """Amplitudes (U,) with their covariance (U, U), and the observed parts of the surface.
 
-    ``spread`` is the scatter of the passes' distances relative to their stated noise, at least 1.
+    ``first_cells`` are those with the earlier calibration. ``spread`` is the scatter of the passes' distances relative
+    to their stated noise, at least 1. ``lengths`` are those of an artefact, if it is known.
     """
 
     amplitudes: np.ndarray
     covariance: np.ndarray
+    first_cells: list[Cell]
     cells: list[Cell]
     spread: float
+    lengths: KnownLengths | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,13 +199,15 @@ def move_calibration(known: StoredEstimate, values: np.ndarray) -> Calibration:
     )
 
 
-def solve_passes(problem: PassProblem, *, size_mm: float) -> PassSolution:
-    """Solve for the amplitudes from cells of a size, and return them with their covariance.
+def solve_passes(problem: PassProblem, *, size_mm: float, artefact: Artefact | None = None) -> PassSolution:
+    """Solve for the amplitudes from cells of a size and an artefact of known lengths.
 
-    Raises CalibrationError if the passes do not overlap or the iteration does not converge.
+    Raises CalibrationError if the passes do not overlap or the iteration does not converge, and EvaluationError if
+    they do not show the artefact.
     """
     amplitudes = np.zeros(problem.unknowns)
-    corrections = [np.zeros(len(each.line)) for each in problem.passes]
+    none = [np.zeros(len(each.line)) for each in problem.passes]
+    corrections, first_cells, lengths = none, [], None
     ends = np.cumsum([len(each.line) for each in problem.passes])[:-1]
     spread, step = 1.0, np.zeros(problem.unknowns)
     cell_of = weights = np.empty(0)
@@ -209,7 +216,11 @@ def solve_passes(problem: PassProblem, *, size_mm: float) -> PassSolution:
         if done < _FREE_ROUNDS:
             cell_of = divide(points.places_mm, size_mm)
         cells = observe(points, cell_of, spread, keep=done > _FREE_ROUNDS)
+        first_cells = first_cells or cells
         if done == _FREE_ROUNDS:
+            if artefact is not None:
+                placed, first = problem.place(amplitudes, none), problem.passes[0].pose
+                lengths = measure_known_lengths(placed, amplitudes, artefact, pose=first[len(first) // 2])
             # Points and weights stay, so that the iteration converges.
             cell_of = np.full(len(points.number), -1)
             for number, cell in enumerate(cells):
@@ -223,8 +234,12 @@ def solve_passes(problem: PassProblem, *, size_mm: float) -> PassSolution:
         total = np.eye(problem.unknowns)
         gradient = amplitudes.copy()
         for cell, weight in zip(cells, weights, strict=True):
-            total += weight * cell.rows.T @ cell.rows
-            gradient += weight * cell.rows.T @ cell.residuals
+            rows = cell.apart.T @ cell.rows
+            total += weight * rows.T @ rows
+            gradient += weight * rows.T @ (cell.apart.T @ cell.residuals)
+        if lengths is not None:
+            total += lengths.rows.T @ lengths.rows
+            gradient += lengths.rows.T @ lengths.residuals(amplitudes)
         step = -np.linalg.solve(total, gradient)
         amplitudes = amplitudes + step
         corrections = np.split(_correct(cells, points, step), ends)
@@ -235,8 +250,8 @@ def solve_passes(problem: PassProblem, *, size_mm: float) -> PassSolution:
             f"the passes do not converge: the last step was {np.abs(step).max():.2g} prior standard uncertainties; "
             "give better poses or a better calibration"
         )
-    covariance = _covariance(cells, weights, total, points)
-    return PassSolution(amplitudes, covariance, cells, spread)
+    covariance = _covariance(cells, weights, total, points, lengths)
+    return PassSolution(amplitudes, covariance, first_cells, cells, spread, lengths)
 
 
 def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.ndarray:
@@ -248,14 +263,16 @@ def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.
     return corrections
 
 
-def _covariance(cells: Sequence[Cell], weights: np.ndarray, total: np.ndarray, points: PassPoints) -> np.ndarray:
-    """Return the covariance (U, U): noise, positions of images that many cells share, and prior knowledge."""
+def _covariance(
+    cells: Sequence[Cell], weights: np.ndarray, total: np.ndarray, points: PassPoints, lengths: KnownLengths | None
+) -> np.ndarray:
+    """Return the covariance (U, U): noise, positions of images that many cells share, lengths and prior knowledge."""
     inverse = np.linalg.inv(total)
     of_images = np.zeros((int(points.image.max()) + 1, len(total)))
-    spread = np.eye(len(total))
+    spread = np.eye(len(total)) if lengths is None else np.eye(len(total)) + lengths.rows.T @ lengths.rows
     for cell, weight in zip(cells, weights, strict=True):
         own = np.sqrt(np.maximum(1.0 - cell.images**2, 0.0))
-        rows = weight * cell.rows
+        rows = weight * cell.apart @ (cell.apart.T @ cell.rows)
         spread += (rows * own[:, None]).T @ (rows * own[:, None])
         np.add.at(of_images, points.image[cell.some], rows * cell.images[:, None])
     return inverse @ (spread + of_images.T @ of_images) @ inverse

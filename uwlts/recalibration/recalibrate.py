@@ -1,9 +1,10 @@
 """Recalibration of a sensor by overlapping passes over an unknown scene, with known motions between them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from scipy.stats import chi2
@@ -14,15 +15,16 @@ from uwlts.errors import CalibrationError, CaptureError, RangeError
 from uwlts.fitting.next_observation import Forecast
 from uwlts.fitting.patches import find_disc_radius
 from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
 from uwlts.model.calibration import Calibration, KnownMedium, KnownStage
 from uwlts.model.library import load_sensor
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.short_text import Brief
 from uwlts.optics.brightness import select_sharp_lines
-from uwlts.optics.fitness import check_fits
 from uwlts.recalibration.as_built import as_built
 from uwlts.recalibration.next_pass import NextPass, rank_passes
 from uwlts.recalibration.pass_estimate import MotionUncertainty, Pass, PassProblem, PassSolution, solve_passes
+from uwlts.recalibration.surface_cells import Cell
 from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px, independent_components, window_shift_std_mm
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -84,6 +86,27 @@ class ParameterChange:
         return f"{label.words}: {label.format_with_std(self.before, self.std_before)}, now {after}"
 
 
+@dataclass(frozen=True, eq=False)
+class SurfaceParts:
+    """Parts of the surface: middle (C, 3) in the frame of the poses, number of passes (C,), and distances (C,).
+
+    ``apart_mm`` is the root mean square distance of the points from the surface that all passes share.
+    """
+
+    middle_mm: np.ndarray
+    passes: np.ndarray
+    apart_mm: np.ndarray
+
+    @classmethod
+    def of(cls, cells: Sequence[Cell]) -> Self:
+        """Return the parts of solved cells."""
+        return cls(
+            np.array([cell.middle_mm for cell in cells]),
+            np.array([len(cell.passes) for cell in cells]),
+            np.array([cell.apart_mm for cell in cells]),
+        )
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Recalibrated(Brief):
     """Calibration from passes, what they changed, and doubts.
@@ -96,27 +119,31 @@ class Recalibrated(Brief):
     parameters : tuple of ParameterChange
     spread : float
         Disagreement of the passes relative to their noise, at least 1.
-    cells : int
-        Number of parts of the surface in which two or more passes agree or disagree.
+    parts_before, parts : SurfaceParts
+        Parts of the surface that two or more passes see, with the earlier and with the new calibration.
     next_passes : tuple of Forecast
         Further passes, the most helpful one first; ``candidate.pose`` is the pose in the common frame.
     doubts : tuple of str
         Reasons against the new calibration; it should not be used if there are any.
+    warnings : tuple of str
+        Doubts about single passes, as by `reconstruct`.
     """
 
     calibration: Calibration
     lengths: tuple[StatedLength, ...]
     parameters: tuple[ParameterChange, ...]
     spread: float
-    cells: int
+    parts_before: SurfaceParts
+    parts: SurfaceParts
     next_passes: tuple[Forecast[NextPass], ...]
     doubts: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """Return a summary as text."""
         lines = [
-            f"{self.cells} parts of the surface; the passes' distances scatter {self.spread:.2f} times as much as "
-            "their noise (at least 1)"
+            f"{len(self.parts.passes)} parts of the surface; the passes' distances scatter {self.spread:.2f} times as "
+            "much as their noise (at least 1)"
         ]
         lines += [
             f"100 mm along {each.axis}: standard uncertainty {each.before_mm:.3f} mm before, {each.after_mm:.3f} mm now"
@@ -147,6 +174,7 @@ def recalibrate(
     poses: np.ndarray | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
     pose_unit: Unit | None = None,
+    artefact: Artefact | dict[str, object] | str | Path | None = None,
     stripe: StripeSettings = None,
     progress: ProgressListener = ignore_progress,
 ) -> Recalibrated:
@@ -170,6 +198,8 @@ def recalibrate(
         table. By default the frames have poses, all in one frame; a single pass needs none.
     pose_format, pose_unit
         As for `reconstruct`.
+    artefact
+        Pipe, step or spheres of known size that all the passes see, as for `evaluate`: known lengths of the job.
     stripe
         As for `reconstruct`.
     progress
@@ -186,6 +216,8 @@ def recalibrate(
         A file cannot be read, or the passes are of different sensors or media.
     CalibrationError
         The calibration states no uncertainty or does not fit, or the passes do not overlap.
+    EvaluationError
+        The passes do not show the artefact.
     RangeError
         A standard uncertainty is not positive.
 
@@ -197,6 +229,10 @@ def recalibrate(
     for name, std in (("pose_std_mm", pose_std_mm), ("pose_std_deg", pose_std_deg)):
         if not std > 0:
             raise RangeError(f"`{name}` is {std:g}; expected a positive number")
+    if isinstance(artefact, str | Path):
+        artefact = read_artefact(artefact)
+    elif isinstance(artefact, dict):
+        artefact = parse_artefact(artefact)
     given = (
         read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0] if isinstance(poses, str | Path) else poses
     )
@@ -218,9 +254,11 @@ def recalibrate(
         else:
             prior = read_calibration(calibration)
         require_joint(prior)
-        gathered = []
+        gathered, warnings = [], []
         for number, scan in enumerate(scans):
-            gathered.append(_gather(scan, prior, None if given is None else given[number], stripe))
+            one, doubts = _gather(scan, prior, None if given is None else given[number], stripe)
+            gathered.append(one)
+            warnings += [text if scan.path.name in text else f"{scan.path.name}: {text}" for text in doubts]
             progress(number + 1, len(scans) + 1)
     known = read_stored_estimate(prior, header.sensor, header.medium)
     root, by_stage = independent_components(known, prior, header)
@@ -238,14 +276,15 @@ def recalibrate(
     )
     start = problem.place(np.zeros(problem.unknowns), [np.zeros(len(each.line)) for each in gathered])
     radius = max(find_disc_radius(start.places_mm[start.number == each]) for each in range(len(gathered)))
-    solution = solve_passes(problem, size_mm=_CELL * radius)
+    solution = solve_passes(problem, size_mm=_CELL * radius, artefact=artefact)
     progress(len(scans) + 1, len(scans) + 1)
-    return summarise(problem, solution, prior, header.stage_direction)
+    return replace(summarise(problem, solution, prior, header.stage_direction), warnings=tuple(warnings))
 
 
-def _gather(scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: StripeSettings) -> Pass:
-    """Return the stripe centres of a capture, with the noise of each and the place of each image."""
-    check_fits(scan.header, prior, source=scan.path.name)
+def _gather(
+    scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: StripeSettings
+) -> tuple[Pass, list[str]]:
+    """Return the stripe centres of a capture, with the noise of each and the place of each image, and warnings."""
     of_frames = sensor_poses(scan)
     posed = np.asarray(np.isfinite(of_frames).all(axis=(1, 2)))
     if pose is None and not posed[scan.laser_on].all():
@@ -275,7 +314,7 @@ def _gather(scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: 
     # `reconstruct` adds the shift to the origin of the light, and motion during the exposure.
     beside = np.einsum("nji,nj->ni", rotation, points - origin) - found[0] - travel[:, None] * direction
     even = np.linalg.norm(beside, axis=1) < _SHIFTED * noise * np.linalg.norm(found[1][:, :, 0], axis=1)
-    return Pass(
+    found_pass = Pass(
         scan.path.name,
         kept.frame[even],
         kept.line[even],
@@ -285,6 +324,7 @@ def _gather(scan: Capture, prior: Calibration, pose: np.ndarray | None, stripe: 
         travel[even],
         of_images if pose is None else pose @ of_images,
     )
+    return found_pass, cloud.warnings
 
 
 def summarise(
@@ -312,7 +352,8 @@ def summarise(
         lengths,
         changes,
         solution.spread,
-        len(solution.cells),
+        SurfaceParts.of(solution.first_cells),
+        SurfaceParts.of(solution.cells),
         tuple(rank_passes(problem, solution, by_amplitudes)),
         tuple(_find_doubts(problem, solution)),
     )
@@ -344,7 +385,8 @@ def _lengths(
 
 def _find_doubts(problem: PassProblem, solution: PassSolution) -> list[str]:
     """Return the reasons against a solution: deviations beyond chance, each of unit variance before the passes."""
-    limit = _FALSE_ALARM / (len(problem.passes) + 1)
+    lengths = solution.lengths
+    limit = _FALSE_ALARM / (len(problem.passes) + 1 + (0 if lengths is None else len(lengths.names)))
     doubts = []
     if solution.spread > _POOR_FIT:
         doubts.append(
@@ -368,6 +410,14 @@ def _find_doubts(problem: PassProblem, solution: PassSolution) -> list[str]:
                 f"{each.name} does not fit the others (probability {probability:.1g}): {names[worst]} deviates "
                 f"{sizes[worst]:.1f} times as much as stated"
             )
+    if lengths is not None:
+        chances = lengths.chances(solution.amplitudes, solution.covariance)
+        doubts += [
+            f"the passes contradict the known {name} (probability {chance:.1g}): it is not as stated, or other "
+            "surfaces are taken for it"
+            for name, chance in zip(lengths.names, chances, strict=True)
+            if chance < limit
+        ]
     return doubts
 
 

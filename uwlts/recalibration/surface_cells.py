@@ -1,7 +1,8 @@
 """Observations of an unknown surface by several passes, without the surface's own parameters.
 
 The surface is divided into cells. In each, all passes together determine a second-order surface, which is eliminated by
-orthogonal projection, so that only the disagreement of the passes remains. An unknown surface that all passes share is
+orthogonal projection. Only the offsets and slopes between passes remain: what a single pass deviates from such a
+surface is the surface's own form. An unknown surface that all passes share is
 unbiased, whereas the distance from a surface that one pass determines correlates with its noise. Normals and
 derivatives are taken at observations that are corrected for their residuals (Gauss-Helmert model: Pope, Some pitfalls
 to be avoided in the iterative adjustment of nonlinear problems, 1972).
@@ -21,6 +22,9 @@ _OUTLIER = 5.0
 """Distance from a pass's own surface, in robust standard deviations, beyond which a point is left out."""
 _ROUGHEST = 5.0
 """Largest scatter about the passes' own surfaces relative to the median cell: cells on edges exceed it."""
+_CONDITION = 60.0
+"""Largest condition number of a cell's surface and offsets. Usual cells have 5 to 30; those of one or two images, whose
+curvature along the stage only noise determines, from 90 (seeds 3, 301 and 303 of the study)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +51,7 @@ class Cell:
     """One cell: its points ``some`` (n,), ``normal`` (3,) and ``middle_mm`` (3,) of its surface.
 
     ``rows`` (n, U) and ``residuals`` (n,) are whitened, without the surface; ``mean_row`` (U,) is the mean derivative
-    of the height. ``by_px`` (n,) are the derivatives of the height by the stripe centre, ``std`` (n,) its standard
+    of the height. ``apart`` (n, K) are orthonormal patterns of the passes' offsets and slopes. ``by_px`` (n,) are the derivatives of the height by the stripe centre, ``std`` (n,) its standard
     deviations, and ``images`` (n,) the whitened effects of the images' positions. ``scatter`` is the ratio of the
     heights' scatter to the stated noise, at least 1. ``offset_square`` is the mean square of the whitened disagreement
     of the passes.
@@ -59,12 +63,18 @@ class Cell:
     rows: np.ndarray
     mean_row: np.ndarray
     residuals: np.ndarray
+    apart: np.ndarray
     by_px: np.ndarray
     std: np.ndarray
     images: np.ndarray
     scatter: float
     offset_square: float
     passes: tuple[int, ...]
+
+    @property
+    def apart_mm(self) -> float:
+        """Root mean square of the distances from the common surface."""
+        return float(np.sqrt(np.mean((self.residuals * self.std) ** 2)))
 
 
 def divide(places_mm: np.ndarray, size_mm: float) -> np.ndarray:
@@ -124,6 +134,9 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         # Offset and slopes of all passes but one, so that their disagreement is no scatter.
         others = points.number[some, None] == enough[1:]
         own = (others[:, :, None] * surface[:, None, :3]).reshape(len(some), -1)
+        design = np.hstack([surface, own])
+        if not keep and np.linalg.cond(design) > _CONDITION:
+            return None
         shape = np.linalg.lstsq(surface, w, rcond=None)[0] / size
         slope_u, slope_v = shape[1] + 2 * shape[3] * u + shape[4] * v, shape[2] + shape[4] * u + 2 * shape[5] * v
         up = axes[:, 0] - slope_u[:, None] * axes[:, 2] - slope_v[:, None] * axes[:, 1]
@@ -131,7 +144,7 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         by_image = np.einsum("ni,ni->n", up, points.image_mm[some])
         std = spread * np.sqrt((by_px * points.noise_px[some]) ** 2 + by_image**2)
         height = (w - by_px * points.correction_px[some]) / std
-        base = np.linalg.qr(np.hstack([surface, own]) / std[:, None])[0]
+        base = np.linalg.qr(design / std[:, None])[0]
         left = height - base @ (base.T @ height)
         freedom = len(some) - base.shape[1]
         if freedom < _FEWEST:
@@ -159,6 +172,7 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         rows - shared @ (shared.T @ rows),
         mean_row / length,
         height - shared @ (shared.T @ height),
+        apart,
         by_px,
         std,
         by_image / std,

@@ -12,7 +12,8 @@ from tests.system.in_process import uwlts
 from tests.uwlts.joint_views import seen
 from twin.scene.campaign import replace_values
 from uwlts.calibration.joint.stored_estimate import read_stored_estimate
-from uwlts.errors import CalibrationError
+from uwlts.errors import CalibrationError, EvaluationError
+from uwlts.model.artefacts import PipeStandard, PlaneStandard
 from uwlts.model.library import load_sensor
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import CaptureHeader, Medium
@@ -121,14 +122,14 @@ def record(built, water, height, pose, rng, name, *, moved_mm=0.0):
     return Pass(name, frame, line, centre, np.full(len(line), NOISE_PX), np.zeros((len(line), 3)), TRAVEL[frame], poses)
 
 
-def campaign(seed, motions, *, moved_mm=0.0):
-    """Return a drawn sensor with its water, and the passes over a drawn surface as a problem.
+def campaign(seed, motions, *, moved_mm=0.0, height=None):
+    """Return a drawn sensor with its water, and the passes over a drawn surface, or a given one, as a problem.
 
     The scene moves by ``moved_mm`` before the second pass.
     """
     rng = np.random.default_rng([61, seed])
     built, water = draw_sensor(rng)
-    height = draw_surface(rng)
+    height = draw_surface(rng) if height is None else height
     passes = [
         record(built, water, height, pose_of(*pose), rng, name, moved_mm=moved_mm * (number == 1))
         for number, (name, pose) in enumerate(motions.items())
@@ -141,8 +142,9 @@ def campaign(seed, motions, *, moved_mm=0.0):
     return built, water, problem
 
 
-def solve(problem):
-    return summarise(problem, solve_passes(problem, size_mm=9.0), problem.known.calibration, (1.0, 0.0, 0.0))
+def solve(problem, artefact=None):
+    solution = solve_passes(problem, size_mm=9.0, artefact=artefact)
+    return summarise(problem, solution, problem.known.calibration, (1.0, 0.0, 0.0))
 
 
 def measure(built, water, calibration):
@@ -222,6 +224,40 @@ def test_the_advised_pass_gives_what_was_expected():
     *_, problem = campaign(4, SHIFTED)
     given = np.sqrt(np.mean([each.after_mm**2 for each in solve(problem).lengths]))
     assert given == pytest.approx(expected, rel=0.3)
+
+
+def pipe(x, y):
+    """Return the height of a pipe of 240 mm along X."""
+    return 120.0 - np.sqrt(120.0**2 - np.clip(y, -100.0, 100.0) ** 2)
+
+
+@pytest.mark.parametrize("stated_mm", [240.0, 241.0])
+def test_a_known_diameter_replaces_a_motion_or_is_contradicted(stated_mm):
+    built, water, problem = campaign(5, SHIFTED, height=pipe)
+    unknown = solve(problem)
+    found = solve(problem, PipeStandard(diameter_mm=stated_mm, diameter_uncertainty_mm=0.02))
+    assert unknown.lengths[0].after_mm > 1.5 * found.lengths[0].after_mm
+    if stated_mm == 240.0:
+        assert not found.doubts
+        assert (
+            np.abs(measure(built, water, found.calibration) - 100.0) < [3.5 * x.after_mm for x in found.lengths]
+        ).all()
+    else:
+        assert any("the known pipe diameter" in doubt for doubt in found.doubts)
+
+
+def test_one_pass_over_a_pipe_of_known_diameter_reduces_the_uncertainty():
+    built, water, problem = campaign(8, {"only": (0.0, 0.0, 0.0)}, height=pipe)
+    found = solve(problem, PipeStandard(diameter_mm=240.0))
+    assert found.lengths[0].after_mm < 0.9 * found.lengths[0].before_mm
+    off = np.abs(measure(built, water, found.calibration) - 100.0)
+    assert (off < [3.5 * each.after_mm for each in found.lengths]).all()
+
+
+def test_lengths_of_a_plane_are_refused():
+    *_, problem = campaign(5, SHIFTED, height=lambda x, y: 0.2 * x)
+    with pytest.raises(EvaluationError, match="no known length"):
+        solve(problem, PlaneStandard())
 
 
 def is_named(seed):
