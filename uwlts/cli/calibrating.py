@@ -7,7 +7,17 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.command_options import STRIPE, CalibrationOut, Overwrite, a_file, app, wrote, wrote_page
+from uwlts.cli.command_options import (
+    STRIPE,
+    CalibrationOut,
+    Overwrite,
+    a_file,
+    a_page,
+    app,
+    wrote,
+    wrote_files,
+    wrote_page,
+)
 from uwlts.errors import DescriptionError, OutputError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.command_line import Call, command_from, say, show, warn
@@ -139,6 +149,11 @@ def recalibrate(
         a_file(".json"),
         Parameter(help="Calibration to write. Without it, the passes only check the old one."),
     ] = None,
+    page: Annotated[
+        Path | None,
+        a_page("recalibration"),
+        Parameter(help="Page to write, with all figures as JSON beside it: for a.html, a.recalibration.json."),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts recalibrate a.h5 b.h5 --calibration old.json --poses p.csv --pose-std-mm 0.01 --pose-std-deg 0.005
@@ -148,11 +163,14 @@ def recalibrate(
     found = call()
     show(found.lines())
     warn(*found.warnings, *found.doubts)
+    if page is not None:
+        uwlts.report.write_recalibration(page, found, overwrite=overwrite)
     if found.doubts:
+        wrote_files(page)
         sys.exit(1)
     if out is not None:
         found.calibration.save(out, overwrite=overwrite)
-        wrote([], [], out)
+    wrote_files(out, page)
 
 
 @command_from(app, uwlts, "calibrate_polynomials", job="Calibrate", shortcuts=STRIPE)

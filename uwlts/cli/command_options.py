@@ -100,8 +100,9 @@ def wrote(lines: Iterable[str], warnings: Iterable[str], *paths: Path | None) ->
 
 
 def wrote_files(*paths: Path | None) -> None:
-    """Print the files written for a result."""
-    say(f"wrote {', '.join(str(path) for path in paths if path is not None)}")
+    """Print the files written for a result, if any."""
+    if written := ", ".join(str(path) for path in paths if path is not None):
+        say(f"wrote {written}")
 
 
 def cloud_written(path: Path, points: int) -> str:

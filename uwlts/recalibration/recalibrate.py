@@ -1,10 +1,10 @@
 """Recalibration of a sensor by overlapping passes over an unknown scene, with known motions between them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from scipy.stats import chi2
@@ -90,7 +90,7 @@ class ParameterChange:
 class SurfaceParts:
     """Parts of the surface: middle (C, 3) in the frame of the poses, number of passes (C,), and distances (C,).
 
-    ``apart_mm`` is the root mean square distance of the points from the surface that all passes share.
+    ``apart_mm`` is the root mean square distance of the passes from the surface that they share.
     """
 
     middle_mm: np.ndarray
@@ -154,6 +154,26 @@ class Recalibrated(Brief):
             lines.append(f"not determined by these passes, known from before: {', '.join(kept)}")
         lines += self.advice()
         return lines
+
+    def record(self) -> dict[str, Any]:
+        """Return lengths, parameters, advice and doubts as JSON; values in the units of the calibration's estimate."""
+        return {
+            "lengths_100_mm": [asdict(each) for each in self.lengths],
+            "parameters": [
+                {"name": each.key.text, "before": each.before, "std_before": each.std_before}
+                | {"after": each.after, "std": each.std, "determined": each.determined}
+                for each in self.parameters
+            ],
+            "parts": len(self.parts.passes),
+            "scatter_by_noise": self.spread,
+            "next_passes": [
+                {"words": each.candidate.words, "pose": each.candidate.pose.tolist()}
+                | {"length_std_before_mm": each.before, "length_std_after_mm": each.after}
+                for each in self.next_passes
+            ],
+            "doubts": self.doubts,
+            "warnings": self.warnings,
+        }
 
     def advice(self) -> list[str]:
         """Return the most helpful further passes as text."""
@@ -337,7 +357,7 @@ def summarise(
     of_parameters = problem.root @ covariance @ problem.root.T
     lengths, by_amplitudes = _lengths(problem, solution, moved)
     changes = tuple(
-        ParameterChange(key, float(a), float(s), float(b), float(t))
+        ParameterChange(key, float(a) + 0.0, float(s), float(b), float(t))  # no negative zero
         for key, a, s, b, t in zip(
             moved.parameters.keys,
             problem.known.values,

@@ -51,10 +51,10 @@ class Cell:
     """One cell: its points ``some`` (n,), ``normal`` (3,) and ``middle_mm`` (3,) of its surface.
 
     ``rows`` (n, U) and ``residuals`` (n,) are whitened, without the surface; ``mean_row`` (U,) is the mean derivative
-    of the height. ``apart`` (n, K) are orthonormal patterns of the passes' offsets and slopes. ``by_px`` (n,) are the derivatives of the height by the stripe centre, ``std`` (n,) its standard
-    deviations, and ``images`` (n,) the whitened effects of the images' positions. ``scatter`` is the ratio of the
-    heights' scatter to the stated noise, at least 1. ``offset_square`` is the mean square of the whitened disagreement
-    of the passes.
+    of the height. ``apart`` (n, K) are orthonormal patterns of the passes' offsets and slopes. ``by_px`` (n,) are the
+    derivatives of the height by the stripe centre, ``std`` (n,) its standard deviations, and ``images`` (n,) the
+    whitened effects of the images' positions. ``scatter`` is the ratio of the heights' scatter to the stated noise, at
+    least 1. ``offset_square`` is the mean square of the whitened disagreement of the passes.
     """
 
     some: np.ndarray
@@ -73,8 +73,8 @@ class Cell:
 
     @property
     def apart_mm(self) -> float:
-        """Root mean square of the distances from the common surface."""
-        return float(np.sqrt(np.mean((self.residuals * self.std) ** 2)))
+        """Root mean square distance of the passes from their common surface, as offsets and slopes."""
+        return float(np.sqrt(np.mean((self.apart @ (self.apart.T @ self.residuals) * self.std) ** 2)))
 
 
 def divide(places_mm: np.ndarray, size_mm: float) -> np.ndarray:

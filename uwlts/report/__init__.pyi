@@ -7,4 +7,5 @@ from .change_page import write_change as write_change
 from .domain_page import write_domain_gap as write_domain_gap
 from .findings_page import write_findings as write_findings
 from .frames import to_frame as to_frame
+from .recalibration_page import write_recalibration as write_recalibration
 from .registration_page import write_registration as write_registration

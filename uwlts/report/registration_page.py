@@ -1,6 +1,6 @@
 """Page of a registration: scans, overlaps with their distances, and undetermined movements."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +72,7 @@ def _scans(registered: RegisteredScans) -> str:
         if (first, second) == _VIEWS[-1]:
             axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
-    return _draw_views(draw)
+    return draw_views(draw)
 
 
 def _overlaps(registered: RegisteredScans) -> str:
@@ -87,18 +87,20 @@ def _overlaps(registered: RegisteredScans) -> str:
         known: dict[str, Any] = {"c": distance, "cmap": "RdBu", "vmin": -limit, "vmax": limit, "linewidths": 0}
         return axes.scatter(places[:, first], places[:, second], s=4, **known)
 
-    return _draw_views(draw, label="distance / mm")
+    return draw_views(draw, label="distance / mm")
 
 
-def _draw_views(draw: Callable[[Any, int, int], Any], *, label: str | None = None) -> str:
-    """Draw three views along the axes, side by side."""
+def draw_views(
+    draw: Callable[[Any, int, int], Any], *, label: str | None = None, ticks: Sequence[int] | None = None
+) -> str:
+    """Draw three views along the axes, side by side; with a label, a bar of the colours has ``ticks``."""
     figure, axes = new_figure(11.0, 3.8, columns=3)
     drawn = None
     for (first, second), ax in zip(_VIEWS, axes, strict=True):
         drawn = draw(ax, first, second)
         ax.set(xlabel=f"{'XYZ'[first]} / mm", ylabel=f"{'XYZ'[second]} / mm", aspect="equal")
     if label is not None and drawn is not None:
-        figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
+        figure.colorbar(drawn, ax=axes, label=label, ticks=ticks, shrink=0.8)
     return png_data_uri(figure, dpi=130)
 
 
