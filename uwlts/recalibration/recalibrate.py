@@ -103,7 +103,7 @@ class SurfaceParts:
         return cls(
             np.array([cell.middle_mm for cell in cells]),
             np.array([len(cell.passes) for cell in cells]),
-            np.array([cell.apart_mm for cell in cells]),
+            np.array([np.sqrt(np.mean(cell.apart_mm**2)) for cell in cells]),
         )
 
 
@@ -375,7 +375,7 @@ def summarise(
         SurfaceParts.of(solution.first_cells),
         SurfaceParts.of(solution.cells),
         tuple(rank_passes(problem, solution, by_amplitudes)),
-        tuple(_find_doubts(problem, solution)),
+        tuple(_find_doubts(problem, solution, by_amplitudes)),
     )
 
 
@@ -403,26 +403,40 @@ def _lengths(
     return tuple(StatedLength(*each) for each in zip("YZ", before.tolist(), after.tolist(), strict=True)), rows
 
 
-def _find_doubts(problem: PassProblem, solution: PassSolution) -> list[str]:
-    """Return the reasons against a solution: deviations beyond chance, each of unit variance before the passes."""
+def _find_doubts(problem: PassProblem, solution: PassSolution, by_amplitudes: np.ndarray) -> list[str]:
+    """Return the reasons against a solution: deviations beyond chance, each of unit variance before the passes.
+
+    ``by_amplitudes`` (2, U) are the derivatives of the lengths.
+    """
     lengths = solution.lengths
-    limit = _FALSE_ALARM / (len(problem.passes) + 1 + (0 if lengths is None else len(lengths.names)))
+    limit = _FALSE_ALARM / (len(problem.passes) + 2 + (0 if lengths is None else len(lengths.names)))
     doubts = []
     if solution.spread > _POOR_FIT:
+        apart = np.concatenate([cell.apart_mm**2 for cell in solution.cells])
+        number = np.concatenate([cell.number for cell in solution.cells])
+        squares = np.bincount(number, apart) / np.maximum(np.bincount(number), 1)
         doubts.append(
-            f"the passes disagree {solution.spread:.1f} times as much as their noise: the scene moved or is too rough, "
-            "or a pass is of another scene or mirrored"
+            f"the passes disagree {solution.spread:.1f} times as much as their noise, most of all "
+            f"{problem.passes[int(np.argmax(squares))].name}: the scene moved or is too rough, or this pass is of "
+            "another scene or mirrored"
         )
-    shared = slice(0, problem.of_sensor)
-    if (probability := _chance(solution, shared)) < limit:
+    unknowns = np.eye(problem.unknowns)
+    if (probability := _chance(solution, unknowns[: problem.of_sensor])) < limit:
         doubts.append(
             f"the earlier calibration and the passes contradict each other (probability {probability:.1g}): the sensor "
             "changed by more than it states, or the motion is not as stated"
         )
+    if (probability := _chance(solution, np.linalg.qr(by_amplitudes.T)[0].T)) < limit:
+        changes = zip("YZ", by_amplitudes @ solution.amplitudes, strict=True)
+        doubts.append(
+            f"lengths change by more than the earlier calibration states (probability {probability:.1g}), 100 mm along "
+            + " and ".join(f"{axis} by {change:+.3f} mm" for axis, change in changes)
+            + ": the sensor changed, or poses or stage have another scale"
+        )
     names = ("its position", "its direction", "the index of the water")
     for number, each in enumerate(problem.passes):
         columns = problem.of_pass(number)
-        if (probability := _chance(solution, columns)) < limit:
+        if (probability := _chance(solution, unknowns[columns])) < limit:
             own = solution.amplitudes[columns]
             sizes = [np.linalg.norm(own[:3]) / np.sqrt(3), np.linalg.norm(own[3:6]) / np.sqrt(3), abs(own[6])]
             worst = int(np.argmax(sizes))
@@ -441,9 +455,9 @@ def _find_doubts(problem: PassProblem, solution: PassSolution) -> list[str]:
     return doubts
 
 
-def _chance(solution: PassSolution, columns: slice) -> float:
-    """Return the probability of deviations as large as the amplitudes of some columns, in determined directions."""
-    own, covariance = solution.amplitudes[columns], solution.covariance[columns, columns]
+def _chance(solution: PassSolution, directions: np.ndarray) -> float:
+    """Return the probability of deviations as large along orthonormal directions (K, U), as far as determined."""
+    own, covariance = directions @ solution.amplitudes, directions @ solution.covariance @ directions.T
     values, vectors = np.linalg.eigh(np.eye(len(own)) - covariance)
     tested = values > _DETERMINED
     square = float(np.sum((vectors.T @ own)[tested] ** 2 / values[tested]))

@@ -48,7 +48,7 @@ class PassPoints:
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One cell: its points ``some`` (n,), ``normal`` (3,) and ``middle_mm`` (3,) of its surface.
+    """One cell: its points ``some`` (n,) of the passes ``number`` (n,), ``normal`` (3,) and ``middle_mm`` (3,).
 
     ``rows`` (n, U) and ``residuals`` (n,) are whitened, without the surface; ``mean_row`` (U,) is the mean derivative
     of the height. ``apart`` (n, K) are orthonormal patterns of the passes' offsets and slopes. ``by_px`` (n,) are the
@@ -58,6 +58,7 @@ class Cell:
     """
 
     some: np.ndarray
+    number: np.ndarray
     normal: np.ndarray
     middle_mm: np.ndarray
     rows: np.ndarray
@@ -69,12 +70,16 @@ class Cell:
     images: np.ndarray
     scatter: float
     offset_square: float
-    passes: tuple[int, ...]
 
     @property
-    def apart_mm(self) -> float:
-        """Root mean square distance of the passes from their common surface, as offsets and slopes."""
-        return float(np.sqrt(np.mean((self.apart @ (self.apart.T @ self.residuals) * self.std) ** 2)))
+    def passes(self) -> np.ndarray:
+        """Numbers of the passes."""
+        return np.unique(self.number)
+
+    @property
+    def apart_mm(self) -> np.ndarray:
+        """Distances (n,) of the passes from the surface that they share, as offsets and slopes."""
+        return self.apart @ (self.apart.T @ self.residuals) * self.std
 
 
 def divide(places_mm: np.ndarray, size_mm: float) -> np.ndarray:
@@ -167,6 +172,7 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
     length, normal = float(np.linalg.norm(up.mean(axis=0))), up.mean(axis=0)
     return Cell(
         some,
+        points.number[some],
         normal / length,
         middle,
         rows - shared @ (shared.T @ rows),
@@ -178,5 +184,4 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         by_image / std,
         scatter,
         float(np.sum((apart.T @ height) ** 2)) / max(apart.shape[1], 1),
-        tuple(enough.tolist()),
     )
