@@ -1,15 +1,18 @@
 """Recalibration of drawn sensors by rendered passes over scenes without an artefact, against the rendered truth.
 
-    python -m docs.studies.recalibration --first 100 --count 10 --kinds shifted,turned --write
-    python -m docs.studies.recalibration --first 200 --count 5 --kinds "scene moved"
+    python -m docs.studies.recalibration --first 1000 --count 10 --kinds shifted,turned,robot --checks 10 --write
 
 Each campaign draws a sensor, its water, its stage and the errors of the poses from the sensor's table [uncertainty],
 renders passes over one of five scenes, and recalibrates the described sensor. Lengths are those between the mean true
 points of two parts of a pass (along Y) and of two passes (along Z), in the sensor's coordinates, scaled to 100 mm.
+
+Checks: the calibration by the shifted passes is checked by three further passes of the same sensor over another scene,
+without and with a fault.
 """
 
 import tempfile
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +30,16 @@ from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Sensor
 from uwlts.recalibration.as_built import as_built
 from uwlts.storage.capture import open_capture
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.truth import read_truth, truth_path
 
 POSE_MM, POSE_DEG = 0.01, 0.005
 PASSES = {"reference": (0.0, 0.0, 0.0), "shifted": (40.0, 0.0, 0.0), "lower": (0.0, 60.0, 0.0)}
 """Shift along Y and along Z, mm, and turn about Z, deg."""
 TURNED = {"0": (0.0, 0.0, 0.0), "90": (0.0, 0.0, 90.0), "180": (0.0, 0.0, 180.0), "lower": (0.0, 60.0, 0.0)}
-FAULTS = ("scene moved", "pose scale", "warmer", "mirrored")
+ROBOT_MM, ROBOT_DEG = 0.05, 0.02
+FAULTS = ("none", "scene moved", "pose scale", "warmer", "mirrored")
+CHECKED = ["fault", "checks", "doubted", "names the pass or the scale"]
 HEAD = ["passes", "campaigns", "100 mm along", "before, mm", "stated", "after, mm", "stated", "error / stated"]
 HEAD += ["within 2 stated", "doubted"]
 UNCERTAINTY = {
@@ -154,15 +160,23 @@ def passes_of(turned: bool) -> dict[str, np.ndarray]:
     return poses
 
 
-def record(seed: int, folder: Path, *, turned: bool = False, fault: str = "none") -> tuple[list[Path], np.ndarray]:
-    """Render the passes of a campaign; return the captures and their stated poses (K, 4, 4)."""
+def record(
+    seed: int, folder: Path, *, turned: bool = False, later: bool = False, warmer: bool = False
+) -> tuple[list[Path], np.ndarray]:
+    """Render the passes of a campaign; return the captures and their stated poses (K, 4, 4).
+
+    ``later`` passes of the same sensor see another scene. The second pass may be in ``warmer`` water, by 5 K.
+    """
     rng = np.random.default_rng([2026, seed])
     sensor = describe_sensor()
     built = draw_sensor(sensor, rng)
-    warmer = float(rng.normal(0.0, sensor.uncertainty.temperature_k))
+    off_k = float(rng.normal(0.0, sensor.uncertainty.temperature_k))
     objects, count = draw_scene(rng, seed % 5), 61
     scale = rng.normal(0.0, sensor.uncertainty.stage_scale)
     lean = np.tan(np.radians(sensor.uncertainty.stage_alignment_deg)) * rng.standard_normal(2)
+    if later:
+        rng = np.random.default_rng([2026, seed, 1])
+        objects = draw_scene(rng, (seed + 1) % 5)
     captures, stated = [], []
     for number, (name, pose) in enumerate(passes_of(turned).items()):
         stated.append(pose)
@@ -170,17 +184,11 @@ def record(seed: int, folder: Path, *, turned: bool = False, fault: str = "none"
         error[:3, :3] = Rotation.from_rotvec(POSE_DEG * rng.standard_normal(3), degrees=True).as_matrix()
         error[:3, 3] = POSE_MM * rng.standard_normal(3)
         scaled = pose.copy()
-        scaled[:3, 3] *= 1.0 + scale + (1e-3 if fault == "pose scale" else 0.0)
+        scaled[:3, 3] *= 1.0 + scale
         true = error @ scaled
-        if fault == "scene moved" and number == 1:
-            true[:3, 3] += 0.1 * np.array([0.6, 0.0, 0.8])
+        hot = 5.0 if warmer and number == 1 else 0.0
         whole = np.linalg.inv(true)
-        media = {
-            key: each
-            if each.kind == "air"
-            else each.warmer_by(warmer + (5.0 if fault == "warmer" and number == 1 else 0.0))
-            for key, each in built.media.items()
-        }
+        media = {key: each if each.kind == "air" else each.warmer_by(off_k + hot) for key, each in built.media.items()}
         position = np.linspace(-45.0, 45.0, count)
         off = scale * position + sensor.uncertainty.stage_position_mm * rng.standard_normal(count)
         table = {
@@ -202,7 +210,7 @@ def record(seed: int, folder: Path, *, turned: bool = False, fault: str = "none"
                 }
             },
         }
-        out = folder / f"{seed}-{name}.h5"
+        out = folder / f"{seed}{'-later' * later}-{name}{'-warmer' * bool(hot)}.h5"
         captures.append(out)
         if out.exists():
             continue
@@ -241,22 +249,59 @@ def measure(captures: list[Path], found: uwlts.Calibration) -> dict[str, float]:
     return {"Y": 100.0 * (along_y - true_y) / true_y, "Z": 100.0 * (along_z - true_z) / true_z}
 
 
-def run(seed: int, folder: Path, *, turned: bool, fault: str) -> dict[str, Any]:
-    """Return ``rows`` of axis, error and stated uncertainty before and after, mm, and the ``doubts`` of a campaign."""
-    captures, poses = record(seed, folder, turned=turned, fault=fault)
-    if fault == "mirrored":
-        poses[1, 1, 3] *= -1.0
+def run(seed: int, folder: Path, kind: str) -> dict[str, Any]:
+    """Return ``rows`` of axis, error and stated uncertainty before and after, mm, the ``doubts``, and what was found.
+
+    A ``robot`` moves the shifted passes, but states poses that err by 0.05 mm and 0.02 deg.
+    """
+    captures, poses = record(seed, folder, turned=kind == "turned")
+    mm, deg = (ROBOT_MM, ROBOT_DEG) if kind == "robot" else (POSE_MM, POSE_DEG)
+    if kind == "robot":
+        rng = np.random.default_rng([2026, seed, 2])
+        for pose in poses:
+            turn = np.sqrt(ROBOT_DEG**2 - POSE_DEG**2) * rng.standard_normal(3)
+            pose[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix() @ pose[:3, :3]
+            pose[:3, 3] += np.sqrt(ROBOT_MM**2 - POSE_MM**2) * rng.standard_normal(3)
     sensor, described = describe_sensor(), folder / "described.toml"
     described.write_text(tomli_w.dumps(sensor.model_dump(exclude_none=True)), encoding="utf-8")
     try:
-        found = uwlts.recalibrate(
-            captures, calibration=described, poses=poses, pose_std_mm=POSE_MM, pose_std_deg=POSE_DEG
-        )
+        found = uwlts.recalibrate(captures, calibration=described, poses=poses, pose_std_mm=mm, pose_std_deg=deg)
     except uwlts.Error as error:
         return {"rows": [], "doubts": (f"refused: {error}",)}
     before, after = (measure(captures, each) for each in (as_built(sensor, sensor.media["water"]), found.calibration))
     rows = [(each.axis, before[each.axis], each.before_mm, after[each.axis], each.after_mm) for each in found.lengths]
-    return {"rows": rows, "doubts": found.doubts}
+    return {"rows": rows, "doubts": found.doubts, "calibration": found.calibration}
+
+
+def check(seed: int, folder: Path, calibration: uwlts.Calibration, fault: str) -> tuple[str, ...]:
+    """Return the doubts about later passes of the same sensor with a fault; the second pass has it."""
+    captures, poses = record(seed, folder, later=True, warmer=fault == "warmer")
+    if fault == "scene moved":
+        poses[1, :3, 3] += 0.1 * np.array([0.6, 0.0, 0.8])
+    if fault == "pose scale":
+        poses[:, :3, 3] /= 1.001
+    if fault == "mirrored":
+        mirrored = folder / f"{seed}-mirrored.h5"
+        with open_capture(captures[1]) as plain, CaptureWriter(mirrored, plain.header, dtype=np.uint8) as writer:
+            for frame in map(plain.__getitem__, range(len(plain))):
+                writer.append(replace(frame, seen=np.ascontiguousarray(frame.image[:, ::-1])))
+        captures[1] = mirrored
+    try:
+        found = uwlts.recalibrate(
+            captures, calibration=calibration, poses=poses, pose_std_mm=POSE_MM, pose_std_deg=POSE_DEG
+        )
+    except uwlts.Error as error:
+        return (f"refused: {error}",)
+    finally:
+        if fault == "mirrored":
+            captures[1].unlink()
+    return found.doubts
+
+
+def is_named(fault: str, doubts: tuple[str, ...]) -> bool:
+    """Return whether a doubt names the pass with the fault, or the scale."""
+    words = ("scale",) if fault == "pose scale" else ("shifted", "mirrored.h5")
+    return any(word in doubt for doubt in doubts for word in words)
 
 
 def summarise(kind: str, results: list[dict[str, Any]]) -> list[list[str]]:
@@ -280,20 +325,38 @@ app = App(help=__doc__)
 
 @app.default
 def main(
-    *, first: int = 0, count: int = 10, kinds: str = "shifted", keep: Path | None = None, write: bool = False
+    *,
+    first: int = 0,
+    count: int = 10,
+    kinds: str = "shifted",
+    checks: int = 0,
+    keep: Path | None = None,
+    write: bool = False,
 ) -> None:
-    """Run campaigns of kinds (shifted, turned, or a fault), print each, and publish the table."""
-    rows = []
+    """Run campaigns of kinds (shifted, turned, robot) and checks with each fault, and publish the tables."""
+    rows, doubts = [], {fault: list[tuple[str, ...]]() for fault in FAULTS}
     for kind in kinds.split(","):
         results = []
         for seed in range(first, first + count):
-            with tempfile.TemporaryDirectory() if keep is None else nullcontext(str(keep / kind / str(seed))) as folder:
-                Path(folder).mkdir(parents=True, exist_ok=True)
-                fault = kind if kind in FAULTS else "none"
-                results.append(run(seed, Path(folder), turned=kind == "turned", fault=fault))
-            print(kind, seed, results[-1], flush=True)
+            of_kind = "turned" if kind == "turned" else "shifted"
+            with (
+                tempfile.TemporaryDirectory() if keep is None else nullcontext(str(keep / of_kind / str(seed))) as made
+            ):
+                folder = Path(made)
+                folder.mkdir(parents=True, exist_ok=True)
+                results.append(run(seed, folder, kind))
+                print(kind, seed, results[-1]["rows"], results[-1]["doubts"], flush=True)
+                if kind == "shifted" and seed < first + checks and results[-1]["rows"]:
+                    for fault in FAULTS:
+                        doubts[fault].append(check(seed, folder, results[-1]["calibration"], fault))
+                        print(fault, seed, doubts[fault][-1], flush=True)
         rows += summarise(kind, results)
-    publish({"recalibration by passes": table(HEAD, rows)}, write=write)
+    found = [
+        [fault, str(len(each)), f"{sum(map(bool, each))} of {len(each)}"]
+        + ["" if fault == "none" else f"{sum(is_named(fault, own) for own in each)} of {len(each)}"]
+        for fault, each in doubts.items()
+    ]
+    publish({"recalibration by passes": table(HEAD, rows), "checks by passes": table(CHECKED, found)}, write=write)
 
 
 if __name__ == "__main__":

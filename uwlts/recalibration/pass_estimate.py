@@ -67,7 +67,8 @@ class PassSolution:
     """Amplitudes (U,) with their covariance (U, U), and the observed parts of the surface.
 
     ``first_cells`` are those with the earlier calibration. ``spread`` is the scatter of the passes' distances relative
-    to their stated noise, at least 1. ``lengths`` are those of an artefact, if it is known.
+    to their stated noise, at least 1. ``used`` (K,) is the part of each
+    pass's points that agree with a surface of another pass. ``lengths`` are those of an artefact, if it is known.
     """
 
     amplitudes: np.ndarray
@@ -75,6 +76,7 @@ class PassSolution:
     first_cells: list[Cell]
     cells: list[Cell]
     spread: float
+    used: np.ndarray
     lengths: KnownLengths | None
 
 
@@ -210,7 +212,7 @@ def solve_passes(problem: PassProblem, *, size_mm: float, artefact: Artefact | N
     corrections, first_cells, lengths = none, [], None
     ends = np.cumsum([len(each.line) for each in problem.passes])[:-1]
     spread, step = 1.0, np.zeros(problem.unknowns)
-    cell_of = weights = np.empty(0)
+    cell_of = weights = used = np.empty(0)
     for done in range(_ROUNDS):
         points = problem.place(amplitudes, corrections)
         if done < _FREE_ROUNDS:
@@ -221,6 +223,8 @@ def solve_passes(problem: PassProblem, *, size_mm: float, artefact: Artefact | N
             if artefact is not None:
                 placed, first = problem.place(amplitudes, none), problem.passes[0].pose
                 lengths = measure_known_lengths(placed, amplitudes, artefact, pose=first[len(first) // 2])
+            number = np.concatenate([cell.number for cell in cells])
+            used = np.bincount(number, minlength=len(none)) / [len(each) for each in none]
             # Points and weights stay, so that the iteration converges.
             cell_of = np.full(len(points.number), -1)
             for number, cell in enumerate(cells):
@@ -251,7 +255,7 @@ def solve_passes(problem: PassProblem, *, size_mm: float, artefact: Artefact | N
             "give better poses or a better calibration"
         )
     covariance = _covariance(cells, weights, total, points, lengths)
-    return PassSolution(amplitudes, covariance, first_cells, cells, spread, lengths)
+    return PassSolution(amplitudes, covariance, first_cells, cells, spread, used, lengths)
 
 
 def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.ndarray:

@@ -50,6 +50,8 @@ _FALSE_ALARM = 0.05
 """Probability of a doubt about right passes, by all tests together."""
 _POOR_FIT = 2.0
 """Disagreement of passes relative to their noise above which the surface is not the same in all passes."""
+_APART = 0.25
+"""Least part of a pass's points that agree with a surface of another pass, relative to the best pass."""
 _DETERMINED = 0.3
 """Least fraction of a prior variance that the passes remove in a direction whose deviation is tested. In weaker
 directions, ripples of welds alone deviated by 10 standard deviations (seeds 3 and 8 of the study)."""
@@ -420,6 +422,12 @@ def _find_doubts(problem: PassProblem, solution: PassSolution, by_amplitudes: np
             f"{problem.passes[int(np.argmax(squares))].name}: the scene moved or is too rough, or this pass is of "
             "another scene or mirrored"
         )
+    doubts += [
+        f"{each.name} hardly agrees with the others: only {100 * used:.0f} % of its points lie on a surface that "
+        "another pass sees: it is mirrored, of another scene, its pose is wrong, or it overlaps too little"
+        for each, used in zip(problem.passes, solution.used, strict=True)
+        if used < _APART * solution.used.max()
+    ]
     unknowns = np.eye(problem.unknowns)
     if (probability := _chance(solution, unknowns[: problem.of_sensor])) < limit:
         doubts.append(
