@@ -62,14 +62,14 @@ def measure_known_lengths(
         raise EvaluationError(f"a {artefact.kind} has no known length: give a pipe, a step or spheres")
     by_points = np.array([gradients[figure.key.name] @ rotation.T for figure in figures])
     noise = np.einsum("lni,ni->ln", by_points, points.by_px) * points.noise_px
-    by_image = np.einsum("lni,ni->ln", by_points, points.image_mm)
-    of_images = np.array([np.bincount(points.image, row) for row in by_image])
+    by_image = np.einsum("lni,kni->lkn", by_points, points.image_mm)
+    of_images = np.array([[np.sum(np.bincount(points.image, part) ** 2) for part in row] for row in by_image])
     calibrated = [figure.key.calibrated for figure in figures]
     known = np.array([(each.uncertainty_mm or 0.0) / 2.0 if each else 0.0 for each in calibrated])
     return KnownLengths(
         tuple(each.name if each else "" for each in calibrated),
         np.array([figure.value_mm for figure in figures]),
         np.einsum("lni,niu->lu", by_points, points.by_unknowns),
-        np.sqrt(np.sum(noise**2, axis=1) + np.sum(of_images**2, axis=1) + known**2),
+        np.sqrt(np.sum(noise**2, axis=1) + np.sum(of_images, axis=1) + known**2),
         unknowns,
     )

@@ -178,12 +178,16 @@ class PassProblem:
                     by_px,
                     corrections_px[number],
                     each.noise_px,
-                    of_images,
+                    of_images[None],
                     first + each.frame,
                 )
             )
             first += len(each.pose)
-        return PassPoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+        joined = (
+            np.concatenate([getattr(part, name) for part in parts], axis=int(name == "image_mm"))
+            for name in vars(parts[0])
+        )
+        return PassPoints(*joined)
 
 
 def move_calibration(known: StoredEstimate, values: np.ndarray) -> Calibration:
@@ -254,7 +258,7 @@ def solve_passes(problem: PassProblem, *, size_mm: float, artefact: Artefact | N
             f"the passes do not converge: the last step was {np.abs(step).max():.2g} prior standard uncertainties; "
             "give better poses or a better calibration"
         )
-    covariance = _covariance(cells, weights, total, points, lengths)
+    covariance = estimate_covariance(cells, weights, total, points, lengths)
     return PassSolution(amplitudes, covariance, first_cells, cells, spread, used, lengths)
 
 
@@ -267,16 +271,17 @@ def _correct(cells: Sequence[Cell], points: PassPoints, step: np.ndarray) -> np.
     return corrections
 
 
-def _covariance(
+def estimate_covariance(
     cells: Sequence[Cell], weights: np.ndarray, total: np.ndarray, points: PassPoints, lengths: KnownLengths | None
 ) -> np.ndarray:
     """Return the covariance (U, U): noise, positions of images that many cells share, lengths and prior knowledge."""
     inverse = np.linalg.inv(total)
-    of_images = np.zeros((int(points.image.max()) + 1, len(total)))
+    of_images = np.zeros((len(points.image_mm), int(points.image.max()) + 1, len(total)))
     spread = np.eye(len(total)) if lengths is None else np.eye(len(total)) + lengths.rows.T @ lengths.rows
     for cell, weight in zip(cells, weights, strict=True):
-        own = np.sqrt(np.maximum(1.0 - cell.images**2, 0.0))
+        own = np.sqrt(np.maximum(1.0 - np.sum(cell.images**2, axis=0), 0.0))
         rows = weight * cell.apart @ (cell.apart.T @ cell.rows)
         spread += (rows * own[:, None]).T @ (rows * own[:, None])
-        np.add.at(of_images, points.image[cell.some], rows * cell.images[:, None])
-    return inverse @ (spread + of_images.T @ of_images) @ inverse
+        for together, shares in zip(of_images, cell.images, strict=True):
+            np.add.at(together, points.image[cell.some], rows * shares[:, None])
+    return inverse @ (spread + np.einsum("kiu,kiv->uv", of_images, of_images)) @ inverse

@@ -32,8 +32,8 @@ class PassPoints:
     """Points of all passes (N) in the common frame, at corrected observations.
 
     ``places_mm`` (N, 3), ``number`` (N,) is that of the pass, ``by_unknowns`` (N, 3, U), ``by_px`` (N, 3) and
-    ``correction_px`` (N,) of the stripe centre. ``noise_px`` (N,) is its standard deviation, ``image_mm`` (N, 3) the
-    shift by one standard deviation of the image's position, and ``image`` (N,) the number of the image.
+    ``correction_px`` (N,) of the stripe centre. ``noise_px`` (N,) is its standard deviation, ``image_mm`` (K, N, 3)
+    the shifts by one standard deviation of each error of the image's place, and ``image`` (N,) the number of the image.
     """
 
     places_mm: np.ndarray
@@ -52,8 +52,8 @@ class Cell:
 
     ``rows`` (n, U) and ``residuals`` (n,) are whitened, without the surface; ``mean_row`` (U,) is the mean derivative
     of the height. ``apart`` (n, K) are orthonormal patterns of the passes' offsets and slopes. ``by_px`` (n,) are the
-    derivatives of the height by the stripe centre, ``std`` (n,) its standard deviations, and ``images`` (n,) the
-    whitened effects of the images' positions. ``scatter`` is the ratio of the heights' scatter to the stated noise, at
+    derivatives of the height by the stripe centre, ``std`` (n,) its standard deviations, and ``images`` (K, n)
+    the whitened effects of the images' places. ``scatter`` is the ratio of the heights' scatter to the stated noise, at
     least 1. ``offset_square`` is the mean square of the whitened disagreement of the passes.
     """
 
@@ -146,8 +146,8 @@ def _observe(points: PassPoints, some: np.ndarray, spread: float, *, fewest: int
         slope_u, slope_v = shape[1] + 2 * shape[3] * u + shape[4] * v, shape[2] + shape[4] * u + 2 * shape[5] * v
         up = axes[:, 0] - slope_u[:, None] * axes[:, 2] - slope_v[:, None] * axes[:, 1]
         by_px = np.einsum("ni,ni->n", up, points.by_px[some])
-        by_image = np.einsum("ni,ni->n", up, points.image_mm[some])
-        std = spread * np.sqrt((by_px * points.noise_px[some]) ** 2 + by_image**2)
+        by_image = np.einsum("ni,kni->kn", up, points.image_mm[:, some])
+        std = spread * np.sqrt((by_px * points.noise_px[some]) ** 2 + np.sum(by_image**2, axis=0))
         height = (w - by_px * points.correction_px[some]) / std
         base = np.linalg.qr(design / std[:, None])[0]
         left = height - base @ (base.T @ height)
