@@ -36,6 +36,7 @@ def reconstruct(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts reconstruct scan.h5 --calibration calibration.json --out scan.cloud.h5"""
+    from uwlts.recalibration.pass_check import check_passes
     from uwlts.storage.capture import Capture
     from uwlts.storage.cloud import VERIFIED
 
@@ -44,6 +45,8 @@ def reconstruct(
         lit = int(capture.laser_on.sum())
     cloud.save(out, overwrite=overwrite)
     warn(*cloud.warnings)
+    if check := check_passes(cloud):
+        (say if check.agree else warn)(check.text)
     if until := cloud.metadata.get(VERIFIED):
         say(f"calibration verified until {until}")
     say(f"laser images with a point: {len(set(cloud.frame.tolist()))} of {lit}")

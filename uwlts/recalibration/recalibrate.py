@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from scipy.stats import chi2
 
 from uwlts.calibration.joint.observability import compute_lengths, project_sheet_points, sample_sheet
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, read_stored_estimate, require_joint
@@ -23,8 +22,16 @@ from uwlts.model.short_text import Brief
 from uwlts.optics.brightness import select_sharp_lines
 from uwlts.recalibration.as_built import as_built
 from uwlts.recalibration.next_pass import NextPass, rank_passes
-from uwlts.recalibration.pass_estimate import MotionUncertainty, Pass, PassProblem, PassSolution, solve_passes
-from uwlts.recalibration.surface_cells import Cell
+from uwlts.recalibration.pass_estimate import (
+    POOR_FIT,
+    MotionUncertainty,
+    Pass,
+    PassProblem,
+    PassSolution,
+    chance,
+    solve_passes,
+)
+from uwlts.recalibration.surface_cells import CELL, Cell
 from uwlts.reconstruction.point_uncertainty import estimate_stripe_noise_px, independent_components, window_shift_std_mm
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.progress import ProgressListener, ignore_progress
@@ -43,18 +50,10 @@ on rendered pipes, flanges and welds (seeds 1 to 3 of the study), where such poi
 _LINES = 4
 """One of these many profile lines is used: speckle correlates the noise of neighbours, which the surface would
 follow. With all lines, lengths were 0.03 mm too short (seeds 1, 2, 6, 7)."""
-_CELL = 1.5
-"""Size of a cell relative to the disc radius of the sparsest pass (`find_disc_radius`), in which a second-order surface
-suffices; seen on simulated surfaces with wavelengths from 45 mm."""
 _FALSE_ALARM = 0.05
 """Probability of a doubt about right passes, by all tests together."""
-_POOR_FIT = 2.0
-"""Disagreement of passes relative to their noise above which the surface is not the same in all passes."""
 _APART = 0.25
 """Least part of a pass's points that agree with a surface of another pass, relative to the best pass."""
-_DETERMINED = 0.3
-"""Least fraction of a prior variance that the passes remove in a direction whose deviation is tested. In weaker
-directions, ripples of welds alone deviated by 10 standard deviations (seeds 3 and 8 of the study)."""
 
 
 @dataclass(frozen=True)
@@ -298,7 +297,7 @@ def recalibrate(
     )
     start = problem.place(np.zeros(problem.unknowns), [np.zeros(len(each.line)) for each in gathered])
     radius = max(find_disc_radius(start.places_mm[start.number == each]) for each in range(len(gathered)))
-    solution = solve_passes(problem, size_mm=_CELL * radius, artefact=artefact)
+    solution = solve_passes(problem, size_mm=CELL * radius, artefact=artefact)
     progress(len(scans) + 1, len(scans) + 1)
     return replace(summarise(problem, solution, prior, header.stage_direction), warnings=tuple(warnings))
 
@@ -413,7 +412,7 @@ def _find_doubts(problem: PassProblem, solution: PassSolution, by_amplitudes: np
     lengths = solution.lengths
     limit = _FALSE_ALARM / (len(problem.passes) + 2 + (0 if lengths is None else len(lengths.names)))
     doubts = []
-    if solution.spread > _POOR_FIT:
+    if solution.spread > POOR_FIT:
         apart = np.concatenate([cell.apart_mm**2 for cell in solution.cells])
         number = np.concatenate([cell.number for cell in solution.cells])
         squares = np.bincount(number, apart) / np.maximum(np.bincount(number), 1)
@@ -429,12 +428,12 @@ def _find_doubts(problem: PassProblem, solution: PassSolution, by_amplitudes: np
         if used < _APART * solution.used.max()
     ]
     unknowns = np.eye(problem.unknowns)
-    if (probability := _chance(solution, unknowns[: problem.of_sensor])) < limit:
+    if (probability := chance(solution.amplitudes, solution.covariance, unknowns[: problem.of_sensor])) < limit:
         doubts.append(
             f"the earlier calibration and the passes contradict each other (probability {probability:.1g}): the sensor "
             "changed by more than it states, or the motion is not as stated"
         )
-    if (probability := _chance(solution, np.linalg.qr(by_amplitudes.T)[0].T)) < limit:
+    if (probability := chance(solution.amplitudes, solution.covariance, np.linalg.qr(by_amplitudes.T)[0].T)) < limit:
         changes = zip("YZ", by_amplitudes @ solution.amplitudes, strict=True)
         doubts.append(
             f"lengths change by more than the earlier calibration states (probability {probability:.1g}), 100 mm along "
@@ -444,7 +443,7 @@ def _find_doubts(problem: PassProblem, solution: PassSolution, by_amplitudes: np
     names = ("its position", "its direction", "the index of the water")
     for number, each in enumerate(problem.passes):
         columns = problem.of_pass(number)
-        if (probability := _chance(solution, unknowns[columns])) < limit:
+        if (probability := chance(solution.amplitudes, solution.covariance, unknowns[columns])) < limit:
             own = solution.amplitudes[columns]
             sizes = [np.linalg.norm(own[:3]) / np.sqrt(3), np.linalg.norm(own[3:6]) / np.sqrt(3), abs(own[6])]
             worst = int(np.argmax(sizes))
@@ -461,15 +460,6 @@ def _find_doubts(problem: PassProblem, solution: PassSolution, by_amplitudes: np
             if chance < limit
         ]
     return doubts
-
-
-def _chance(solution: PassSolution, directions: np.ndarray) -> float:
-    """Return the probability of deviations as large along orthonormal directions (K, U), as far as determined."""
-    own, covariance = directions @ solution.amplitudes, directions @ solution.covariance @ directions.T
-    values, vectors = np.linalg.eigh(np.eye(len(own)) - covariance)
-    tested = values > _DETERMINED
-    square = float(np.sum((vectors.T @ own)[tested] ** 2 / values[tested]))
-    return float(chi2.sf(square, int(tested.sum()))) if tested.any() else 1.0
 
 
 def _build(

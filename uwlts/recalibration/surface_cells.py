@@ -16,6 +16,9 @@ from scipy.spatial import KDTree
 from uwlts.errors import CalibrationError
 from uwlts.fitting.least_squares import MAD_TO_STD
 
+CELL = 1.5
+"""Size of a cell relative to the disc radius of the sparsest pass (`find_disc_radius`), in which a second-order surface
+suffices; seen on simulated surfaces with wavelengths from 45 mm."""
 _FEWEST = 8
 """Least number of points of a pass in a cell: two more than a second-order surface has coefficients."""
 _OUTLIER = 5.0

@@ -283,21 +283,10 @@ def test_passes_without_overlap_are_refused():
 
 
 def write_capture(path, each):
-    """Write a pass as a capture of a 3D camera, with independent noise on each line of the sensor."""
-    camera = SENSOR.camera
+    """Write a pass as a capture of a 3D camera."""
     with CaptureWriter(path, HEADER, dtype=np.uint8, centre_lines=True) as writer:
         for number, position in enumerate(TRAVEL):
-            own = each.frame == number
-            centre = np.full(camera.width_px, np.nan)
-            order = np.argsort(each.line[own])
-            line = each.line[own][order]
-            inner = np.arange(int(line[0]) + 1, int(line[-1]))
-            # Not across parts outside the image.
-            inner = inner[(inner > 150) & (inner < 490)]
-            inner = inner[np.diff(line)[np.searchsorted(line, inner) - 1] < 10.0]
-            centre[inner] = CubicSpline(line, each.centre_px[own][order])(inner)
-            centre += NOISE_PX * np.random.default_rng(number).normal(size=len(centre))
-            stripe = Coordinates().stripe(centre, stripe_along="width", length_px=camera.height_px)
+            stripe = coordinates_of(each, each.frame == number)
             writer.append(Frame(stripe, float(position), True, 1.0, float(number)))
 
 
@@ -329,3 +318,57 @@ def test_the_command_writes_a_calibration_only_without_doubts(tmp_path, monkeypa
     assert not (tmp_path / "new.json").exists()
     write_poses(poses, np.array([np.eye(4)] * 2), overwrite=True)
     assert "2 poses are given for 3 passes" in uwlts(*command).stderr
+
+
+def survey(path, built_passes, *, moved_mm=0.0):
+    """Write passes as one capture with poses of its images, each pass to the other side; return its cloud's check.
+
+    The poses of the second pass are stated ``moved_mm`` beside their place.
+    """
+    along = np.eye(4)
+    with CaptureWriter(path, HEADER, dtype=np.uint8, centre_lines=True, covariances=True) as writer:
+        for turn, each in enumerate(built_passes):
+            for number, position in list(enumerate(TRAVEL))[:: 1 - 2 * (turn % 2)]:
+                own = each.frame == number
+                along[0, 3] = position
+                pose = each.pose[number] @ along
+                pose[2, 3] += moved_mm * (turn == 1)
+                known = np.diag([0.01**2] * 3 + [1e-10] * 3)
+                stripe = coordinates_of(each, own)
+                writer.append(Frame(stripe, 0.0, True, 1.0, float(len(writer)), pose=pose, pose_covariance=known))
+    return path
+
+
+def coordinates_of(each, own):
+    """Return the stripe of an image of a pass, with independent noise on each line of the sensor."""
+    camera = SENSOR.camera
+    centre, order = np.full(camera.width_px, np.nan), np.argsort(each.line[own])
+    line = each.line[own][order]
+    inner = np.arange(int(line[0]) + 1, int(line[-1]))
+    # Not across parts outside the image.
+    inner = inner[(inner > 150) & (inner < 490)]
+    inner = inner[np.diff(line)[np.searchsorted(line, inner) - 1] < 10.0]
+    centre[inner] = CubicSpline(line, each.centre_px[own][order])(inner)
+    centre += NOISE_PX * np.random.default_rng(int(1e6 * line[0])).normal(size=len(centre))
+    return Coordinates().stripe(centre, stripe_along="width", length_px=camera.height_px)
+
+
+@pytest.mark.parametrize("moved_mm", [0.0, 0.3])
+def test_a_scan_with_overlaps_checks_itself(tmp_path, monkeypatch, moved_mm):
+    exact = MotionUncertainty(pose_mm=1e-5, pose_rad=1e-7, pose_scale=5e-5, image_mm=0.003)
+    monkeypatch.setitem(globals(), "MOTION", exact)
+    monkeypatch.setitem(globals(), "NOISE_PX", 0.0)
+    *_, problem = campaign(7, SHIFTED)
+    monkeypatch.setitem(globals(), "NOISE_PX", 0.1)
+    calibration = solve(problem).calibration
+    calibration.save(tmp_path / "found.json")
+    capture = survey(tmp_path / "survey.h5", problem.passes, moved_mm=moved_mm)
+    done = uwlts(
+        "reconstruct", str(capture), "--calibration", str(tmp_path / "found.json"), "--out", str(tmp_path / "c.h5")
+    )
+    assert done.returncode == 0, done.stderr
+    if moved_mm:
+        assert "disagree beyond the stated uncertainty" in done.stderr
+    else:
+        assert "3 passes overlap" in done.stdout
+        assert "agree within the stated uncertainty" in done.stdout

@@ -1,0 +1,138 @@
+"""Check of a cloud by its own overlaps: surfaces that the sensor passed twice agree within the stated uncertainty.
+
+The unknowns are the independent errors in the cloud's uncertainty (calibration, water, mount, path), of zero mean and
+unit variance. One linear step estimates them from the disagreement of the passes (`surface_cells`). What they become,
+relative to chance, is the verdict.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from uwlts.errors import CalibrationError, EvaluationError
+from uwlts.fitting.least_squares import biweight
+from uwlts.fitting.patches import find_disc_radius
+from uwlts.fitting.propagation import noise_shifts
+from uwlts.recalibration.pass_estimate import POOR_FIT, chance, estimate_covariance
+from uwlts.recalibration.surface_cells import CELL, PassPoints, divide, observe
+from uwlts.storage.cloud import PointCloud
+
+_LINES = 4  # one of these many profile lines, as for a recalibration
+_MOST_POINTS = 30_000  # for a second of computation
+_SMOOTHED = 9
+"""Number of images whose mean motion is the direction of a pass: steps vary with what is seen."""
+_DOUBTED = 0.01
+"""Probability of chance below which passes disagree: once in a hundred right scans."""
+_PART = 0.1  # least weight of a group of errors in a pattern that counts as its own
+
+
+@dataclass(frozen=True)
+class PassCheck:
+    """Agreement of a cloud's passes: their number, that of the common parts of the surface, and the probability.
+
+    ``scatter`` is the ratio of the disagreement that no stated error explains to the noise, at least 1. ``cause`` is
+    the stated error that explains the disagreement best.
+    """
+
+    passes: int
+    parts: int
+    probability: float
+    scatter: float
+    cause: str
+
+    @property
+    def agree(self) -> bool:
+        """True unless the disagreement is beyond chance."""
+        return self.probability >= _DOUBTED and self.scatter <= POOR_FIT
+
+    @property
+    def text(self) -> str:
+        """The result in words."""
+        seen = f"{self.passes} passes overlap in {self.parts} parts of the surface"
+        if self.agree:
+            return f"{seen}, and agree within the stated uncertainty (probability {self.probability:.2g})"
+        if self.scatter > POOR_FIT:
+            why = f"{self.scatter:.1f} times their noise: the scene moved, or the poses err by more than stated"
+        else:
+            why = f"(probability {self.probability:.1g}): most of it would follow from an error of {self.cause}"
+        return f"{seen}, and disagree beyond the stated uncertainty, {why}; uwlts recalibrate tells more"
+
+
+def split_passes(cloud: PointCloud) -> np.ndarray:
+    """Return the pass (N,) of each point: a pass ends where the images' motion turns by more than 90 deg."""
+    image, of_point = np.unique(cloud.frame, return_inverse=True)
+    sums = [np.bincount(of_point, axis) for axis in cloud.points_mm.T]
+    place = np.stack(sums, axis=1) / np.bincount(of_point)[:, None]
+    number = np.zeros(len(image), int)
+    if len(image) > _SMOOTHED:
+        way = np.gradient(uniform_filter1d(place, _SMOOTHED, axis=0), axis=0)
+        reference = 0
+        for each in range(1, len(image)):
+            turned = each > reference and way[each] @ way[reference] < 0
+            if turned:
+                # The turn itself has no direction.
+                reference = min(each + _SMOOTHED, len(image) - 1)
+            number[each] = number[each - 1] + turned
+    return number[of_point]
+
+
+def check_passes(cloud: PointCloud) -> PassCheck | None:
+    """Return the agreement of a cloud's passes; None without their overlap, or without the cloud's uncertainty."""
+    if cloud.uncertainty is None:
+        return None
+    number = split_passes(cloud)
+    chosen = np.flatnonzero(cloud.line % _LINES == 0)
+    chosen = chosen[:: max(1, len(chosen) // _MOST_POINTS)]
+    number, known, places = number[chosen], cloud.uncertainty[chosen], cloud.points_mm[chosen]
+    if number.max(initial=0) == 0:
+        return None
+    points = PassPoints(
+        places,
+        number,
+        known.patterns_mm.astype(np.float64).transpose(1, 2, 0),
+        noise_shifts(known),
+        np.zeros(len(places)),
+        np.ones(len(places)),
+        known.image_errors_mm().astype(np.float64),
+        cloud.frame[chosen],
+    )
+    try:
+        radius = max(find_disc_radius(places[number == each]) for each in np.unique(number))
+        cells = observe(points, divide(places, CELL * radius), 1.0, keep=False)
+    except (CalibrationError, EvaluationError):
+        return None  # no overlap, or too few points
+    unknowns = len(known.patterns_mm)
+    amplitudes, squares, weights = np.zeros(unknowns), np.ones(len(cells)), np.ones(len(cells))
+    total = np.eye(unknowns)
+    for _ in range(2):
+        total, gradient = np.eye(unknowns), np.zeros(unknowns)
+        spread = max(1.0, float(np.sqrt(np.mean(squares[weights > 0]))))
+        for cell, weight in zip(cells, weights, strict=True):
+            rows = cell.apart.T @ cell.rows / spread
+            total += weight * rows.T @ rows
+            gradient += weight * rows.T @ (cell.apart.T @ cell.residuals) / spread
+        amplitudes = -np.linalg.solve(total, gradient)
+        left = [cell.apart.T @ (cell.residuals + cell.rows @ amplitudes) for cell in cells]
+        squares = np.array([np.mean(each**2) if len(each) else 0.0 for each in left])
+        weights = biweight(np.sqrt(squares / max(float(np.median(squares)), 1e-12)))
+    covariance = estimate_covariance(cells, weights / spread**2, total, points, None)
+    probability = chance(amplitudes, covariance, np.eye(unknowns))
+    return PassCheck(
+        len(np.unique(number)), len(cells), probability, spread, _find_cause(cloud, amplitudes, covariance)
+    )
+
+
+def _find_cause(cloud: PointCloud, amplitudes: np.ndarray, covariance: np.ndarray) -> str:
+    """Return the name of the group of errors whose deviation is the least probable."""
+    assert cloud.uncertainty is not None
+    words = {"sensor": "the calibration", "mount": "the mount"}
+    shared = cloud.uncertainty.shared
+    groups = {words.get(name.split()[0], "the water's index"): by for name, by in shared.items()}
+    alone = np.all([~by.any(axis=1) for by in shared.values()], axis=0)
+    groups["the poses"] = np.eye(len(amplitudes))[:, alone]
+    chances = {}
+    for name, by in groups.items():
+        vectors, sizes, _ = np.linalg.svd(by, full_matrices=False)
+        chances[name] = chance(amplitudes, covariance, vectors[:, sizes > _PART].T)
+    return min(chances, key=chances.__getitem__)
