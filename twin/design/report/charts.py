@@ -1,9 +1,8 @@
-"""Charts of a study: figures over free variables, Pareto front, parallel coordinates, rendering against formulas."""
+"""Charts of a study: figures over free variables, Pareto front, rendering against formulas."""
 
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Sequence
 from functools import partial
 from html import escape
@@ -16,7 +15,7 @@ from plotly.subplots import make_subplots
 
 from twin.design.choice import StudyResults, find_pareto_front
 from twin.design.designs import HighlightedDesign
-from twin.design.figures_of_merit import CLASS_NAMES, RENDERED_SCATTERING_DEPTH
+from twin.design.figures_of_merit import RENDERED_SCATTERING_DEPTH
 from twin.design.report import study_tables as tables
 from twin.design.verification import Agreement
 from uwlts.pages.toolkit import BLUE, COLOURS, INK, RED, legend_below, new_figure
@@ -42,11 +41,9 @@ _SHOWN = (
 """Figures shown in addition to objectives and constraints, the most informative first."""
 _MOST_PANELS = 9  # of a figure, so that it fits on a page
 _PANEL_COLUMNS = 3  # of a page's width
-# Limits: more points and lines make a page slow; more axes would overlap.
+# Limits: more points make a page slow.
 MOST_POINTS = 20_000
-MOST_LINES = 5_000
 _MOST_IN_PANEL = 2_000
-_MOST_DIMENSIONS = 12
 _IN_SVG = 2500
 """Above this number, points are drawn with WebGL, which is faster."""
 _WIDE_RANGE = 30.0
@@ -252,54 +249,3 @@ def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
     chosen = kept.copy()
     chosen[others] = True
     return chosen
-
-
-def parallel_chart(judged: StudyResults) -> Interactive | None:
-    """Draw each design that meets the constraints as a line over free variables, objectives and constraints."""
-    if not judged.feasible.any():
-        return None
-    places = np.flatnonzero(sample(judged.feasible, judged.front(judged.of_interest), MOST_LINES))
-    names = list(dict.fromkeys([*judged.study.free(), *judged.study.figures()]))[:_MOST_DIMENSIONS]
-    objective = judged.study.objectives[0]
-    colours = judged.figure(objective.figure)[places]
-    low, high = float(colours.min()), float(np.quantile(colours, 0.95))
-    figure = go.Figure(
-        go.Parcoords(
-            dimensions=[_dimension(judged, name, places) for name in names],
-            labelangle=-12,
-            line={
-                "color": tables.round_for_json(colours),
-                "colorscale": "Viridis",
-                "showscale": True,
-                "cmin": low,
-                "cmax": high if high > low else low + max(abs(low), 1e-9),
-                "reversescale": objective.goal == "maximise",
-                "colorbar": {"title": {"text": _escaped(tables.label_of(objective.figure)), "side": "right"}},
-            },
-        )
-    )
-    figure.update_layout(height=470, margin_t=110)
-    total = int(judged.feasible.sum())
-    count = f"{len(places):,} of {total:,} designs" if len(places) < total else f"All {total:,} designs"
-    return figure, f"{count} that meet all constraints. Drag along an axis to select designs by their values."
-
-
-def _dimension(judged: StudyResults, name: str, places: np.ndarray) -> dict[str, object]:
-    """Return a parallel axis: choices and laser classes by name, else numbers."""
-    values, variable = judged.columns[name][places], judged.study.free().get(name)
-    label = _escaped(tables.label_of(name))
-    if variable is not None and variable.values is not None:
-        options = list(variable.values)
-        # Tick labels are plain text and need no escaping.
-        texts = [
-            textwrap.shorten(tables.value_text(name, option, unit=False), 24, placeholder="…") for option in options
-        ]
-        ticks, codes = list(range(len(options))), [options.index(value) for value in values.tolist()]
-    elif name == "laser_class":
-        ticks, texts, codes = list(CLASS_NAMES), list(CLASS_NAMES.values()), tables.round_for_json(values)
-    else:
-        low, high = float(values.min()), float(values.max())
-        margin = 0.0 if high > low else max(abs(low) * 0.05, 1e-6)
-        return {"label": label, "values": tables.round_for_json(values), "range": [low - margin, high + margin]}
-    ends = [ticks[0] - 0.3, ticks[-1] + 0.3]
-    return {"label": label, "values": codes, "tickvals": ticks, "ticktext": texts, "range": ends}

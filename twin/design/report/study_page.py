@@ -18,10 +18,9 @@ from uwlts.pages.toolkit import FigureCollector, figure_svg, render_page
 _BEST = 20
 """Designs in the table of the best."""
 _DRAWN = (
-    "Lengths in mm; near, far and stand-off are measured from the window. Left: along the sheet, with the camera's "
-    "view in blue and the sheet in red (thick: in the camera's view and in the tinted measuring volume). Right: onto "
-    "the sheet, with the laser's fan, the image's border in blue, and the line's lengths. Windows and rays are to "
-    "scale; the housings are only indicated."
+    "Along the sheet, lengths in mm; near, far and stand-off are measured from the window. The camera's view is blue, "
+    "the sheet red (thick: in the camera's view and in the tinted measuring volume). Windows and rays are to scale; "
+    "the housings are only indicated."
 )
 
 
@@ -43,7 +42,7 @@ def page_text(
     judged, collected = StudyResults(study, columns), FigureCollector()
     nothing = "" if judged.works.any() else "None of the designs works: see the reasons below."
     over_free = charts.figures_chart(judged, marked)
-    pareto, parallel = charts.pareto_chart(judged, marked), charts.parallel_chart(judged)
+    pareto = charts.pareto_chart(judged, marked)
     return render_page(
         "twin.design.report",
         "template.html.j2",
@@ -56,7 +55,6 @@ def page_text(
         drawing=_drawing(study, marked),
         over_free=over_free and collected.add(*over_free),
         pareto=pareto and collected.add(*pareto),
-        parallel=parallel and collected.add(*parallel),
         nothing=nothing if len(judged) else "No design has been evaluated.",
         number=tables.number_text,
         value=tables.value_text,
@@ -78,15 +76,15 @@ def _drawing(study: Study, marked: Sequence[HighlightedDesign]) -> tuple[Markup 
         return None, "There is no design to draw."
     chosen, base = marked[-1], marked[0]
     try:
-        views = drawing.make_views(chosen.sensor, study.medium_of(chosen.sensor))
+        view = drawing.make_view(chosen.sensor, study.medium_of(chosen.sensor))
     except Error as error:
         return None, f"The design cannot be drawn: {error}."
     other = None
     if base is not chosen:
         with suppress(Error):
-            other = drawing.make_views(base.sensor, study.medium_of(base.sensor))
+            other = drawing.make_view(base.sensor, study.medium_of(base.sensor))
     behind = f" Dashed grey behind, as far as it fits in: {base.label}." if other else ""
-    return figure_svg(drawing.draw(*views, other)), _DRAWN + behind
+    return figure_svg(drawing.draw(view, other)), _DRAWN + behind
 
 
 def _best(judged: StudyResults) -> tuple[list[str], list[list[str]]]:
