@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from tests.uwlts.alignment.test_align import LOOP_MM
 from tests.uwlts.path_views import ALTITUDE_MM, STEP_MM, bed, ride, scan
-from twin.scene.vehicle import Vehicle
+from twin.scene.platform_kinds import Vehicle
 from uwlts.alignment.alignment_options import AlignmentOptions
 from uwlts.alignment.crossing_search import accept_hypothesis, add_overlaps
 from uwlts.alignment.drift_model import DriftModel, choose_drift_model

@@ -14,12 +14,10 @@ import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, SerializeAsAny, Tag, model_validator
 
 from twin.scene.forms import AnyForm
-from twin.scene.guide_and_table import LinearGuide, RotaryTable
 from twin.scene.motion import Motion
+from twin.scene.platform_kinds import LinearGuide, Robot, RotaryTable, Vehicle
 from twin.scene.platforms import IdealPath, Platform
-from twin.scene.robot import Robot
 from twin.scene.scene_object import FlatObject, Pose, Reflectance, SceneObject
-from twin.scene.vehicle import Vehicle
 from uwlts.errors import DescriptionError
 from uwlts.model.library import find_description, read_table, validate_description
 from uwlts.model.sensor import Description, Medium, NotNegative, Positive, Sensor, Table, Vector
