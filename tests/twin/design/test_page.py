@@ -21,9 +21,8 @@ from twin.design.designs import (
     select_design,
 )
 from twin.design.figures_of_merit import FIGURES
-from twin.design.report.charts import choose_pareto_axes, figures_chart, pareto_chart, sample
 from twin.design.report.drawing import make_view
-from twin.design.report.study_page import page_text
+from twin.design.report.study_page import choose_pareto_axes, figures_chart, page_text, pareto_chart, sample
 from twin.design.report.study_tables import (
     agreement_text,
     label_of,
