@@ -31,8 +31,7 @@ from .reconstruction.reconstruct import reconstruct as reconstruct
 from .reconstruction.verify import verify as verify
 from .registration.register import register as register
 from .report import plot as plot
-from .report.file_description import describe as describe
-from .report.reading import read as read
+from .report.file_description import describe as describe, read as read
 from .storage.capture import Capture as Capture
 from .storage.cloud import PointCloud as PointCloud
 from .storage.export_ import export as export

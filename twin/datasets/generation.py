@@ -26,8 +26,7 @@ from twin.datasets.data_set import EXPOSURE, DataSetDescription, LineStatus, loa
 from twin.datasets.labels import MEANINGS, make_labels
 from twin.recording.campaigns import PLAN, keep_to_plan, make_folder, require_at_least
 from twin.rendering_options import CPU, Options, Variant, use_variant
-from twin.scene.description import Scene
-from twin.scene.paths import Value, with_values
+from twin.scene.description import Scene, Value, with_values
 from uwlts.errors import DesignError, Error
 from uwlts.files.json_files import write_model
 from uwlts.files.reading import log_warnings
@@ -217,7 +216,7 @@ def _apply_values(sensor: Sensor, values: dict[str, Value], source: str) -> Sens
 
 if TYPE_CHECKING:
     from twin.recording.sensor_simulator import SensorSimulator, SimulatedImage
-    from twin.scene.motion import Shot
+    from twin.scene.platforms import Shot
 
 MOST_ATTEMPTS = 20
 """Largest number of draws of a scene until the sensor can measure it; more indicate an error in the description."""

@@ -10,7 +10,7 @@ from twin.experiments.runner import THESIS, Method, inspected_as
 from twin.scene.campaign import Take
 from twin.scene.description import Scene, medium_of
 from twin.scene.forms import PittedPipe
-from twin.scene.motion import Motion
+from twin.scene.platforms import Motion
 from uwlts.errors import CaptureError
 from uwlts.files.json_files import read_json
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, StepStandard, parse_artefact

@@ -44,8 +44,8 @@ from twin.light.walk import Walker
 from twin.light.water import Scattering
 from twin.rendering_options import ALL, Effects
 from twin.scene.description import Scene
-from twin.scene.motion import Light as LightName
 from twin.scene.objects import build_objects
+from twin.scene.platforms import Light as LightName
 from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
 

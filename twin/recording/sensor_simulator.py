@@ -21,8 +21,7 @@ from twin.recording.frame_truth import (
 from twin.rendering_options import Options
 from twin.scene.description import PrintedPlate, Scene, medium_of, replace_values
 from twin.scene.finish import shift_points
-from twin.scene.motion import Light, Shot
-from twin.scene.platforms import Platform
+from twin.scene.platforms import Light, Platform, Shot
 from twin.sensor.detector import INVALID, PeakFinder, electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.flaws import add_glare, as_built, deliver_image, dirt, laser_shares, vignette
 from twin.sensor.speckle import Speckle, coherence

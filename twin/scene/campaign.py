@@ -11,8 +11,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from twin.scene.description import Block, PrintedPlate, Scene, load_scene, replace_values
-from twin.scene.motion import Motion
-from twin.scene.platforms import Platform
+from twin.scene.platforms import Motion, Platform
 from uwlts.errors import DescriptionError
 from uwlts.model.artefacts import StepStandard, parse_artefact
 from uwlts.model.library import find_description, load_sensor, read_levels, validate_description
