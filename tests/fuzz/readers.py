@@ -27,7 +27,7 @@ from tests.uwlts.storage.test_vendor_files import BLOCK
 from twin.datasets.data_set import load_description as load_data_set
 from twin.design.study import load_study
 from twin.design.sweep import encode_part, read_parts
-from twin.experiments.published import load_published
+from twin.experiments.figures import load_published
 from twin.scene.campaign import load_campaign
 from twin.scene.description import Mesh, load_scene
 from twin.scene.finish import read_grey

@@ -22,8 +22,19 @@ from twin.rendering_options import Options
 from twin.scene.description import PrintedPlate, Scene, medium_of, replace_values
 from twin.scene.finish import shift_points
 from twin.scene.platforms import Light, Platform, Shot
-from twin.sensor.detector import INVALID, PeakFinder, electrons_per_ms, fixed_pattern, grey_values
-from twin.sensor.flaws import add_glare, as_built, deliver_image, dirt, laser_shares, vignette
+from twin.sensor.detector import (
+    INVALID,
+    PeakFinder,
+    add_glare,
+    as_built,
+    deliver_image,
+    dirt,
+    electrons_per_ms,
+    fixed_pattern,
+    grey_values,
+    laser_shares,
+    vignette,
+)
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object

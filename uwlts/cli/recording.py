@@ -53,7 +53,7 @@ def doctor(call: Call) -> None:
 @command_from(app, uwlts, "design", job="Design")
 def design(call: Call) -> None:
     """Example: uwlts design thesis --medium water"""
-    from uwlts.optics.design_table import format_table
+    from uwlts.optics.nominal import format_table
 
     show(format_table(call()))
 

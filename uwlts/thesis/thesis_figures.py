@@ -9,8 +9,7 @@ import numpy as np
 from scipy import stats
 
 from uwlts.calibration.capture_evidence import step_evidence
-from uwlts.calibration.sequential.step_images import StepImage, label_step
-from uwlts.calibration.sequential.window_distance import solve_window
+from uwlts.calibration.sequential.step_images import StepImage, label_step, solve_window
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.evaluation.artefact_figures import evaluate_spheres
 from uwlts.model.any_calibration import AnyCalibration

@@ -12,7 +12,7 @@ from twin.light.renderer import Renderer
 from twin.recording.record_scene import record_scene
 from twin.recording.sensor_simulator import SensorSimulator
 from twin.rendering_options import NONE, Flaws, Options
-from twin.sensor.flaws import dirt
+from twin.sensor.detector import dirt
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture

@@ -29,11 +29,11 @@ from uwlts.calibration.sequential.sheet_fit import (
     object_frame,
     points_on_target,
 )
-from uwlts.calibration.sequential.step_images import label_steps
-from uwlts.calibration.sequential.window_distance import (
+from uwlts.calibration.sequential.step_images import (
     WindowSolution,
     doubt_step_height,
     doubt_target_size,
+    label_steps,
     solve_window,
 )
 from uwlts.calibration.target_stripes import doubt_sheet_at_rest
